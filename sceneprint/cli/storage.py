@@ -146,9 +146,9 @@ def run_fsck(options: argparse.Namespace) -> int:
             tqdm.write(_line(finding))
     repaired = sum(each.done is not None for each in findings)
     if repaired:
-        kept_days = settings_of(options).audit_log_days
+        days = settings_of(options).audit_log_days
         with acting_as(COMMAND), open_command_store(settings_of(options)) as store:
-            Audit(store, kept_days).record("store.repaired", options.map, repaired=repaired)
+            Audit(store, days).record("store.repaired", options.map, repaired=repaired)
     if options.json is not None:
         record = {"checked": dict(counts), "findings": [_record(each) for each in findings]}
         write_whole(options.json, (json.dumps(record, indent=1) + "\n").encode())

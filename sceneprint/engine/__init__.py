@@ -1,4 +1,4 @@
-"""The engine: computation on stored frames, from uploads to answers.
+"""The engine: storage, signing and search of frames, from uploads to answers.
 
 frame  --Uploads.add-->  store  --JobRunner.run-->  signature  --Queries.upload-->  Answer
 """

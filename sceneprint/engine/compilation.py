@@ -1,8 +1,8 @@
-"""Compilation of kernels in advance, by separate processes.
+"""Ahead-of-time compilation of numba kernels by separate processes.
 
-A process that compiles cannot answer requests, so other processes compile the kernels and write
-their machine code to the disk: one those of signing and one those of validation. Kernels of clouds
-and of views of surfaces are compiled when the first cloud or surface arrives.
+Compilation would block requests, so other processes compile the kernels and cache their machine
+code on disk: one process compiles the kernels of signing, another those of validation. Kernels of
+clouds and of rendered views are compiled when the first cloud or surface arrives.
 
     python -m sceneprint.engine.compilation signing|validation|clouds FOLDER_OF_TABLES
 """
@@ -26,20 +26,20 @@ from sceneprint.geometry.signature import pair_features
 from sceneprint.geometry.views import plan
 from sceneprint.models import PRESETS, read_model
 
-#: Kernel of each part that is compiled last; if its machine code exists, the part is compiled.
+#: The last kernel that each part compiles; if its machine code is cached, the part is complete.
 _LAST = {"signing": pair_features._count, "validation": icp.refine_in_place, "clouds": plan._add}
-#: Parts that a service for depth images needs, and those that a service for clouds needs.
+#: Parts that a service for depth images needs, and parts that a service for clouds needs.
 DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
-#: Seconds between checks of the processes.
+#: Seconds between checks of the compiling processes.
 _LOOK_S = 0.05
 #: Seconds between reports of progress.
 _REPORT_S = 5.0
-#: Held during compilation, so that other threads wait.
+#: Lock during compilation, for which other threads wait.
 _compiling = threading.Lock()
 
 
 def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
-    """Return the parts that are not compiled yet for this processor and version."""
+    """Return the parts that are not compiled for this processor and version."""
     return tuple(part for part in parts if not code_folder(_LAST[part])[1])
 
 
@@ -49,14 +49,16 @@ def compile_kernels(
 ) -> None:  # fmt: skip
     """Compile missing parts, each in its own process, and wait for the processes.
 
-    Kernels of a failed process are compiled on first use. The target is x86-64-v3, since wider
-    vector instructions slow down processors with slow gather instructions (docs/performance.md).
-    On other processors, such as arm64, and if NUMBA_CPU_NAME is set, it is the actual processor.
+    If a process fails, its kernels are compiled on first use. The target is x86-64-v3, since wider
+    vector instructions are slower on processors with slow gather instructions
+    (docs/performance.md). On other architectures, and if NUMBA_CPU_NAME is set, it is the actual
+    processor.
 
     Parameters
     ----------
-    cache_dir : folder of pair tables, in which the table for signing is created
-    say : function that receives each line of progress
+    cache_dir : folder of pair tables, in which a table is created
+    parts : parts to compile, from `ALL`
+    say : function that receives lines of progress
     stop : event that cancels the compilation
     """
     with _compiling:
@@ -65,14 +67,14 @@ def compile_kernels(
             return
         report, started = say or (lambda _: None), time.monotonic()
         report(
-            f"first use after installation: compiling kernels for {' and '.join(absent)}, once; "
-            "it takes half a minute on two idle processors"
+            f"first use after installation: compiling kernels for {' and '.join(absent)}; this "
+            "takes half a minute on two idle processors"
         )
         environment = dict(os.environ)
         if not environment.get("NUMBA_CPU_NAME") and runs_here():
             environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES}
-        # clouds come last, since they reuse kernels of the other parts; each process writes a byte
-        # per compiled kernel to the file
+        # compile clouds last, since they reuse kernels of the other parts; each process writes one
+        # byte per compiled kernel to the file
         with os.fdopen(os.memfd_create("compiled kernels"), "wb") as compiled:
             for group in ([one for one in absent if one != "clouds"], ["clouds"]):
                 commands = {part: (part, str(cache_dir)) for part in group if part in absent}
@@ -85,7 +87,7 @@ def _run(
     commands: Mapping[str, Sequence[str]], environment: Mapping[str, str], compiled: IO[bytes],
     report: Callable[[str], None], stop: threading.Event | None,
 ) -> bool:  # fmt: skip
-    """Compile parts concurrently; return whether `stop` was set."""
+    """Run compiling processes, and report progress; return whether `stop` was set."""
     running: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for part, arguments in commands.items():
@@ -106,8 +108,8 @@ def _run(
                     del running[part]
                     if process.returncode:
                         report(
-                            f"kernels for {part} not compiled (exit code {process.returncode})"
-                            "; they are compiled on first use"
+                            f"kernels for {part} not compiled (exit code {process.returncode}); "
+                            "they are compiled on first use"
                         )
             time.sleep(_LOOK_S)
     finally:
@@ -118,13 +120,13 @@ def _run(
 
 
 def _compile(part: str, cache_dir: Path) -> None:
-    """Compile the kernels of a part by using each of them once."""
+    """Compile the kernels of a part by calling each kernel once."""
     from sceneprint.engine.signers import warm_clouds, warm_signing, warm_validation, warm_views
     from sceneprint.pipeline import open_signer
 
     model = read_model(PRESETS[0])
     p = model.parameters.validation
-    # a stored result of signing, so that both parts can be compiled concurrently
+    # a stored artifact makes validation independent of signing
     corner = read_geometry(files("sceneprint.engine").joinpath("corner.artifact").read_bytes())
     if part == "validation":
         warm_validation(corner, p)
@@ -145,7 +147,7 @@ def _report_kernels() -> None:
 
     class Reporter(event.Listener):
         def on_start(self, _event: Any) -> None:
-            """Do nothing: kernels are counted at their end."""
+            """Do nothing; kernels are counted when their compilation ends."""
 
         def on_end(self, _event: Any) -> None:
             sys.stdout.write(".")

@@ -1,4 +1,4 @@
-"""The shared objects of an engine: settings, store, wakeup, signers, readers and query log."""
+"""Context of an engine: settings, store, wakeup, signers, readers and query log."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from sceneprint.store.wakeup import Notices, Wakeup
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """The shared objects of one process; safe to share between threads.
+    """Objects that the parts of an engine share in one process; safe to share between threads.
 
     Parameters
     ----------
-    bell : signal that wakes workers which wait for jobs
-    indexes : indexes of all maps, which a fleet may share
-    cores : processor cores for queries
+    bell : signal that wakes workers waiting for jobs
+    indexes : indexes of all maps
+    cores : allocation of processor cores to queries
     """
 
     settings: Settings
@@ -48,7 +48,7 @@ class Context:
 def open_context(
     settings: Settings, patience_s: float = 0.0, may_go_on: Callable[[float], bool] | None = None
 ) -> Iterator[Context]:
-    """Open a store and the objects that use it, and close them at the end.
+    """Open a context, and close it at the end.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def require_writable(settings: Settings) -> None:
 
 def _enter(stack: ExitStack, settings: Settings) -> Context:
     decoders: Decoders = LocalDecoders(settings.concurrent_requests)
-    if settings.decoders > 0:  # the processes start with the first upload
+    if settings.decoders > 0:
         decoders = DecoderPool(
             settings.decoders,
             settings.decoder_memory_bytes,
             settings.decoder_timeout_s,
             current_tenant,
         )
-    with ExitStack() as opened:  # closes what was opened if a later step fails
+    with ExitStack() as opened:  # closes the objects if a later step fails
         store = open_store(
             settings.database, settings.blobs, settings.geometry_cache_bytes, decoders
         )
@@ -93,7 +93,7 @@ def _enter(stack: ExitStack, settings: Settings) -> Context:
         server = not store.database.is_sqlite
         bell = Notices(store.database) if server else Wakeup(settings.bell_dir)
         opened.callback(bell.close)
-        # concurrent requests use all cores, and a fixed order of sums gives reproducible bytes
+        # one BLAS thread: requests run in parallel, and the order of sums is reproducible
         opened.enter_context(threadpool_limits(1))
         cores = opened.enter_context(closing(Cores(settings.query_cores)))
         answers = open_answers(store.blobs, settings.query_dir)

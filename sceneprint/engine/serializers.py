@@ -1,4 +1,4 @@
-"""API records and entity tags of rows of the store."""
+"""Conversion of store rows to API records and entity tags."""
 
 from __future__ import annotations
 
@@ -38,30 +38,30 @@ from sceneprint_client.api.base import Direction
 from sceneprint_client.api.frames import Kind, SampleRange
 from sceneprint_client.poses import quaternion_of
 
-#: Columns of a frame that can be edited.
+#: Editable columns of a frame.
 EDITABLE = (
     "robot", "session", "captured_at", "tags", "pose_parent", "pose", "base_frame", "base", "up",
     "name", "sequence",
 )  # fmt: skip
 
 
-#: Like `json.dumps(parts, sort_keys=True)`, which would create an encoder for each call.
+#: Equivalent to `json.dumps(parts, sort_keys=True)`, without creating an encoder in each call.
 _encode = json.JSONEncoder(sort_keys=True).encode
 
 
 def tag_of(*parts: object) -> str:
-    """Return an entity tag of 32 digits, which is a hash of the parts as JSON."""
+    """Return an entity tag: 32 hexadecimal digits of a hash of the parts as JSON."""
     encoded = _encode(parts)
     return hashlib.sha256(encoded.encode()).hexdigest()[:32]
 
 
 def frame_tag(frame: FrameRow) -> str:
-    """Return the entity tag of a frame, which changes with its editable columns."""
+    """Return the entity tag of a frame: a hash of its editable columns."""
     return tag_of("frame", [getattr(frame, name) for name in EDITABLE])
 
 
 def map_tag(row: MapRow) -> str:
-    """Return the entity tag of a map, which changes with its editable columns."""
+    """Return the entity tag of a map: a hash of its editable columns."""
     limits = row.quota_frames, row.quota_bytes, row.retention_days
     return tag_of("map", row.name, row.title, *limits, row.up)
 
@@ -79,52 +79,53 @@ def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
 
 
 def when(seconds: float | None) -> Any:
-    """Return seconds since 1970 as a time in UTC."""
+    """Convert seconds since 1970 to a time in UTC; None remains None."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
 
 
 def model_label(name: str, model_id: str) -> str:
-    """Return the label of a model, as `Model.label` does."""
+    """Return the label of a model; see `Model.label`."""
     return f"{name}-{model_id[:12]}"
 
 
 def sensor_frame(frame_id: str, kind: Kind) -> str:
-    """Return the name of a sensor frame in transforms: optical for a camera, else with its axes."""
+    """Return the name of a sensor frame: ID.optical for a camera, else ID.sensor."""
     return f"{frame_id}.optical" if kind == "depth" else f"{frame_id}.sensor"
 
 
 def sensor_of(frame: FrameRow) -> str:
-    """Return the name of a stored frame's sensor frame in transforms."""
+    """Return the name of the sensor frame of a stored frame."""
     return sensor_frame(frame.id, frame.kind)
 
 
 def query_sensor(frame: FrameName | None, kind: Kind, maps: Sequence[str]) -> str:
-    """Return the name of a query's sensor frame in transforms.
+    """Return the name of the coordinate frame of the sensor of a query.
 
-    It contains the id of a stored frame only if its own map is searched alone, since another map
-    may have a frame of the same id.
+    The name contains the id of a stored frame only if no other map is searched, since another map
+    may have a frame with the same id.
 
     Parameters
     ----------
-    frame : stored frame that is the query; None for an upload
+    frame : stored frame that is queried; None for an upload
+    kind : kind of the query frame
     maps : names of the searched maps
     """
     alone = frame is not None and list(maps) == [frame.map]
     return sensor_frame(frame.frame_id if frame is not None and alone else "query", kind)
 
 
-#: Time span of `recent_queries`, seconds.
+#: Length of the period of `recent_queries`, seconds.
 RECENT_S = 3600.0
 
 
 def map_records(connection: Connection, rows: Sequence[MapRow]) -> list[Map]:
-    """Return the API records of maps; the queries of all maps are counted together."""
+    """Return the API records of maps."""
     counts = count_statuses(connection, time.time() - RECENT_S)
     return [map_record(connection, row, counts.get(row.number, {})) for row in rows]
 
 
 def map_record(connection: Connection, row: MapRow, recent: Mapping[str, int] | None = None) -> Map:
-    """Return the API record of a map; without `recent`, count its recent queries."""
+    """Return the API record of a map; `recent` is its number of recent queries by status."""
     if recent is None:
         since = time.time() - RECENT_S
         recent = count_statuses(connection, since, row.number).get(row.number, {})
@@ -160,13 +161,13 @@ def map_record(connection: Connection, row: MapRow, recent: Mapping[str, int] | 
 
 
 def frame_records(connection: Connection, row: MapRow, rows: list[FrameRow]) -> list[Frame]:
-    """Return the API records of frames of one map, without content that a purge removes."""
+    """Return the API records of frames of a map; fields that a purge has removed are null."""
     jobs = signing_jobs(connection, [frame.number for frame in rows])
     return [_frame(row, without_content(frame), jobs[frame.number]) for frame in rows]
 
 
 def job_progress(job: JobRow) -> Progress | None:
-    """Return the progress of a long job; None before the end of its first slice."""
+    """Return the progress of a long job; None before the end of the first slice."""
     if job.progress is None:
         return None
     fields = {name: job.progress[name] for name in Progress.model_fields if name in job.progress}
@@ -237,12 +238,12 @@ def _direction(up: Sequence[float] | None) -> Direction | None:
 
 
 def sample_range_of(frame: FrameRow) -> SampleRange | None:
-    """Return the range of a frame's samples; None after its purge."""
+    """Return the sample range of a frame; None after a purge."""
     return None if frame.samples is None else SampleRange.model_validate(frame.samples)
 
 
 def _sensor_record(frame: FrameRow) -> dict[str, Any]:
-    """Return the fields of a frame's record that describe its samples or points."""
+    """Return the fields of a frame record that describe its samples or points."""
     if frame.cloud is None:
         return {
             "kind": "depth",

@@ -1,4 +1,4 @@
-"""Cached signers of models, and use of all kernels before the first request."""
+"""Cache of signers by model, and warm-up of all kernels before the first request."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from sceneprint.types import Cloud, DepthFrame, Geometry, Intrinsics, ReferenceS
 
 log = logging.getLogger(__name__)
 
-#: Seconds for which a request waits for the compilation of kernels.
+#: Maximum seconds that a request waits for the compilation of kernels.
 KERNELS_S = 20.0
 
 
 class Signers:
-    """Signers by the ids of their models, which are in the database.
+    """Cached signers of the models of a store; safe to share between threads.
 
     Parameters
     ----------
@@ -47,11 +47,11 @@ class Signers:
         self._compiled.set()
 
     def hold(self) -> None:
-        """Let signing and validation wait while another process compiles kernels."""
+        """Make signing and validation wait, while another process compiles kernels."""
         self._compiled.clear()
 
     def release(self) -> None:
-        """Let signing and validation continue after `hold`."""
+        """Let signing and validation proceed after `hold`."""
         self._compiled.set()
 
     def require_kernels(self, wait_s: float | None = None) -> None:
@@ -71,7 +71,7 @@ class Signers:
         Busy : If kernels are still being compiled.
         """
         self.require_kernels()
-        with self._lock:  # a table takes seconds to build, so only one thread may
+        with self._lock:  # avoid building the same table twice
             if model_id not in self._open:
                 with self.database.read() as connection:
                     content = model_content(connection, model_id)
@@ -80,7 +80,7 @@ class Signers:
             return self._open[model_id]
 
     def of(self, model: Model) -> Signer:
-        """Return the signer of a model that need not be stored; raise Busy as `__call__` does."""
+        """Return the signer of a model, stored or not; raise Busy while kernels are compiled."""
         self.require_kernels()
         with self._lock:
             if model.id not in self._open:
@@ -88,27 +88,27 @@ class Signers:
             return self._open[model.id]
 
     def warm(self) -> None:
-        """Load code and tables of all models in use before a request needs them."""
+        """Load the kernels and the tables of all models in use."""
         with self.database.read() as connection:
             used = {one for row in list_maps(connection) for one in models_of(row)}
         for model_id in used:
             try:
                 warm(self(model_id))
-            except ModelError as error:  # maps of other models are not affected
+            except ModelError as error:
                 log.error("model unusable", extra={"model": model_id, "error": str(error)})
 
 
 def warm(signer: Signer, *, clouds: bool = False) -> bool:
-    """Sign, search and validate a corner of a room, to compile or load all kernels.
+    """Compile or load all kernels: sign, search and validate the image of a corner of a room.
 
     Parameters
     ----------
     signer : signer, whose table is loaded
-    clouds : whether to include kernels of clouds, which take long to compile
+    clouds : whether to include the kernels of clouds
 
     Returns
     -------
-    is_complete : whether every stage has run; False for a model whose range excludes the corner
+    is_complete : whether all stages have run; False if the corner is out of the range of the model
     """
     p = signer.model.parameters.validation
     with suppress(FrameError):
@@ -120,7 +120,7 @@ def warm(signer: Signer, *, clouds: bool = False) -> bool:
 
 
 def warm_signing(signer: Signer) -> bytes:
-    """Sign and search the corner, and return its artifact."""
+    """Sign and search the image of a corner; return its artifact."""
     signature, seen = prepare(_corner(), signer)
     metric, rows = signer.model.metric, signature.vector[None].copy()
     search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
@@ -131,15 +131,15 @@ def warm_signing(signer: Signer) -> bytes:
 
 
 def warm_validation(geometry: Geometry, p: ValidationParameters) -> bool:
-    """Validate a corner against itself, draw it, and return whether it was accepted."""
-    drawn = sample_points(geometry.surface, 1)  # the dashboard draws points in this way
+    """Validate a geometry against itself, and draw it; return whether it was accepted."""
+    drawn = sample_points(geometry.surface, 1)  # as the dashboard does
     patches_at(drawn, geometry.patches)
     residuals(drawn, geometry.surface, np.eye(4), p.agreement)
     return validate(geometry, geometry, p=p).status == "accepted"
 
 
 def warm_clouds(signer: Signer, geometry: Geometry) -> None:
-    """Sign and validate the corner as points, with and without a viewpoint."""
+    """Sign and validate the corner as a point cloud, with and without a viewpoint."""
     p = signer.model.parameters.validation
     for has_viewpoint in (True, False):
         _, points = prepare(_cloud(_corner(), has_viewpoint=has_viewpoint), signer)
@@ -147,7 +147,7 @@ def warm_clouds(signer: Signer, geometry: Geometry) -> None:
 
 
 def warm_views() -> None:
-    """Choose and render views of a small room, from its points and from its triangles."""
+    """Choose and render views of a small room, as a cloud and as a mesh."""
     model = read_model("depth").parameters
     camera = view_parameters(model, Intrinsics(40, 30, 36, 36, 19.5, 14.5))
     corners = np.array([[x, y, z] for x in (0, 3) for y in (0, 3) for z in (0, 2.5)], np.float32)
@@ -164,7 +164,7 @@ def warm_views() -> None:
 
 
 def _corner() -> DepthFrame:
-    """Return a view of a wall, a floor and a box at a distance of two metres."""
+    """Return a depth image of a wall, a floor and a box at a distance of two metres."""
     camera = Intrinsics(256, 192, 220, 220, 127.5, 95.5)
     y, x = np.mgrid[0:192, 0:256]
     right, down = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
@@ -174,7 +174,7 @@ def _corner() -> DepthFrame:
 
 
 def _cloud(frame: DepthFrame, *, has_viewpoint: bool) -> Cloud:
-    """Return the points of a depth image."""
+    """Convert a depth image to a point cloud, with or without a viewpoint."""
     k = frame.intrinsics
     v, u = np.nonzero(frame.depth)
     z = frame.depth[v, u]

@@ -34,4 +34,4 @@ def test_a_map_is_pulled_and_renewed(
     said = sceneprint("pull", "--map", "nowhere", "--data", copy, expect=2)
     assert "nowhere" in said.stderr
     said = sceneprint("pull", "--map", "pulled", "--data", rooms, expect=2)
-    assert "is not a folder of pulled maps" in said.stderr
+    assert "contains files, but no pulled maps" in said.stderr

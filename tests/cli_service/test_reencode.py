@@ -39,7 +39,7 @@ def test_a_map_is_signed_anew_while_its_service_runs(
     answer = sceneprint("query", "anew", frame, "--json").stdout
     assert f'"model":"{told.model}"' in answer.replace(": ", ":")
     again = reencode("--model", "paper", expect=2).stderr
-    assert again.startswith("sceneprint reencode: Map 'anew' is already signed with paper-")
+    assert again.startswith("sceneprint reencode: Map 'anew' already uses the model paper-")
 
 
 def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint: Run, tmp_path: Path) -> None:

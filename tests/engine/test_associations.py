@@ -403,7 +403,7 @@ def test_too_many_frames_are_refused_in_words(
     engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(associations, "MOST_FRAMES", 8)
-    with pytest.raises(InvalidRequest, match="have 12 frames, but an association takes at most 8"):
+    with pytest.raises(InvalidRequest, match="12 frames, but an association can have at most 8"):
         engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     late = Filter(captured_after=BEGIN + timedelta(seconds=4))
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"], filter=late))

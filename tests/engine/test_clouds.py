@@ -65,7 +65,7 @@ def lose(engine: Engine, frame_id: str) -> None:
 def test_what_could_not_be_read_again_is_not_let_in() -> None:
     """A format that only its caller knows is lost with him."""
     odd = write_ply(np.eye(3)[np.arange(12) % 3]).replace(b"ply\n", b"ply\t\n", 1)
-    with pytest.raises(UnreadableCloud, match="does not start like a file"):
+    with pytest.raises(UnreadableCloud, match="does not have the magic bytes"):
         read_upload(odd, said(format="ply"), HERE)
 
 

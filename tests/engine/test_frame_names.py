@@ -189,7 +189,7 @@ def test_an_empty_trajectory_says_why(empty: Engine, uploads: Any, tmp_path: Pat
     send(empty, uploads[0], session="s", pose=None)
     assert told() == (0, "none of its 1 frames has a pose; send `pose` with uploads, or edit them")
     after = datetime(2026, 1, 1, tzinfo=UTC)
-    assert told(captured_after=after) == (0, "the map has no frame of session 's' in that time")
+    assert told(captured_after=after) == (0, "the map has no frame of session 's' in this period")
     send(empty, uploads[1], session="s")
     count, why = told()
     assert count == 0

@@ -138,7 +138,7 @@ def test_frames_that_cannot_be_compared(
     sent = (uploads[1].data, uploads[1].meta)
     with pytest.raises(InvalidRequest, match=r"map hall has depth-.* and map big has paper-"):
         full.queries.compare(stored, other, Comparison())
-    with pytest.raises(InvalidRequest, match="not signed with model 'paper'"):
+    with pytest.raises(InvalidRequest, match="not signed with the model 'paper'"):
         full.queries.compare(stored, sent, Comparison(model="paper"))
     with pytest.raises(InvalidRequest, match="is received"):
         full.queries.compare(other, sent, Comparison())

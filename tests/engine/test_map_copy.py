@@ -302,7 +302,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     other.mkdir()
     (other / "sceneprint.db").touch()
     for folder in (other, other / "sceneprint.db"):
-        with pytest.raises(InvalidRequest, match="not a folder of pulled maps"):
+        with pytest.raises(InvalidRequest, match="but no pulled maps"):
             map_copy.claim_folder(folder)
 
 

@@ -81,7 +81,7 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(
     assert second.state == FrameState.REDUNDANT
     assert second.reason == (
         f"the map already covers this place: the distance to frame {first.frame_id} is {near:.3f} "
-        f"of the distance of unrelated frames (required: more than {between:g})"
+        f"of the distance between unrelated frames, but `if_novel` requires more than {between:g}"
     )
     job = empty.get_job(second.job_id)
     assert (job.state, job.error) == (JobState.SUCCEEDED, None)

@@ -258,7 +258,7 @@ def test_every_frame_of_the_ranking_is_explained(
     assert outcomes == {"not_selected", "skipped", "accepted", "rejected"}
     plain = ask(full, names[0], k=3, stages=["retrieve"], explain=True).explanations
     assert [one.outcome for one in plain] == ["ranked"] * 3 + ["not_selected"] * 8
-    assert plain[3].reason == "not among the first 3 of the ranking, which were the candidates"
+    assert plain[3].reason == "not a candidate: these were the first 3 frames of the ranking"
 
 
 def test_a_frame_is_explained_where_it_was_lost(
@@ -301,7 +301,7 @@ def test_a_frame_is_explained_where_it_was_lost(
     turn = explained(near[5], k=1, stages=VR)
     right(turn)
     assert (turn.lost_at, turn.selected) == ("turn", True)
-    said = "enough matches were accepted before it; aligned only for this explanation"
+    said = "enough matches were accepted before it; validated only for this explanation"
     assert turn.reason.startswith(said)
     missed = explained(near[4], candidates=2, stages=VR)
     right(missed)
@@ -341,7 +341,7 @@ def test_what_an_approximate_index_missed_is_said(
         assert (one.rank, one.shortlisted) == (rank, name != lost)
         if name == lost:
             assert (one.lost_at, one.ranked) == ("shortlist", False)
-            assert one.reason == "the index missed it, although its rank is 2; query with `exact`"
+            assert one.reason.startswith("the approximate index missed it, although its rank is 2")
         elif rank <= 4:  # one place is free
             assert (one.lost_at, one.ranked) == (None, True)
         else:

@@ -153,7 +153,7 @@ def test_a_map_made_anew_has_the_quota_of_the_one_before(empty):
     assert (made.quota_frames, made.quota_bytes, made.retention_days) == (3, None, None)
     assert empty.create_map(NewMap(name="hall", model="depth"))[1] is False
     assert empty.create_map(NewMap(name="hall", model="depth", quota_frames=3))[1] is False
-    with pytest.raises(MapExists, match="different title, model, limits or up"):
+    with pytest.raises(MapExists, match="its title, model, limits or up vector differ"):
         empty.create_map(NewMap(name="hall", model="depth", quota_frames=4))
     empty.delete_map("hall")
     made, _ = empty.create_map(NewMap(name="hall", model="depth", quota_frames=None))

@@ -291,7 +291,7 @@ def test_what_cannot_be_begun(full: Engine, short_sighted: Path) -> None:
         full.reencode("nowhere", "paper")
     with pytest.raises(UnreadableModel):
         full.reencode("hall", "/nowhere.safetensors")
-    with pytest.raises(Conflict, match=r"is already signed with depth-.*\. There is nothing to do"):
+    with pytest.raises(Conflict, match=r"already uses the model depth-.*\."):
         full.reencode("hall", "depth")
     with pytest.raises(Conflict, match="not switching to another model"):
         map_lifecycle.cancel_reencoding(full.store, "hall")

@@ -169,7 +169,7 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     answer = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
     assert answer.model.startswith("small-")
     models[:] = [DEPTH, small_file] * 5
-    with pytest.raises(Busy, match="kept changing its model"):
+    with pytest.raises(Busy, match="switched its model repeatedly"):
         full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
 
 

@@ -1,1 +1,1 @@
-"""Keys, statistics, events and the audit log."""
+"""Administration of a store: keys, tenants, statistics, events and the audit log."""

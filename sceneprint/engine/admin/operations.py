@@ -1,4 +1,4 @@
-"""Events, audit log, keys and tenants of a store, and the removal of their old rows."""
+"""Events, audit log, keys and tenants of a store, and removal of expired rows."""
 
 from __future__ import annotations
 
@@ -54,17 +54,18 @@ from sceneprint_client.api.base import MAP_OR_EVERY
 #
 # after  --begin-->  place  --next_events-->  events and the next place, repeatedly
 #
-# A place is a number among the events of all maps, and stays in the process. Readers get `seen`
-# instead, the last event up to it that they may see.
+# A place is the number of an event among those of all maps. It is not sent to readers, who receive
+# `seen` instead: the number of the last event that they may read.
 
 
 class EventSlice(NamedTuple):
-    """The next events of a reader.
+    """A slice of the event stream of a reader.
 
     Parameters
     ----------
-    place : number up to which the events are complete
-    seen : last number up to it that the reader may see
+    events : events, oldest first
+    place : number of the last event that was read, of any map
+    seen : number of the last event up to `place` that the reader may read
     """
 
     events: list[EventRow]
@@ -72,19 +73,21 @@ class EventSlice(NamedTuple):
     seen: int
 
 
-def begin(database: Database, wanted: EventFilter, kept: int, after: int | None) -> EventSlice:
-    """Return the place at which a reader starts, and a `missed` event if events were removed.
+def begin(database: Database, wanted: EventFilter, minimum: int, after: int | None) -> EventSlice:
+    """Start an event stream: return its first place, and a `missed` event if events were removed.
 
     Parameters
     ----------
-    kept : number of newest events of each map that are never removed
-    after : number of the reader's last event; None: start with new events
+    database : database of the events
+    wanted : events that the reader may read and has requested
+    minimum : number of newest events per map that are never removed
+    after : number of the last event that the reader has received; None starts with new events
     """
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
         seen = newest_seen(connection, wanted)
-        lost = after is not None and removal_floor(connection, wanted, kept, after) > after
+        lost = after is not None and removal_floor(connection, wanted, minimum, after) > after
     if after is None:
         return EventSlice([], newest, seen)
     if after > newest:  # the database was restored to an earlier state
@@ -93,7 +96,7 @@ def begin(database: Database, wanted: EventFilter, kept: int, after: int | None)
 
 
 def next_events(database: Database, wanted: EventFilter, place: int, most: int) -> EventSlice:
-    """Return at most `most` events after a place."""
+    """Return the next slice of a stream: at most `most` events after a place."""
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
@@ -104,38 +107,38 @@ def next_events(database: Database, wanted: EventFilter, place: int, most: int) 
 
 
 def missed(place: int) -> EventRow:
-    """Return an event that reports removed ones before the remaining ones."""
+    """Return a `missed` event: events after `place` were removed unread."""
     return EventRow(place, time.time(), MISSED, None, None, None, {})
 
 
 log = logging.getLogger(__name__)
 
-#: Seconds between removals of old events, and maximum number of events in one.
+#: Seconds between removals of old events, and maximum number of events per removal.
 TIDY_S = 60.0
 AT_MOST = 20_000
-#: Maximum number of prefixes of kinds in a request.
+#: Maximum number of prefixes of event kinds in a request.
 MOST_KINDS = 20
 
 
 class Events:
-    """Events of one store, and their removal."""
+    """The events of a store: pages of them, and removal of old ones."""
 
     def __init__(self, store: Store, settings: Settings) -> None:
         self._store, self._settings = store, settings
         self._tidied = time.monotonic()
 
     def wanted(self, map_name: str | None = None, kinds: Sequence[str] = ()) -> EventFilter:
-        """Return the filter of a request.
+        """Return the event filter of a request.
 
         Parameters
         ----------
-        map_name : only map; None: all
-        kinds : prefixes of kinds; empty: all
+        map_name : map of the events; None selects all maps
+        kinds : prefixes of event kinds, such as `frame.`; an empty sequence selects all kinds
 
         Raises
         ------
         UnknownMap : If the map does not exist.
-        InvalidRequest : If there are too many kinds, or one is malformed.
+        InvalidRequest : If there are more than MOST_KINDS kinds, or a kind is malformed.
         """
         if len(kinds) > MOST_KINDS or not all(re.fullmatch(r"[a-z_.]{1,32}", k) for k in kinds):
             raise InvalidRequest(
@@ -157,10 +160,11 @@ class Events:
 
         Parameters
         ----------
-        after : id of an event, after which the page starts
+        wanted : filter, see the method `wanted`
+        after : id of the event before the first event of the page
         cursor : `next_cursor` of the previous page
         limit : maximum number of events
-        newest_first : whether the newest comes first
+        newest_first : whether to sort the events from new to old
 
         Raises
         ------
@@ -183,9 +187,10 @@ class Events:
         return EventPage(items=items, next_cursor=more, newest=seals.seal("event", newest))
 
     def tidy(self) -> int:
-        """Remove old events and idempotent requests if it is due; return the number of events.
+        """Remove old events and idempotency keys, at most every TIDY_S seconds; return the number
+        of removed events.
 
-        Errors are logged, and a later call tries again.
+        Errors are logged; a later call retries.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
@@ -198,13 +203,13 @@ class Events:
             return 0
 
     def remove_surplus(self) -> int:
-        """Remove surplus events in blocks; return their number."""
-        kept, indexes = self._settings.events_per_map, Path(self._settings.indexes)
+        """Remove events beyond the number stored per map, in blocks; return their number."""
+        stored_events, indexes = self._settings.events_per_map, Path(self._settings.indexes)
 
         def spent(connection: Connection, limit: int) -> list[int]:
-            if not surplus_events(connection, kept, (), 1):
-                return []  # the usual case, in which no index is read
-            return surplus_events(connection, kept, anchors(indexes), limit)
+            if not surplus_events(connection, stored_events, (), 1):
+                return []  # usual case; avoids reading the indexes
+            return surplus_events(connection, stored_events, anchors(indexes), limit)
 
         return remove_in_blocks(self._store.database, spent, remove_events, AT_MOST)
 
@@ -217,22 +222,22 @@ def event_record(seals: OpaqueIds, row: EventRow) -> Event:
     )  # fmt: skip
 
 
-#: Seconds between removals of old lines of the audit log.
+#: Seconds between removals of expired lines of the audit log.
 PRUNE_S = 3600.0
-#: Number of lines to read at once.
+#: Number of audit lines read in one transaction.
 _BLOCK = 1000
 
 
 class Audit:
-    """The audit log of one store.
+    """The audit log of a store.
 
     Parameters
     ----------
-    kept_days : age at which lines are removed
+    days : age in days at which lines are removed
     """
 
-    def __init__(self, store: Store, kept_days: float) -> None:
-        self._store, self._kept_s = store, DAY_S * kept_days
+    def __init__(self, store: Store, days: float) -> None:
+        self._store, self._lifetime_s = store, DAY_S * days
         self._pruned = time.monotonic() - PRUNE_S
 
     def record_refusal(
@@ -248,25 +253,25 @@ class Audit:
     def record(
         self, action: str, map_name: str | None = None, target: str | None = None, **data: Any
     ) -> None:
-        """Write a line for a change outside the database, or in many transactions."""
+        """Write a line for a change that is not made by a single database transaction."""
         with self._store.database.write(turn=False) as connection:
             audit_log.record_change(connection, action, map_name, target, **data)
 
     def tidy(self, now: float | None = None) -> int:
-        """Remove expired lines if it is due, and return their number.
+        """Remove expired lines, at most every PRUNE_S seconds; return the number of removed lines.
 
-        Errors are logged, and a later call tries again.
+        Errors are logged; a later call retries.
 
         Parameters
         ----------
-        now : seconds since 1970; None reads the clock of the database
+        now : current time, seconds since 1970; None reads the clock of the database
         """
         if time.monotonic() - self._pruned < PRUNE_S or self._store.database.read_only:
             return 0
         self._pruned = time.monotonic()
 
         def spent(connection: Connection, limit: int) -> list[int]:
-            before = (read_clock(connection) if now is None else now) - self._kept_s
+            before = (read_clock(connection) if now is None else now) - self._lifetime_s
             return audit_log.surplus_lines(connection, before, limit)
 
         try:
@@ -276,9 +281,9 @@ class Audit:
             return 0
 
     def lines(self, wanted: AuditFilter) -> Iterator[AuditLine]:
-        """Yield all lines, oldest first."""
+        """Yield the lines that pass a filter, oldest first."""
         after = 0
-        while True:  # a transaction for each block, as the reader may be slow
+        while True:  # one transaction per block, since the consumer may be slow
             with self._store.database.read() as connection:
                 block = audit_log.list_lines(connection, wanted, _BLOCK, after=after)
             if not block:
@@ -289,7 +294,7 @@ class Audit:
     def page(
         self, wanted: AuditFilter, cursor: str | None = None, limit: int = 100
     ) -> Page[AuditLine]:
-        """Return a page of lines, newest first.
+        """Return a page of the lines that pass a filter, newest first.
 
         Raises
         ------
@@ -312,20 +317,20 @@ def create_key(
     store: Store, name: str, grants: Mapping[str, Scope] | None = None,
     expires_at: datetime | None = None, tenant: str | None = None,
 ) -> MadeKey:  # fmt: skip
-    """Create a key, and return it with its secret, which is not stored.
+    """Create a key, and return it with its secret, of which only a hash is stored.
 
     Parameters
     ----------
-    grants : scope by name of a map, or `*` for all maps; None grants admin for all maps
-    expires_at : end of validity, with a time zone; None for no end
-    tenant : owner; None selects a tenant with the key's name
+    grants : scope by map name, where `*` stands for all maps; None grants `admin` on all maps
+    expires_at : time with a time zone at which the key expires; None for no expiry
+    tenant : name of the owner; None creates or selects the tenant with the name of the key
 
     Raises
     ------
-    InvalidRequest : If the name is empty, too long, not printable or reserved; if a map name is
-        malformed; or `expires_at` is out of range.
+    InvalidRequest : If the name is empty, too long, not printable or reserved, a map name is
+        malformed, or `expires_at` is out of range.
     Conflict : If the name is in use.
-    UnknownTenant : If the tenant does not exist.
+    UnknownTenant : If `tenant` does not exist.
     """
     _check_name(name, "key")
     granted: dict[str, Scope] = dict(grants or {EVERY: "admin"})
@@ -378,7 +383,7 @@ def _check_name(name: str, of: str) -> None:
         )
 
 
-#: Default and maximum seconds for which the former secret stays valid after a rotation.
+#: Default and maximum validity of the old secret after a rotation, seconds.
 OVERLAP_S, MOST_OVERLAP_S = 3600.0, 30 * 86_400.0
 
 
@@ -389,15 +394,15 @@ def revoke_key(store: Store, name: str) -> None:
 
 
 def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey:
-    """Replace the secret of a key, and return the key with its new secret.
+    """Replace the secret of a key; return the key with its new secret.
 
     Parameters
     ----------
-    overlap_s : seconds for which the former secret remains valid
+    overlap_s : seconds for which the old secret remains valid
 
     Raises
     ------
-    InvalidRequest : `overlap_s` is negative, or more than 30 days.
+    InvalidRequest : If `overlap_s` is negative or longer than 30 days.
     UnknownKey : If the key does not exist.
     """
     if not 0 <= overlap_s <= MOST_OVERLAP_S:
@@ -429,11 +434,11 @@ def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page
 
 
 def _until(expires_at: datetime) -> float:
-    """Return the seconds since 1970 of a time that UTC can represent."""
+    """Convert a time to seconds since 1970; raise InvalidRequest outside of the years 1 to 9999."""
     seconds = expires_at.timestamp()
     try:
         datetime.fromtimestamp(seconds, UTC)
-    except (ValueError, OverflowError) as error:  # its zone or rounding puts it out of range
+    except (ValueError, OverflowError) as error:  # out of range after conversion or rounding
         raise InvalidRequest(
             f"{expires_at.isoformat()} is not within the years 1 to 9999 of UTC. Omit expires_at "
             "to create a key that does not expire.",

@@ -60,7 +60,7 @@ MOST = 200
 
 
 def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexState:
-    """Return the state of a map's newest readable index, from its manifest."""
+    """Return the state of the newest readable index of a map, from its manifest."""
     for _, path in manifests(index_folder(indexes, row)):
         manifest = _read(path)
         if manifest is not None and row.pruned_revision <= manifest.revision <= row.revision:
@@ -72,14 +72,14 @@ def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexStat
 
 
 def index_states(connection: Connection, indexes: Path) -> list[IndexState]:
-    """Return the states of the maps that changed most often, the longest tail first."""
+    """Return the index states of the MOST maps with the most changes, longest tail first."""
     rows = sorted(list_maps(connection), key=lambda row: -row.revision)[:MOST]
     states = [index_state(connection, indexes, row) for row in rows]
     return sorted(states, key=lambda state: (-state.tail, state.map))
 
 
 def anchors(indexes: Path) -> frozenset[int]:
-    """Return the numbers of the events that are anchors of this machine's indexes."""
+    """Return the numbers of the events to which the indexes of this machine are anchored."""
     if not indexes.is_dir():
         return frozenset()
     folders = [folder for folder in indexes.iterdir() if is_index_folder(folder.name)]
@@ -95,19 +95,19 @@ def _read(path: Path) -> IndexManifest | None:
         return None  # readers skip it too
 
 
-# Sizes of a store's parts on disk.
+# Disk usage of a store.
 
-#: Maximum number of files to measure; the size of the others is extrapolated.
+#: Maximum number of files to measure; the total size is extrapolated from them.
 MEASURED = 5_000
-#: Maximum number of frames of a map to measure, evenly spaced in upload order.
+#: Maximum number of frames per map to measure, evenly spaced in upload order.
 WEIGHED = 1_000
-#: Maximum number of frames of a store, and of objects, to measure in an object store.
+#: With an object store: maximum number of frames to sample, and of objects to measure.
 SPREAD, ASKED = 64, 16
 _HERE = func.current_database()
 
 
 def _bytes_of(folder: Path) -> int:
-    """Return the bytes of all files below a folder; files that are removed meanwhile count 0."""
+    """Return the total size of the files below a folder in bytes."""
     total = 0
     for path in folder.rglob("*"):
         with suppress(OSError):
@@ -117,7 +117,7 @@ def _bytes_of(folder: Path) -> int:
 
 
 def sizes(settings: Settings, store: Store) -> Sizes:
-    """Return the bytes of all parts of a store."""
+    """Return the bytes used by database, blobs and indexes, and the free bytes of the disk."""
     free, disk = _free_of(settings.data_dir)
     blobs = settings.blobs
     return Sizes(
@@ -128,9 +128,10 @@ def sizes(settings: Settings, store: Store) -> Sizes:
 
 
 def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRow) -> Sizes:
-    """Return the bytes of one map, which reveal nothing of other maps.
+    """Return the bytes used by one map.
 
-    A blob that several frames share counts for each of them.
+    A blob that several frames share counts for each frame, since otherwise the result would reveal
+    the content of other maps.
     """
     numbers, total = frame_queries.frames_with_uploads(connection, row.number, WEIGHED)
     uploads, signed, blobs = frame_queries.stored_sizes(connection, numbers)
@@ -153,7 +154,7 @@ def _of_database(database: Database) -> int | None:
 
 
 def _of_objects(store: Store) -> int:
-    """Return the bytes of all blobs in an object store, extrapolated from some rows."""
+    """Return the total size of blobs in an object store in bytes, extrapolated from some frames."""
     with store.database.read() as connection:
         sample = frame_queries.sample_frames(connection, SPREAD)
         uploads, _, artifacts = frame_queries.stored_sizes(connection, sample)
@@ -164,7 +165,7 @@ def _of_objects(store: Store) -> int:
 
 
 def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
-    """Return the bytes of some blobs; in an object store, extrapolate from a few."""
+    """Return the total size of blobs in bytes; in an object store, extrapolate from a sample."""
     if isinstance(blobs, FolderBlobs):
         return sum(blobs.size(digest) or 0 for digest in artifacts)
     sample = artifacts[:: max(-(-len(artifacts) // ASKED), 1)]
@@ -176,7 +177,10 @@ def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
 
 
 def _of_blobs(folder: Path) -> int:
-    """Return the bytes of all blobs, extrapolated: names are hashes, so all folders are alike."""
+    """Return the total size of the blobs in a folder in bytes, extrapolated from some subfolders.
+
+    File names are hashes, so all subfolders have similar sizes.
+    """
     try:
         parts = sorted(one.path for one in os.scandir(folder) if one.is_dir())
     except OSError:
@@ -191,13 +195,13 @@ def _of_blobs(folder: Path) -> int:
 
 
 def _file_sizes(folder: Path) -> Iterator[int]:
-    """Yield the bytes of each file of a folder."""
+    """Yield the size of each file in a folder, bytes."""
     try:
         for one in os.scandir(folder):
             if one.is_file(follow_symlinks=False):
                 yield _size(one)
     except OSError:
-        return  # removed in the meantime, or missing
+        return
 
 
 def _size(path: Path | os.DirEntry[str]) -> int:
@@ -208,7 +212,7 @@ def _size(path: Path | os.DirEntry[str]) -> int:
 
 
 def _free_of(folder: Path) -> tuple[int, int]:
-    """Return the free and total bytes of the disk of a folder, which may be missing."""
+    """Return the free and total bytes of the disk that contains a folder, even a missing folder."""
     try:
         usage = shutil.disk_usage(nearest_folder(folder))
     except OSError:
@@ -217,13 +221,13 @@ def _free_of(folder: Path) -> tuple[int, int]:
 
 
 MINUTE_S, HOUR_S = 60.0, 3600.0
-#: Seconds for which measured sizes are reused, as measuring takes long.
+#: Seconds for which measured sizes are cached.
 MEASURED_S = 30.0
-#: Seconds for which metrics are reused.
-TOLD_S = 1.0
-#: Number of frames and jobs above which a thread counts them, and its maximum share of time.
+#: Seconds for which metrics are cached.
+METRICS_CACHE_S = 1.0
+#: Number of frames and jobs from which a thread counts them, and its maximum share of the time.
 MANY, COUNTING = 100_000, 0.01
-#: Kinds of samples: counts of a service, and starts of workers.
+#: Kinds of samples: request counts of a service, and worker starts.
 SERVICE, WORKER = "service", "worker"
 
 
@@ -233,9 +237,10 @@ class Figures:
 
     Parameters
     ----------
-    began : number of workers that started in the last hour
+    stats : statistics
+    began : number of worker starts in the last hour
     events : number of the newest event
-    waiting : queued jobs by tenant
+    waiting : number of queued jobs by tenant
     """
 
     stats: Stats
@@ -246,13 +251,15 @@ class Figures:
 
 @dataclass(frozen=True)
 class StoreCounts:
-    """Counts that take longer the larger the store is.
+    """Counts whose computation time grows with the store.
 
     Parameters
     ----------
-    frames, jobs : numbers by state
-    sizes : bytes on the disk
+    frames, jobs : number of frames and of jobs, by state
+    indexes : result of `index_states`
+    sizes : result of `sizes`
     at : time of the counts, seconds since 1970
+    seconds : duration of the computation
     """
 
     frames: Mapping[str, int]
@@ -264,23 +271,23 @@ class StoreCounts:
 
     @property
     def is_large(self) -> bool:
-        """Whether the store is too large to be counted for each request."""
+        """Whether the store is too large to be counted on every request."""
         return sum(self.frames.values()) + sum(self.jobs.values()) >= MANY
 
     @property
     def is_old(self) -> bool:
-        """Whether the counts are outdated, or the clock was set back."""
+        """Whether the counts are due for renewal, or the clock was set back."""
         return not 0 <= time.time() - self.at < self.seconds / COUNTING
 
 
 def record_start(store: Store, worker: str) -> None:
-    """Record the start of a worker; ignore errors of the store."""
+    """Record the start of a worker; ignore store errors."""
     with suppress(SceneprintError), store.database.write(turn=False) as connection:
         store_counts.add_sample(connection, WORKER, worker, {})
 
 
 class Statistics:
-    """Statistics of one store."""
+    """Statistics of a store; safe to share between threads."""
 
     def __init__(self, context: Context) -> None:
         self._store, self._settings, self._bell = context.store, context.settings, context.bell
@@ -297,7 +304,7 @@ class Statistics:
         Parameters
         ----------
         minutes : length of the history, from 1 to 60
-        map_name : only map; None: all
+        map_name : map to report; None selects all maps
 
         Raises
         ------
@@ -343,17 +350,17 @@ class Statistics:
 
     def figures(self) -> Figures:
         """Return the metrics of the whole store, at most a second old."""
-        with self._lock:  # concurrent requests wait for the same metrics
+        with self._lock:  # concurrent requests share one computation
             now = time.monotonic()
-            if self._figures is None or now - self._figures[0] > TOLD_S:
+            if self._figures is None or now - self._figures[0] > METRICS_CACHE_S:
                 self._figures = now, self._look()
             return self._figures[1]
 
     def counts(self, connection: Connection) -> StoreCounts:
-        """Return the counts of frames and jobs, the states of indexes, and sizes.
+        """Return the counts of frames and jobs, the index states, and the sizes.
 
-        For a large store, return the last counts; a thread renews them for the share COUNTING of
-        the time.
+        For a large store, the counts are cached; a background thread renews them, and spends at
+        most the share COUNTING of the time on it.
         """
         counts = self._counts
         if counts is None or not counts.is_large:
@@ -361,13 +368,13 @@ class Statistics:
         if counts.is_old and self._counting.acquire(blocking=False):
             try:
                 threading.Thread(target=self._count_again, name="counts", daemon=True).start()
-            except BaseException:  # no thread could start; the next request tries again
+            except BaseException:  # no thread could be started; the next request retries
                 self._counting.release()
                 raise
         return counts
 
     def state_counts(self) -> tuple[dict[str, int], dict[str, int]]:
-        """Return how many frames and how many jobs are in each state; see `counts`."""
+        """Return the numbers of frames and of jobs by state; see `counts`."""
         with self._store.database.read() as connection:
             counts = self.counts(connection)
         return dict(counts.frames), dict(counts.jobs)
@@ -399,13 +406,13 @@ class Statistics:
             return Figures(stats, began, newest, waiting)
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
-        """Return processes that wait for jobs (on SQLite, of this machine), or run one."""
+        """Return the processes that wait for or run a job (on SQLite, those of this machine)."""
         busy = store_counts.running_jobs(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
 
     def sizes(self) -> Sizes:
-        """Return the bytes on the disk, at most MEASURED_S old."""
+        """Return the result of `sizes`, at most MEASURED_S seconds old."""
         now = time.monotonic()
         if self._sizes is None or now - self._sizes[0] > MEASURED_S:
             self._sizes = now, sizes(self._settings, self._store)
@@ -414,7 +421,7 @@ class Statistics:
     def _sizes_of_map(self, connection: Connection, row: MapRow) -> Sizes:
         now = time.monotonic()
         recent = {n: one for n, one in list(self._sizes_of.items()) if now - one[0] <= MEASURED_S}
-        if row.number not in recent:  # concurrent requests may measure twice
+        if row.number not in recent:
             recent[row.number] = now, sizes_of_map(connection, self._store, self._indexes, row)
             self._sizes_of = recent
         return recent[row.number][1]
@@ -440,11 +447,17 @@ def _minutes(
     happened: Mapping[tuple[int, str], int], samples: list[store_counts.Sample] | None,
     start: float, count: int,
 ) -> list[Minute]:  # fmt: skip
-    """Return the counts of each minute, including those without events."""
+    """Return the counts of `count` minutes from `start` (seconds since 1970), including empty ones.
+
+    Parameters
+    ----------
+    happened : number of events by minute and kind
+    samples : request counts of services; None leaves them out
+    """
     of_minute: dict[int, list[store_counts.Sample]] = {place: [] for place in range(count)}
     for sample in samples or ():
         place = int((sample.at - start) // MINUTE_S)
-        if place in of_minute:  # a sample may be in the future if a clock was set back
+        if place in of_minute:  # false for a sample in the future, after a clock was set back
             of_minute[place].append(sample)
     return [
         Minute(
@@ -461,7 +474,7 @@ def _recent_counts(
     happened: Mapping[tuple[int, str], int], places: range,
     samples: list[store_counts.Sample] | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the fields of `Counted` for some minutes."""
+    """Return the fields of `Counted`, summed over the minutes `places`; see `_minutes`."""
     counts: dict[str, Any] = {
         outcome: sum(happened.get((place, f"frame.{outcome}"), 0) for place in places)
         for outcome in OUTCOMES

@@ -49,19 +49,20 @@ from sceneprint_client.api import Job, Page
 from sceneprint_client.api.frames import ImportItem, ImportOptions, UploadSummary, upload_summary
 from sceneprint_client.formats import HEAD, format_at
 
-# Frames of an archive are added in blocks. An error of one frame does not affect the others.
+# Frames of an archive are added in blocks. An error in one frame does not affect the others.
 #
 #     archive  --steps_of-->  Steps  --next_block-->  a block  --add_block-->  ImportItems
 #
-# Frames are added like uploads, so a repeated slice finds them as duplicates.
+# Frames are added like uploads, so that a repeated slice recognises them as duplicates.
 
-#: Maximum number of frames in one commit, and of their bytes in memory; a cloud may have 512 MiB.
+#: Maximum number of frames in one commit, and their maximum total size in bytes. A larger frame is
+#: committed alone.
 _AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """A frame of an archive, or the error of reading it."""
+    """A frame of an archive, or the error that occurred when the archive was read."""
 
     name: str
     sequence: FrameSequence | None = None
@@ -70,9 +71,9 @@ class Step:
 
 
 def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterator[Step]:
-    """Yield the frames and errors of an archive in a fixed order.
+    """Yield every `every`-th frame of each sequence of an archive, after the errors.
 
-    With `session`, all frames belong to that session; otherwise, each sequence is a session.
+    The order is the same in each call. Without `session`, each sequence is a session of its own.
     """
     for name, reason in archive.refused:
         yield Step(name, refused=errors.UnreadableArchive(reason))
@@ -82,7 +83,7 @@ def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterat
 
 
 def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step]:
-    """Return the next block with at least one step."""
+    """Return the block of at least one step that follows the first `done` steps."""
     count = size = 0
     for step in steps[done : done + _AT_ONCE]:
         size += 0 if step.reference is None else archive.size_of(step.reference)
@@ -95,14 +96,14 @@ def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[S
 def add_block(
     uploads: Uploads, task: LongJob, block: Sequence[tuple[str, Callable[[], Upload]]]
 ) -> list[ImportItem]:
-    """Add a block of frames in one commit, if this worker still holds the job.
+    """Add frames in one commit, and return their results; raise LostLease if the job was cancelled.
 
     Parameters
     ----------
-    block : name of each frame, and the function that reads it
+    block : name and reading function of each frame
     """
 
-    def fence(connection: Connection) -> None:  # the job may be cancelled
+    def fence(connection: Connection) -> None:
         queue.check_held(connection, task.job)
 
     outcomes: list[UploadOutcome | None] = []
@@ -111,23 +112,23 @@ def add_block(
         try:
             uploaded.append(read())
             outcomes.append(None)
-        except (errors.StoreError, errors.Busy):  # a repeated slice can read the frame
+        except (errors.StoreError, errors.Busy):  # temporary, so the slice is repeated
             raise
         except errors.SceneprintError as error:
             outcomes.append(UploadOutcome(None, error=error))
         except MemoryError:
             outcomes.append(_too_large())
-    rest = iter(_added(uploads, task.of_map.name, uploaded, fence))
+    rest = iter(_add_frames(uploads, task.of_map.name, uploaded, fence))
     return [
         import_item(name, outcome or next(rest))
         for (name, _), outcome in zip(block, outcomes, strict=True)
     ]
 
 
-def _added(
+def _add_frames(
     uploads: Uploads, map_name: str, block: list[Upload], fence: Callable[[Connection], None]
 ) -> list[UploadOutcome]:
-    """Add frames together, or separately if memory is too small."""
+    """Add frames in one commit, or one by one if memory does not suffice; return their results."""
     if not block:
         return []
     try:
@@ -135,7 +136,7 @@ def _added(
     except MemoryError:
         if len(block) == 1:
             return [_too_large()]
-    return [one for each in block for one in _added(uploads, map_name, [each], fence)]
+    return [_add_frames(uploads, map_name, [upload], fence)[0] for upload in block]
 
 
 def _too_large() -> UploadOutcome:
@@ -157,8 +158,8 @@ def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
 def _summary_of(
     archive: Archive, steps: Sequence[Step], items: Sequence[dict[str, Any]], options: ImportOptions
 ) -> UploadSummary:
-    """Return the summary of an import with these results of its steps."""
-    results = [ImportItem.model_validate(one) for one in items]
+    """Return the summary of an import from the results `items` of its steps."""
+    results = [ImportItem.model_validate(item) for item in items]
     without, frames = Counter[str](), 0
     for step, item in zip(steps, results, strict=True):
         if step.sequence is None:
@@ -168,15 +169,15 @@ def _summary_of(
             without["refused"] += 1
         elif not item.has_pose:
             without[step.sequence.unposed if options.with_poses else "with_poses is false"] += 1
-    notes = [one.note for one in archive.sequences if one.note]
+    notes = [sequence.note for sequence in archive.sequences if sequence.note]
     return upload_summary(
-        frames, without, [one.samples for one in results if one.samples is not None], notes,
-        lost=sum(one.lost for one in archive.sequences if options.with_poses),
+        frames, without, [item.samples for item in results if item.samples is not None], notes,
+        lost=sum(sequence.lost for sequence in archive.sequences if options.with_poses),
     )  # fmt: skip
 
 
 def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
-    """Return the item of an import for the result of one frame."""
+    """Convert the result of one upload to an item of an import."""
     item = item_of(outcome)
     if item.frame is None:
         return ImportItem(
@@ -189,11 +190,11 @@ def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
     )  # fmt: skip
 
 
-#: Kinds of the jobs that import archives, maps in one file, and recordings, by `as`.
+#: Job kinds of imports by the field `as` of a request.
 KINDS = {"frames": "import", "map": "import-map", "recording": "import-bag"}
-#: Seconds between removals of archives of finished imports.
+#: Seconds between removals of the archives of finished imports.
 TIDY_S = 5.0
-#: Maximum size of a compressed tar's content, relative to the largest accepted archive.
+#: Maximum size of an inflated tar, as a multiple of the largest accepted archive.
 _UNPACKED = 4
 #: Maximum number of ids in one statement.
 _IDS_AT_ONCE = 500
@@ -202,7 +203,12 @@ _MOST_PIXELS = 640
 
 
 class _FileBytes:
-    """Filter that checks the bytes of a map's file or of a recording."""
+    """Filter that checks the format of a received map file or recording.
+
+    Parameters
+    ----------
+    is_map : whether the file is a map, instead of a recording
+    """
 
     def __init__(self, name: str, *, is_map: bool) -> None:
         self._name, self._is_map, self._head, self._size = name, is_map, b"", 0
@@ -221,26 +227,31 @@ class _FileBytes:
         yield chunk
 
     def end(self) -> Iterator[bytes]:
-        """Raise UnreadableCloud or UnreadableArchive for another format; yield nothing."""
+        """Check the format of the complete file; yield nothing.
+
+        Raises
+        ------
+        UnreadableCloud, UnreadableArchive : If the file is not a map, or not a recording.
+        """
         form = format_at(self._head, "recording")
         if self._is_map:
             surface_format(self._head, self._name, self._size)
         elif form is None or form.name not in ("mcap", "rosbag1"):
             raise errors.UnreadableArchive(
-                f"{self._name} is neither an MCAP file nor a ROS 1 bag. A rosbag2 folder or "
-                "database can be sent with `sceneprint upload MAP FOLDER`."
+                f"{self._name} is neither an MCAP file nor a ROS 1 bag. To send a rosbag2 folder "
+                "or database, use `sceneprint upload MAP FOLDER`."
             )
         yield from ()
 
 
 class Receiver:
-    """A file that is being received; see `Imports.receive`.
+    """An incoming file; see `Imports.receive`.
 
     Parameters
     ----------
-    blob : its blob, with compressed tars inflated
-    source : filter that converts received bytes to stored ones
-    reserve : function that reserves bytes of the map's quota before they are written
+    blob : blob to write; compressed tars are inflated
+    source : filter that converts received bytes to stored bytes
+    reserve : function that reserves bytes in the quota of the map before they are written
     """
 
     def __init__(
@@ -249,11 +260,11 @@ class Receiver:
         self._blob, self._source, self._reserve = blob, source, reserve
 
     def write(self, chunk: bytes) -> None:
-        """Write the next part.
+        """Write the next chunk of the file.
 
         Raises
         ------
-        UnreadableArchive : If the file is not an archive, is damaged, or is too large.
+        UnreadableArchive : If the file is damaged, too large, or not an archive.
         UnreadableCloud : If the file is not a map.
         QuotaExceeded : If the map has no room for the file.
         StoreFull, UnusableStore : If the blob cannot be written.
@@ -261,7 +272,7 @@ class Receiver:
         self._write(self._source.pieces(chunk))
 
     def end(self) -> queue.JobFile:
-        """Make the blob durable; see `write` for errors."""
+        """Write the blob to disk, and return its record; see `write` for errors."""
         self._write(self._source.end())
         return queue.JobFile(
             ARCHIVE, self._blob.keep(), self._blob.size, "application/octet-stream"
@@ -274,7 +285,7 @@ class Receiver:
 
 
 def states_of_import(connection: Connection, job: JobRow) -> Counter[str]:
-    """Return the number of an import's frames in each state."""
+    """Count the frames of an import by state."""
     items = queue.items_of(connection, job.number)
     ids = [item["frame_id"] for item in items if item["frame_id"] is not None]
     counts = Counter[str]()
@@ -287,11 +298,11 @@ def states_of_import(connection: Connection, job: JobRow) -> Counter[str]:
 
 
 def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewParameters:
-    """Return the parameters of the views of a map.
+    """Return the sensor parameters for views of an imported map.
 
     Raises
     ------
-    InvalidRequest : If a camera was sent for a model of scans.
+    InvalidRequest : If the options contain a camera, but the model is for 360-degree scans.
     """
     k = options.camera
     camera = None
@@ -311,7 +322,7 @@ def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewPa
 
 
 class Imports:
-    """Imports of archives, and the start of imports of maps."""
+    """Imports of archives; also receives and queues maps and recordings."""
 
     def __init__(self, context: Context, uploads: Uploads) -> None:
         self._store, self._bell, self._uploads = context.store, context.bell, uploads
@@ -320,15 +331,15 @@ class Imports:
 
     @contextmanager
     def receive(self, map_name: str, options: ImportOptions) -> Iterator[Receiver]:
-        """Receive a file in parts; remove it unless `Receiver.end` is called.
+        """Receive a file in chunks; remove it unless `Receiver.end` is called.
 
-        Its bytes count against the map's quota from their arrival until the end of the context,
-        within which `begin` must be called.
+        Received bytes count against the quota of the map until the context ends. Call `begin`
+        within the context.
 
         Raises
         ------
         UnknownMap : If the map does not exist.
-        InvalidRequest : If a camera was sent for a map of scans.
+        InvalidRequest : If the options contain a camera, but the map is for 360-degree scans.
         ReadOnlyStore, StoreFull, UnusableStore : If the store cannot be written.
         """
         with self._store.database.read() as connection:
@@ -355,7 +366,7 @@ class Imports:
             incoming.add(row.number, -reserved)
 
     def _require_room(self, row: MapRow, incoming: int) -> None:
-        """Check that a map has room for all incoming bytes; purge tombstones if necessary."""
+        """Make room for incoming bytes by purging tombstones, or raise QuotaExceeded."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
         if row.quota_bytes is None or row.used_bytes + incoming <= row.quota_bytes:
@@ -368,17 +379,17 @@ class Imports:
         self, map_name: str, archive: queue.JobFile, options: ImportOptions,
         once: IdempotentRequest | None = None,
     ) -> tuple[Job, bool]:  # fmt: skip
-        """Queue the import of a received file.
+        """Queue the job that imports a received file.
 
         Returns
         -------
         job : job of the import
-        replayed : whether an earlier request of `once` queued it
+        replayed : whether an earlier request with the key of `once` queued the job
 
         Raises
         ------
         UnknownMap, IdempotencyConflict, QuotaExceeded : See `queue_task`; the archive is removed.
-        Conflict : If an import of the same archive has just ended and removed it.
+        Conflict : If an import of the same file has just ended and removed the file.
         """
         data = options.model_dump(mode="json", by_alias=True)
         try:
@@ -394,8 +405,8 @@ class Imports:
             )
         except Swept as error:
             raise errors.Conflict(
-                "Another import of the same file ended and removed the file while it was being "
-                "received. Send the file again."
+                "Another import of the same file ended during the transfer, and removed the file. "
+                "Send the file again."
             ) from error
         except errors.SceneprintError:
             collect_deleted_blobs(self._store, [archive.blob])
@@ -407,7 +418,7 @@ class Imports:
     def items(
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100
     ) -> Page[ImportItem]:
-        """Return a page of the results of an archive's frames or a map's views, in order.
+        """Return a page of the results of an import, in the order of its frames or views.
 
         Raises
         ------
@@ -424,7 +435,7 @@ class Imports:
         return Page[ImportItem](items=[ImportItem(**one) for one in rows[:limit]], next_cursor=more)
 
     def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Import at least one block of an archive's frames."""
+        """Run a slice of an import: add at least one block of frames."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(ARCHIVE)
@@ -435,7 +446,7 @@ class Imports:
         try:
             with self._open(file, options.name) as archive:
                 return self._slice(task, archive, options, is_over)
-        except errors.UnreadableArchive:  # a retry does not help, and the archive may be large
+        except errors.UnreadableArchive:  # a retry would fail too, so free the space
             with self._store.database.write() as connection:
                 number = task.job.number
                 unused = queue.remove_parts(connection, number, items=False, files=IMPORT_FILES)
@@ -443,16 +454,17 @@ class Imports:
             raise
 
     def tidy(self) -> int:
-        """Remove archives of finished imports if it is due; return their number.
+        """Remove the archives of finished imports, at most every TIDY_S seconds; return their
+        number.
 
         Raises
         ------
-        UnusableStore : If the store cannot be written; the next call tries again.
+        UnusableStore : If the store cannot be written; the next call retries.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
         self._tidied = time.monotonic()
-        with self._store.database.read() as connection:  # there is usually none, so do not lock
+        with self._store.database.read() as connection:  # usually none, so avoid a write lock
             if not queue.finished_with_file(connection, ARCHIVE):
                 return 0
         with self._store.database.write() as connection:

@@ -1,4 +1,4 @@
-"""Decode uploads and their metadata to frames, and identify their content.
+"""Decoding of uploads and their metadata to frames, and content identity.
 
 bytes, FrameMeta  --read_upload-->  Read: Frame | Cloud  --content_id-->  64 digits
 """
@@ -27,7 +27,8 @@ from sceneprint_client.files import naming
 from sceneprint_client.formats import CloudFormat, format_at, titles_of
 from sceneprint_client.poses import rotation_of
 
-#: Name of a cloud's own coordinates as a base frame, if its viewpoint is not their origin.
+#: Name of the base frame of a cloud that has its own coordinate frame: its viewpoint is not the
+#: origin.
 GIVEN_FRAME = "cloud"
 
 
@@ -37,9 +38,10 @@ class Read:
 
     Parameters
     ----------
-    cloud : stored description of a cloud: packing, viewpoint, units per metre, number of points,
-        and corrections
-    base : name of the robot's base frame and T_base_sensor; None if unknown
+    frame : frame for the geometry
+    cloud : stored description of a cloud: file format, viewpoint, units per metre, number of
+        points, and a note on corrections; None for a depth image
+    base : name of the base frame of the robot, and T_base_sensor (4, 4); None if unknown
     """
 
     frame: AnyFrame
@@ -53,14 +55,14 @@ class Read:
 
 
 def read_upload(data: bytes, meta: FrameMeta, decoders: Decoders) -> Read:
-    """Decode an upload, and check it as far as is possible without signing it.
+    """Decode an upload, and validate it except for checks that require signing.
 
     Raises
     ------
-    FrameError : If the samples cannot be decoded, the camera is invalid or of another image, the
-        pose or T_base_sensor is not rigid, or there are no samples.
-    InvalidRequest : If a depth image has no camera, a cloud has one, or metadata does not apply;
-        UnsupportedType if the package that unpacks the file is not installed.
+    FrameError : If the samples are missing or cannot be decoded, the camera is invalid or does not
+        fit the image, or the pose or T_base_sensor is not rigid.
+    InvalidRequest : If a depth image lacks a camera, or metadata does not apply to the kind of
+        frame; UnsupportedType if a package for the file type is not installed.
     Busy : If no decoder is free, or none can be started.
     """
     with decoders.place() as decoder:
@@ -88,11 +90,11 @@ def _read(data: bytes, meta: FrameMeta, decoder: Decoder) -> Read:
             trust_depth=meta.trust_depth,
         )
     except errors.DecoderFailure as error:
-        raise errors.UnreadableFrame(_failed(error)) from error
+        raise errors.UnreadableFrame(_decoding_error(error)) from error
     return Read(frame, None, base)
 
 
-def _failed(error: errors.DecoderFailure) -> str:
+def _decoding_error(error: errors.DecoderFailure) -> str:
     return f"The file cannot be decoded: {error}. Write it again, or send it in another format."
 
 
@@ -101,7 +103,7 @@ def read_stored(data: bytes, row: FrameRow, decoders: Decoders) -> AnyFrame:
 
     Raises
     ------
-    DamagedBlob : If the decoder fails, although it accepted the upload earlier.
+    DamagedBlob : If the decoder fails.
     Busy : If no decoder is free, or none can be started.
     """
     try:
@@ -116,10 +118,10 @@ def read_stored(data: bytes, row: FrameRow, decoders: Decoders) -> AnyFrame:
 
 def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
     if row.cloud is not None:
-        # the upload may have been replaced by one with another packing
+        # do not use the stored format: a later upload of the same points may have another format
         return decode_cloud(
             data,
-            file_format=_packing(data),
+            file_format=_file_format(data),
             viewpoint=viewpoint_of(row),
             units_per_metre=row.cloud["units_per_metre"],
             name=row.id,
@@ -132,12 +134,12 @@ def _read_stored(data: bytes, row: FrameRow, decoder: Decoder) -> AnyFrame:
         along_ray=row.depth_along_ray,
         name=row.id,
         samples_of=decoder.samples,
-        trust_depth=True,  # the frame was accepted before
+        trust_depth=True,  # the upload was validated earlier
     )
 
 
 def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
-    """Return the viewpoint of a stored cloud in its coordinates; None for a depth image."""
+    """Return the viewpoint (x, y, z) of a stored cloud in its own frame; None for a depth image."""
     if row.cloud is None or row.cloud["viewpoint"] is None:
         return None
     x, y, z = row.cloud["viewpoint"]
@@ -145,7 +147,11 @@ def viewpoint_of(row: FrameRow) -> tuple[float, float, float] | None:
 
 
 def content_id(read: Read) -> str:
-    """Return the hash of samples and camera, or of points and viewpoint, regardless of packing."""
+    """Return the content hash of a frame, which does not depend on the file format.
+
+    It covers the samples and the camera of a depth image, or the points and the viewpoint of a
+    cloud.
+    """
     if isinstance(read.frame, Cloud):
         viewpoint = None if read.cloud is None else read.cloud["viewpoint"]
         digest = hashlib.sha256(f"cloud {json.dumps(viewpoint)}\n".encode())
@@ -160,16 +166,17 @@ def content_id(read: Read) -> str:
 def columns(
     meta: FrameMeta, pose: Floats | None, base: tuple[str, Floats] | None
 ) -> dict[str, Any]:
-    """Return the columns of an upload's metadata.
+    """Convert the metadata of an upload to columns of its frame.
 
     Parameters
     ----------
-    pose, base : T_parent_sensor, and the base as in `Read`
+    pose : T_parent_sensor (4, 4); None if unknown
+    base : see `Read`
     """
     parent = None
     if meta.pose is not None:
         own = meta.session if meta.robot is None else f"{meta.robot}/{meta.session}"
-        parent = meta.pose.parent_frame or own  # two robots may use the same names of sessions
+        parent = meta.pose.parent_frame or own
     return {
         "intrinsics": None if meta.intrinsics is None else meta.intrinsics.model_dump(),
         "depth_scale": meta.depth_scale,
@@ -191,12 +198,13 @@ def columns(
 def base_of(
     transform: GivenBase | None, viewpoint: Sequence[float] | None
 ) -> tuple[str, Floats] | None:
-    """Return the name of a robot's base frame, and T_base_sensor.
+    """Return the name of the base frame of a robot, and T_base_sensor (4, 4); None if unknown.
 
     Parameters
     ----------
-    viewpoint : viewpoint of a cloud. Without `transform`, the cloud's coordinates replace the base
-        unless the viewpoint is their origin, so that answers also contain their pose
+    transform : T_base_sensor in the request
+    viewpoint : viewpoint of a cloud. Without `transform`, the coordinate frame of the cloud serves
+        as the base frame, unless the viewpoint is its origin
 
     Raises
     ------
@@ -211,13 +219,13 @@ def base_of(
     return GIVEN_FRAME, T
 
 
-def _packing(data: bytes) -> CloudFormat:
-    """Return the format of an accepted cloud; without a signature, it is a KITTI scan."""
+def _file_format(data: bytes) -> CloudFormat:
+    """Return the file format of an accepted cloud; one without magic bytes is a KITTI scan."""
     return format_of(data) or "kitti"
 
 
 def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
-    """Return whether an upload is a point cloud; an NPY array with a camera is an image."""
+    """Return whether an upload is a point cloud; an NPY array with intrinsics is a depth image."""
     if meta.format is not None:
         return True
     cloud_format = format_of(data)
@@ -241,15 +249,15 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Deco
             points_of=decoder.points,
         )
     except errors.DecoderFailure as error:
-        raise errors.UnreadableCloud(_failed(error)) from error
-    except errors.MissingDependency as error:  # the file's type is not supported here
+        raise errors.UnreadableCloud(_decoding_error(error)) from error
+    except errors.MissingDependency as error:
         raise errors.UnsupportedType(str(error)) from error
-    if scan.file_format != _packing(data):  # the stored file could not be recognised later
+    if scan.file_format != _file_format(data):  # `read_stored` would use the wrong format
         raise errors.UnreadableCloud(
-            f"The file was sent as {scan.file_format.upper()}, but does not start like a file of "
-            "that format. Write the file again, or correct the format."
+            f"The file was sent as {scan.file_format.upper()}, but does not have the magic bytes "
+            "of this format. Write the file again, or correct `format`."
         )
-    # -0.0 is the same viewpoint as 0.0
+    # adding 0.0 converts -0.0 to 0.0, which is the same viewpoint
     seen_from = None if scan.viewpoint is None else [value + 0.0 for value in scan.viewpoint]
     stored = {
         "format": scan.file_format,
@@ -262,18 +270,18 @@ def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Deco
 
 
 def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
-    """Raise InvalidRequest if metadata does not apply to the kind of frame."""
+    """Raise InvalidRequest if a field of `defaults` is set although it does not apply to `kind`."""
     extra = [name for name, default in defaults.items() if getattr(meta, name) != default]
     if extra:
         raise errors.InvalidRequest(
             f"The frame is a {kind}, and {' and '.join(f'`{name}`' for name in extra)} would have "
-            "no effect. Omit what does not apply, or check that you sent the right file.",
+            "no effect. Omit them, or check that you sent the right file.",
             tuple((name, f"does not apply to a {kind}") for name in extra),
         )
 
 
 def _without_camera(data: bytes) -> errors.SceneprintError:
-    """Return the error for an upload without intrinsics."""
+    """Return the error for a depth image without intrinsics, or for an unknown file format."""
     if format_at(data, "depth") is not None:
         return errors.InvalidRequest(
             "The frame is a depth image, but its intrinsics are missing. Send width, height, "
@@ -293,16 +301,16 @@ def _camera(k: CameraIntrinsics) -> Intrinsics:
     return Intrinsics(k.width, k.height, k.fx, k.fy, k.cx, k.cy, tuple(k.distortion))
 
 
-#: Maximum deviation of a quaternion's length from 1.
+#: Maximum deviation of the length of a quaternion from 1.
 _TOLERANCE = 1e-2
 
 
 def pose_matrix(pose: GivenTransform, what: str = "") -> Floats:
-    """Return T_parent_sensor (4, 4) of a pose or another transform in either notation.
+    """Convert a pose or another transform to a matrix (4, 4), such as T_parent_sensor.
 
     Parameters
     ----------
-    what : prefix of errors, if the transform is not a pose
+    what : name of the transform in errors, if it is not a pose
 
     Raises
     ------
@@ -316,14 +324,13 @@ def _matrix(pose: GivenTransform) -> Floats:
     if pose.matrix is not None:
         return rigid_transform(np.array(pose.matrix))
     t, r = pose.translation, pose.rotation
-    if t is None or r is None:  # the schema requires both without a matrix
+    if t is None or r is None:  # excluded by the schema
         raise InvalidPose("The pose is incomplete. Send translation and rotation, or matrix.")
     q = np.array([r.x, r.y, r.z, r.w])
     length = float(np.linalg.norm(q))
     if not abs(length - 1.0) <= _TOLERANCE:
         raise InvalidPose(
-            f"The quaternion of the pose has length {length:.3g}, not 1. Send a unit quaternion "
-            "x, y, z, w."
+            f"The quaternion of the pose has length {length:.3g}. Send a unit quaternion."
         )
     T = np.eye(4)
     T[:3, :3] = rotation_of(q / length)

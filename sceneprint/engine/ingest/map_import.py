@@ -1,9 +1,9 @@
-"""Import of a map from one cloud or mesh, whose rendered views become frames.
+"""Import of a map from one cloud or mesh: rendered views of it become frames.
 
     file  --read-->  surface  --choose-->  viewpoints  --render-->  frames  --sign, test-->  result
 
-Each phase takes one or more slices of the job. The job's file is first the upload, then the decoded
-surface, then the surface with viewpoints. It counts against the map's quota until the job is over.
+Each phase is one or more slices of the job. The file of the job is first the upload, then the
+decoded surface, then the surface with viewpoints. It counts against the quota until the job ends.
 """
 
 from __future__ import annotations
@@ -63,22 +63,23 @@ from sceneprint_client.api.frames import VIRTUAL, ImportOptions, MapImportResult
 
 #: Number of views to render and add in one commit.
 _AT_ONCE = 16
-#: Seconds between checks whether all views are signed.
+#: Seconds between checks for unsigned views.
 _PAUSE_S = 1.0
-#: Maximum units per metre of rendered depth images, and units of the farthest point.
+#: Maximum depth units per metre of rendered images, and maximum depth in these units.
 _DEPTH_SCALE, _FARTHEST = 1000.0, 65_000
-#: Maximum number of weak areas in a result.
+#: Maximum number of weak areas in an import result.
 _MOST_WEAK = 20
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSurface:
-    """The file of a job: a surface and its viewpoints, as consecutive NPY arrays.
+    """The file of a job: a surface and its viewpoints.
 
     Parameters
     ----------
-    poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views to add and of the test
-        views; empty until they are chosen
+    surface : decoded surface
+    poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views to add, and of the views
+        to test localisation with; empty before the phase `choose`
     floor : height of the floor along `up`, metres
     """
 
@@ -88,7 +89,7 @@ class StoredSurface:
     floor: float = 0.0
 
     def write(self, file: Any) -> None:
-        """Write the arrays to a file."""
+        """Write the surface to a file as consecutive NPY arrays."""
         s = self.surface
         triangles = np.empty((0, 3), np.int32) if s.triangles is None else s.triangles
         floor = np.array([self.floor])
@@ -97,7 +98,7 @@ class StoredSurface:
 
     @classmethod
     def read(cls, file: BinaryIO) -> StoredSurface:
-        """Read the arrays of `write`."""
+        """Read a surface from a file of `write`."""
         arrays = [npy.read_array(file, allow_pickle=False) for _ in range(7)]
         points, triangles, offset, up, poses, held_out, floor = arrays
         surface = ReferenceSurface(points, triangles if len(triangles) else None, offset, up)
@@ -109,18 +110,19 @@ _NO_POSES: Floats = np.empty((0, 4, 4))
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """The upload of a rendered view."""
+    """A rendered view: bytes and metadata of an upload."""
 
     data: bytes
     meta: FrameMeta
 
 
 class _Views:
-    """Renderer of a job's views.
+    """Renderer of the views of a job.
 
     Parameters
     ----------
     stored : surface and viewpoints
+    parameters : sensor parameters
     """
 
     def __init__(
@@ -130,10 +132,14 @@ class _Views:
         self._renderer = Renderer(stored.surface, parameters)
 
     def upload(self, number: int) -> Upload:
-        """Return the upload of a view by its number.
+        """Render a view, and return its upload.
 
-        Its id is a hash of content and viewpoint, so that a repeated view is added once, but equal
+        The frame id is a hash of content and viewpoint: a repeated view is a duplicate, but equal
         views of two places are two frames.
+
+        Parameters
+        ----------
+        number : index into the poses
         """
         pose, options = self._stored.poses[number], self._options
         view = self.view(pose)
@@ -153,7 +159,7 @@ class _Views:
         return Upload(view.data, meta, options.priority, options.if_novel, frame_id)
 
     def view(self, pose: Floats) -> _View:
-        """Return a view at a pose, without the pose in its metadata."""
+        """Render a view at T_map_sensor (4, 4); the metadata does not contain the pose."""
         seen, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
             return _View(encode_npy(seen), FrameMeta())
@@ -167,22 +173,23 @@ class _Views:
 
 
 def names_of(options: ImportOptions) -> tuple[str, str]:
-    """Return the session and the parent frame of an import's views."""
+    """Return the names of the session and of the parent frame for the views of an import."""
     stem = PurePath(options.name).stem
     own = stem if options.robot is None else f"{options.robot}/{stem}"
     return options.session or stem, options.parent_frame or own
 
 
 class MapImporter:
-    """Handler of jobs that import maps from files.
+    """Handler of jobs that import maps from single files.
 
     Parameters
     ----------
-    queries : queries, for the test of the map with held-out views
+    uploads : store of the views
+    queries : queries that test the localisation of held-out views
     """
 
     def __init__(self, context: Context, uploads: Uploads, queries: Queries) -> None:
-        # processor time; the rest of the job's time remains for writing
+        # limit of processor time, which leaves a quarter of the timeout for writing
         self._limits = SurfaceLimits(seconds=0.75 * context.settings.job_timeout_s)
         self._store, self._signers = context.store, context.signers
         self._uploads, self._queries = uploads, queries
@@ -192,7 +199,7 @@ class MapImporter:
         }  # fmt: skip
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice: one phase, or a part of it."""
+        """Run a slice: a phase of the import, or part of a phase."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(ARCHIVE)
@@ -207,7 +214,7 @@ class MapImporter:
     def _read(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Decode the file in a confined process."""
+        """Decode the uploaded file in a confined process, and store its surface."""
         del is_over, task
         axis = options.up if isinstance(options.up, str) else None
         surface_options = SurfaceOptions(units_per_metre=options.units_per_metre, up=axis)
@@ -236,15 +243,15 @@ class MapImporter:
     def _choose(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Choose the viewpoints."""
+        """Choose the viewpoints, and store them with the surface."""
         del is_over
         stored = self._stored(file)
         plan = choose_views(stored.surface, self._parameters(task.of_map, options))
         n, tests = len(plan.poses), len(plan.held_out)
         if not n:
             raise InvalidRequest(
-                "A sensor would see too little from every place in the map. Check the units and "
-                "the up axis, or pass the height of the sensor."
+                "At every viewpoint in the map, a sensor would see too little surface. Check the "
+                "units and the up axis, or pass the height of the sensor."
             )
         self._require_room(task.of_map, n)
         floor = 0.0 if plan.floor is None else plan.floor
@@ -258,14 +265,14 @@ class MapImporter:
     def _render(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Render and add views, at least one block."""
+        """Render and add at least one block of views."""
         stored = self._stored(file)
         views = self._views(task, options, stored)
         progress, items = dict(task.progress), list[dict[str, Any]]()
         if not progress["rendered"] and options.offset is None and stored.surface.offset.any():
             self._require_one_offset(task, options, stored.surface.offset, views)
 
-        def fence(connection: Connection) -> None:  # the job may be cancelled
+        def fence(connection: Connection) -> None:
             queue.check_held(connection, task.job)
 
         while progress["rendered"] < progress["views"] and (not items or not is_over()):
@@ -291,7 +298,7 @@ class MapImporter:
     def _await_signatures(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Wait until all views are signed."""
+        """Check whether all views are signed; if not, schedule another check."""
         del options, file, is_over
         progress = dict(task.progress)
         states = self._states(task)
@@ -305,7 +312,7 @@ class MapImporter:
     def _test(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Localise held-out views, at least one, and return the result after the last."""
+        """Localise at least one held-out view; after the last, conclude the job."""
         stored = self._stored(file)
         poses, progress = stored.held_out, dict(task.progress)
         outcomes = progress["outcomes"] = list(progress["outcomes"])
@@ -349,24 +356,24 @@ class MapImporter:
     def _require_one_offset(
         self, task: LongJob, options: ImportOptions, offset: Floats, views: _Views
     ) -> None:
-        """Check that the parent frame has no frames with another offset."""
+        """Raise InvalidRequest if the parent frame has frames that used another offset."""
         _, parent = names_of(options)
         number, first = task.of_map.number, str(views.upload(0).frame_id)
         with self._store.database.read() as connection:
             in_use = has_parent_frame(connection, number, parent)
             if not in_use or living_frame(connection, number, first) is not None:
-                return  # the first file, or a repeated one
+                return  # the first file of the parent frame, or a repeated import
         x, y, z = offset.tolist()
         raise InvalidRequest(
             f"The parent frame {parent!r} already has frames, but {options.name} lies far from the "
             f"origin of that frame and would get the offset {x:.0f},{y:.0f},{z:.0f}. Send the "
             "`offset` (--offset) of the first file in this parent frame, or another "
             "`parent_frame`.",
-            (("offset", "needed, since the parent frame has frames"),),
+            (("offset", "required, since the parent frame has frames"),),
         )
 
     def _require_room(self, row: MapRow, views: int) -> None:
-        """Check that the quota has room for all views."""
+        """Raise QuotaExceeded if the map has no room for all views."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
             frames = map_usage(connection, row.number).frames
@@ -382,7 +389,7 @@ class MapImporter:
             return states_of_import(connection, task.job)
 
     def _outcome(self, row: MapRow, views: _Views, pose: Floats, options: ImportOptions) -> str:
-        """Return the outcome of localising a robot at a pose; the query uses one core."""
+        """Localise a view rendered at a pose, on one core; return the coverage outcome."""
         session, parent = names_of(options)
         view = views.view(pose)
         query = Query(keep=False, filter=Filter(session=[session], tags=[VIRTUAL]))
@@ -394,7 +401,7 @@ class MapImporter:
 
         try:
             answer = steadily(self._store, [row.name], ask)
-        except FrameError:  # the view cannot be signed
+        except FrameError:
             return "not_found"
         stop = PathFrame(
             -1, "", None, None, None, parent, pose.tolist(), is_cloud=view.meta.intrinsics is None
@@ -410,7 +417,7 @@ class MapImporter:
         counts = Counter(outcomes)
         names = ("points", "triangles", "units_per_metre", "units_from", "up_from", "notes")
         facts: dict[str, Any] = {name: progress[name] for name in names}
-        # all views are checked, since each has a pose in the map's parent frame
+        # no view is unchecked, since all have a pose in the parent frame of the map
         facts |= {name: counts[name] for name in COVERAGE_OUTCOMES if name != "unchecked"}
         return MapImportResult(
             **facts, up=Direction(**_xyz(surface.up)), offset=Vector(**_xyz(surface.offset)),
@@ -421,39 +428,40 @@ class MapImporter:
         )  # fmt: skip
 
 
-#: Maximum distance of points from their origin in metres, so that single precision is sufficient.
+#: Maximum distance of points from their origin in metres; single precision suffices up to it.
 _FARTHEST_M = 20_000.0
 
 
 def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> ReferenceSurface:
-    """Return a surface relative to another offset; raise InvalidRequest if it is far away."""
+    """Move a surface to another offset; raise InvalidRequest if the offset is too far from it."""
     to = np.array([offset.x, offset.y, offset.z])
     points = surface.points + (surface.offset - to)
     if not np.abs(points).max() <= _FARTHEST_M:
         middle = ", ".join(f"{x:.0f}" for x in surface.offset + surface.points.mean(axis=0))
         raise InvalidRequest(
-            f"{name} lies around {middle}, more than {_FARTHEST_M / 1000:.0f} km from the offset. "
-            "Check the offset, which is in metres, and the units of the file.",
+            f"The centre of {name} is {middle}, more than {_FARTHEST_M / 1000:.0f} km from the "
+            "offset. Check the offset (in metres) and the units of the file.",
             (("offset", "too far from the surface"),),
         )
     return replace(surface, points=points.astype(np.float32), offset=to)
 
 
 def _counted(progress: dict[str, Any]) -> dict[str, Any]:
-    """Return the progress with the sum of its steps."""
+    """Return the progress with `done` updated to the number of completed steps."""
     return progress | {"done": sum(progress[name] for name in ("rendered", "signed", "tested"))}
 
 
 def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
-    """Return the squares of the floor with fewer than half of their test views localised.
+    """Return the floor squares in which fewer than half of the test views were localised.
 
     Parameters
     ----------
-    stored : surface with the poses of the views
+    stored : surface with the poses of the test views
+    outcomes : outcome of each test view
 
     Returns
     -------
-    areas : weak areas, those with the most failed views first
+    areas : weak areas, sorted by the number of failed views from high to low
     """
     if not outcomes:
         return []

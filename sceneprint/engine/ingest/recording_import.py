@@ -2,8 +2,8 @@
 
     file  --read-->  outline and index  --add-->  items
 
-The first slice reads the recording once, and stores the selected frames as an index. The other
-slices read single messages. A confined process reads the file in all slices.
+The first slice scans the recording, and stores an index of the selected frames. The other slices
+read single messages. In all slices, a confined process reads the file.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.frames import ImportItem, ImportOptions, upload_summary
 
 _INDEX = IMPORT_FILES[1]
-#: Maximum number of frames in one commit, and of their bytes in memory, as for archives.
+#: Maximum number of frames in one commit, and their maximum total size in bytes.
 _AT_ONCE, _BYTES_AT_ONCE = 16, 128 << 20
 
 
 class RecordingImporter:
-    """Handler of jobs that import recordings."""
+    """Handler of jobs that import ROS recordings."""
 
     def __init__(self, context: Context, uploads: Uploads) -> None:
-        # processor time; the rest of the job's time remains for writing
+        # limit of processor time, which leaves a quarter of the timeout for writing
         self._seconds = 0.75 * context.settings.job_timeout_s
         self._store, self._uploads = context.store, uploads
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice: read the recording, or add at least one block of its frames."""
+        """Run a slice: scan the recording, or add at least one block of its frames."""
         require_rosbags()
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
@@ -79,7 +79,7 @@ class RecordingImporter:
                 decoder.close()
 
     def _read(self, decoder: RecordingDecoder, options: ImportOptions) -> SliceResult:
-        """Store the outline, which users see even if no frame can be used, and the index."""
+        """Scan the recording, and store its index; the progress contains the outline for users."""
         text, index = decoder.outline(options)
         progress = {
             "done": 0, "total": len(index.frames), "phase": "add", "received": 0, "there": 0,
@@ -103,14 +103,14 @@ class RecordingImporter:
             progress["largest"] = max(len(data), progress["largest"])
             return Upload(data, meta, options.priority, options.if_novel)
 
-        frame_s = math.inf  # duration of a frame of the last block
+        frame_s = math.inf  # seconds per frame of the last block
         while progress["done"] < len(frames) and (not items or not is_over()):
             start = time.monotonic()
-            # sizes and durations are unknown until a frame is read, so the first block has one
+            # sizes and durations are unknown before the first block, which is a single frame
             room = _BYTES_AT_ONCE // (progress["largest"] or _BYTES_AT_ONCE)
             count = max(1, min(_AT_ONCE, room, int(SLICE_S / frame_s)))
             block = frames[progress["done"] :][:count]
-            reads = [(str(one["name"]), partial(upload, one)) for one in block]
+            reads = [(str(frame["name"]), partial(upload, frame)) for frame in block]
             for item in add_block(self._uploads, task, reads):
                 items.append(item.model_dump(mode="json"))
                 progress[{202: "received", 200: "there"}.get(item.status, "refused")] += 1
@@ -129,13 +129,13 @@ class RecordingImporter:
     ) -> dict[str, Any]:  # fmt: skip
         with self._store.database.read() as connection:
             before = queue.items_of(connection, task.job.number)
-        results = [ImportItem.model_validate(one) for one in [*before, *items]]
+        results = [ImportItem.model_validate(item) for item in [*before, *items]]
         without = Counter(
-            "refused" if one.frame_id is None else "" if options.with_poses else
+            "refused" if item.frame_id is None else "" if options.with_poses else
             "with_poses is false"
-            for one in results if one.frame_id is None or not one.has_pose
+            for item in results if item.frame_id is None or not item.has_pose
         )  # fmt: skip
-        ranges = [one.samples for one in results if one.samples is not None]
+        ranges = [item.samples for item in results if item.samples is not None]
         summary = upload_summary(
             len(results), without, ranges, index.notes, lost=index.outline.lost
         )

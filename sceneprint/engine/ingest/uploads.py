@@ -1,8 +1,8 @@
-"""Uploads: check and store frames durably, and queue their signing, many in one commit.
+"""Uploads: durable storage of frames, and jobs that sign them.
 
     Upload  --read_upload-->  decoded  --Store.blobs-->  durable blob  --add_frame-->  Added
 
-An answered upload cannot be lost. Concurrent uploads share the wait for the disk.
+An acknowledged upload is never lost. Concurrent uploads share commits.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames
 from sceneprint_client.api import Added, FrameMeta, FrameState
 from sceneprint_client.api.frames import BatchItem, SampleRange, check_frame_id, problem_of
 
-# Identity: an upload is a new frame, a duplicate, or a conflict.
+# Identity: decide whether an upload is a new frame, a duplicate, or a conflict.
 
-#: Names of columns in error messages.
+#: Names of columns in error messages, where they differ from the column.
 _FIELDS = {
     "pose_parent": "pose.parent_frame", "base": "T_base_sensor", "content_id": "content",
     "cloud": "units_per_metre",
 }  # fmt: skip
 #: Columns that do not distinguish uploads: the same content with another name is a duplicate, and
-#: keeps its first name; samples follow from the content.
+#: the samples follow from the content.
 _LABELS = ("name", "sequence", "samples")
 
 
@@ -58,13 +58,14 @@ def find_duplicate(
 
     Parameters
     ----------
-    metadata : the upload's columns
-    frame_id : requested id: only its frame is compared; None compares all frames with the content
+    content : content hash of the upload
+    metadata : metadata columns of the upload
+    frame_id : id of the only frame to compare; None compares all frames with the same content
 
     Raises
     ------
-    FrameConflict : If the frame with the id has other content or metadata; without an id, if every
-        frame with the content has other metadata.
+    FrameConflict : If frame `frame_id` has different content or metadata; without `frame_id`, if
+        all frames with the same content have different metadata.
     """
     if frame_id is not None:
         frame = living_frame(connection, row.number, frame_id)
@@ -85,14 +86,14 @@ def find_duplicate(
     if alike:
         raise errors.FrameConflict(
             f"Frame {alike[0].id} has the same content, but a different "
-            f"{', '.join(_differing(alike[0], metadata))}. A map stores the same content once: "
-            "delete that frame first, send it unchanged, or PUT it under its own id."
+            f"{', '.join(_differing(alike[0], metadata))}. A map stores the same content once. "
+            "Delete the stored frame first, send the frame unchanged, or PUT it with its own id."
         )
     return None
 
 
 def _sent_value(frame: FrameRow, name: str) -> Any:
-    """Return a column of a frame as it was sent, before a join moved its pose."""
+    """Return a column of a frame as uploaded, that is, before a join changed its pose."""
     if frame.sent_parent is not None and name in ("pose", "pose_parent"):
         return frame.sent_pose if name == "pose" else frame.sent_parent
     return getattr(frame, name)
@@ -108,14 +109,15 @@ def _differing(frame: FrameRow, metadata: dict[str, Any]) -> list[str]:
 
 
 def _caller_value(name: str, value: Any) -> Any:
-    """Return the part of a column that the caller supplied: for a cloud, only its units."""
+    """Return the part of a column that the caller supplied: of `cloud`, only the units."""
     return value["units_per_metre"] if name == "cloud" and value is not None else value
 
 
 def is_retried(state: FrameState) -> bool:
     """Return whether a repeated upload retries a frame in this state.
 
-    Failed and redundant frames are retried: the frame that made them redundant may be deleted.
+    Failed frames are retried, and redundant frames, since the frame that they duplicated may have
+    been deleted.
     """
     return state in (FrameState.FAILED, FrameState.REDUNDANT)
 
@@ -126,9 +128,9 @@ class UploadResult:
 
     Parameters
     ----------
-    added : the frame and its job; None if the upload was refused
-    new : False if the frame existed already, and nothing is to be done
-    error : why the upload was refused
+    added : record of the frame and its job; None if the upload was refused
+    new : whether the upload queued a job; False for a duplicate
+    error : reason for the refusal; None if the upload was accepted
     """
 
     added: Added | None
@@ -137,14 +139,14 @@ class UploadResult:
 
     @property
     def accepted(self) -> Added:
-        """The frame and its job; raise `error` if the upload was refused."""
+        """Record of the frame and its job; raise `error` if the upload was refused."""
         if self.added is None:
             raise self.error or ValueError("neither stored nor refused")
         return self.added
 
 
 def item_of(outcome: UploadResult) -> BatchItem:
-    """Return the item of a batch for an upload's result."""
+    """Convert the result of an upload to an item of a batch response."""
     if outcome.error is not None:
         problem = problem_of(outcome.error)
         return BatchItem(status=problem.status, frame=None, problem=problem)
@@ -152,7 +154,7 @@ def item_of(outcome: UploadResult) -> BatchItem:
 
 
 def upload_response(connection: Connection, frame: FrameRow) -> Added:
-    """Return the answer to an upload of a stored frame."""
+    """Return the response to an upload whose frame is stored."""
     job_id = signing_jobs(connection, [frame.number])[frame.number]
     return _added(frame, job_id, frame.reason)
 
@@ -167,22 +169,29 @@ def _added(frame: FrameRow, job_id: str, reason: str | None = None) -> Added:
 def replayed(
     connection: Connection, row: MapRow, data: dict[str, Any]
 ) -> list[UploadResult] | None:
-    """Return stored results with their current frames; None if the map was replaced."""
+    """Return the results of an earlier request with the current states of its frames.
+
+    Return None if the map was deleted and created again.
+
+    Parameters
+    ----------
+    data : results as stored by `IdempotentRequest`
+    """
     results = []
-    for one in data["frames"]:
-        if "error" in one:
-            results.append(UploadResult(None, error=_error(one)))
+    for stored in data["frames"]:
+        if "error" in stored:
+            results.append(UploadResult(None, error=_error(stored)))
             continue
-        own = frames.c.id == one["frame_id"], frames.c.map_number == row.number
+        own = frames.c.id == stored["frame_id"], frames.c.map_number == row.number
         frame = connection.execute(select(frames).where(*own)).mappings().first()
         if frame is None:
             return None
-        results.append(UploadResult(upload_response(connection, frame_row(frame)), one["new"]))
+        results.append(UploadResult(upload_response(connection, frame_row(frame)), stored["new"]))
     return results
 
 
 def _stored_outcome(outcome: UploadResult) -> dict[str, Any]:
-    """Return the JSON that stores an upload's result."""
+    """Convert the result of an upload to JSON for an idempotency key; see `_error`."""
     if outcome.added is not None:
         return {"frame_id": outcome.added.frame_id, "new": outcome.new}
     error = outcome.error
@@ -199,16 +208,17 @@ def _error(stored: dict[str, Any]) -> errors.SceneprintError:
 
 @dataclass(frozen=True, eq=False)
 class Upload:
-    """A frame as sent.
+    """A frame to store, as sent by a client.
 
     Parameters
     ----------
-    data : a depth image as PNG or NPY, or a point cloud: see `sceneprint.formats.points`
-    priority : frames of a higher priority are signed first; ignored if the frame exists
-    if_novel : minimum distance from the nearest frame of the map, as a share of the distance of
-        unrelated frames; None: no minimum. For a duplicate that is not signed yet, the weaker
-        condition applies
-    frame_id : requested id; None: a new one, or the duplicate's
+    data : file of a depth image (PNG or NPY), or of a point cloud (see `sceneprint.formats.points`)
+    meta : metadata
+    priority : priority of the job; ignored if the frame exists
+    if_novel : minimum distance from the nearest frame of the map, as a share of the mean distance
+        between unrelated frames; None accepts any distance. If the frame exists and is not signed
+        yet, the smaller minimum applies
+    frame_id : requested id; None selects a new id, or that of the duplicate
     """
 
     data: bytes
@@ -220,7 +230,7 @@ class Upload:
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """A decoded upload, with its identity and columns."""
+    """An upload after decoding: its blob, content hash and metadata columns."""
 
     upload: Upload
     blob: str
@@ -234,24 +244,24 @@ class _Prepared:
 
     @property
     def blob_columns(self) -> dict[str, Any]:
-        """Columns of the upload's bytes and novelty."""
+        """Columns of the blob and of the novelty threshold."""
         return {"blob": self.blob, "bytes": self.size, "novelty": self.upload.if_novel}
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns of a new frame; see `add_frame`."""
+        """All columns of a new frame; see `add_frame`."""
         return {"content_id": self.content, **self.blob_columns, **self.metadata}
 
 
 @dataclass(frozen=True, eq=False)
 class _Request:
-    """Uploads to store together.
+    """Uploads to store in one transaction.
 
     Parameters
     ----------
-    todo : uploads without a result yet, by index
+    todo : uploads without a result, by their index in the request
     results, once, fence : see `Uploads.add_all`
-    left : possibly unused blobs of the last attempt
+    left : blobs of the last attempt that may be unreferenced
     """
 
     todo: dict[int, _Prepared]
@@ -262,34 +272,34 @@ class _Request:
 
     @cached_property
     def blobs(self) -> dict[str, bytes]:
-        """Blobs to write before the rows."""
-        return {one.blob: one.upload.data for one in self.todo.values()}
+        """Bytes of the blobs to write before the rows, by digest."""
+        return {prepared.blob: prepared.upload.data for prepared in self.todo.values()}
 
     @property
     def is_single(self) -> bool:
-        """Whether the request is one upload, and writes only its frame."""
+        """Whether the request stores exactly one frame, without a fence."""
         return len(self.results) == len(self.todo) == 1 and self.fence is None
 
 
 class IncomingBytes:
-    """Bytes of archives that this process is receiving, by map; no row counts them yet."""
+    """Number of bytes of incoming archives by map, which no row in the database counts yet."""
 
     def __init__(self) -> None:
         self._sizes, self._guard = Counter[int](), threading.Lock()
 
     def add(self, map_number: int, size: int) -> int:
-        """Add bytes, which may be negative, and return the map's sum."""
+        """Add bytes (negative to remove) to the count of a map, and return the new count."""
         with self._guard:
             self._sizes[map_number] += size
             return self._sizes[map_number]
 
 
 class Uploads:
-    """Store uploaded frames in maps; safe to share between threads."""
+    """Storage of uploaded frames; safe to share between threads."""
 
     def __init__(self, context: Context) -> None:
         self._store, self._bell = context.store, context.bell
-        # groups by map, while a thread writes to it
+        # write groups by map number, while a thread writes to the map
         self._writes = WeakValueDictionary[int | None, Grouping]()
         self._guard = threading.Lock()
         self._new_frames = NewFrames(context.store.database)
@@ -300,21 +310,21 @@ class Uploads:
     ) -> tuple[UploadResult, bool]:
         """Store a frame in a map durably, and queue its signing.
 
-        An upload with the content and the metadata of a frame is a duplicate. It retries a failed
-        or redundant frame, and replaces a lost or damaged upload.
+        An upload with the content and the metadata of a stored frame is a duplicate: it retries a
+        failed or redundant frame, and replaces a lost or damaged blob.
 
         Returns
         -------
-        outcome : result with `added`
-        replayed : whether an earlier request with the key of `once` stored it
+        result : result with `added`
+        replayed : whether an earlier request with the key of `once` stored the frame
 
         Raises
         ------
         UnknownMap : If the map does not exist.
         InvalidRequest : If the frame id is not valid. See also `read_upload`.
         FrameError : See `read_upload`.
-        FrameConflict : If the frame exists with other content or metadata.
-        QuotaExceeded : If the map's quota has no room for another frame; nothing was stored.
+        FrameConflict : See `find_duplicate`.
+        QuotaExceeded : If the map has no room for the frame; nothing was stored.
         IdempotencyConflict : See `IdempotentRequest`.
         UnusableStore : If the disk is full, or the database cannot be written; nothing was stored.
         """
@@ -327,13 +337,12 @@ class Uploads:
         self, map_name: str, uploads: Sequence[Upload], once: IdempotentRequest | None = None,
         fence: Callable[[Connection], None] | None = None,
     ) -> tuple[list[UploadResult], bool]:  # fmt: skip
-        """Store frames in a map in one commit; see `add`.
-
-        The results contain errors of single frames.
+        """Store frames in a map in one commit; their results contain errors of single frames.
 
         Parameters
         ----------
-        fence : function that is called in the commit before anything is written; if it raises a
+        map_name, uploads, once : see `add`
+        fence : function that is called first in the transaction; if it raises a
             `SceneprintError`, nothing is stored
 
         Raises
@@ -341,11 +350,11 @@ class Uploads:
         UnknownMap, IdempotencyConflict, UnusableStore : See `add`; nothing was stored.
         """
         with self._store.database.read() as connection:
-            row = find_map(connection, map_name)  # before decoding
+            row = find_map(connection, map_name)
             before = _before(connection, row, once)
         if before is not None:
             for upload, outcome in zip(uploads, before, strict=True):
-                if outcome.added is not None:  # the stored upload may be lost
+                if outcome.added is not None:  # the stored blob may be lost
                     self._renew(map_name, outcome.added.frame_id, upload)
             return before, True
         outcomes: list[UploadResult | None] = [None] * len(uploads)
@@ -383,20 +392,20 @@ class Uploads:
         return _Prepared(upload, blob, content_id(read), metadata)
 
     def _read_result(self, map_name: str, ready: _Prepared) -> UploadResult | None:
-        """Return the result of an upload without a write; None if a write is needed."""
+        """Return the result of an upload that requires no write; None if a write is required."""
         try:
             with self._store.database.read() as connection:
                 row = find_map(connection, map_name)
                 frame = find_duplicate(
                     connection, row, ready.content, ready.metadata, ready.upload.frame_id
                 )
-                if frame is None:  # check the quota before a blob is written
+                if frame is None:  # check the quota before writing a blob
                     require_room(connection, row, ready.size + self.incoming.add(row.number, 0))
                 if frame is None or is_retried(frame.state):
                     return None
                 waits = frame.state in (FrameState.RECEIVED, FrameState.SIGNING)
                 if waits and frame.novelty is not None:
-                    return None  # its novelty threshold may change
+                    return None  # the write may relax the novelty threshold
                 added = upload_response(connection, frame)
         except (errors.StoreError, errors.UnknownMap):
             raise
@@ -407,7 +416,7 @@ class Uploads:
         return UploadResult(added.model_copy(update={"reason": reason}))
 
     def _renew(self, map_name: str, frame_id: str, upload: Upload) -> None:
-        """Replace the lost upload of a frame."""
+        """Replace the blob of a frame if it is lost or damaged."""
         left = repair.take_upload(self._store, map_name, frame_id, upload.data)
         if left:
             garbage_collection.collect_blobs(self._store, left)
@@ -420,16 +429,17 @@ class Uploads:
 
         Parameters
         ----------
-        row : map, as read before decoding
-        ready : decoded uploads by their place
+        row : map
+        ready : decoded uploads by index
+        results, once, fence : see `add_all`
 
         Returns
         -------
-        outcomes : results of all uploads
-        replayed : whether an earlier request stored them
+        results : results of all uploads
+        replayed : see `add`
         """
-        self._store.database.require_writable()  # check this before blobs are written
-        todo = {i: one for i, one in ready.items() if results[i] is None}
+        self._store.database.require_writable()  # before any blob is written
+        todo = {i: prepared for i, prepared in ready.items() if results[i] is None}
         request = _Request(todo, results, once, fence)
         blobs = request.blobs
         while True:
@@ -455,30 +465,32 @@ class Uploads:
                 return written
 
     def _insert_single(self, row: MapRow, request: _Request) -> UploadResult | None:
-        """Insert one new frame in one round trip to PostgreSQL, together with concurrent ones.
+        """Insert a new frame by one statement that concurrent uploads share, on PostgreSQL.
 
-        Return None on SQLite, which has no round trips, and if the frame needs more statements.
+        Return None without writing if the frame is not new or has a requested id, other uploads
+        wait for the map, or the database is SQLite.
         """
-        [one] = request.todo.values()
-        if self._store.database.is_sqlite or one.upload.frame_id is not None:
+        [prepared] = request.todo.values()
+        if self._store.database.is_sqlite or prepared.upload.frame_id is not None:
             return None
-        if row.number in self._writes:  # earlier uploads wait for the map
+        if row.number in self._writes:
             return None
-        new = _new_frame(row, one, request.once)
+        new = _new_frame(row, prepared, request.once)
         if not self._new_frames.receive(new):
             return None
-        # a deletion may have removed the blob before the commit; a worker that misses it retries
-        self._store.blobs.ensure(one.blob, one.upload.data)
+        # a deletion may have removed the blob before the commit; until it is written again, a
+        # worker retries
+        self._store.blobs.ensure(prepared.blob, prepared.upload.data)
         return _new_result(new)
 
     def _store_all(
         self, row: MapRow, request: _Request, connection: Connection
     ) -> tuple[list[UploadResult | None], bool] | None:
-        """Store uploads in a transaction; return None if a blob or the map was deleted."""
+        """Store uploads in a transaction; return None if a blob or the map no longer exists."""
         if request.fence is not None:
             request.fence(connection)
         if not all(map(self._store.blobs.holds, request.blobs)):
-            return None  # check this first, since the frame of a replay may need the blob
+            return None  # also before a replay, since its frame may refer to the blob
         if request.once is not None:
             now = find_map(connection, row.name)
             if now.number != row.number:
@@ -489,23 +501,24 @@ class Uploads:
                 return list(before), True
         request.left.clear()
         written = _insert_new(connection, row, request.todo)
-        for i, one in request.todo.items():
+        for i, prepared in request.todo.items():
             if i in written:
                 continue
             now = find_map(connection, row.name)
             if now.number != row.number:
                 return None
-            written[i] = _store_one(connection, now, one, request.left)
-        outcomes = [written.get(i, one) for i, one in enumerate(request.results)]
+            written[i] = _store_single(connection, now, prepared, request.left)
+        results = [written.get(i, result) for i, result in enumerate(request.results)]
         if request.once is not None and not any(
-            one is not None and isinstance(one.error, errors.QuotaExceeded) for one in outcomes
-        ):  # a repeated request may succeed
-            stored = [_stored_outcome(one) for one in outcomes if one is not None]
+            result is not None and isinstance(result.error, errors.QuotaExceeded)
+            for result in results
+        ):  # after QuotaExceeded, a repeated request may succeed
+            stored = [_stored_outcome(result) for result in results if result is not None]
             request.once.store(connection, {"frames": stored})
-        return outcomes, False
+        return results, False
 
     def _grouping(self, row: MapRow) -> Grouping:
-        """Return the group of writes to a map that are committed together; SQLite has one group."""
+        """Return the write group of a map; on SQLite, all maps share one group."""
         key = None if self._store.database.is_sqlite else row.number
         with self._guard:
             group = self._writes.get(key)
@@ -517,15 +530,15 @@ class Uploads:
 def _before(
     connection: Connection, row: MapRow, once: IdempotentRequest | None
 ) -> list[UploadResult] | None:
-    """Return the results of an earlier identical request; None without one."""
+    """Return the results of an earlier request with the key of `once`; None if there is none."""
     data = None if once is None else once.stored_result(connection)
     return None if data is None else replayed(connection, row, data)
 
 
 def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
-    """Return the row of a frame that may be new.
+    """Return the row of a frame to insert unless it exists.
 
-    With `once`, on PostgreSQL, the same statement stores the result for the idempotency key.
+    With `once` (PostgreSQL only), the statement also stores the result for the idempotency key.
     """
     frame_id = uuid.uuid4().hex
     outcome = None
@@ -535,7 +548,7 @@ def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = N
 
 
 def _new_result(new: NewFrame) -> UploadResult:
-    """Return the result of an upload whose frame was inserted."""
+    """Return the result of an upload that inserted a frame."""
     added = Added(
         frame_id=new.frame_id, job_id=new.job_id, state=FrameState.RECEIVED, reason=None,
         samples=SampleRange.model_validate(new.values["samples"]),
@@ -547,18 +560,21 @@ def _new_result(new: NewFrame) -> UploadResult:
 def _insert_new(
     connection: Connection, row: MapRow, todo: dict[int, _Prepared]
 ) -> dict[int, UploadResult]:
-    """Insert new frames, and return their results by index; see `_store_one` for the others."""
-    new = {i: _new_frame(row, one) for i, one in todo.items() if one.upload.frame_id is None}
+    """Insert the uploads that are new frames, and return their results by index."""
+    new = {
+        i: _new_frame(row, prepared)
+        for i, prepared in todo.items() if prepared.upload.frame_id is None
+    }  # fmt: skip
     ids = receive_frames(connection, list(new.values()))
-    return {i: _new_result(one) for i, one in new.items() if one.frame_id in ids}
+    return {i: _new_result(frame) for i, frame in new.items() if frame.frame_id in ids}
 
 
-def _store_one(
+def _store_single(
     connection: Connection, row: MapRow, ready: _Prepared, left: list[str]
 ) -> UploadResult:
-    """Store an upload and return its result; add unused blobs to `left`."""
+    """Store an upload, and return its result; add blobs that may be unreferenced to `left`."""
     upload = ready.upload
-    try:  # repeats the search, since another upload may have been first
+    try:  # search again: another upload may have added the frame
         frame = find_duplicate(connection, row, ready.content, ready.metadata, upload.frame_id)
     except errors.FrameConflict as error:
         left.append(ready.blob)
@@ -568,7 +584,7 @@ def _store_one(
         left.append(ready.blob)
         return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
-    # the quota counts a failed frame already, but the size of the upload may differ
+    # the quota already counts the former blob of a failed frame, whose size may differ
     counted = 0 if frame is None or new else frame.bytes
     try:
         left.extend(make_room(connection, row, ready.size - counted, new=new))
@@ -577,8 +593,8 @@ def _store_one(
         return UploadResult(None, error=error)
     if frame is None:
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
-    else:  # retry it
-        left.append(frame.blob)  # the new upload may have another packing
+    else:
+        left.append(frame.blob)  # the new blob may have another file format
         frame = renew_frame(connection, frame.number, ready.blob_columns)
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)

@@ -1,9 +1,9 @@
-"""Write groups: writes that arrive during another write share the next transaction.
+"""Group commit: writes that arrive during another write share the next transaction.
 
-A commit waits for the disk regardless of its size, so eight clients need not wait eight times.
+The duration of a commit hardly depends on its size, so shared commits increase the throughput.
 
-    run(a), run(b), run(c)  --Grouping, in one commit-->       each gets its own result
-    receive(a), receive(b)  --NewFrames, in one statement-->   whether each was inserted
+    run(a), run(b), run(c)  --Grouping, in write commit-->       result of each call
+    receive(a), receive(b)  --NewFrames, in write statement-->   whether each frame was inserted
 """
 
 from __future__ import annotations
@@ -23,21 +23,20 @@ from sceneprint.store.new_frames import NewFrame, receive_frames
 T = TypeVar("T")
 W = TypeVar("W")
 
-#: Maximum number of writes in one transaction, for which other writers wait.
+#: Maximum number of writes in write transaction; other writers wait for its end.
 MOST_TOGETHER = 32
-#: Seconds for which new frames of several maps wait for a locked map. Locks usually last a few
-#: milliseconds.
+#: Maximum seconds that a statement with new frames of several maps waits for a locked map.
 MAPS_WAIT_S = 0.25
 
 
 class _Waiting(Generic[W]):
-    """A waiting write, and its result.
+    """A write that waits for its transaction, and its result.
 
     Parameters
     ----------
-    leads : whether its thread writes for all threads; see `_Group`
-    ready : set when the write is done, or its thread leads
-    left : whether its thread no longer waits
+    leads : whether the thread of this write is the leader; see `_Group`
+    ready : event that is set when the write is done, or its thread becomes the leader
+    left : whether the thread was interrupted and no longer waits
     """
 
     def __init__(self, work: W) -> None:
@@ -49,7 +48,7 @@ class _Waiting(Generic[W]):
 
 
 class _Group(Generic[W]):
-    """Writes of many threads, of which one at a time leads and performs all waiting writes."""
+    """Writes of many threads; one thread, the leader, performs all waiting writes."""
 
     def __init__(self) -> None:
         self._waiting: list[_Waiting[W]] = []
@@ -57,9 +56,10 @@ class _Group(Generic[W]):
         self._led = False
 
     def _await(self, work: W) -> Any:
-        """Add a write, wait until this or another thread has performed it, and return its result.
+        """Queue a write, wait until a leader has performed it, and return its result or raise its
+        error.
 
-        The error of the write is raised. An interrupted thread withdraws a write that waits.
+        An interruption (such as Ctrl-C) withdraws the write if it has not started.
         """
         mine = _Waiting(work)
         with self._list:
@@ -68,11 +68,11 @@ class _Group(Generic[W]):
         try:
             if not mine.leads:
                 mine.ready.wait()
-            while not mine.done:  # a batch may end before this write
+            while not mine.done:  # a full batch may exclude this write
                 self._write()
-        except BaseException:  # such as Ctrl-C
+        except BaseException:
             with self._list:
-                mine.left = True  # the leading thread must not return this write to the list
+                mine.left = True  # the leader must not queue this write again
                 if mine in self._waiting:
                     self._waiting.remove(mine)
             raise
@@ -84,7 +84,7 @@ class _Group(Generic[W]):
         return mine.result
 
     def _hand_over(self) -> None:
-        """Pass the lead to the next thread."""
+        """Make the thread of the next waiting write the leader."""
         with self._list:
             self._led = bool(self._waiting)
             if self._waiting:
@@ -92,28 +92,28 @@ class _Group(Generic[W]):
                 self._waiting[0].ready.set()
 
     def _write(self) -> None:
-        """Perform a batch of the first waiting writes."""
+        """Perform a batch of waiting writes, oldest first."""
         batch: list[_Waiting[W]] = []
         try:
             self._write_together(batch)
-        except BaseException:  # Ctrl-C stops only this caller, so others perform their writes
+        except BaseException:  # an interruption of this thread must not lose writes of others
             with self._list:
-                back = [one for one in batch if not (one.done or one.left)]
+                back = [write for write in batch if not (write.done or write.left)]
                 self._waiting = back + self._waiting
             raise
         finally:
-            for one in batch:
-                if one.done:
-                    one.ready.set()
+            for write in batch:
+                if write.done:
+                    write.ready.set()
 
     def _take(self, batch: list[_Waiting[W]], *, all_: bool = False) -> None:
-        """Move the first waiting writes to `batch`."""
+        """Move up to MOST_TOGETHER waiting writes to `batch`, or all with `all_`."""
         with self._list:
             batch[:] = self._waiting[: None if all_ else MOST_TOGETHER]
             del self._waiting[: len(batch)]
 
     def _write_together(self, batch: list[_Waiting[W]]) -> None:
-        """Perform waiting writes in one transaction, and return them in `batch`."""
+        """Move waiting writes to `batch`, and perform them in one transaction."""
         raise NotImplementedError
 
 
@@ -121,7 +121,7 @@ _Work = Callable[[Connection], Any]
 
 
 class Grouping(_Group[_Work]):
-    """Group of threads that share transactions on one database.
+    """Write group of a database or of a map.
 
     Parameters
     ----------
@@ -137,66 +137,64 @@ class Grouping(_Group[_Work]):
 
         Parameters
         ----------
-        do : function that writes. It may be called several times, and must raise errors other than
-            `UnusableStore` before it writes, since other writes of the transaction continue
+        do : function that writes. It may be called several times. It must not write before it
+            raises an error other than `UnusableStore`, since the transaction is committed anyway
         """
-        own = copy_context()  # another thread may call the function
+        own = copy_context()  # the leader calls the function in the context of this thread
         return cast(T, self._await(lambda connection: own.run(do, connection)))
 
     def _write_together(self, batch: list[_Waiting[_Work]]) -> None:
-        """Perform waiting writes in one transaction, or each in its own after an error."""
+        """Perform waiting writes in one transaction; if it fails, in separate transactions."""
         try:
             with self._database.write(map_number=self._map_number) as connection:
-                self._take(batch)  # after the wait for the lock, since more writes have arrived
-                for one in batch:
-                    _do(one, connection)
+                self._take(batch)  # include writes that arrived during the wait for the lock
+                for write in batch:
+                    _do(write, connection)
         except Exception as error:
-            if not batch:  # the lock was not acquired, so all waiting writes fail
+            if not batch:  # the lock was not acquired
                 self._take(batch, all_=True)
             of_all = isinstance(error, UnusableStore) and not is_conflict(error)
             if len(batch) == 1 or of_all:
-                for one in batch:
-                    one.result, one.error = None, error
+                for write in batch:
+                    write.result, write.error = None, error
             else:
-                for one in batch:  # one write made the shared transaction fail
-                    self._write_alone(one)
-                    one.done = True
-        for one in batch:
-            one.done = True
+                for write in batch:
+                    self._write_alone(write)
+                    write.done = True
+        for write in batch:
+            write.done = True
 
-    def _write_alone(self, one: _Waiting[_Work]) -> None:
-        one.result = one.error = None
+    def _write_alone(self, write: _Waiting[_Work]) -> None:
+        write.result = write.error = None
         try:
             with self._database.write(map_number=self._map_number) as connection:
-                _do(one, connection)
+                _do(write, connection)
         except Exception as error:
-            one.result, one.error = None, error
+            write.result, write.error = None, error
 
 
-def _do(one: _Waiting[_Work], connection: Connection) -> None:
-    one.result = one.error = None
+def _do(write: _Waiting[_Work], connection: Connection) -> None:
+    write.result = write.error = None
     try:
-        one.result = one.work(connection)
+        write.result = write.work(connection)
     except UnusableStore:
         raise
     except SceneprintError as error:
-        one.error = error
+        write.error = error
 
 
 class NewFrames(_Group[NewFrame]):
-    """Group of threads that insert new frames of many maps by one statement on PostgreSQL."""
+    """Write group that inserts new frames of all maps by one statement; PostgreSQL only."""
 
     def __init__(self, database: Database) -> None:
         super().__init__()
         self._database = database
 
     def receive(self, frame: NewFrame) -> bool:
-        """Insert a frame, and return after the commit.
+        """Insert a frame, and return after the commit whether it was inserted.
 
-        Returns
-        -------
-        inserted : whether the frame was inserted. If not, it must be written alone, because it is
-            not new (see `receive_frames`), another frame failed, or a map was locked
+        If it was not, the caller must write it separately: the frame may exist already, another
+        frame of the statement failed, or a map was locked.
 
         Raises
         ------
@@ -206,18 +204,18 @@ class NewFrames(_Group[NewFrame]):
 
     def _write_together(self, batch: list[_Waiting[NewFrame]]) -> None:
         self._take(batch)
-        frames = [one.work for one in batch]
-        numbers = {one.row.number for one in frames}
+        frames = [write.work for write in batch]
+        numbers = {write.row.number for write in frames}
         try:
             with self._database.write_maps(numbers, MAPS_WAIT_S) as connection:
                 ids = receive_frames(connection, frames)
-            for one in batch:
-                one.result = one.work.frame_id in ids
+            for write in batch:
+                write.result = write.work.frame_id in ids
         except UnusableStore as error:
-            for one in batch:
-                one.error = error
-        except Exception:  # separate writes show which frame is wrong
-            for one in batch:
-                one.result = False
-        for one in batch:
-            one.done = True
+            for write in batch:
+                write.error = error
+        except Exception:  # the separate writes raise the error of the failed frame
+            for write in batch:
+                write.result = False
+        for write in batch:
+            write.done = True

@@ -1,1 +1,1 @@
-"""Jobs from claim to outcome."""
+"""Execution of jobs: claims, handlers, results and retries."""

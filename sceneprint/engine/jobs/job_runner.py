@@ -1,4 +1,4 @@
-"""Execution of jobs: claim the next one, run it, or put it back."""
+"""Runner of all kinds of jobs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sceneprint_client.api import JobState
 
 
 class JobRunner:
-    """Runner of a store's jobs: signing of frames, and slices of long jobs.
+    """Runner of the jobs of a store: signing of frames, and slices of long jobs.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class JobRunner:
         self._tasks = Tasks(context.store, context.bell, self.handlers)
 
     def claim(self, worker: str) -> Work | LongJob | None:
-        """Claim the next job; return None if there is none. See `signature_job.claim`."""
+        """Claim the next job; return None if no job is due. See `signature_job.claim`."""
         return signature_job.claim(self._context.store, worker, self._context.settings.job_lease_s)
 
     def due_in_s(self) -> float | None:
@@ -59,7 +59,7 @@ class JobRunner:
     def run(self, work: Work | LongJob, broke: Callable[[], None] | None = None) -> JobState | None:
         """Run a claimed job or a slice of it; see `signature_job.run` and `Tasks.run`."""
         context, settings = self._context, self._context.settings
-        with work_of(work.job.tenant):  # new jobs belong to the same tenant
+        with work_of(work.job.tenant):  # jobs that this job creates belong to the same tenant
             if isinstance(work, LongJob):
                 return self._tasks.run(work, settings.job_lease_s, settings.job_timeout_s, broke)
             return signature_job.run(

@@ -1,4 +1,4 @@
-"""Transitions of jobs of single frames, such as cancellation and retry, and lease renewal."""
+"""State transitions of jobs, such as failure, cancellation and retry, and lease renewal."""
 
 from __future__ import annotations
 
@@ -30,13 +30,19 @@ from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
 log = logging.getLogger(__name__)
 
-#: Seconds until a job whose result could not be stored is due again.
+#: Delay in seconds before the next attempt of a job whose result could not be stored.
 LEFT_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A claimed job of a single frame."""
+    """A claimed job that signs a frame.
+
+    Parameters
+    ----------
+    job : row of the job at the claim
+    frame, map : rows of its frame and map
+    """
 
     job: JobRow
     frame: FrameRow
@@ -44,21 +50,21 @@ class Work:
 
     @property
     def again(self) -> bool:
-        """Whether the job signs an indexed frame again, which stays indexed in the meantime."""
+        """Whether the job signs an indexed frame again; the frame stays indexed until the end."""
         return self.job.kind == REENCODE
 
     @property
     def model_id(self) -> str:
-        """Id of the model to sign with."""
+        """Id of the model of the new signature."""
         return self.job.model_id or self.map.model_id
 
 
 class Outdated(Exception):
-    """The map's model has changed since the job was claimed."""
+    """The map has switched to another model since the job was claimed."""
 
 
 def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
-    """Queue a claimed job that was not started, such as when a worker stops."""
+    """Return a claimed job to the queue, due after `after_s` seconds; ignore a lost lease."""
     writing = store.database.write(map_number=work.map.number)
     with suppress(LostLease), writing as connection:
         queue.release_job(connection, work.job, after_s)
@@ -67,7 +73,7 @@ def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
 
 
 def restart_jobs(store: Store, work: Work) -> JobState | None:
-    """Queue or cancel a job whose model the map no longer uses."""
+    """Queue or cancel a job whose map has switched models; return its state, None without lease."""
     if not work.again:
         put_back(store, work)
         return JobState.QUEUED
@@ -80,15 +86,15 @@ def restart_jobs(store: Store, work: Work) -> JobState | None:
 
 
 def record_job_event(connection: Connection, kind: str, work: Work) -> None:
-    """Record an event of a job."""
+    """Record an event with the frame and the id of a job."""
     record_event(connection, kind, work.map.name, work.frame.id, work.job.id)
 
 
 def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
-    """Fail the job of a frame that cannot be signed, and reject the frame; return the job's state.
+    """Mark a job as failed, and its frame as rejected, after an error that a retry would repeat.
 
-    A frame that is signed again (`work.again`) keeps its state. If the map has another model by
-    now, the jobs of the frame start again. The result is None if the lease was lost.
+    A frame that is signed again (`work.again`) is not rejected. If the map has switched models, the
+    job is restarted; see `restart_jobs`. Return the state of the job; None if the lease was lost.
     """
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
@@ -107,7 +113,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
 
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
-    """Queue a failed job for another attempt, or mark it dead."""
+    """Queue a failed job for another attempt, or mark it as dead; return its state."""
     reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
@@ -126,7 +132,7 @@ def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
 
 
 def failure_texts(error: Exception) -> tuple[str, str]:
-    """Return the message and the traceback of a job's error."""
+    """Return the message and the traceback of an error."""
     reason = str(error)
     if not isinstance(error, SceneprintError):
         reason = f"{type(error).__name__}: {error}"
@@ -134,7 +140,7 @@ def failure_texts(error: Exception) -> tuple[str, str]:
 
 
 def about(work: Work, **more: object) -> dict[str, object]:
-    """Return the fields of a log line about a job."""
+    """Return the log fields of a job, and the fields `more`."""
     return {
         "job_id": work.job.id, "frame_id": work.frame.id, "map": work.map.name,
         "attempt": work.job.attempts, **more,
@@ -143,7 +149,7 @@ def about(work: Work, **more: object) -> dict[str, object]:
 
 @contextmanager
 def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> Iterator[None]:
-    """Renew a lease in another thread during the work, for at most `longest_s` seconds."""
+    """Renew the lease of a job in a thread during the context, for at most `longest_s` seconds."""
     done = threading.Event()
 
     def renew() -> None:
@@ -153,8 +159,8 @@ def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> It
                 with store.database.write(turn=False) as connection:
                     queue.renew(connection, claim, lease_s)
             except LostLease:
-                return  # storing the result fails later
-            except SceneprintError as error:  # the database may recover before the lease ends
+                return
+            except SceneprintError as error:  # retry until the lease expires
                 log.warning("lease not renewed", extra={"error": str(error)})
 
     thread = threading.Thread(target=renew, name="lease", daemon=True)
@@ -166,7 +172,7 @@ def renewed(store: Store, claim: JobRow, lease_s: float, longest_s: float) -> It
         thread.join()
 
 
-# Jobs for users and operators: list, cancel, retry; and jobs of dead workers.
+# Operations of users on jobs, and jobs of dead workers.
 
 CANCELLED = "its job was cancelled"
 _BEING_SIGNED = (FrameState.RECEIVED, FrameState.SIGNING)
@@ -200,15 +206,15 @@ def get_job(store: Store, job_id: str) -> Job:
 
 
 def cancel(store: Store, job_id: str) -> Job:
-    """Cancel a job that is not over; return a cancelled job unchanged.
+    """Cancel a queued or running job; return a cancelled job unchanged.
 
-    A worker that runs the job continues, but its result is refused. The archive of an import is
+    A worker may continue with the job, but its result is refused. The archive of an import is
     removed immediately.
 
     Raises
     ------
     UnknownJob : If the job does not exist.
-    JobOver : If the job has succeeded or failed.
+    JobOver : If the job succeeded, failed or is dead.
     """
     with store.database.write() as connection:
         job = queue.find_job(connection, job_id)
@@ -224,18 +230,17 @@ def cancel(store: Store, job_id: str) -> Job:
 
 
 def retry(store: Store, bell: Wakeup, job_id: str) -> tuple[Job, bool]:
-    """Retry a failed or cancelled job by a new job of the same priority.
+    """Retry a failed, dead or cancelled job by a new job of the same priority; resume a long job.
 
     Returns
     -------
-    job : new job, or an existing one that retries the frame already
-    is_new : whether the job is new
+    job : new or resumed job, or an unfinished job that already retries the frame
+    is_new : whether the job was queued by this call
 
     Raises
     ------
     UnknownJob : If the job does not exist.
-    CannotRetry : If the job succeeded, its frame has a later job that is over, or the upload is
-        missing.
+    CannotRetry : If the job succeeded, a later job of its frame has ended, or the upload is lost.
     """
     job, is_new = _retry(store, job_id)
     if is_new:
@@ -255,16 +260,16 @@ def _retry(store: Store, job_id: str) -> tuple[Job, bool]:
             return _job_record(connection, latest), False
         if latest.number != job.number:
             raise CannotRetry(
-                f"Job {job.id} was replaced by {latest.id}, which is {latest.state}. Retry that "
-                "job."
+                f"Job {job.id} was replaced by job {latest.id}, whose state is {latest.state}. "
+                "Retry the later job."
             )
         can_retry = frame.state in _GIVEN_UP
         if job.kind == REENCODE:
             can_retry = frame.state == FrameState.INDEXED and row.next_model_id == job.model_id
         if not (job.state.over and can_retry) or job.state == JobState.SUCCEEDED:
             raise CannotRetry(
-                f"Job {job.id} is {job.state} and its frame is {frame.state}, so there is "
-                "nothing to retry."
+                f"Job {job.id} is {job.state} and its frame is {frame.state}, so no retry is "
+                "needed."
             )
         if not store.blobs.holds(frame.blob):
             raise CannotRetry(
@@ -283,9 +288,9 @@ def retry_dead(
     store: Store, bell: Wakeup, cursor: str | None = None, limit: int = 100,
     map_names: Collection[str] | None = None,
 ) -> RetriedJobs:  # fmt: skip
-    """Retry a page of dead jobs, newest first; ignore jobs that were already retried.
+    """Retry the dead jobs of a page, newest first; skip jobs that were already retried.
 
-    Each retry has its own transaction, so retries before an error remain.
+    Each retry is a transaction of its own, so an error does not undo earlier retries.
 
     Raises
     ------
@@ -310,7 +315,8 @@ def worker_died(
 ) -> JobState | None:
     """Release a job of a dead worker before the end of its lease.
 
-    See `queue.fail_dead_worker` for parameters. Return the state of the job; None if unchanged.
+    Return the new state of the job; None if another worker has it or it is over. See
+    `queue.fail_dead_worker` for the parameters.
     """
     with store.database.write() as connection:
         job = fail_dead_worker(connection, job_id, token, error, traceback, counts=counts)
@@ -329,7 +335,7 @@ def worker_died(
 
 
 def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
-    """Set the frame of a job to failed, unless it is indexed or deleted."""
+    """Mark the frame of a job as failed, unless the frame is indexed or deleted."""
     if job.frame_number is None:
         return
     frame = frame_of(connection, job.frame)
@@ -340,11 +346,11 @@ def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
 
 
 def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
-    """Continue a failed long job after its last slice."""
+    """Queue a failed long job again, so that it resumes after its last slice; see `retry`."""
     if not job.state.over:
         return _job_record(connection, job), False
     if job.state == JobState.SUCCEEDED:
-        raise CannotRetry(f"Job {job.id} is {job.state}, so there is nothing to retry.")
+        raise CannotRetry(f"Job {job.id} is {job.state}, so no retry is needed.")
     queue.requeue_job(connection, job)
     record_change(connection, "job.retried", _map_name(connection, job), job.id)
     return _job_record(connection, queue.find_job(connection, job.id)), True

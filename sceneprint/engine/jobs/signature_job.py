@@ -1,4 +1,4 @@
-"""The worker's main job: claim a frame, sign it, and store the results in one commit."""
+"""The main job of workers: claim a frame, sign it, and store the results in one commit."""
 
 from __future__ import annotations
 
@@ -39,15 +39,16 @@ from sceneprint_client.api import FrameState, JobState
 
 log = logging.getLogger(__name__)
 
-#: Seconds that a result waits for an unreachable server, and between two attempts. A worker that
-#: must stop has more time.
+#: Maximum seconds to retry storing a result while the database is unreachable, and seconds between
+#: attempts. The time that a worker has to stop is longer.
 AWAY_S, AGAIN_S = 12.0, 0.5
 
 
 def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob | None:
-    """Claim the next job; return None if there is none. Mark jobs dead that kill every worker.
+    """Claim the next job for `lease_s` seconds; return None if no job is due.
 
-    A job that does not belong to a frame is a LongJob. See also `queue.claim`.
+    Before that, mark jobs as dead that ended too many workers. A job without a frame is a LongJob.
+    See also `queue.claim`.
     """
     with store.database.read() as connection:
         if not queue.has_due(connection):
@@ -73,7 +74,7 @@ def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob
 
 @dataclass(frozen=True)
 class SigningResult:
-    """A frame's signature to be stored, and the artifact that it refers to."""
+    """The signature of a frame, and the artifact that it refers to, as bytes."""
 
     signature: StoredSignature
     artifact: bytes
@@ -83,19 +84,19 @@ def run(
     store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, lease_s: float,
     longest_s: float, broke: Callable[[], None] | None = None,
 ) -> JobState | None:  # fmt: skip
-    """Sign a claimed frame.
+    """Run a claimed job: sign its frame, and store the result.
 
     Parameters
     ----------
-    lease_s : seconds of each renewal
-    longest_s : seconds after which the lease is no longer renewed, as the work may never end
-    broke : function that is called after an unexpected error, since the state of this process may
-        be damaged
+    work : claimed job
+    lease_s : duration of the lease after each renewal, seconds
+    longest_s : seconds after which the lease is no longer renewed, in case that signing hangs
+    broke : function to call after an unexpected error, which may have damaged this process
 
     Returns
     -------
-    state : state of the job; queued if it failed and will be retried, or if the map's model
-        changed; None if the lease was lost, and the result with it
+    state : new state of the job: queued if it will be retried; None if the lease was lost and the
+        result discarded
     """
     start = time.perf_counter()
     state: JobState | None
@@ -115,7 +116,7 @@ def run(
         state = lifecycle.reject(store, work, error)
     except errors.UnusableStore:  # a full disk does not count as a failure of the frame
         with suppress(errors.UnusableStore):  # otherwise, the lease expires
-            # with a delay, so that another worker can claim it, whose disk may have room
+            # with a delay, so that a worker with a free disk can claim the job
             lifecycle.put_back(store, work, lifecycle.LEFT_S)
             if result is not None:
                 collect_blobs(store, [result.signature.geometry])
@@ -125,7 +126,7 @@ def run(
         if broke is not None and not isinstance(error, errors.SceneprintError):
             broke()
     if result is not None and state != JobState.SUCCEEDED:
-        unused = [result.signature.geometry]  # nothing refers to the artifact
+        unused = [result.signature.geometry]
     if unused:
         collect_blobs(store, unused)
     if state is None:
@@ -137,7 +138,7 @@ def run(
 
 
 def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> SigningResult:
-    """Sign a frame and store its artifact."""
+    """Sign a frame, and store its artifact."""
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
@@ -155,9 +156,9 @@ def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> SigningResult
 def _store_patiently(
     store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, result: SigningResult
 ) -> list[str]:
-    """Call `_store`, and retry while another server replaces a failed one.
+    """Call `_store`; while the database is unreachable, retry for AWAY_S seconds.
 
-    If the failed server had committed the result, the retry raises LostLease.
+    If an earlier attempt was committed after all, a retry raises LostLease.
     """
     until = time.monotonic() + AWAY_S
     while True:
@@ -172,11 +173,11 @@ def _store_patiently(
 def _store(
     store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, result: SigningResult
 ) -> list[str]:
-    """Store signature, artifact, state and the end of the job in one commit.
+    """Store the signature and the new states of frame and job in one commit.
 
     Returns
     -------
-    blobs : blobs of a redundant frame, which are unreferenced now
+    blobs : blobs that may be unreferenced now, such as those of a redundant frame
     """
     signature = result.signature
     if work.again:
@@ -221,23 +222,23 @@ _SWEPT = "A deletion removed the artifact, so the frame is signed again."
 
 
 def _index_alone(store: Store, work: lifecycle.Work, result: SigningResult) -> bool:
-    """Index a frame in one round trip to PostgreSQL; return False if nothing was written."""
+    """Index a new frame by one statement, if possible; return whether it was."""
     signature = result.signature
     if store.database.is_sqlite or work.frame.novelty is not None:
         return False
     with store.database.write(map_number=work.frame.map_number, single=True) as connection:
         is_indexed = index_claimed_frame(connection, work.job, work.frame, work.map.name, signature)
-    if is_indexed:  # a deletion may have removed the artifact before the commit
+    if is_indexed:  # write the artifact again if a deletion removed it before the commit
         store.blobs.ensure(signature.geometry, result.artifact)
     return is_indexed
 
 
 def _replace_signature(store: Store, work: lifecycle.Work, signature: StoredSignature) -> list[str]:
-    """Replace or add the signature of an indexed frame, and end the job, in one commit.
+    """Replace or add a signature of an indexed frame, and end the job, in one commit.
 
     Returns
     -------
-    blobs : former blobs of the frame
+    blobs : blobs of the replaced signature
     """
     number = work.frame.number
     with store.database.write(map_number=work.frame.map_number) as connection:
@@ -254,30 +255,30 @@ def _replace_signature(store: Store, work: lifecycle.Work, signature: StoredSign
         return [blob for blob in before if blob != signature.geometry]
 
 
-# Novelty: `if_novel` of an upload rejects frames of places that the map has.
+# Novelty: with `if_novel`, a frame of a place that the map already covers becomes redundant.
 #
 # signature  --find_nearest-->  Nearest, at a revision  --why_redundant, in the commit-->  reason
 #
-# The search holds no lock. The commit compares frames that were indexed after it, so that only one
-# of two simultaneous frames of a place is stored.
+# The search holds no lock. The commit also compares frames that were indexed after the search, so
+# that of two simultaneous frames of a place, only one is stored.
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """The number and the distance of a map's nearest frame at a revision; None in an empty map."""
+    """Number and distance of the nearest frame at a revision of the map; None in an empty map."""
 
     revision: int
     nearest: tuple[int, int] | None
 
 
 class Stale(Exception):
-    """The nearest frame was deleted after the search, so the search must be repeated."""
+    """The nearest frame changed after the search, so the search must be repeated."""
 
 
 def find_nearest(
     database: Database, readers: Readers, row: MapRow, signature: StoredSignature
 ) -> Nearest | None:
-    """Search a map for the nearest frame.
+    """Search a map for the frame nearest to a signature.
 
     Parameters
     ----------
@@ -285,7 +286,7 @@ def find_nearest(
 
     Returns
     -------
-    nearest : nearest frame; None if the map has another model now
+    nearest : nearest frame; None if the signature is of another model than the map
 
     Raises
     ------
@@ -309,13 +310,19 @@ def why_redundant(
     connection: Connection, frame: FrameRow, signature: StoredSignature, seen: Nearest | None,
     model: Model,
 ) -> str | None:  # fmt: skip
-    """Return why a frame is redundant, in the transaction that would index it; None if it is novel.
+    """Return the reason why a frame is redundant; None if it is novel.
+
+    Call this in the transaction that indexes the frame.
+
+    Parameters
+    ----------
+    seen : result of `find_nearest`
 
     Raises
     ------
-    Stale : If the nearest frame was deleted, so the search must be repeated.
+    Stale : If the nearest frame has changed since the search.
     """
-    novelty = frame_of(connection, frame.number).novelty  # an upload may have relaxed it
+    novelty = frame_of(connection, frame.number).novelty  # may have been relaxed since the claim
     row = map_of_number(connection, frame.map_number)
     if novelty is None or seen is None or row.model_id != signature.model_id:
         return None
@@ -329,7 +336,7 @@ def why_redundant(
     other = frame_of(connection, nearest[0]).id
     return (
         f"the map already covers this place: the distance to frame {other} is {share:.3f} of the "
-        f"distance of unrelated frames (required: more than {novelty:g})"
+        f"distance between unrelated frames, but `if_novel` requires more than {novelty:g}"
     )
 
 

@@ -1,9 +1,9 @@
-"""Long jobs, which do not belong to a single frame and run in slices.
+"""Long jobs: jobs of a map or of the store that run in slices.
 
     queue_task  -->  queued  --claim-->  LongJob  --Tasks.run-->  a SliceResult for each slice
 
-Results and progress of a slice are stored in one commit, which checks the job's token. The slice of
-a dead worker is repeated.
+The results and the progress of a slice are stored in one commit, which verifies that the worker
+still holds the job. If a worker dies, its slice is repeated.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from sceneprint_client.api import Job, JobState
 
 
 class Swept(StoreError):
-    """A deletion removed a file before the commit that refers to it."""
+    """A blob was removed before the commit that refers to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +54,7 @@ class LongJob:
 
     Parameters
     ----------
+    job : row of the job at the claim
     map : map of the job; None for a job without a map
     """
 
@@ -67,12 +68,12 @@ class LongJob:
 
     @property
     def progress(self) -> dict[str, Any]:
-        """Progress as of the last slice; empty before the first."""
+        """Progress after the last slice; empty before the first."""
         return self.job.progress or {}
 
     @property
     def of_map(self) -> MapRow:
-        """The map of a job whose kind always has one."""
+        """Map of the job; raise ValueError if the job has none."""
         if self.map is None:
             raise ValueError(f"job {self.job.id} has no map")
         return self.map
@@ -84,15 +85,18 @@ class SliceResult:
 
     Parameters
     ----------
-    over : whether the job is done
+    over : whether this slice is the last
     progress : `done` and `total` for users, and the state that the next slice needs
-    files : files of this slice, whose blobs exist
-    result : summary, at the end
-    drop : names of files of the job to remove
-    event : kind of the event at the end, such as association.found; its data is `result`
-    write : function that stores more in the commit, and returns blobs that may be unused
-    blobs : existing blobs that `write` refers to
-    after_s : seconds before the next slice, if the job waits for others
+    items : new items of the job
+    files : new files of the job, whose blobs are stored
+    result : result of the job; only from the last slice
+    drop : names of files to remove from the job
+    event : kind of the event to record after the last slice, such as association.found; its data
+        is `result`
+    write : function that stores further rows in the same commit, and returns blobs that may be
+        unreferenced then
+    blobs : stored blobs that `write` refers to
+    after_s : delay before the next slice, seconds
     """
 
     over: bool
@@ -107,24 +111,24 @@ class SliceResult:
     after_s: float = 0.0
 
 
-#: Function that returns whether a slice must end, since its time is over or another job waits.
+#: Function that returns whether a slice must end because its time is up or another job waits.
 IsOver = Callable[[], bool]
-#: Function that runs a slice, at least one step; a slice may be repeated.
+#: Function that runs a slice of at least one step; a slice may be repeated after a crash.
 Handler = Callable[[LongJob, IsOver], SliceResult]
 
 
 log = logging.getLogger(__name__)
 
-#: Maximum duration of a slice, and interval of checks for waiting jobs, in seconds.
+#: Maximum duration of a slice, and seconds between checks for waiting jobs.
 SLICE_S, LOOK_S = 15.0, 0.1
-#: Errors after which a retry would fail too.
+#: Errors that a retry would repeat.
 HOPELESS = (
     FrameError, InvalidRequest, NotFound, Conflict, MissingDependency, QuotaExceeded,
 )  # fmt: skip
 
 
 def ends_within(is_over: IsOver, seconds: float) -> IsOver:
-    """Return an `IsOver` that also ends the slice after some seconds from now."""
+    """Return an `IsOver` that also ends the slice `seconds` seconds from now."""
     until = time.monotonic() + seconds
     return lambda: time.monotonic() >= until or is_over()
 
@@ -140,27 +144,27 @@ def queue_task(
     kind : kind of the job, such as associate
     map_name : map of the job; None for a job without a map
     data : request as JSON
-    priority : priority, on the same scale as that of frames
-    files : files of the job, whose blobs exist
+    priority : priority, on the scale of upload priorities
+    files : files of the job, whose blobs are stored
     once : idempotent request
 
     Returns
     -------
-    job : current state of the job
+    job : record of the job
     replayed : whether an earlier request with the key of `once` queued the job
 
     Raises
     ------
     UnknownMap : If the map does not exist.
-    Swept : If the blob of a file was removed, so it must be stored again.
-    IdempotencyConflict : If an earlier request with the key of `once` differs from this one.
+    Swept : If the blob of a file was removed, so that it must be stored again.
+    IdempotencyConflict : If an earlier request with the key of `once` was different.
     QuotaExceeded : If the map has no room for an archive among the files.
     """
     with store.database.write() as connection:
         row = None if map_name is None else find_map(connection, map_name)
         before = None if once is None else once.stored_result(connection)
         if before is not None:
-            with suppress(UnknownJob):  # the map may have been deleted and created again
+            with suppress(UnknownJob):  # the map was deleted and created again
                 job_before = queue.find_job(connection, before["job_id"])
                 return job_record(job_before, None, map_name), True
         _check_files(store, files)
@@ -178,11 +182,11 @@ def queue_task(
 
 
 class Tasks:
-    """Runner of slices of long jobs.
+    """Runner of long jobs.
 
     Parameters
     ----------
-    handlers : handlers by the kinds of jobs that this process can run
+    handlers : handlers of the job kinds that this process can run
     """
 
     def __init__(self, store: Store, bell: Wakeup, handlers: Mapping[str, Handler]) -> None:
@@ -192,7 +196,7 @@ class Tasks:
         self, task: LongJob, lease_s: float, longest_s: float,
         broke: Callable[[], None] | None = None,
     ) -> JobState | None:  # fmt: skip
-        """Run a slice of a claimed job; other parameters as in `signature_job.run`."""
+        """Run a slice of a claimed job; see `signature_job.run` for parameters and result."""
         start, job = time.perf_counter(), task.job
         state: JobState | None
         try:
@@ -225,7 +229,7 @@ class Tasks:
         return state
 
     def _end_of_slice(self, job: JobRow) -> IsOver:
-        """Return the function that ends a slice which starts now."""
+        """Return the `IsOver` of a slice that starts now."""
         until, look_at = time.monotonic() + SLICE_S, 0.0
 
         def is_over() -> bool:
@@ -247,7 +251,7 @@ class Tasks:
     def _store_result(self, task: LongJob, outcome: SliceResult) -> JobState:
         try:
             unused_now = self._commit(task, outcome)
-        except Exception:  # the blobs are unreferenced
+        except Exception:  # nothing refers to the new blobs
             unused = [*(file.blob for file in outcome.files), *outcome.blobs]
             collect_deleted_blobs(self._store, unused)
             raise
@@ -257,7 +261,7 @@ class Tasks:
         return JobState.SUCCEEDED if outcome.over else JobState.QUEUED
 
     def _commit(self, task: LongJob, outcome: SliceResult) -> list[str]:
-        """Store the results of a slice, and return blobs that may be unreferenced now."""
+        """Store the results of a slice in one commit; return blobs that may be unreferenced now."""
         job, number = task.job, None if task.map is None else task.map.number
         with self._store.database.write(map_number=number) as connection:
             if outcome.over:
@@ -274,14 +278,13 @@ class Tasks:
                 queue.requeue_slice(connection, task.job, outcome.progress, outcome.after_s)
             _check_files(self._store, outcome.files)
             if not all(map(self._store.blobs.holds, outcome.blobs)):
-                raise Swept("A deletion removed the same bytes before they were stored.")
-            # after the changes of the job, which fail if it was deleted
+                raise Swept("A deletion removed a blob before the commit that refers to it.")
             queue.append_items(connection, job.number, outcome.items)
             before = queue.files_of(connection, job.number)
             unused = _make_room(connection, task.map, before, outcome.files)
             queue.add_files(connection, job.number, outcome.files)
             unused += queue.remove_parts(connection, job.number, items=False, files=outcome.drop)
-            unused += [before[one.name].blob for one in outcome.files if one.name in before]
+            unused += [before[file.name].blob for file in outcome.files if file.name in before]
             return unused if outcome.write is None else [*unused, *outcome.write(connection)]
 
     def _fail(self, task: LongJob, reason: str) -> JobState | None:
@@ -304,17 +307,17 @@ class Tasks:
 
 def _check_files(store: Store, files: Collection[queue.JobFile]) -> None:
     """Raise Swept if the blob of a file is missing in the transaction that refers to it."""
-    for one in files:
-        if not store.blobs.holds(one.blob):
-            raise Swept(f"A deletion removed the blob of {one.name} before its job was stored.")
+    for file in files:
+        if not store.blobs.holds(file.blob):
+            raise Swept(f"A deletion removed the blob of {file.name} before its job was stored.")
 
 
 def _make_room(
     connection: Connection, row: MapRow | None, before: Mapping[str, queue.JobFile],
     files: Collection[queue.JobFile],
 ) -> list[str]:  # fmt: skip
-    """Make room for an archive that replaces a smaller one; return doomed blobs."""
-    [size] = [one.bytes for one in files if one.name == ARCHIVE] or [0]
+    """Make room in the quota for a new or larger archive; return blobs that may be unreferenced."""
+    [size] = [file.bytes for file in files if file.name == ARCHIVE] or [0]
     if row is None or size == 0:
         return []
     size_before = before[ARCHIVE].bytes if ARCHIVE in before else 0
@@ -322,7 +325,7 @@ def _make_room(
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:
-    """Return the fields of a log line about a job."""
+    """Return the log fields of a job, and the fields `more`."""
     job = task.job
     name = None if task.map is None else task.map.name
     return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

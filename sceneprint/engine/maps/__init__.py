@@ -1,1 +1,1 @@
-"""Maps, their frames and their model."""
+"""Maps: their lifecycle, frames, surfaces, plans and copies."""

@@ -1,11 +1,11 @@
-"""Copies of single maps in a robot's own store, updated by what is new in the service.
+"""Copies of single maps in the store of a robot, updated incrementally from the service.
 
     digests of the copy's parts  --MapCopies.bundle-->  head of the map, and missing parts
     rows of these parts          -------------------->  missing artifacts
     --pull_map-->  one transaction
 
-Parts of rows have the same bytes in the service and in the copy. A pull that is killed leaves the
-copy unchanged, and the next one reuses the artifacts that it fetched.
+A part consists of the encoded rows of some frames, and has the same bytes in the service and in the
+copy. An interrupted pull leaves the copy unchanged; the next pull reuses its artifacts.
 """
 
 from __future__ import annotations
@@ -49,32 +49,32 @@ from sceneprint_client.api.copies import CopyPart, MapCopy
 if TYPE_CHECKING:
     from sceneprint_client import Client
 
-#: Maximum number of consecutive requests without a new part, after which artifacts count as lost.
+#: Maximum number of consecutive requests without a new part before the pull fails.
 ROUNDS = 10
-#: Size in bytes after which no further part is added to a response.
+#: Size of a response in bytes from which no further part is added.
 MOST_BYTES = 32 << 20
 _NAMES = [one.name for one in COLUMNS]
 
 
 def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes, int]]:
-    """Yield digest, bytes and number of rows of each part of a map's indexed frames."""
+    """Yield the parts of the indexed frames of a map: digest, bytes and number of rows."""
     for rows, _ in cut_rows(encoded_rows(COLUMNS, copied_rows(connection, row)), [0]):
         data = write_part(_NAMES, rows)
         yield hashlib.sha256(data).hexdigest(), data, len(rows)
 
 
 class MapCopies:
-    """The service's side of copies."""
+    """Sources of map copies, on the side of the service."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def bundle(self, map_name: str, have: Collection[str]) -> bytes:
-        """Return a consistent state of a map: a line with its `MapCopy`, and the bytes of parts.
+        """Return a consistent state of a map: a line of JSON (`MapCopy`), then bytes of parts.
 
         Parameters
         ----------
-        have : digests of the caller's parts; about 32 MB of the other parts follow the line
+        have : digests of the parts that the caller has; other parts follow, up to about 32 MB
 
         Raises
         ------
@@ -82,7 +82,7 @@ class MapCopies:
         """
         parts, sent, size = list[CopyPart](), list[bytes](), 0
         with self._store.database.read() as connection:
-            allow(connection, 0)  # sorting the rows of a large map takes long
+            allow(connection, 0)  # no time limit, since sorting the rows of a large map takes long
             row = find_map(connection, map_name)
             name, _ = model_of(connection, row.model_id)
             for digest, data, count in copy_parts(connection, row):
@@ -103,7 +103,7 @@ class MapCopies:
         Raises
         ------
         UnknownMap, NotFound : If no frame of the map has the artifact.
-        DamagedBlob : If the artifact is damaged or was just removed.
+        DamagedBlob : If the artifact is damaged or was removed meanwhile.
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
@@ -115,7 +115,7 @@ class MapCopies:
         return self._store.blobs.get(digest)
 
     def model(self, map_name: str) -> bytes:
-        """Return the file of the map's model; raise UnknownMap if the map does not exist."""
+        """Return the model of a map as a file; raise UnknownMap if the map does not exist."""
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
             return model_of(connection, row.model_id)[1]
@@ -127,10 +127,10 @@ class PulledMap:
 
     Parameters
     ----------
-    revision : revision of the map in the service
+    revision : copied revision of the map
     frames : number of frames in the copy
-    written, removed : numbers of new or changed frames, and of removed ones
-    artifacts, bytes : number and size of the fetched artifacts
+    written, removed : number of new or changed frames, and of removed frames
+    artifacts, bytes : number and total size of the fetched artifacts
     """
 
     revision: int
@@ -141,18 +141,18 @@ class PulledMap:
     bytes: int
 
 
-#: Name of the file that marks a data folder with copies, which `pull_map` may change.
+#: Name of the file that marks a data folder of map copies, which `pull_map` may change.
 _MARK = "map-copy.json"
 
 
 def claim_folder(folder: Path) -> None:
-    """Mark a data folder as one for copies of maps; raise InvalidRequest if it has other files."""
+    """Mark a data folder as a folder of map copies; raise InvalidRequest if it has other files."""
     if (folder / _MARK).is_file():
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InvalidRequest(
-            f"{folder} has files, but is not a folder of pulled maps. Nothing was changed. Pass "
-            "another folder with --data."
+            f"{folder} contains files, but no pulled maps. Nothing was changed. Pass another "
+            "folder with --data."
         )
     make_folder(folder)
     write_durable(folder / _MARK, b"{}", folder_is_new=False)
@@ -160,19 +160,19 @@ def claim_folder(folder: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Pull:
-    """The state of a pull.
+    """Rows of a running pull.
 
     Parameters
     ----------
-    own : encoded rows of the copy, by digest of the part and id
-    fetched : encoded rows from the service, by digest of the part and id
+    own : encoded rows in the copy, by part digest and frame id
+    fetched : encoded rows from the service, by part digest and frame id
     """
 
     own: dict[str, dict[str, Row]]
     fetched: dict[str, dict[str, Row]]
 
     def rows(self, head: MapCopy) -> dict[str, Row]:
-        """Return the rows of all frames of the map, by id."""
+        """Return the rows of all frames of the map, by frame id."""
         parts = self.own | self.fetched
         return {name: row for one in head.parts for name, row in parts[one.digest].items()}
 
@@ -181,20 +181,21 @@ def pull_map(
     client: Client, store: Store, map_name: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> PulledMap:  # fmt: skip
-    """Update the copy of a map to a state that the map had in the service during this call.
+    """Update the copy of a map to its current state in the service.
 
-    Queries of the copy see its former state in the meantime.
+    Until the end, queries of the copy use its former state.
 
     Parameters
     ----------
-    client : client of the service, with a key that may read the map
-    progress : callback with the numbers of fetched frames, and of all frames to fetch
+    client : client with a key that may read the map
+    store : store of the copy
+    progress : callback with the number of fetched frames, and of all frames to fetch
 
     Raises
     ------
-    UnknownMap : If the map does not exist in the service, or the key cannot read it.
-    Conflict : If the map was replaced or lost artifacts meanwhile, or frames were uploaded into the
-        copy.
+    UnknownMap : If the service has no such map that the key may read.
+    Conflict : If the map was replaced, switched its model or lost artifacts meanwhile, or frames
+        were uploaded into the copy.
     DamagedBlob : If the service sent damaged bytes.
     """
     pull = _Pull(_own_parts(store, map_name), {})
@@ -213,7 +214,7 @@ def pull_map(
                     artifacts, size = artifacts + (more > 0), size + more
             except UnknownMap:
                 raise
-            except NotFound:  # the frame was deleted or signed again in the meantime
+            except NotFound:  # the frame was deleted or signed again
                 continue
             pull.fetched[digest] = rows
             if progress is not None:
@@ -234,7 +235,7 @@ def pull_map(
 
 
 def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
-    """Return the rows of a map in the store, by part and id; none if it does not exist."""
+    """Return the rows of a map in the store by part digest and frame id; empty without the map."""
     with store.database.read() as connection:
         row = next((one for one in list_maps(connection) if one.name == map_name), None)
         if row is None:
@@ -256,14 +257,17 @@ def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
             f"A part of map {map_name!r} arrived damaged. Nothing was changed. Pull the map again."
         )
     rows = list(read_rows(data, _NAMES))
-    for _ in decoded_rows(COLUMNS, rows):  # raises if a value has another type
+    for _ in decoded_rows(COLUMNS, rows):  # checks the types of values
         pass
     return {one[0]: one for one in rows}
 
 
 def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) -> int:
-    """Fetch a missing artifact, store it durably, and return the number of fetched bytes; raise
-    DamagedBlob if it arrived damaged.
+    """Fetch and store an artifact unless it is stored; return the number of fetched bytes.
+
+    Raises
+    ------
+    DamagedBlob : If the fetched bytes are damaged.
     """
     if store.blobs.holds(digest):
         return 0
@@ -284,7 +288,7 @@ def _changed(map_name: str) -> Conflict:
 
 
 def _find_copy(connection: Connection, head: MapCopy) -> MapRow | None:
-    """Return the copy of a map in the store; None if it is missing or copies a former map."""
+    """Return the copy of a map; None without a copy, or if it is of a former map of this name."""
     row = next((one for one in list_maps(connection) if one.name == head.name), None)
     if row is None or (row.created_at, row.model_id) != (head.created_at, head.model_id):
         return None
@@ -294,7 +298,7 @@ def _find_copy(connection: Connection, head: MapCopy) -> MapRow | None:
 def _write(
     store: Store, head: MapCopy, pull: _Pull, rows: dict[str, Row], model: bytes
 ) -> tuple[int, int]:
-    """Update the copy in one transaction; return the numbers of written and of removed frames."""
+    """Update the copy in one transaction; return the number of written and of removed frames."""
     before = {name: row for part in pull.own.values() for name, row in part.items()}
     written = [_copied(head, row) for name, row in rows.items() if before.get(name) != row]
     blobs: list[str] = []
@@ -313,8 +317,8 @@ def _write(
         for one in written:
             if not store.blobs.holds(one.signature.geometry):
                 raise DamagedBlob(
-                    f"The artifact {one.signature.geometry[:12]} was just removed. Pull the map "
-                    "again."
+                    f"The artifact {one.signature.geometry[:12]} was removed during the pull. Pull "
+                    "the map again."
                 )
             if one.id in remaining:
                 edit_copied(connection, row, existing[one.id], one)
@@ -326,7 +330,7 @@ def _write(
 
 
 def _copied(head: MapCopy, row: Row) -> CopiedFrame:
-    """Return a frame from its encoded row."""
+    """Decode a row to a frame."""
     ((name, *cells),) = decoded_rows(COLUMNS, [row])
     values: dict[str, Any] = {
         column.name: json.loads(x) if isinstance(column.type, JSON) and x is not None else x
@@ -338,11 +342,11 @@ def _copied(head: MapCopy, row: Row) -> CopiedFrame:
 
 
 def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:
-    """Return the copy, which is created if it is missing or copies a former map.
+    """Return the copy of a map; create it if it is missing, replace it if it is of a deleted map.
 
     Raises
     ------
-    Conflict : If the copy has uploaded frames, which exist nowhere else.
+    Conflict : If the copy has uploaded frames, which would be lost.
     """
     rows = {one.name: one for one in list_maps(connection)}
     before, row = rows.get(head.name), _find_copy(connection, head)
@@ -357,11 +361,11 @@ def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: lis
 
 
 def _require_copied(store: Store, rows: Iterable[FrameRow], map_name: str) -> None:
-    """Raise Conflict if a frame was uploaded into the copy; copied frames have no uploads."""
+    """Raise Conflict if a frame was uploaded into the copy, that is, has an upload."""
     own = [one.id for one in rows if store.blobs.holds(one.blob)]
     if own:
         raise Conflict(
-            f"Map {map_name!r} has {len(own)} frames that were uploaded into the copy, such as "
-            f"{own[0]}. Nothing was changed. Upload these frames to the service, delete them "
-            "from the copy, and pull the map again."
+            f"The copy of map {map_name!r} has {len(own)} uploaded frames, such as {own[0]}. "
+            "Nothing was changed. Upload these frames to the service, delete them from the copy, "
+            "and pull the map again."
         )

@@ -1,4 +1,4 @@
-"""Views of a map's content: frames, sessions, trajectories, and data derived from frames."""
+"""Read access to maps: frames, sessions, trajectories, and data derived from frames."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
 from sceneprint_client.formats import BYTES, format_at
 
-#: Version of derived data in entity tags; raise it when the same frame yields other bytes.
+#: Version of the derived data, for entity tags; increment it if their bytes change.
 FORM = 1
 
 
 @dataclass(frozen=True, eq=False)
 class IndexedFrame:
-    """A signed frame with its map, and the blob of its geometry."""
+    """An indexed frame with its map, its model, and the digest of its geometry."""
 
     row: MapRow
     frame: FrameRow
@@ -64,7 +64,7 @@ class IndexedFrame:
     artifact: str
 
     def tag(self, what: str, *options: object) -> str:
-        """Return the entity tag of data that is derived from the frame."""
+        """Return the entity tag of derived data, named `what`, with some options."""
         return tag_of(what, FORM, self.frame.content_id, self.row.model_id, *options)
 
 
@@ -74,7 +74,7 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
     Raises
     ------
     UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
-    NotIndexed : If the frame is not indexed.
+    NotIndexed : If the frame has another state.
     """
     with store.database.read() as connection:
         row = find_map(connection, map_name)
@@ -97,11 +97,11 @@ def living(row: MapRow, frame: FrameRow) -> FrameRow:
 
 
 def geometry_of(store: Store, signers: Signers, indexed: IndexedFrame) -> Geometry:
-    """Return the geometry of a frame; rebuild a damaged one from the upload.
+    """Return the geometry of a frame; if it is damaged, rebuild it from the upload.
 
     Raises
     ------
-    DamagedBlob : If the upload is damaged too.
+    DamagedBlob : If the upload is damaged as well.
     UnknownFrame, NotIndexed, Busy : See `check_unchanged`.
     """
     try:
@@ -114,30 +114,30 @@ def geometry_of(store: Store, signers: Signers, indexed: IndexedFrame) -> Geomet
 
 
 def check_unchanged(store: Store, indexed: IndexedFrame) -> None:
-    """Check that a frame has not changed since it was read.
+    """Check that a frame is still indexed with the same model as when it was read.
 
     Raises
     ------
-    UnknownFrame, NotIndexed : If the frame was deleted or lost its geometry.
+    UnknownFrame, NotIndexed : If the frame was deleted or is no longer indexed.
     Busy : If the frame was signed with another model.
     """
     now = find_indexed(store, indexed.row.name, indexed.frame.id)
     if (now.frame.number, now.artifact) != (indexed.frame.number, indexed.artifact):
         raise errors.Busy(
-            f"Frame {indexed.frame.id} was signed with another model in the meantime. Try again."
+            f"Frame {indexed.frame.id} was signed with another model during the request. Try again."
         )
 
 
-#: Maximum number of poses in one trajectory.
+#: Maximum number of poses in a trajectory.
 MOST_POSES = 100_000
-#: Maximum numbers of parent frames and of tags in the record of a session.
+#: Maximum number of parent frames, and of tags, in the record of a session.
 _MOST_NAMES = 20
 
 
 def list_frames(
     store: Store, map_name: str, wanted: FrameListing, cursor: str | None, limit: int
 ) -> Page[Frame]:
-    """Return a page of frames, newest first or in the requested order.
+    """Return a page of the frames that pass a filter, in the requested order.
 
     Raises
     ------
@@ -161,7 +161,7 @@ def get_frame(store: Store, map_name: str, frame_id: str) -> Frame:
 
 
 def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
-    """Return the cursor of the page after a frame, with its sort key, since it may be deleted."""
+    """Return the cursor of the page after a frame; it has the sort key, not only the id."""
     sealed = store.seals.seal("frame", last.number)
     if wanted.order != "taken":
         return sealed
@@ -169,7 +169,7 @@ def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
 
 
 def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> CapturePosition | None:
-    """Return the position in a cursor; raise InvalidRequest if the service did not issue it."""
+    """Decode a cursor of `_position_cursor`; raise InvalidRequest if it is not authentic."""
     if cursor is None:
         return None
     if wanted.order != "taken":
@@ -183,7 +183,7 @@ def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> Capt
         is_place = sequence is None or (
             isinstance(sequence, int) and 0 <= sequence <= MOST_SEQUENCE
         )
-    except (ValueError, TypeError, RecursionError):  # a forged cursor
+    except (ValueError, TypeError, RecursionError):
         is_time = is_place = False
     if number is None or not (is_time and is_place):
         raise invalid_cursor(cursor)
@@ -191,7 +191,7 @@ def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> Capt
 
 
 def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -> Page[Session]:
-    """Return a page of sessions by name and robot; frames without a session come first, as one.
+    """Return a page of sessions, sorted by name and robot; frames without a session come first.
 
     Raises
     ------
@@ -210,13 +210,13 @@ def list_sessions(store: Store, map_name: str, cursor: str | None, limit: int) -
 
 
 def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
-    """Return the poses of one run by their stamps; of equal stamps, only the first.
+    """Return the poses of a run, sorted by time stamp, with one pose per stamp.
 
     Raises
     ------
     UnknownMap : If the map does not exist.
-    InvalidRequest : If robot or parent frame are ambiguous, or there are more than MOST_POSES
-        frames.
+    InvalidRequest : If the robot or the parent frame is ambiguous, or the run has more than
+        MOST_POSES frames.
     """
     with store.database.read() as connection:
         row = find_map(connection, map_name)
@@ -230,7 +230,7 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
                 f"Session {run.session!r:.140} has {total} frames, but a trajectory has at most "
                 f"{MOST_POSES}. Limit it with `most`, or select a part with `captured_after` and "
                 "`captured_before`.",
-                (("session", "too long for one answer"),),
+                (("session", "too many frames"),),
             )
         only = run.model_copy(update={"robot": robot, "parent_frame": parent})
         stamps = None if parent is None else stamps_of_run(connection, row.number, only)
@@ -256,7 +256,7 @@ def _why_empty(run: Run, total: int, *, posed: bool) -> str:
     """Return the reason why a trajectory is empty."""
     if not total:
         part = run.captured_after is not None or run.captured_before is not None
-        return f"the map has no frame of session {run.session!r:.140}{' in that time' * part}"
+        return f"the map has no frame of session {run.session!r:.140}{' in this period' * part}"
     if not posed:
         return f"none of its {total} frames has a pose; send `pose` with uploads, or edit them"
     where = "" if run.parent_frame is None else f" in {run.parent_frame!r:.140}"
@@ -267,7 +267,7 @@ def _why_empty(run: Run, total: int, *, posed: bool) -> str:
     return f"none of its {total} frames has a pose{where}{lacking}"
 
 
-#: Meaning of the stamps, for comments in a file.
+#: Descriptions of time stamps, for comments in a file.
 _STAMPS = {
     "captured": "captured_at, seconds since 1970",
     "received": "when it was received, seconds since 1970",
@@ -276,14 +276,14 @@ _STAMPS = {
 
 
 def trajectory_file(track: Trajectory) -> str:
-    """Return a trajectory as the text of a TUM file with comments on its origin."""
+    """Return a trajectory as a text file in TUM format, with comments on its origin."""
     robot = "" if track.robot is None else f", robot {track.robot}"
     number = f"{len(track.poses)}"
     if track.posed > len(track.poses):
         number += f" of {track.posed}, evenly spaced"
     comments = [
         f"map {track.map}, session {track.session}{robot}",
-        f"poses of the sensors' frames in {track.parent_frame or 'no frame'}, metres",
+        f"poses of sensor frames in {track.parent_frame or 'no frame'}, metres",
         f"poses: {number}; frames left out: {track.left_out}",
         f"empty: {track.reason}" if track.stamps is None else f"t: {_STAMPS[track.stamps]}",
         "t tx ty tz qx qy qz qw",
@@ -292,7 +292,7 @@ def trajectory_file(track: Trajectory) -> str:
 
 
 def _only(what: str, wanted: str | None, names: Iterable[str | None], session: str) -> str | None:
-    """Return the requested name, else the only existing one; raise InvalidRequest for several."""
+    """Return `wanted` or the only name in `names`; raise InvalidRequest if that is ambiguous."""
     if wanted is not None:
         return wanted
     names = sorted(set(names), key=lambda name: name or "")
@@ -323,9 +323,9 @@ def _names_of(cursor: str) -> tuple[str, str]:
     try:
         session, robot = _unpacked(cursor)
         if isinstance(session, str) and isinstance(robot, str):
-            f"{session}{robot}".encode()  # raises for a lone surrogate
+            f"{session}{robot}".encode()  # checks for lone surrogates
             return session, robot
-    except (ValueError, TypeError, RecursionError):  # raised for a forged cursor too
+    except (ValueError, TypeError, RecursionError):
         pass
     raise invalid_cursor(cursor)
 
@@ -345,13 +345,13 @@ PLY, PNG, NPY, JSON = "application/ply", "image/png", "application/x-npy", "appl
 
 @dataclass(frozen=True, eq=False)
 class Output(Generic[T]):
-    """Data that is derived from a frame on demand.
+    """Derived data of a frame, computed on demand.
 
     Parameters
     ----------
     tag : entity tag, which changes with the data
-    make : function that computes the data, which takes at most about 100 ms
-    blob : digest of the blob, if the data is stored as a blob instead of in `data`
+    make : function that computes the data, usually within 100 ms
+    blob : digest of the blob that contains the data; None if `make` computes it
     """
 
     tag: str
@@ -360,7 +360,7 @@ class Output(Generic[T]):
 
 
 def upload_type(data: bytes) -> tuple[str, str]:
-    """Return the media type and the file name suffix of an upload."""
+    """Return the media type of an upload, and its file name suffix."""
     kind = format_at(data, "depth", "cloud")
     if kind is None:  # a KITTI scan
         return BYTES, ".bin"
@@ -368,7 +368,7 @@ def upload_type(data: bytes) -> tuple[str, str]:
 
 
 def level_of(patches: Patches) -> PatchLevel:
-    """Return the API record of patches."""
+    """Convert patches to their API record."""
     return PatchLevel(
         mean=[(x, y, z) for x, y, z in patches.means.round(4).tolist()],
         normal=[(x, y, z) for x, y, z in patches.normals.round(4).tolist()],
@@ -378,28 +378,29 @@ def level_of(patches: Patches) -> PatchLevel:
 
 
 def npy_of(vector: bytes) -> bytes:
-    """Return bytes as an NPY file of uint8."""
+    """Return an NPY file with bytes as a uint8 array (D,)."""
     return encode_npy(np.frombuffer(vector, np.uint8))
 
 
 class FrameFiles:
-    """Clouds, pictures, patches, signatures and uploads of frames."""
+    """Derived data and uploads of frames."""
 
     def __init__(self, store: Store, signers: Signers) -> None:
         self._store, self._signers = store, signers
 
     def cloud(self, map_name: str, frame_id: str, within: CloudFrame = "optical") -> Output[bytes]:
-        """Return points and normals of a frame's surface as PLY.
+        """Return the points and normals of a frame as a PLY file.
 
         Parameters
         ----------
-        within : coordinate frame: that of the sensor, the parent frame, or the robot's base
+        map_name, frame_id : map and id of an indexed frame
+        within : coordinate frame of the points: the sensor, the parent frame, or the robot base
 
         Raises
         ------
         UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
         NotIndexed : If the frame is not indexed.
-        InvalidRequest : If the frame's pose or base is not known.
+        InvalidRequest : If the frame lacks the pose or the base that `within` requires.
         """
         indexed = find_indexed(self._store, map_name, frame_id)
         frame, optical = indexed.frame, sensor_of(indexed.frame)
@@ -422,12 +423,12 @@ class FrameFiles:
     def preview(
         self, map_name: str, frame_id: str, view: View = "depth", width: int = 320
     ) -> Output[bytes]:
-        """Return a picture of a frame as PNG; see `sceneprint.pictures`.
+        """Return an image of a frame as PNG; see `sceneprint.pictures`.
 
         Raises
         ------
         UnknownMap, UnknownFrame, NotIndexed : See `cloud`.
-        DamagedBlob : If the upload, which pictures of patches need, is lost.
+        DamagedBlob : If the view is `patches`, and the upload is lost.
         """
         indexed = find_indexed(self._store, map_name, frame_id)
 
@@ -464,7 +465,7 @@ class FrameFiles:
         Raises
         ------
         UnknownMap, UnknownFrame, NotIndexed : See `cloud`.
-        DamagedSignature : If the signature is damaged; the frame is then signed again.
+        DamagedSignature : If the signature is damaged; a job to sign the frame again is queued.
         """
         indexed = find_indexed(self._store, map_name, frame_id)
 
@@ -484,7 +485,7 @@ class FrameFiles:
         return Output(indexed.tag("signature", indexed.frame.id, indexed.row.name), make)
 
     def vector(self, map_name: str, frame_id: str, media_type: str = BYTES) -> Output[bytes]:
-        """Return the bytes of a signature, raw or as an NPY file; see `signature` for errors."""
+        """Return a signature as raw bytes or as an NPY file; see `signature` for errors."""
         indexed = find_indexed(self._store, map_name, frame_id)
 
         def make() -> bytes:
@@ -494,7 +495,7 @@ class FrameFiles:
         return Output(indexed.tag("vector", media_type), make)
 
     def upload(self, map_name: str, frame_id: str) -> Output[bytes]:
-        """Return the unchanged bytes of a frame's upload.
+        """Return the upload of a frame, byte for byte.
 
         Raises
         ------
@@ -514,7 +515,7 @@ class FrameFiles:
         return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
 
     def _hierarchy(self, indexed: IndexedFrame) -> tuple[Surface, Hierarchy]:
-        """Return the hierarchy of the upload, since points of the stored geometry are rounded."""
+        """Compute surface and hierarchy of a frame from its upload; stored points are rounded."""
         p = self._signers(indexed.row.model_id).model.parameters
         frame = read_stored(
             self._store.blobs.get(indexed.frame.blob), indexed.frame, self._store.decoders
@@ -523,7 +524,7 @@ class FrameFiles:
         return seen, hierarchy_of(seen, p, indexed.frame.id)
 
     def _labels(self, indexed: IndexedFrame) -> Ints32:
-        """Return the finest patches as an image, onto which points of a cloud are projected."""
+        """Return the label image of the finest patches; points of a cloud are projected onto it."""
         seen, hierarchy = self._hierarchy(indexed)
         labels = hierarchy.labels[0]
         if isinstance(seen.camera, Intrinsics):
@@ -543,15 +544,15 @@ class FrameFiles:
         if vector is None or sizes is None:
             check_unchanged(self._store, indexed)
             raise errors.DamagedSignature(
-                f"The signature of frame {indexed.frame.id} is missing. Run `sceneprint fsck` to "
-                "find out why."
+                f"The signature of frame {indexed.frame.id} is missing. Run `sceneprint fsck`."
             )
         return vector, sizes
 
 
 def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]:
-    """Return the name of a coordinate frame, and T_name_sensor (4, 4); raise InvalidRequest if the
-    pose or the base of the frame is not known.
+    """Return the name of a coordinate frame, and T_name_sensor (4, 4) of a stored frame.
+
+    Raise InvalidRequest if the frame lacks the pose or the base that `within` requires.
     """
     optical = sensor_of(frame)
     name, matrix = {
@@ -563,7 +564,7 @@ def placed(frame: FrameRow, within: CloudFrame) -> tuple[str, list[list[float]]]
         lacking = "pose" if within == "parent" else "T_base_sensor"
         raise errors.InvalidRequest(
             f"Frame {frame.id} has no {lacking}, so its points are available only in {optical}. "
-            "Use frame=optical, or add it with PATCH.",
-            (("frame", f"it has no {lacking}"),),
+            f"Use frame=optical, or add a {lacking} with PATCH.",
+            (("frame", f"the frame has no {lacking}"),),
         )
     return name, matrix

@@ -2,8 +2,8 @@
 
     begin_reencoding  -->  jobs  -->  a second signature of each frame  --Reencodings.run-->  switch
 
-While a map is re-encoded, queries use its current model. The switch is one commit after all frames
-have signatures of the next model. Another process continues a re-encoding that was interrupted.
+While a map is re-encoded, queries use its current model. Once all frames have signatures of the
+next model, one commit switches the map. Any process continues an interrupted re-encoding.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ from sceneprint_client.api.admin import ModelInfo
 from sceneprint_client.api.base import ROS_NAMES, record_of
 from sceneprint_client.api.listing import FrameEdit, MapEdit
 
-#: Fields of a new map with its quotas and its retention.
+#: Fields of a new map that limit its size or the age of its frames.
 LIMITS = frozenset(("quota_frames", "quota_bytes", "retention_days"))
 
 
@@ -71,12 +71,12 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
 
     Returns
     -------
-    record : the map
-    new : whether it was created
+    record : record of the map
+    new : whether the map was created
 
     Raises
     ------
-    MapExists : If a map of this name has another title, model, quota, retention or up vector.
+    MapExists : If a map of this name exists with different properties.
     """
     model = read_model(new.model)
     limits: dict[str, Any] = new.model_dump(include=set(LIMITS & new.model_fields_set))
@@ -91,14 +91,14 @@ def create_map(store: Store, new: NewMap) -> tuple[Map, bool]:
         differs = any(getattr(existing, name) != value for name, value in limits.items())
         if differs or (existing.title, existing.model_id) != (new.title, model.id):
             raise errors.MapExists(
-                f"Map {new.name!r} already exists with a different title, model, limits or up. Use "
-                "the existing map, delete it, or choose another name."
+                f"Map {new.name!r} already exists, but its title, model, limits or up vector "
+                "differ. Use the existing map, delete it, or choose another name."
             )
         return map_record(connection, existing), False
 
 
 def get_maps(store: Store) -> list[Map]:
-    """Return all maps, by name."""
+    """Return all maps, sorted by name."""
     with store.database.read() as connection:
         return map_records(connection, list_maps(connection))
 
@@ -110,9 +110,9 @@ def get_map(store: Store, name: str) -> Map:
 
 
 def delete_map(context: Context, name: str) -> None:
-    """Delete a map with its content; raise UnknownMap if it does not exist."""
+    """Delete a map with its frames and queries; raise UnknownMap if it does not exist."""
     store = context.store
-    context.query_log.remove_of_map(name)  # removes blocks of rows, between which others write
+    context.query_log.remove_of_map(name)  # in blocks, between which other processes can write
     with store.database.write() as connection:
         blobs = remove_map(connection, find_map(connection, name))
     context.readers.forget(name)
@@ -147,15 +147,15 @@ def edit_frame(
     Parameters
     ----------
     map_name, frame_id : map and id of a frame in any state
-    patch : fields of FrameEdit; None removes a value
-    if_match : entity tags from `frame_tag`; None skips the check
+    patch : fields of FrameEdit to change; None removes a value
+    if_match : entity tags from `frame_tag` that permit the edit; None permits it always
 
     Raises
     ------
     UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
     InvalidRequest : If a field is unknown, not editable or not valid.
     InvalidPose : If a transform is not rigid.
-    PreconditionFailed : If the frame has none of the entity tags.
+    PreconditionFailed : If the entity tag of the frame is not in `if_match`.
     """
     _check_fields(patch)
     with store.database.write() as connection:
@@ -165,7 +165,7 @@ def edit_frame(
             raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was already deleted.")
         _check_tag(f"Frame {frame.id}", frame_tag(frame), if_match)
         values = edited(frame, patch)
-        if "pose_parent" in values:  # the new parent frame may be joined to another
+        if "pose_parent" in values:  # the new parent frame may be joined to a root frame
             values = {"sent_parent": None, "sent_pose": None, **values}
             values |= root_columns(connection, replace(frame, **values))
         now = write_frame(connection, row, frame, values)
@@ -176,10 +176,10 @@ def edit_map(
     store: Store, map_name: str, patch: Mapping[str, Any],
     if_match: Collection[str] | None = None, *, dry_run: bool = False,
 ) -> Map:  # fmt: skip
-    """Edit title, limits and up vector of a map; see `edit_frame` for parameters and errors.
+    """Edit the title, the limits and the up vector of a map; see `edit_frame` for parameters and
+    errors.
 
-    The caller checks the permission to set quotas. With `dry_run`, return the edited map without
-    storing it.
+    The caller must check the permission to set quotas. With `dry_run`, nothing is stored.
     """
     change = record_of(MapEdit, dict(patch), "The edit of the map")
     values = change.model_dump(include=change.model_fields_set)
@@ -194,9 +194,7 @@ def edit_map(
 
 
 def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the columns that a patch changes; raise InvalidRequest or InvalidPose as `edit_frame`
-    does.
-    """
+    """Return the new values of the columns that a patch changes; see `edit_frame` for errors."""
     meta = _merged(frame, patch)
     if meta.pose is not None and meta.pose.of != "sensor":
         raise errors.InvalidRequest(
@@ -209,12 +207,12 @@ def edited(frame: FrameRow, patch: Mapping[str, Any]) -> dict[str, Any]:
     for field, column in (("pose", "pose"), ("T_base_sensor", "base")):
         change = patch.get(field)
         if change is not None and not any(way in change for way in _WAYS):
-            del values[column]  # only the name of its frame changes
+            del values[column]  # the patch changes only the name of the frame
     return values
 
 
 def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
-    """Return the metadata of an upload that would create the edited frame."""
+    """Return the upload metadata of a frame after a patch."""
     values = {
         "robot": frame.robot,
         "session": frame.session,
@@ -240,7 +238,7 @@ def _relative_transform(
 
 
 def _with(now: Mapping[str, Any] | None, change: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a transform after a patch, in only one of its two notations."""
+    """Apply a patch to a transform; the result has only one of the two notations."""
     change = {ROS_NAMES.get(name, name): value for name, value in change.items()}
     old = dict(now or {})
     if "matrix" in old and ("translation" in change or "rotation" in change):
@@ -276,22 +274,22 @@ def _check_tag(what: str, tag: str, if_match: Collection[str] | None) -> None:
 
 log = logging.getLogger(__name__)
 
-#: Maximum number of seconds to remove signatures of former models in one call.
+#: Maximum duration of a call that removes signatures of former models, seconds.
 TIDY_S = 2.0
 
 
 def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Path | Model) -> Map:
-    """Start the re-encoding of a map with another model, or retry its failed jobs.
+    """Start to re-encode a map with another model; if it has started, retry its failed jobs.
 
     Parameters
     ----------
-    model : name of a preset, model file, or loaded model
+    model : name of a preset, path of a model file, or loaded model
 
     Raises
     ------
     UnknownMap : If the map does not exist.
     UnreadableModel : If the model does not exist or cannot be read.
-    Conflict : If the map has this model already, or is switching to another one.
+    Conflict : If the map already has this model, or is switching to a third model.
     """
     next_model = model if isinstance(model, Model) else read_model(model)
     with store.database.write() as connection:
@@ -303,10 +301,7 @@ def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Pat
                 f"or cancel with `sceneprint reencode {row.name} --cancel`."
             )
         if row.next_model_id is None and row.model_id == next_model.id:
-            raise errors.Conflict(
-                f"Map {row.name!r} is already signed with {next_model.label}. There is nothing "
-                "to do."
-            )
+            raise errors.Conflict(f"Map {row.name!r} already uses the model {next_model.label}.")
         if row.next_model_id is None:
             store_model(connection, next_model.id, next_model.name, write_model(next_model))
             stored.begin_reencoding(connection, row, next_model.id)
@@ -320,7 +315,7 @@ def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Pat
 
 
 def cancel_reencoding(store: Store, map_name: str) -> Map:
-    """Cancel a re-encoding, and remove its signatures.
+    """Cancel the re-encoding of a map, and remove the signatures of the next model.
 
     Raises
     ------
@@ -331,9 +326,8 @@ def cancel_reencoding(store: Store, map_name: str) -> Map:
         row = find_map(connection, map_name)
         if row.next_model_id is None:
             raise errors.Conflict(
-                f"Map {row.name!r} is not switching to another model, so there is nothing to "
-                "cancel. To undo a finished switch, run it again with --model and the previous "
-                "model."
+                f"Map {row.name!r} is not switching to another model. To undo a finished switch, "
+                "run `sceneprint reencode` with --model and the previous model."
             )
         stored.cancel_reencoding(connection, row)
     _tidy(store, row)
@@ -342,11 +336,11 @@ def cancel_reencoding(store: Store, map_name: str) -> Map:
 
 
 class Reencodings:
-    """Switches of maps to their next models, whose indexes `upkeep` publishes first."""
+    """Re-encodings of all maps; before a switch, `upkeep` publishes the index of the next model."""
 
     def __init__(self, store: Store, upkeep: Upkeep) -> None:
         self._store, self._upkeep = store, upkeep
-        self._tidied: dict[int, tuple[str, ...]] = {}  # models of maps without stale data
+        self._tidied: dict[int, tuple[str, ...]] = {}  # models of maps without obsolete signatures
 
     def run(self) -> None:
         """Continue the re-encodings of all maps; log errors of single maps."""
@@ -360,12 +354,12 @@ class Reencodings:
                 if self._tidied.get(row.number) != models and _tidy(self._store, row, TIDY_S):
                     self._tidied[row.number] = models
             except errors.UnknownMap:
-                pass  # the map was deleted in the meantime
+                pass
             except errors.SceneprintError as error:
                 log.error("map not reencoded", extra={"map": row.name, "error": str(error)})
 
     def _continue(self, row: MapRow) -> bool:
-        """Continue a re-encoding, and return whether the map has switched."""
+        """Continue the re-encoding of a map; return whether the map has switched."""
         with self._store.database.read() as connection:
             if stored.is_pending(connection, row):
                 return False
@@ -373,21 +367,21 @@ class Reencodings:
             return False
         with self._store.database.read() as connection:
             if not stored.is_complete(connection, row):
-                return False  # failed jobs wait for a retry or a cancellation by the operator
+                return False  # the operator must retry failed jobs or cancel
         try:
             version = self._upkeep.publish_next(row)
         except errors.BusyIndex:
-            return False  # a later call tries again
+            return False
         return self._switch(row, version)
 
     def _switch(self, row: MapRow, version: IndexVersion | None) -> bool:
         with self._store.database.write() as connection:
             now = find_map(connection, row.name)
             if not _still(now, row) or not stored.is_complete(connection, now):
-                return False  # a frame was indexed, or another process switched the map
+                return False  # a frame was indexed meanwhile, or another process switched the map
             usable = trusted(connection, now, version)
             if usable is not None:
-                # frames that were signed later, but whose revision precedes that of the index
+                # raise the revisions of frames that were signed after the index was built
                 signed = stored.frames_signed_by(connection, now, usable.revision)
                 stored.raise_revisions(connection, now, np.setdiff1d(signed, usable.keys).tolist())
             rejected = stored.switch_model(connection, now)
@@ -399,10 +393,10 @@ class Reencodings:
 
 
 def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
-    """Queue jobs for all frames without the next model's signature; return their number."""
+    """Queue jobs for all frames without a signature of the next model; return their number."""
     after, queued = 0, 0
     while True:
-        with store.database.read() as connection:  # usually no frame lacks one, so do not lock
+        with store.database.read() as connection:  # usually none, so avoid a write lock
             if not stored.unqueued_frames(connection, row, after, again=again):
                 return queued
         with store.database.write() as connection:
@@ -415,7 +409,7 @@ def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
 
 
 def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
-    """Remove jobs and signatures of former models of a map; return whether none are left."""
+    """Remove jobs and signatures of former models of a map; return whether all were removed."""
     start = time.monotonic()
     while True:
         with store.database.read() as connection:
@@ -446,18 +440,19 @@ def _still(now: MapRow, row: MapRow) -> bool:
 
 
 class Catalogue:
-    """The presets and the models of a store, with a cache of parsed models."""
+    """Presets and stored models, with a cache of parsed models."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._known: dict[str, Model] = {}
 
     def list_all(self, may_read: Callable[[str], bool]) -> list[ModelInfo]:
-        """Return the records of all models, presets first, then by label.
+        """Return the records of all models: presets first, then the others sorted by label.
 
         Parameters
         ----------
-        may_read : function that returns whether the caller may read a map; other names are left out
+        may_read : function that returns whether the caller may read a map. The records contain only
+            names of these maps
         """
         with self._database.read() as connection:
             by_id = {model.id: model for model in self._stored(connection)}
@@ -480,12 +475,13 @@ class Catalogue:
         ]
 
     def find(self, name: str, may_read: Callable[[str], bool] | None = None) -> Model:
-        """Return a model by its id or label, or by the name of a preset.
+        """Return a preset or a stored model.
 
         Parameters
         ----------
-        may_read : function that returns whether the caller may read a map, which hides models of
-            other maps; None hides none
+        name : name of a preset, or id or label of a model
+        may_read : function that returns whether the caller may read a map. Models of other maps are
+            hidden; None hides no model
 
         Raises
         ------
@@ -517,7 +513,7 @@ class Catalogue:
                     content = model_content(connection, model_id)
                     self._known[model_id] = parse_model(content, f"model {model_id[:12]}")
                 except errors.UnreadableModel:
-                    continue  # another version stored it, which `sceneprint fsck` reports
+                    continue  # a model of another version, which `sceneprint fsck` reports
         return [self._known[model_id] for model_id in ids if model_id in self._known]
 
 

@@ -1,4 +1,4 @@
-"""Plans of maps: coverage by cells, comparison of coverage, and pictures of surfaces.
+"""Plans (views from above) of maps: coverage by cell, its changes, and images of surfaces.
 
 positions, queried frames  --coverage_plans-->  CoveragePlan of each parent frame
 plans before, plans after  --plan_changes-->  cells with their trends
@@ -28,14 +28,14 @@ from sceneprint_client.api.coverage import (
     PlanChanges,
 )
 
-#: Approximate number of cells along the longer side of a plan.
+#: Approximate number of cells along the longer side of a coverage plan.
 _CELLS_ALONG = 20
-#: Minimum width of cells unless the request sets it, metres.
+#: Minimum cell width unless the request sets the width, metres.
 _LEAST_CELL_M = 0.25
-#: Maximum number of cells in all plans; larger plans get wider cells.
+#: Maximum number of cells in all plans of a result; with more, the cells are widened.
 MOST_CELLS = 10_000
 
-#: Largest column and row: JSON does not represent larger integers exactly.
+#: Largest absolute column and row, since JSON does not represent larger integers exactly.
 _FARTHEST_CELL = 2**52
 
 #: Column and row of a cell.
@@ -44,14 +44,14 @@ Place = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class QueriedPosition:
-    """The position (3,) of a queried frame in its parent frame, and its outcome."""
+    """The position (3,) of a queried frame in its parent frame, metres, and its outcome."""
 
     at: Floats
     outcome: CoverageOutcome
 
 
 def cell_width(extent_m: float) -> float:
-    """Return the width of a plan's cells by its longer side, metres: 0.25, 0.5, 1, 2, 5, 10."""
+    """Return the cell width for a plan with a longer side of `extent_m`: 0.25, 0.5, 1, 2, ... m."""
     target = max(extent_m / _CELLS_ALONG, _LEAST_CELL_M)
     steps = [
         _LEAST_CELL_M,
@@ -65,19 +65,19 @@ def coverage_plans(
     queried: Mapping[str, Sequence[QueriedPosition]], positions: Mapping[str, Floats],
     axes: Mapping[str, PlanAxes], cell_m: float | None,
 ) -> tuple[list[CoveragePlan], float]:  # fmt: skip
-    """Count frames by cell.
+    """Count the queried frames and all frames in each cell of the plans.
 
     Parameters
     ----------
     queried : queried frames by parent frame
-    positions : (n, 3) positions of all frames of the map, by parent frame
-    axes : axes of the plan of each parent frame
-    cell_m : width of the cells; None selects a suitable one
+    positions : (n, 3) positions of all frames of the map, by parent frame, metres
+    axes : axes of each plan, by parent frame
+    cell_m : cell width, metres; None selects it by `cell_width`
 
     Returns
     -------
     plans : plans in the order of `queried`
-    cell_m : width of their cells; a multiple of the requested one if there are too many cells
+    cell_m : cell width, metres; a multiple of the requested width if that has too many cells
     """
     flat = {name: positions.get(name, np.empty((0, 3))) @ axes[name].axes.T for name in queried}
     flat_queried = {
@@ -109,7 +109,7 @@ def coverage_plans(
 
 
 def _places(flat: Floats, cell_m: float) -> list[Place]:
-    # coordinates of poses are unbounded; distant ones count in the outermost cell
+    # poses are unbounded; distant positions count in the outermost cells
     places = np.clip(np.floor(flat / cell_m), -_FARTHEST_CELL, _FARTHEST_CELL)
     return [(column, row) for column, row in places.astype(np.int64).tolist()]
 
@@ -135,14 +135,14 @@ def queried_in(cell: CoverageCell) -> int:
 
 
 def localisability(cell: CoverageCell) -> float:
-    """Return the mean over the checked frames of a cell: 1 for found, -1 for wrong, else 0."""
+    """Return the mean score of the checked frames of a cell: 1 for found, -1 for wrong, else 0."""
     return (cell.found - cell.wrong) / max(queried_in(cell) - cell.unchecked, 1)
 
 
 def plan_changes(
     before: Sequence[CoveragePlan], after: Sequence[CoveragePlan]
 ) -> list[PlanChanges]:
-    """Return the changes of cells with queried frames in either of two comparable results."""
+    """Return the changes between two comparable results, of cells with queried frames in either."""
     names = dict.fromkeys(plan.parent_frame for plan in (*after, *before))
     changed = []
     for name in names:
@@ -179,21 +179,21 @@ def _change(
     return CellChange(column=place[0], row=place[1], trend=trend, before=before, after=after)
 
 
-#: Colour that is legible on white and on black, and opacities of a single cell and of a wall.
+#: RGB colour that is legible on white and on black, and opacity of a single cell and of a wall.
 _COLOUR, _OPACITIES = (122, 130, 143), (90.0, 255.0)
-#: Percentile of the pixels' counts that is fully opaque.
+#: Percentile of the counts per pixel from which a pixel is fully opaque.
 _FULL = 97.0
 
 
 @dataclass(frozen=True)
 class PlanFrame:
-    """The frame of a picture on a plan.
+    """Position, size and resolution of an image on a plan.
 
     Parameters
     ----------
     m_per_pixel : width of a pixel, metres
     width, height : size in pixels
-    left, top : upper left corner along the axes, metres
+    left, top : coordinates of the upper left corner along the axes, metres
     """
 
     m_per_pixel: float
@@ -206,14 +206,14 @@ class PlanFrame:
 def plan_frame(
     axes: Floats, low: Sequence[float], high: Sequence[float], cell_m: float, longer: int
 ) -> PlanFrame:
-    """Return the frame of a picture that shows a box.
+    """Return the smallest frame of an image that contains a box.
 
     Parameters
     ----------
     axes : (2, 3) unit vectors to the right and to the top
     low, high : (3,) opposite corners of the box, metres
-    cell_m : minimum length of the sides, metres
-    longer : longer side, pixels
+    cell_m : minimum length of a side, metres
+    longer : length of the longer side, pixels
     """
     ends = np.stack([low, high])
     corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]]
@@ -229,18 +229,19 @@ def surface_picture(
     plan: PlanFrame, axes: Floats, points: Iterable[Floats], cell_m: float,
     heights: tuple[float | None, float | None],
 ) -> bytes:  # fmt: skip
-    """Return a picture of a surface as a PNG that is darker where more points lie above each other.
+    """Draw the plan of a surface as a PNG; a pixel is more opaque the more points it contains.
 
     Parameters
     ----------
+    plan : frame of the image
     axes : (2, 3) axes of the plan
     points : points (N, 3) of each tile, metres
-    cell_m : width of the cells, metres
-    heights : limits of the heights, metres along the up vector; None for no limit
+    cell_m : cell width of the surface, metres
+    heights : minimum and maximum height along the up vector, metres; None for no limit
     """
     from PIL import Image
 
-    # pixels smaller than cells would leave gaps
+    # use pixels at least as wide as the cells, since smaller ones would leave gaps
     step = max(plan.m_per_pixel, cell_m)
     columns, rows = (
         max(math.ceil(side * plan.m_per_pixel / step), 1) for side in (plan.width, plan.height)
@@ -267,7 +268,7 @@ def surface_picture(
     picture[..., 3] = np.where(shown, np.rint(least + share * (full - least)), 0)
     large = Image.fromarray(picture)
     if (columns, rows) != (plan.width, plan.height):
-        # the picture may extend beyond the plan on the right and at the bottom
+        # crop the image, which may extend beyond the plan on the right and at the bottom
         box = (0.0, 0.0, plan.width * plan.m_per_pixel / step,
                plan.height * plan.m_per_pixel / step)  # fmt: skip
         large = large.resize((plan.width, plan.height), Image.Resampling.NEAREST, box=box)

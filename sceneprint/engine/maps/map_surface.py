@@ -1,4 +1,4 @@
-"""Surfaces of maps: their tiles, the frames that saw them, plans, and the start of their jobs."""
+"""Surfaces of maps: tiles, frames that observed a spot, plans, and jobs that build surfaces."""
 
 from __future__ import annotations
 
@@ -52,20 +52,21 @@ from sceneprint_client.surface_encoding import CELL, SIDE, cell_points
 
 log = logging.getLogger(__name__)
 
-#: Maximum number of cells in a plan; with more, the plan uses a coarser level.
+#: Maximum number of cells to draw in a plan; with more, the plan uses a coarser level.
 _DRAWN_CELLS = 1_500_000
-#: Default and maximum radius around a spot in cells, within which a frame must have a point.
+#: Default and maximum radius of the search around a spot, in cell widths.
 _NEAR, _NEAREST = 2.0, float(SIDE)
-#: Maximum number of geometries to read for a page of sightings, and number of frames in a query.
+#: Maximum number of geometries to read for a page of sightings, and number of frames to list at
+#: once.
 _OPENED, _AT_ONCE = 150, 25
-#: Largest coordinate in a request, metres.
+#: Largest absolute coordinate in a request, metres.
 FARTHEST_M = 1e9
-#: Maximum duration of a call that removes tiles, seconds.
+#: Maximum duration of a call that removes a surface, seconds.
 _CALL_S = 10.0
 
 
 class MapSurfaces:
-    """The surfaces of all maps."""
+    """Surfaces of all maps."""
 
     def __init__(self, store: Store, bell: Wakeup) -> None:
         self._store, self._bell = store, bell
@@ -77,12 +78,12 @@ class MapSurfaces:
             return _surface_record(connection, row, surface)
 
     def begin(self, map_name: str) -> tuple[MapSurface, bool]:
-        """Start a job that builds or updates the surface of a map.
+        """Queue a job that builds or updates the surface of a map, unless it is up to date.
 
         Returns
         -------
-        surface : current record
-        pending : whether a job is pending; if not, the surface is up to date
+        surface : record of the surface
+        pending : whether a job is pending
 
         Raises
         ------
@@ -103,7 +104,7 @@ class MapSurfaces:
             record = _surface_record(connection, row, stored.find_surface(connection, row.number))
             if not pending and not record.frames:
                 raise InvalidRequest(
-                    f"Map {row.name!r} has no indexed frame with a pose, so there is no surface. "
+                    f"Map {row.name!r} has no indexed frame with a pose, so it has no surface. "
                     "Send `pose` with uploads, or edit frames with PATCH."
                 )
         collect_deleted_blobs(self._store, blobs)
@@ -112,9 +113,7 @@ class MapSurfaces:
         return record, pending
 
     def remove(self, map_name: str) -> None:
-        """Remove the surface of a map, which is rebuilt only on request; raise UnknownMap if the
-        map does not exist.
-        """
+        """Remove the surface of a map until the next build; raise UnknownMap without the map."""
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
             surface = stored.find_surface(connection, row.number)
@@ -133,11 +132,12 @@ class MapSurfaces:
         self, map_name: str, parent: str | None = None, level: int = 0,
         cursor: str | None = None, limit: int = 1000,
     ) -> Page[SurfaceTile]:  # fmt: skip
-        """Return a page of tiles, by column, row and floor.
+        """Return a page of tiles, sorted by column, row and floor.
 
         Parameters
         ----------
-        parent : parent frame; None selects that of most frames
+        parent : parent frame; None selects the parent frame with the most frames
+        level : level of the tiles; 0 is the finest
 
         Raises
         ------
@@ -162,13 +162,13 @@ class MapSurfaces:
         return Page[SurfaceTile](items=items, next_cursor=more)
 
     def tile(self, map_name: str, digest: str) -> Output[bytes]:
-        """Return the cells of a tile.
+        """Return the cells of a tile as bytes.
 
-        The output raises DamagedBlob if the bytes are lost; a worker then rebuilds the tile.
+        If the bytes are lost, `Output.make` raises DamagedBlob, and a worker rebuilds the tile.
 
         Raises
         ------
-        UnknownMap, NotFound : If the map no longer has the tile.
+        UnknownMap, NotFound : If the map has no tile with this digest.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
@@ -192,20 +192,22 @@ class MapSurfaces:
         self, map_name: str, spot: Sequence[float], radius: float | None = None,
         parent: str | None = None, cursor: str | None = None, limit: int = 20,
     ) -> Page[SurfaceSighting]:  # fmt: skip
-        """Return a page of the frames that saw a spot, nearest viewpoint first.
+        """Return a page of the frames that observed a spot, sorted by distance of the viewpoint.
 
-        A page may have fewer than `limit` frames, since a call reads a limited number of frames.
+        A page may have fewer than `limit` frames, since a call checks a limited number of frames.
 
         Parameters
         ----------
         spot : x, y, z in the parent frame, metres
-        radius : maximum distance of a frame's point from the spot, metres; default: two cells
-        parent : parent frame; None selects that of most frames
+        radius : a frame must have a point within this distance of the spot, metres; default: two
+            cell widths
+        parent : parent frame; None selects the parent frame with the most frames
 
         Raises
         ------
         UnknownMap : If the map does not exist.
-        InvalidRequest : If the service did not issue the cursor, or the radius exceeds 64 cells.
+        InvalidRequest : If the service did not issue the cursor, or the radius is not positive or
+            exceeds 64 cell widths.
         """
         beyond = self._store.seals.moment("frame", cursor)
         with self._store.database.read() as connection:
@@ -246,11 +248,12 @@ class MapSurfaces:
         self, map_name: str, low: Sequence[float], high: Sequence[float],
         parent: str | None = None, cursor: str | None = None, limit: int = 20,
     ) -> Page[SurfaceSighting]:  # fmt: skip
-        """Return a page of the frames with viewpoints in a box, those nearest to its centre first.
+        """Return a page of the frames with viewpoints in a box, sorted by distance from its centre.
 
         Parameters
         ----------
-        low, high : x, y, z of two opposite corners, metres
+        map_name, parent, cursor, limit : see `sightings`
+        low, high : minimum and maximum x, y, z, metres
         """
         beyond = self._store.seals.moment("frame", cursor)
         ends = np.sort([low, high], axis=0).tolist()
@@ -271,18 +274,18 @@ class MapSurfaces:
         self, map_name: str, parent: str | None = None, width: int = PLAN_WIDTH,
         low: float | None = None, high: float | None = None,
     ) -> Output[bytes]:  # fmt: skip
-        """Return a plan of a surface as a PNG with a transparent background.
+        """Draw a surface from above as a PNG with a transparent background.
 
         Parameters
         ----------
-        parent : parent frame; None selects that of most frames
-        width : longer side, pixels
-        low, high : limits of the heights, metres along the up vector
+        parent : parent frame; None selects the parent frame with the most frames
+        width : length of the longer side, pixels
+        low, high : minimum and maximum height along the up vector, metres; None for no limit
 
         Raises
         ------
         UnknownMap : If the map does not exist.
-        NotFound : If there is no surface in the parent frame.
+        NotFound : If the map has no surface in the parent frame.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)
@@ -314,7 +317,7 @@ class MapSurfaces:
         return Output(tag, make)
 
     def _points(self, surface: SurfaceRow, tile: TileRow) -> Floats:
-        """Return the points (N, 3) of a tile, metres; none if it is lost or was replaced."""
+        """Return the points (N, 3) of a tile, metres; empty if the tile is lost or was replaced."""
         try:
             cells = tile_cells(self._store, tile, scale_of(surface))
         except DamagedBlob:
@@ -330,7 +333,7 @@ class MapSurfaces:
         return bool(((apart * apart).sum(axis=1) <= within * within).any())
 
     def _rebuild_tile(self, row: MapRow, tile: TileRow) -> None:
-        """Schedule the rebuild of a lost tile; raise NotFound if it was replaced meanwhile."""
+        """Schedule a lost tile to be rebuilt; raise NotFound if the tile was replaced meanwhile."""
         with self._store.database.write() as connection:
             now = stored.tile_of_number(connection, tile.number)
             if now is None or now.blob != tile.blob:
@@ -342,7 +345,7 @@ class MapSurfaces:
 
 
 def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple[bool, list[str]]:
-    """Queue a job for a surface that is out of date, unless one is pending; remove the former job.
+    """Queue a job for an outdated surface, unless a job is pending; remove the former job.
 
     Returns
     -------
@@ -378,7 +381,7 @@ def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple
 
 
 def remove_block(store: Store, row: MapRow) -> bool:
-    """Remove a block of a deleted surface; return whether nothing is left."""
+    """Remove a block of the rows of a deleted surface; return whether all are removed."""
     with store.database.write(map_number=row.number) as connection:
         surface = stored.find_surface(connection, row.number)
         if surface is None or surface.wanted:
@@ -392,30 +395,30 @@ def remove_block(store: Store, row: MapRow) -> bool:
     return over
 
 
-#: Seconds between checks of all maps, and maximum delay of a job while frames are arriving.
+#: Seconds between checks of all maps, and maximum delay of a job while new frames arrive.
 LOOK_S, LONGEST_S = 5.0, 60.0
-#: Replaces the time of the first change of a map whose changes have been handled.
+#: Time of the first change, for a map without unhandled changes.
 _DONE = math.inf
-#: Maximum number of rows of surfaces to add in one check.
+#: Maximum number of surface rows to insert in one check.
 _ROWS_AT_ONCE = 100
 
 
 class SurfaceUpkeep:
-    """Starter of jobs for surfaces that are out of date; any number of processes may run it.
+    """Scheduler of jobs for outdated surfaces; several processes may run it at the same time.
 
     Parameters
     ----------
-    auto : whether new frames start jobs, or only deleted ones
+    auto : whether new frames start jobs; deleted frames always do
     """
 
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:
         self._store, self._bell, self._auto = store, bell, auto
         self._next = 0.0
-        # revision and edits of changed maps, and the time of the first change
+        # by map: revision and number of edits, and time of the first unhandled change
         self._seen: dict[int, tuple[tuple[int, int], float]] = {}
 
     def run(self) -> None:
-        """Check all maps if it is due; log errors, after which the next check tries again."""
+        """Check all maps, at most every LOOK_S seconds; log errors instead of raising them."""
         if time.monotonic() < self._next:
             return
         self._next = time.monotonic() + LOOK_S
@@ -440,7 +443,7 @@ class SurfaceUpkeep:
     def _look(
         self, row: MapRow, surface: SurfaceRow, seen: tuple[tuple[int, int], float] | None
     ) -> None:
-        """Start a job once no more frames arrive, or after LONGEST_S."""
+        """Start a job once no new frames arrive, at the latest LONGEST_S after the first change."""
         at = row.revision, surface.pose_edits
         changed = seen is None or seen[0] != at
         since = time.monotonic() if seen is None or (changed and seen[1] == _DONE) else seen[1]
@@ -448,7 +451,7 @@ class SurfaceUpkeep:
         if since == _DONE or (changed and time.monotonic() - since < LONGEST_S):
             return
         self._seen[row.number] = at, _DONE
-        with self._store.database.read() as connection:  # usually nothing is due, so do not lock
+        with self._store.database.read() as connection:  # usually none is due: avoid a write lock
             if not self._is_due(connection, row, surface):
                 return
         with self._store.database.write(map_number=row.number) as connection:
@@ -462,13 +465,13 @@ class SurfaceUpkeep:
             self._bell.ring()
 
     def _is_due(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
-        """Return whether to start a job without a request."""
+        """Return whether an outdated surface should be updated without a request."""
         if self._has_failed(connection, row, surface):
             return False
         return self._auto or bool(stored.frames_to_remove(connection, surface, 1))
 
     def _has_failed(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
-        """Return whether the last job failed with the same frames; the user has to retry it."""
+        """Return whether the last job failed, and the frames have not changed since."""
         job = _job_of(connection, surface)
         if job is None or not job.state.over or job.state == JobState.SUCCEEDED:
             return False
@@ -496,7 +499,7 @@ def _job_of(connection: Connection, surface: SurfaceRow) -> JobRow | None:
 
 
 def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | None) -> MapSurface:
-    """Return the API record of a surface."""
+    """Return the API record of a surface; None stands for a map without a surface."""
     if surface is None:
         return MapSurface(
             map=row.name, state="none", job_id=None, error=None, frames=0,
@@ -564,8 +567,8 @@ def _parent_record(
 
 def _unknown_tile(row: MapRow, digest: str) -> NotFound:
     return NotFound(
-        f"Map {row.name!r} has no tile {digest!r:.80}: it changed or was removed. List tiles with "
-        f"GET /v1/maps/{row.name}/surface/tiles."
+        f"Map {row.name!r} has no tile {digest!r:.80}. It may have changed or been removed. List "
+        f"the tiles with GET /v1/maps/{row.name}/surface/tiles."
     )
 
 
@@ -583,7 +586,7 @@ def _vector(at: Sequence[float]) -> Vector:
 
 
 def _parent_name(surface: SurfaceRow | None, parent: str | None) -> str | None:
-    """Return the requested parent frame, or that of most frames."""
+    """Return the requested parent frame, or the parent frame with the most frames."""
     if parent is not None or surface is None:
         return parent
     return surface.parents[0]["parent_frame"] if surface.parents else None
@@ -602,7 +605,7 @@ def _place_of(cursor: str | None) -> TilePlace | None:
 
 
 def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[TilePlace]:
-    """Return the places of the tiles that a ball may touch."""
+    """Return the places of all tiles that a ball with the radius `within` may intersect."""
     low = [math.floor((at - within) / tile_m) for at in spot]
     high = [math.floor((at + within) / tile_m) for at in spot]
     x, y, z = (range(a, b + 1) for a, b in zip(low, high, strict=True))
@@ -610,7 +613,7 @@ def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[T
 
 
 def _drawn_level(surface: SurfaceRow, totals: Sequence[LevelTotals], plan: PlanFrame) -> int:
-    """Return the coarsest level as fine as the pixels, or a coarser one for too many cells."""
+    """Return the coarsest level as fine as a pixel, or a coarser level that has fewer cells."""
     fine = [one for one in totals if surface.cell_m * FACTOR**one.level <= plan.m_per_pixel]
     first = fine[-1].level if fine else 0
     few = [one.level for one in totals if one.level >= first and one.cells <= _DRAWN_CELLS]

@@ -1,11 +1,11 @@
-"""Edits and deletions of selected frames or of whole sessions.
+"""Editing and deletion of selected frames and of sessions.
 
 map, FrameSelection  --delete_selection-->  FramesDeleted
 map, FramesEdit  --edit_selection-->  FramesEdited, with the inverse edits
 map, session  --delete_session | edit_session-->  SessionChange
 
-Each block of frames has its own transaction, since other writers wait for it. An interrupted call
-can be repeated and continues with the remaining frames.
+Each block of frames is a transaction of its own, so that other writers need not wait long. After an
+interruption, repeat the call to process the remaining frames.
 """
 
 from __future__ import annotations
@@ -47,8 +47,9 @@ def delete_selection(
 
     Parameters
     ----------
-    tombstones : store of the deleted frames
-    seconds : duration after which no further block is started
+    selection : frames to delete
+    tombstones : handler of the deletion
+    seconds : time after which no further block is started
 
     Raises
     ------
@@ -76,11 +77,11 @@ def delete_selection(
 def edit_selection(
     store: Store, map_name: str, edit: FramesEdit, seconds: float = CALL_S
 ) -> FramesEdited:
-    """Edit at most 1000 selected frames in blocks.
+    """Edit up to 1000 selected frames in blocks.
 
     Raises
     ------
-    UnknownMap, UnknownFrame : If the map or the frame `after` does not exist.
+    UnknownMap, UnknownFrame : If the map or the frame `edit.after` does not exist.
     InvalidRequest : If a frame would get too many tags; earlier frames remain edited.
     """
     until, done, changed = time.monotonic() + seconds, 0, 0
@@ -107,7 +108,7 @@ def edit_selection(
 
 
 def edited_tags(frame: FrameRow, edit: FramesEdit | SessionEdit) -> list[str]:
-    """Return the tags of a frame after an edit; raise InvalidRequest if there are too many."""
+    """Return the tags of a frame after an edit; raise InvalidRequest if they are too many."""
     removed = set(edit.remove_tags)
     tags = [tag for tag in frame.tags if tag not in removed]
     tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]
@@ -124,7 +125,7 @@ def _edit(
     connection: Connection, row: MapRow, frame: FrameRow, edit: FramesEdit,
     inverse: dict[str, dict[str, Any]],
 ) -> int:  # fmt: skip
-    """Edit a frame, and add the inverse edit to `inverse`; return the number of changed frames."""
+    """Edit a frame, and add the inverse edit to `inverse`; return 1 if it changed, else 0."""
     values: dict[str, Any] = {}
     for name in ("session", "robot"):
         if name in edit.model_fields_set:
@@ -148,7 +149,7 @@ def _edit(
 def _selected(
     connection: Connection, row: MapRow, selection: FrameSelection, after: int, limit: int
 ) -> list[FrameRow]:
-    """Return the next selected frames in the order of uploads."""
+    """Return up to `limit` selected frames after frame number `after`, in upload order."""
     if selection.filter is not None:
         beyond = CapturePosition(after, None, None)
         return list_frames(connection, row.number, beyond, limit, _in_order(selection))
@@ -161,7 +162,7 @@ def _selected(
 
 
 def _count(connection: Connection, row: MapRow, selection: FrameSelection, after: int) -> int:
-    """Return the number of selected frames after one."""
+    """Return the number of selected frames after frame number `after`."""
     if selection.filter is not None:
         return count_listed(connection, row.number, _in_order(selection), after)
     return len(_selected(connection, row, selection, after, MOST_SELECTED))
@@ -175,7 +176,7 @@ def delete_session(
     store: Store, map_name: str, session: str, tombstones: Tombstones, robot: str | None = None,
     seconds: float = CALL_S,
 ) -> SessionChange:  # fmt: skip
-    """Delete frames of a session, in any state, in blocks.
+    """Delete all frames of a session in blocks.
 
     Parameters
     ----------
@@ -194,17 +195,19 @@ def edit_session(
     store: Store, map_name: str, session: str, edit: SessionEdit, robot: str | None = None,
     after: str | None = None, seconds: float = CALL_S,
 ) -> SessionChange:  # fmt: skip
-    """Change the name, the robot and the tags of a session's frames in blocks.
+    """Change the session name, the robot and the tags of the frames of a session in blocks.
 
-    Renaming a session to an existing name merges the two. Poses and their parent frames remain.
+    Renaming a session to an existing name merges the two. Poses and parent frames do not change.
 
     Parameters
     ----------
-    after : id of the last frame of an earlier call, after which this one continues
+    store, map_name, session, robot, seconds : see `delete_session`
+    edit : changes
+    after : id of the last frame that an earlier call processed; this call continues after it
 
     Returns
     -------
-    change : new names, and the number of processed frames
+    change : new names, number of processed frames, and id of the last frame
 
     Raises
     ------
@@ -234,7 +237,7 @@ def edit_session(
 
 
 def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
-    """Return the columns of a frame after an edit."""
+    """Return the new values of the columns of a frame that an edit changes."""
     values: dict[str, object] = {}
     if edit.session is not None:
         values["session"] = edit.session
@@ -246,7 +249,7 @@ def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
 
 
 def _of_session(session: str, robot: str | None) -> FrameSelection:
-    """Return the selection of a session, without validation, since old names may be invalid."""
+    """Return the selection of a session, without validation of names that may predate it."""
     robots = [] if robot is None else [robot]
     listing = FrameListing.model_construct(session=[session], robot=robots)
     return FrameSelection.model_construct(filter=listing)

@@ -1,9 +1,9 @@
 """Jobs that build and update the surface of a map in slices.
 
-    new frames                -->  fused into the tiles that they touch
-    deleted or moved frames   -->  their tiles rebuilt from the other frames that touch them
+    new frames                -->  fused into the tiles that they overlap
+    deleted or moved frames   -->  their tiles rebuilt from the remaining frames
 
-Each slice handles some frames, and stores the tiles and its progress in one commit. Therefore tiles
+Each slice processes some frames, and stores tiles and progress in one commit. Tiles therefore
 always consist of the frames that are recorded as fused, and an interrupted job continues after its
 last slice.
 """
@@ -50,27 +50,27 @@ from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.surface_encoding import CELL, NO_SESSION, SIDE, STEPS
 
-#: Kind of the jobs, and kind of the event at their end.
+#: Kind of the jobs, and kind of the event after a job.
 SURFACE, UPDATED = "surface", "surface.updated"
-#: Seconds for which a slice fuses frames; writing its tiles takes about as long.
+#: Seconds for which a slice fuses frames; writing the tiles takes about as long.
 SLICE_S = 1.5
-#: Number of levels of a surface, and width of the finest cells in voxels of the map's model.
+#: Number of levels of a surface, and finest cell width in voxels of the model of the map.
 LEVELS, VOXELS = 3, 2.5
-#: Maximum numbers of parent frames in a record, and of sessions that cells distinguish.
+#: Maximum number of parent frames in a record, and of sessions that cells distinguish.
 MOST_PARENTS, MOST_SESSIONS = 20, 10_000
-#: Numbers of frames to read at once, and to remove in one slice.
+#: Number of frames to read at once, and to remove in one slice.
 _FRAMES, _REMOVED = 256, 500
-#: Maximum numbers of changed tiles, and of cells of frames or tiles, in a slice.
+#: Maximum number of changed tiles, and of processed cells, in a slice.
 _TILES, _CELLS = 96, 1_500_000
 
 
 def cell_width(voxel_m: float) -> float:
-    """Return the width of the finest cells for a model with voxels of this width, metres."""
+    """Return the finest cell width for a model with voxels of the width `voxel_m`, metres."""
     return float(np.clip(VOXELS * voxel_m, 1e-3, 100.0))
 
 
 def surface_points(geometry: Geometry) -> Floats:
-    """Return all points (N, 3) of a geometry in the sensor frame."""
+    """Return all points (N, 3) of a geometry in the sensor frame, metres."""
     points = geometry.surface.points[geometry.surface.valid]
     if geometry.surface.spread is not None:
         spread = geometry.surface.spread
@@ -79,7 +79,7 @@ def surface_points(geometry: Geometry) -> Floats:
 
 
 def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
-    """Return the cells of a tile as clients receive them; raise DamagedBlob if they are lost."""
+    """Return the cells of a tile with times on a scale; raise DamagedBlob if the tile is lost."""
     data = store.blobs.get(tile.blob or "")
     if tile.level:
         return np.frombuffer(data, CELL)
@@ -87,7 +87,7 @@ def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
 
 
 def scale_of(surface: SurfaceRow) -> TimeScale | None:
-    """Return the scale of times in the tiles of a surface; None if no frame has a time."""
+    """Return the time scale of the tiles of a surface; None if no frame has a capture time."""
     if surface.taken_from is None:
         return None
     return TimeScale(surface.taken_from, surface.taken_step_s)
@@ -99,13 +99,13 @@ _Key = tuple[str, TilePlace]
 
 @dataclass
 class _Slice:
-    """The changes of a slice.
+    """Changes of tiles in a slice.
 
     Parameters
     ----------
-    tiles : columns of tiles by parent frame, level and place; None for tiles that are now empty
-    damaged : damaged tiles of the finest level, to rebuild from frames
-    unread : damaged tiles of coarser levels, to rebuild from the finest level
+    tiles : columns of changed tiles by parent frame, level and place; None for empty tiles
+    damaged : damaged tiles of the finest level, to be rebuilt from frames
+    unread : damaged tiles of coarser levels, to be rebuilt from the finest level
     blobs : new blobs that `tiles` refers to
     """
 
@@ -115,7 +115,7 @@ class _Slice:
     blobs: list[str] = field(default_factory=list)
 
     def store(self, connection: Connection, map_number: int) -> tuple[dict[_Key, int], list[str]]:
-        """Write the tiles; return numbers of those of the finest level, and unused blobs."""
+        """Write the tiles; return the numbers of the finest tiles, and unreferenced blobs."""
         numbers: dict[_Key, int] = {}
         unused: list[str] = []
         for (parent, level, place), values in self.tiles.items():
@@ -161,7 +161,7 @@ class SurfaceHandler:
             progress |= {"done": 0, "after": 0, "checked": False}
             with self._store.database.read() as connection:
                 progress["total"] = stored.count_left(connection, surface)
-        if not progress["checked"]:  # remove all frames first, so that tiles are rebuilt once
+        if not progress["checked"]:  # remove frames first, so that each tile is rebuilt only once
             return self._remove_frames(surface, progress)
         with self._store.database.read() as connection:
             rebuilt = stored.tiles_to_rebuild(connection, row.number, _TILES)
@@ -176,11 +176,11 @@ class SurfaceHandler:
         if new:
             return self._add(row, surface, progress, new, is_over)
         if progress["after"]:
-            return SliceResult(False, progress | {"after": 0})  # repeat for edited frames
+            return SliceResult(False, progress | {"after": 0})  # start over for edited frames
         return self._conclude(row, surface, progress)
 
     def _reset(self, row: MapRow, surface: SurfaceRow, task: LongJob) -> SliceResult:
-        """Remove a block of tiles of another model; reset the surface after the last block."""
+        """Remove a block of tiles of a former model; after the last block, reset the surface."""
         cell_m = cell_width(self._signers(row.model_id).model.parameters.cloud.voxel_size)
 
         def write(connection: Connection) -> Collection[str]:
@@ -196,7 +196,7 @@ class SurfaceHandler:
         return SliceResult(False, dict(task.progress), write=write)
 
     def _remove_frames(self, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Remove deleted and edited frames, and schedule the rebuild of their tiles."""
+        """Remove deleted and edited frames, and schedule their tiles to be rebuilt."""
         with self._store.database.read() as connection:
             numbers = stored.frames_to_remove(connection, surface, _REMOVED)
         if not numbers:
@@ -213,7 +213,7 @@ class SurfaceHandler:
         self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow],
         is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        """Rebuild tiles from the frames that touch them, while time allows."""
+        """Rebuild tiles from the frames that overlap them, while time allows."""
         tiles = _first_cells(tiles)
         last = tiles[0].rebuilt_to or 0
         sums: dict[_Key, list[CellSums]] = {}
@@ -258,7 +258,7 @@ class SurfaceHandler:
     def _rescale(
         self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow]
     ) -> SliceResult:
-        """Encode tiles again with the current time scale of the surface."""
+        """Encode tiles again, with the current time scale of the surface."""
         done = _Slice()
         self._publish(surface, self._sums_of(_first_cells(tiles), done), done)
         return self._result(surface, progress, done, _Sessions(surface.sessions))
@@ -267,7 +267,7 @@ class SurfaceHandler:
         self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any],
         new: Sequence[FusedFrame], is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        """Fuse frames into the tiles that they touch, while time allows."""
+        """Fuse frames into the tiles that they overlap, while time allows."""
         times = [one.captured_at for one in new if one.captured_at is not None]
         scale = scale_of(surface)
         if times and (scale is None or not scale.holds(min(times), max(times))):
@@ -291,7 +291,7 @@ class SurfaceHandler:
         for key, sums in self._sums_of(before, done).items():
             parts[key].append(sums)
         for key in done.damaged:
-            del parts[key]  # the tile is rebuilt from all frames that touch it
+            del parts[key]  # the damaged tile is rebuilt from all its frames
         changed = {key: fuse_cells(own) for key, own in parts.items()}
         self._publish(surface, changed, done)
         progress["after"] = added[-1].number
@@ -299,7 +299,7 @@ class SurfaceHandler:
         return self._result(surface, progress, done, sessions, _Addition(row, added, touches))
 
     def _change_scale(self, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Extend the time scale of a surface to frames outside of its range."""
+        """Extend the time scale of a surface to all its frames."""
 
         def write(connection: Connection) -> Collection[str]:
             times = stored.capture_range(connection, surface)
@@ -314,7 +314,7 @@ class SurfaceHandler:
         return SliceResult(False, progress, write=write)
 
     def _conclude(self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Return the end of the job, or another slice if frames have changed in the meantime."""
+        """End the job, or continue with another slice if frames have changed meanwhile."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
             now = stored.find_surface(connection, row.number)
@@ -343,7 +343,7 @@ class SurfaceHandler:
     def _cells(
         self, surface: SurfaceRow, frame: FusedFrame, sessions: _Sessions
     ) -> dict[_Key, CellSums]:
-        """Return the cells of a frame by tile; none if its geometry is lost or damaged."""
+        """Return the cells of a frame by tile; empty if its geometry is lost or damaged."""
         try:
             geometry = read_geometry(self._store.blobs.get(frame.geometry))
         except (DamagedBlob, UnreadableGeometry):
@@ -354,7 +354,7 @@ class SurfaceHandler:
         return {(frame.parent, place): cells for place, cells in tiles.items()}
 
     def _sums_of(self, tiles: Iterable[TileRow], done: _Slice) -> dict[_Key, CellSums]:
-        """Return the sums of tiles, and add damaged tiles to `done.damaged`."""
+        """Read the cell sums of tiles; add damaged tiles to `done.damaged`."""
         sums: dict[_Key, CellSums] = {}
         for tile in tiles:
             key = tile.parent, tile.place
@@ -368,7 +368,7 @@ class SurfaceHandler:
         return sums
 
     def _publish(self, surface: SurfaceRow, changed: Mapping[_Key, CellSums], done: _Slice) -> None:
-        """Store tiles of the finest level, and update the coarser levels."""
+        """Store changed tiles of the finest level in `done`, and update the coarser levels."""
         scale = scale_of(surface)
         parts: dict[_Key, Cells] = {}
         for (parent, place), rows in changed.items():
@@ -388,7 +388,7 @@ class SurfaceHandler:
     def _publish_coarser(
         self, surface: SurfaceRow, level: int, parts: Mapping[_Key, Cells], done: _Slice
     ) -> dict[_Key, Cells]:
-        """Store changed tiles of a coarser level; return the changed parts of the next level."""
+        """Store changed tiles of a coarser level in `done`; return their cells by coarser tile."""
         groups: dict[_Key, dict[TilePlace, Cells]] = {}
         for (parent, place), cells in parts.items():
             x, y, z = (one // FACTOR for one in place)
@@ -448,7 +448,7 @@ class SurfaceHandler:
 
 @dataclass(frozen=True)
 class _Addition:
-    """Frames that a slice adds to a surface, and the tiles that they touch."""
+    """Frames that a slice adds to a surface, and the tiles that they overlap."""
 
     row: MapRow
     frames: list[FusedFrame]
@@ -456,14 +456,14 @@ class _Addition:
 
 
 class _Sessions:
-    """Names of sessions by their index in cells; new names are appended."""
+    """Session names by their index in cells; `index` appends new names."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
         self._index = {name: i for i, name in enumerate(names)}
 
     def index(self, name: str | None) -> int:
-        """Return the index of a session; NO_SESSION without a name or beyond MOST_SESSIONS."""
+        """Return the index of a session; NO_SESSION without a name, or if MOST_SESSIONS exist."""
         if name is None or (name not in self._index and len(self.names) >= MOST_SESSIONS):
             return NO_SESSION
         if name not in self._index:
@@ -475,11 +475,11 @@ class _Sessions:
 def parent_records(
     connection: Connection, row: MapRow, known: Mapping[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return the records of a surface's parent frames, those with the most frames first.
+    """Return the records of the parent frames of a surface, sorted by number of frames.
 
     Parameters
     ----------
-    known : earlier records by name, whose axes and up vectors are reused
+    known : earlier records by name; their axes and up vectors are reused
     """
     counts = stored.count_fused(connection, row.number)
     names = sorted(counts, key=lambda name: (-counts[name], name))[:MOST_PARENTS]
@@ -498,12 +498,12 @@ def parent_records(
 
 
 def _with_total(progress: dict[str, Any]) -> dict[str, Any]:
-    """Return the progress with a total that includes frames which were added during the job."""
+    """Return the progress with a total that includes frames added during the job."""
     return progress | {"total": max(progress["total"], progress["done"])}
 
 
 def _restart(surface: SurfaceRow, progress: dict[str, Any], keys: Sequence[_Key]) -> SliceResult:
-    """Return a slice that schedules the rebuild of tiles from the first frame on."""
+    """Return the result of a slice that schedules tiles to be rebuilt."""
     done = _Slice(damaged=list(keys))
 
     def write(connection: Connection) -> Collection[str]:
@@ -513,7 +513,7 @@ def _restart(surface: SurfaceRow, progress: dict[str, Any], keys: Sequence[_Key]
 
 
 def _first_cells(tiles: Sequence[TileRow]) -> list[TileRow]:
-    """Return the first tiles with at most _CELLS cells, at least one."""
+    """Return as many of the first tiles as have up to _CELLS cells in total, at least one."""
     room = np.cumsum([one.cells for one in tiles]) <= _CELLS
     return list(tiles[: max(int(room.sum()), 1)])
 
@@ -521,7 +521,7 @@ def _first_cells(tiles: Sequence[TileRow]) -> list[TileRow]:
 def _tiles_of(
     connection: Connection, surface: SurfaceRow, keys: Iterable[_Key], level: int = 0
 ) -> list[TileRow]:
-    """Return the existing tiles at some places."""
+    """Return the tiles that exist at the places `keys` on a level."""
     places: dict[str, list[TilePlace]] = {}
     for parent, place in keys:
         places.setdefault(parent, []).append(place)

@@ -1,4 +1,4 @@
-"""Tombstones of deleted frames, which can be restored for a while and are purged afterwards."""
+"""Tombstones: deleted frames can be restored for a while, and are purged afterwards."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from sceneprint.store.tombstones import (
 from sceneprint_client.api import Page
 from sceneprint_client.api.listing import MOST_REFUSED, FrameDeletion, FramesRestored, RefusedFrame
 
-#: Maximum number of frames to change in one transaction, for which other writers wait 20 ms.
+#: Maximum number of frames to change in one transaction (about 20 ms).
 AT_ONCE = 100
-#: Maximum duration of a call in seconds; it returns the number of remaining frames.
+#: Maximum duration of a call, seconds; the result contains the number of remaining frames.
 CALL_S = 10.0
-#: Ids of deletions, which fit into 64 bits.
+#: Format of deletion ids, which fit into 64 bits.
 _NUMBER = re.compile("[0-9]{1,18}")
 
 
@@ -42,24 +42,24 @@ class Tombstones:
 
     Parameters
     ----------
-    seconds : duration for which deleted frames can be restored; 0 disables restoration
-    wake : function that is called when restored frames wait for a signature
+    seconds : time for which deleted frames can be restored; 0 disables restoration
+    wake : function to call when restored frames wait for a signature
     """
 
     def __init__(self, store: Store, seconds: float, wake: Callable[[], None]) -> None:
         self._store, self._seconds, self._wake = store, seconds, wake
 
     def begin(self, row: MapRow) -> int | None:
-        """Return the number of a new deletion; None if it cannot be undone.
+        """Create a deletion, and return its number; None if restoration is disabled.
 
         Parameters
         ----------
-        row : row of the map, read in the writing transaction
+        row : row of the map, read in the same write transaction
         """
         return row.revision + 1 if self._seconds > 0 else None
 
     def delete_frame(self, map_name: str, frame_id: str) -> None:
-        """Delete a frame at once; raise UnknownMap or UnknownFrame if it does not exist."""
+        """Delete a frame; raise UnknownMap or UnknownFrame if it does not exist."""
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
             frame = find_frame(connection, row, frame_id)
@@ -67,7 +67,7 @@ class Tombstones:
         collect_deleted_blobs(self._store, blobs)
 
     def find(self, connection: Connection, row: MapRow, number: int | None) -> FrameDeletion | None:
-        """Return a deletion; None if it does not exist or cannot be undone."""
+        """Return a deletion that can be undone; None if there is none with this number."""
         if number is None:
             return None
         deletion = find_deletion(connection, row.number, self._seconds, number)
@@ -90,12 +90,12 @@ class Tombstones:
         return Page[FrameDeletion](items=items, next_cursor=more)
 
     def restore_one(self, map_name: str, frame_id: str) -> None:
-        """Restore a deleted frame, which queries find again immediately.
+        """Restore a deleted frame; queries find it again immediately.
 
         Raises
         ------
         UnknownMap, UnknownFrame : If the frame cannot be restored.
-        Conflict : If its content was uploaded again.
+        Conflict : If the same content was uploaded again.
         QuotaExceeded : If the map has no room for the frame.
         """
         with self._store.database.write() as connection:
@@ -121,12 +121,12 @@ class Tombstones:
         Parameters
         ----------
         deletion_id : id of a deletion from `list_all`
-        seconds : duration after which no further block is started
+        seconds : time after which no further block is started
 
         Raises
         ------
         UnknownMap, UnknownDeletion : If the deletion does not exist or cannot be undone.
-        QuotaExceeded : If the map has no room for all of its frames; none was restored.
+        QuotaExceeded : If the map has no room for all frames; none was restored.
         """
         until, done, last, left = time.monotonic() + seconds, 0, 0, 1
         refused: list[RefusedFrame] = []
@@ -138,7 +138,7 @@ class Tombstones:
                 if deletion is None:
                     if not last:
                         raise _unknown_deletion(row, deletion_id)
-                    left = 0  # the deletion has expired in the meantime
+                    left = 0  # the deletion has expired
                     break
                 if not last:
                     _require_room(row, deletion)
@@ -159,27 +159,27 @@ class Tombstones:
         )
 
     def purge(self, *, everything: bool = False) -> int:
-        """Purge tombstones that can no longer be restored; with `everything`, all tombstones.
+        """Purge tombstones that have expired; with `everything`, purge all tombstones.
 
         Returns
         -------
-        purged : number of frames
+        purged : number of purged frames
         """
         with self._store.database.read() as connection:
             rows, purged = list_maps(connection), 0
         for row in rows:
             while numbers := self._spent(row, everything=everything):
                 with self._store.database.write(map_number=row.number) as connection:
-                    # without frames that were restored or purged in the meantime
-                    existing = {one[0] for one in oldest_tombstones(connection, row.number)}
-                    numbers = [one for one in numbers if one in existing]
+                    # skip frames that were restored or purged meanwhile
+                    existing = {row[0] for row in oldest_tombstones(connection, row.number)}
+                    numbers = [number for number in numbers if number in existing]
                     blobs = purge_frames(connection, row.number, numbers)
                 collect_deleted_blobs(self._store, blobs)
                 purged += len(numbers)
         return purged
 
     def _spent(self, row: MapRow, *, everything: bool) -> list[int]:
-        """Return the numbers of the oldest expired tombstones of a map."""
+        """Return the frame numbers of the oldest expired tombstones of a map; see `purge`."""
         with self._store.database.read() as connection:
             over = read_clock(connection) - self._seconds
             oldest = oldest_tombstones(connection, row.number)
@@ -194,17 +194,17 @@ class Tombstones:
 
 def _unknown_deletion(row: MapRow, deletion_id: str) -> UnknownDeletion:
     return UnknownDeletion(
-        f"Map {row.name!r} has no deletion {deletion_id!r:.80} that can be undone: it never "
-        "existed, has expired, or all its frames were restored. "
-        f"See GET /v1/maps/{row.name}/deletions for the deletions that can be undone."
+        f"Map {row.name!r} has no deletion {deletion_id!r:.80} that can be undone. It never "
+        "existed, has expired, or all its frames were restored. List the deletions that can be "
+        f"undone with GET /v1/maps/{row.name}/deletions."
     )
 
 
 def _require_room(row: MapRow, deletion: Deletion) -> None:
-    """Check that the quota has room for all frames of a deletion, whose bytes still count."""
+    """Raise QuotaExceeded if the frames of a deletion exceed the quota; their bytes still count."""
     if row.quota_frames is not None and row.used_frames + deletion.frames > row.quota_frames:
         raise QuotaExceeded(
-            f"The deletion has {deletion.frames} frames, but the quota of map {row.name!r} has no "
-            "room for all of them, so no frame was restored. Restore single frames, or ask the "
-            "operator for a larger quota."
+            f"The deletion has {deletion.frames} frames, which exceeds the quota of map "
+            f"{row.name!r}, so no frame was restored. Restore single frames, or ask the operator "
+            "for a larger quota."
         )

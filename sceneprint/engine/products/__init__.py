@@ -1,1 +1,1 @@
-"""Products of jobs: coverage, associations and differences of sessions, and reconstructions."""
+"""Products that jobs compute: coverage, associations, session differences, reconstructions."""

@@ -1,4 +1,4 @@
-"""Associations of two sessions, or of a session with itself, frame by frame.
+"""Associations: matches between the frames of two sessions, or within a session.
 
 sessions  --start-->  frames  --step-->  edges  --finish_association-->  verdicts, joins
 """
@@ -60,23 +60,23 @@ from sceneprint_client.api import Page
 from sceneprint_client.api.base import Transform
 from sceneprint_client.api.sessions import APART, Association, Edge, GraphFormat, NewAssociation
 
-#: Maximum number of frames of both sessions; more would take hours.
+#: Maximum number of frames of both sessions.
 MOST_FRAMES = 5000
 
 
 def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
-    """Return session and robot of each side; loop closures have one side."""
+    """Return session and robot of each side of an association; a loop closure has one side."""
     robots: list[str | None] = [*(request.robots or [])] or [None] * len(request.sessions)
     return list(zip(request.sessions, robots, strict=True))
 
 
 def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> list[list[PathFrame]]:
-    """Return the frames of each session that pass the filter, in chronological order.
+    """Return the frames of each session that pass the filter of a request, in chronological order.
 
     Raises
     ------
-    InvalidRequest : If a session has no indexed frame, frames of several robots, or too many
-        frames.
+    InvalidRequest : If a session has no such frame or frames of several robots, or the sessions
+        have more than MOST_FRAMES frames.
     """
     sides, runs = sessions_of(request), []
     numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
@@ -88,8 +88,8 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
         numbers = [[number for number in own if number in passing] for own in numbers]
     if sum(map(len, numbers)) > MOST_FRAMES:
         raise InvalidRequest(
-            f"The sessions have {sum(map(len, numbers))} frames, but an association takes at "
-            f"most {MOST_FRAMES}. Narrow them with `filter`, for example by captured_after "
+            f"The sessions have {sum(map(len, numbers))} frames, but an association can have at "
+            f"most {MOST_FRAMES}. Select fewer frames with `filter`, for example by captured_after "
             "and captured_before.",
             (("sessions", "too many frames"),),
         )
@@ -108,15 +108,16 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
         if len(robots) > 1:
             raise InvalidRequest(
                 f"Session {session!r:.80} exists for several robots: {', '.join(robots)!r:.200}. "
-                "Specify one in `robots`.",
+                "Specify a robot in `robots`.",
                 (("robots", "needed"),),
             )
     return runs
 
 
 def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
-    """Return the frames with which the next frame is compared, in ascending order: those of the
-    other session, or earlier ones of the same session.
+    """Return the numbers of the frames to compare the next frame with, in ascending order.
+
+    These are the frames of the other session, or earlier frames of the same session.
     """
     place, target = progress["done"], progress["target"]
     if len(request.sessions) == 2:
@@ -124,13 +125,13 @@ def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
     apart = request.apart or (1 if request.not_within_s is not None else APART)
     before = np.array(target[: max(place - apart + 1, 0)], np.int64)
     if request.not_within_s is not None:
-        times = np.array(progress["taken"], float)  # NaN if unknown, which compares as false
+        times = np.array(progress["taken"], float)  # NaN if unknown: comparisons are false
         before = before[times[: len(before)] < times[place] - request.not_within_s]
     return np.sort(before)
 
 
 class Associations(StepwiseProducts[NewAssociation, Association]):
-    """Associations of the sessions of maps."""
+    """Associations of sessions of maps."""
 
     kind = "associate"
     record = Association
@@ -151,7 +152,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     def step(
         self, task: LongJob, request: NewAssociation, progress: dict[str, Any]
     ) -> list[dict[str, Any]]:
-        """Return the edges of one frame; skip a frame that is deleted or damaged."""
+        """Match the next frame, and return its edges; skip a deleted or damaged frame."""
         number, among = progress["source"][progress["done"]], eligible(request, progress)
         if not len(among):
             return []
@@ -162,7 +163,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             blobs = geometry_blobs(connection, [number], row.model_id)
         geometry = self._geometry(row, number, blobs)
         if number not in vectors or not alive or geometry is None:
-            if alive:  # the frame is damaged, so it is signed again
+            if alive:  # damaged, not deleted
                 resign_frames(self._store, row, [number], row.model_id)
             progress["skipped"] += 1
             return []
@@ -191,7 +192,6 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             (one for one in matches if one.validation.status == "accepted"),
             key=lambda one: order[one.index],
         )
-        # edges with frames that are deleted later are left out of pages
         return [
             _item(number, one) for one in accepted if one.validation.overlap >= request.min_overlap
         ]
@@ -200,7 +200,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         self, task: LongJob, request: NewAssociation, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Return the end of a job: verdicts on the edges, and joins of the sessions."""
+        """Conclude a job with verdicts on the edges, and joins of the parent frames."""
         source, target = progress["source"], progress["target"]
         with self._store.database.read() as connection:
             edges = items_of(connection, task.job.number) + items
@@ -219,8 +219,10 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         )  # fmt: skip
 
     def _rooted(self, task: LongJob, joins: list[dict[str, Any]]) -> list[ParentJoin]:
-        """Return the transforms of strong joins to the root, which is the parent frame with the
-        oldest frames, and set the field `root` of these joins.
+        """Return the transforms of strong joins to the root, the parent frame with the oldest
+        frames.
+
+        Also set the field `root` of these joins.
         """
         with self._store.database.read() as connection:
             parents = [run.parent for run in posed_runs(connection, task.of_map.number)]
@@ -240,18 +242,18 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
     def _geometry(self, row: MapRow, number: int, blobs: Mapping[int, str]) -> Geometry | None:
         """Return the geometry of a frame; None if it was deleted or is damaged."""
-        if number not in blobs:  # the frame was deleted in the meantime
+        if number not in blobs:
             return None
         try:
             return self._store.geometries.read(blobs[number])
-        except (DamagedBlob, UnreadableGeometry):  # the other frames are still useful
+        except (DamagedBlob, UnreadableGeometry):
             resign_frames(self._store, row, [number], row.model_id)
             return None
 
     def _view(self, of: MapRow) -> tuple[MapRow, Model, IndexView]:
-        """Return the current row, model and view of a map; raise UnknownMap if it was deleted."""
+        """Return the current row, model and index view of a map; raise UnknownMap if deleted."""
         row = of
-        while True:  # the map may switch its model while the signer is loaded
+        while True:  # repeat if the map switches its model while the signer is loaded
             model = self._context.signers(row.model_id).model
             with self._store.database.read() as connection:
                 row = find_map(connection, of.name)
@@ -263,8 +265,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     def undo_join(self, map_name: str, job_id: str) -> Association:
         """Undo the joins of an association, and return it.
 
-        Its frames get the poses that the remaining joins imply, or the poses as sent. An
-        association without a join does not change.
+        The frames are moved to the poses that the remaining joins imply, or back to the uploaded
+        poses. An association without joins does not change.
 
         Raises
         ------
@@ -284,21 +286,21 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             return self.record_of(job, map_name)
 
     def check_removal(self, connection: Connection, job: JobRow) -> None:
-        """Raise JoinStands if poses of the map depend on an association."""
+        """Raise JoinStands if poses of the map depend on a join of an association."""
         if job.map_number is not None and is_joined_by(connection, job.map_number, job.id):
             raise JoinStands(
-                f"Association {job.id} joined parent frames of its map, and undoing this join "
-                "requires it. Undo the join first: send DELETE to the path of the association, "
-                "followed by /join."
+                f"Association {job.id} cannot be deleted, because it joined parent frames of the "
+                "map. Undo the join first: send DELETE to the path of the association, followed "
+                "by /join."
             )
 
     def items(
         self, connection: Connection, job: JobRow, first: int, limit: int
     ) -> list[dict[str, Any]]:
-        """Return edges, with their verdicts after the association has succeeded."""
+        """Return edges; after the association has succeeded, they include their verdicts."""
         edges = super().items(connection, job, first, limit)
         verdicts = [dict[str, Any](consistent=None, loops=None, closed=None)] * len(edges)
-        if job.result is not None:  # verdicts are stored after the edges
+        if job.result is not None:
             after = job.result["edges"] + first
             verdicts = items_of(connection, job.number, after, len(edges))
         return [item | verdict for item, verdict in zip(edges, verdicts, strict=True)]
@@ -307,11 +309,13 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
         min_overlap: float = 0.0, *, consistent: bool | None = None,
     ) -> Page[Edge]:  # fmt: skip
-        """Return a page of edges between existing frames, in the order of the job.
+        """Return a page of the edges between existing frames, in the order of their creation.
 
         Parameters
         ----------
-        consistent : True selects supported edges, False outvoted ones, None all
+        map_name, job_id, cursor, limit : see `page_of_items`
+        min_overlap : minimum overlap of the edges
+        consistent : True selects supported edges, False outvoted edges, None all edges
         """
 
         def records(connection: Connection, block: list[dict[str, Any]]) -> list[Edge]:
@@ -331,14 +335,15 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         self, map_name: str, job_id: str, kind: GraphFormat = "g2o", min_overlap: float = 0.0,
         *, odometry: bool = False, consistent: bool = True,
     ) -> str:  # fmt: skip
-        """Return the pose graph of an association as a file.
+        """Return the pose graph of an association as a text file.
 
         Parameters
         ----------
         min_overlap : minimum overlap of the edges
+        kind : file format
         odometry : whether to add edges between consecutive frames
-        consistent : whether to select only edges that another edge or a join supports, instead of
-            all that were not outvoted
+        consistent : True selects edges that another edge or a join supports; False selects all
+            edges that were not outvoted
 
         Raises
         ------
@@ -366,22 +371,20 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
 
 def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> list[str]:
-    """Join parent frames in the commit that ends an association; return no unused blobs.
+    """Join parent frames in the commit that ends an association; return an empty list of blobs.
 
     Raises
     ------
-    Swept : If another association joined one of the frames; the end of the job is then repeated.
+    Swept : If another association joined one of the parent frames, so the slice must be repeated.
     """
     for one in joins:
         if not join_parent(connection, task.of_map.number, one, task.job.id):
-            raise Swept(
-                f"Another association has joined {one.parent} or {one.root} in the meantime."
-            )
+            raise Swept(f"Another association has joined {one.parent} or {one.root} meanwhile.")
     return []
 
 
 def _item(number: int, match: PairMatch) -> dict[str, Any]:
-    """Return the stored item of an edge."""
+    """Return the item that stores an edge from frame `number`."""
     v = match.validation
     T = np.eye(4) if v.T_match_query is None else v.T_match_query
     return {

@@ -1,4 +1,4 @@
-"""Consensus of the edges of an association: their consistency, and joins of the sessions.
+"""Consensus of the edges of an association: verdicts on edges, and joins of parent frames.
 
 edges, frames with poses  --finish_association-->  verdicts, joins
 """
@@ -27,7 +27,7 @@ from sceneprint.store.frame_queries import PathFrame
 from sceneprint.types import Floats
 from sceneprint_client.api.sessions import Join, NewAssociation
 
-#: Weight of the vote of a weak edge, relative to a strong one.
+#: Weight of the vote of a weak edge, relative to a strong edge.
 _WEAK = 0.5
 
 
@@ -35,21 +35,23 @@ def finish_association(
     items: list[dict[str, Any]], source: list[int], target: list[int], stops: dict[int, PathFrame],
     request: NewAssociation, scale: float = 1.0,
 ) -> tuple[list[dict[str, Any]], dict[str, int], list[dict[str, Any]]]:  # fmt: skip
-    """Check edges against each other, and join parent frames by votes of the accepted edges.
+    """Check the edges against each other, and join parent frames by votes of the edges.
 
     An edge is consistent if it closes a loop with an edge of another viewpoint, or agrees with the
     join of its two parent frames.
 
     Parameters
     ----------
-    source, target : numbers of the frames of both runs, in chronological order
-    stops : frames by number, without deleted ones
-    scale : ratio of the model's lengths to those for rooms
+    items : items of all edges
+    source, target : frame numbers of both runs, in chronological order
+    stops : existing frames by number
+    request : options of the association
+    scale : scale of lengths of the model, relative to a model for rooms
 
     Returns
     -------
-    verdicts : verdict of each edge, in their order, as items
-    counts : numbers of consistent, inconsistent and unchecked edges
+    verdicts : verdict of each edge as an item, in the order of `items`
+    counts : number of consistent, inconsistent and unchecked edges
     joins : joins as JSON
     """
     named = sorted({stop.parent for stop in stops.values() if stop.parent is not None})
@@ -95,7 +97,7 @@ def _joins(
     verdict: EdgeVerdicts, stops: dict[int, PathFrame], request: NewAssociation,
     numbers: JoiningParameters,
 ) -> tuple[list[dict[str, Any]], NDArray[np.bool_]]:  # fmt: skip
-    """Return the join of each pair of parent frames with edges, and which edges agree with it."""
+    """Return a join for each pair of parent frames with edges, and a mask of the agreeing edges."""
     between: dict[tuple[str, str], list[int]] = {}
     for i in np.flatnonzero(verdict.accepted).tolist():
         ends = [stops.get(items[i][side]) for side in ("from", "to")]

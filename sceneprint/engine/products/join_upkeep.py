@@ -1,8 +1,8 @@
-"""Automatic associations that may join the parent frames of a map.
+"""Automatic associations, which join the parent frames of a map.
 
-In a map with poses in several parent frames, the largest session of each parent frame is associated
-with the largest session of the root frame, once no frame waits for a signature. An association is
-repeated only after its sessions have grown, and not at all if its join was undone.
+In a map with several parent frames, the largest session of each parent frame is associated with the
+largest session of the root frame, once no frame waits for a signature. An association is repeated
+only after its sessions have grown, and never if its join was undone.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ log = logging.getLogger(__name__)
 
 #: Seconds between checks of all maps.
 LOOK_S = 5.0
-#: Minimum number of frames in each session: a strong join has ten votes from five frames of each.
+#: Minimum number of frames in each session; a strong join needs votes of five frames in each.
 LEAST_FRAMES = 5
-#: Factor by which the number of frames must grow before two sessions are associated again.
+#: Factor by which two sessions must grow before they are associated again.
 GROWTH = 1.25
-#: Maximum number of a map's newest associations to consider.
+#: Number of the newest associations of a map to consider.
 _JOBS = 200
 
 
 class JoinUpkeep:
-    """Starter of associations if `auto` is set; any number of processes may run it."""
+    """Scheduler of associations; several processes may run it. Without `auto`, it does nothing."""
 
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:
         self._store, self._bell, self._auto = store, bell, auto
         self._next = 0.0
-        self._settled: dict[int, int] = {}  # revisions of maps without due associations
+        self._settled: dict[int, int] = {}  # revisions of maps that need no check
 
     def run(self) -> None:
-        """Check all maps if it is due; log errors, after which the next check tries again."""
+        """Check all maps, at most every LOOK_S seconds; log errors instead of raising them."""
         if not self._auto or time.monotonic() < self._next:
             return
         self._next = time.monotonic() + LOOK_S
@@ -63,15 +63,15 @@ class JoinUpkeep:
             log.warning("search for joins failed", extra={"error": str(error)})
 
     def _look(self, row: MapRow) -> bool:
-        """Start an association of a map if one is due; return whether it needs no further check."""
-        with self._store.database.read() as connection:  # usually nothing is due, so do not lock
+        """Start an association if one is due; return whether the map needs no further check."""
+        with self._store.database.read() as connection:  # usually none is due: avoid a write lock
             if _is_busy(connection, row):
                 return False
             if _due(connection, row) is None:
                 return True
         with self._store.database.write(map_number=row.number) as connection:
             row = map_of_number(connection, row.number)
-            request = _due(connection, row)  # another process may have been first
+            request = _due(connection, row)  # again, under the lock
             if request is not None:
                 data = request.model_dump(mode="json", exclude_unset=True)
                 kind = Associations.kind
@@ -87,49 +87,49 @@ def _is_busy(connection: Connection, row: MapRow) -> bool:
 
 
 def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
-    """Return the next association that may join parent frames of a map; None if none is due."""
+    """Return the next association to start in a map; None if no association is due."""
     runs = posed_runs(connection, row.number)
     largest = _largest(runs)
     if len(largest) < 2:
         return None
     kind = Associations.kind
-    jobs = [one.job for one in list_jobs(connection, None, _JOBS, None, kind, [row.name])]
+    jobs = [run.job for run in list_jobs(connection, None, _JOBS, None, kind, [row.name])]
     if any(not job.state.over for job in jobs):
         return None
     undone = undone_pairs(connection, row.number)
     root, *others = largest
-    for one in others:
-        if {one.parent, root.parent} in undone:
+    for run in others:
+        if {run.parent, root.parent} in undone:
             continue
-        request = _request(one, root)
-        if request is not None and _is_worth(request, one.frames + root.frames, jobs):
+        request = _request(run, root)
+        if request is not None and _is_worth(request, run.frames + root.frames, jobs):
             return request
     return None
 
 
 def _largest(runs: Sequence[ParentRun]) -> list[ParentRun]:
-    """Return the largest named session of each parent frame, the root's first."""
+    """Return the largest named session of each parent frame, starting with the root frame."""
     runs_by_parent: dict[str, ParentRun] = {}
-    for one in runs:
-        if one.session is not None and one.frames > runs_by_parent.get(one.parent, _NONE).frames:
-            runs_by_parent[one.parent] = one
+    for run in runs:
+        if run.session is not None and run.frames > runs_by_parent.get(run.parent, _NONE).frames:
+            runs_by_parent[run.parent] = run
     return list(runs_by_parent.values())
 
 
 _NONE = ParentRun("", None, None, 0, 0)
 
 
-def _request(one: ParentRun, root: ParentRun) -> NewAssociation | None:
-    """Return the request to associate two sessions; None if they are too small or too large."""
-    few = min(one.frames, root.frames) < LEAST_FRAMES
-    if few or one.frames + root.frames > MOST_FRAMES:
+def _request(run: ParentRun, root: ParentRun) -> NewAssociation | None:
+    """Return a request to associate two sessions; None if their size does not permit it."""
+    few = min(run.frames, root.frames) < LEAST_FRAMES
+    if few or run.frames + root.frames > MOST_FRAMES:
         return None
-    sides = {"sessions": [one.session, root.session], "robots": [one.robot, root.robot]}
+    sides = {"sessions": [run.session, root.session], "robots": [run.robot, root.robot]}
     if None in sides["robots"]:
         del sides["robots"]
     try:
         return NewAssociation.model_validate(sides)
-    except ValidationError:  # one session with poses in both parent frames
+    except ValidationError:  # the same session has poses in both parent frames
         return None
 
 

@@ -1,9 +1,9 @@
-"""Coverage of a map: each frame is localised in the rest of the map.
+"""Coverage of a map: each frame is localised with the help of the other frames.
 
     frames  --step-->  items  --coverage_plans-->  plans, counts
 
-A query excludes the frame itself and, depending on the request, frames of the same time or session.
-Its answer is otherwise that for a robot, and is not stored.
+Each query excludes the frame itself and, depending on the request, frames of the same time or
+session. Otherwise it equals the query of a robot. The answer is not stored.
 """
 
 from __future__ import annotations
@@ -61,23 +61,23 @@ from sceneprint_client.api.coverage import (
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """A succeeded coverage job."""
+    """A succeeded coverage job, with its request and its result."""
 
     request: NewMapCoverage
     result: CoverageResult
     plans: list[CoveragePlan]
 
 
-#: Maximum number of parent frames with a plan; those with the most queried frames come first.
+#: Maximum number of parent frames with a plan, selected by their number of queried frames.
 MOST_PLANS = 20
 #: Duration in seconds that exceeds any session.
 _FOREVER_S = 1e12
-#: Errors after which a frame is skipped: it was deleted, edited or damaged.
+#: Errors of a deleted, edited or damaged frame, which is skipped.
 _SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, UnreadableGeometry)
 
 
 def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage) -> list[int]:
-    """Return the numbers of the frames that a coverage job queries, in its order.
+    """Return the numbers of the frames that a coverage job queries, in this order.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage
 
 
 class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
-    """Coverage of maps."""
+    """Coverages of maps."""
 
     kind = "coverage"
     record = MapCoverage
@@ -124,7 +124,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
     def step(
         self, task: LongJob, request: NewMapCoverage, progress: dict[str, Any]
     ) -> list[dict[str, Any]]:
-        """Query one frame; skip it if it was deleted or is damaged."""
+        """Query the next frame, and return its item; skip a deleted or damaged frame."""
         row, number = task.of_map, progress["frames"][progress["done"]]
         with self._store.database.read() as connection:
             stop = path_frames(connection, [number]).get(number)
@@ -142,10 +142,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         return [{"frame": number} | item]
 
     def _answer(self, row: MapRow, stop: PathFrame, request: NewMapCoverage) -> Answer:
-        """Return the answer to a frame without the excluded frames.
-
-        The query uses one core; the other cores remain for queries of robots.
-        """
+        """Query a frame without the excluded frames, on one core; return the answer."""
         plain = Query(seed=request.seed, keep=False)
         origin = QueryOrigin(stop.robot, stop.session, stop.captured_at)
         left_out_s = request.not_within_s
@@ -156,10 +153,10 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
             query = plain.model_copy(update={"filter": Filter(not_within_s=left_out_s)})
 
         def ask(rows: list[MapRow]) -> Answer:
-            self._context.signers(rows[0].model_id)  # outside of a transaction, as loading is slow
+            self._context.signers(rows[0].model_id)  # slow, so before the transaction
             ready = prepare_stored(self._store, self._context.signers, row.name, stop.id, plain)
             if ready.frame is None or ready.frame[0] != stop.number:
-                raise UnknownFrame(f"Frame {stop.id} was deleted, and a new frame has its id.")
+                raise UnknownFrame(f"Frame {stop.id} was deleted and replaced by a new frame.")
             ready = replace(ready, origin=origin)
             return self._queries.answer(rows, ready, query, Deadline(None))
 
@@ -169,7 +166,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         self, task: LongJob, request: NewMapCoverage, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Return the end of a job: counts, and plans as items after those of the frames."""
+        """Conclude a job with counts, and plans as items after the items of the frames."""
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
             results = items_of(connection, task.job.number) + items
@@ -196,11 +193,12 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         self, map_name: str, job_id: str, cursor: str | None = None, limit: int = 100,
         outcome: CoverageOutcome | None = None,
     ) -> Page[CoverageFrame]:  # fmt: skip
-        """Return a page of queried frames that still exist, even while the job runs.
+        """Return a page of the queried frames that still exist; the job may be running.
 
         Parameters
         ----------
-        outcome : outcome of the frames; None selects all
+        map_name, job_id, cursor, limit : see `page_of_items`
+        outcome : outcome of the frames; None selects all frames
         """
 
         def records(connection: Connection, block: list[dict[str, Any]]) -> list[CoverageFrame]:
@@ -216,17 +214,16 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         return Page[CoverageFrame](items=items, next_cursor=more)
 
     def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
-        """Compare a result with an earlier one of the same map and the same options.
+        """Compare two results of the same map and the same options.
 
         Parameters
         ----------
-        map_name, job_id : map and id of the later job
-        since : id of the earlier job
+        job_id, since : ids of the later and of the earlier job
 
         Raises
         ------
         UnknownMap, UnknownJob, NotIndexed : If a job does not exist or has not succeeded.
-        InvalidRequest : If the results cannot be compared.
+        InvalidRequest : If the results have different options, cells or axes.
         """
         with self._store.database.read() as connection:
             after = self._measured(connection, map_name, job_id)
@@ -249,7 +246,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
 
 
 def _require_comparable(before: _Measured, after: _Measured) -> None:
-    """Raise InvalidRequest unless two results have the same options, cells and axes."""
+    """Raise InvalidRequest if two results have different options, cells or axes."""
     names = [
         name
         for name in NewMapCoverage.model_fields
@@ -257,23 +254,23 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
     ]
     if names:
         raise InvalidRequest(
-            f"The two results cannot be compared: {', '.join(names)} of their requests differ. "
-            "Measure again with the same options.",
+            "The two results cannot be compared, since their requests differ in "
+            f"{', '.join(names)}. Measure again with the same options.",
             (("since", "different options"),),
         )
     if before.result.cell_m != after.result.cell_m:
         raise InvalidRequest(
-            f"The two results cannot be compared: their cells are {before.result.cell_m:g} m and "
-            f"{after.result.cell_m:g} m wide. Measure again with `cell_m` = "
+            f"The two results cannot be compared, since their cells are {before.result.cell_m:g} m "
+            f"and {after.result.cell_m:g} m wide. Measure again with `cell_m` = "
             f"{before.result.cell_m:g}.",
-            (("since", "different width of cells"),),
+            (("since", "different cell width"),),
         )
     axes = {plan.parent_frame: [*plan.x_axis, *plan.y_axis] for plan in before.plans}
     for plan in after.plans:
         own = [*plan.x_axis, *plan.y_axis]
         if not np.allclose(axes.get(plan.parent_frame, own), own, atol=1e-3):
             raise InvalidRequest(
-                f"The two results cannot be compared: the vertical of parent frame "
+                f"The two results cannot be compared, since the up vector of parent frame "
                 f"{plan.parent_frame!r:.80} has changed. Set `up` of the map, and measure both "
                 "again.",
                 (("since", "different vertical"),),
@@ -281,7 +278,7 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
 
 
 def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
-    """Return the plans of a succeeded job, which are its items after those of the frames."""
+    """Return the plans of a succeeded job, which are stored as items after those of the frames."""
     items = items_of(connection, job.number, (job.result or {})["frames"])
     return [CoveragePlan.model_validate(one) for one in items]
 
@@ -300,13 +297,13 @@ def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> Coverage
 
 
 def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict[str, Any]:
-    """Return the item of a queried frame: its outcome, errors, and ids of look-alikes.
+    """Return the item of a queried frame: outcome, pose errors, and ids of look-alikes.
 
     Parameters
     ----------
-    answer : answer to the frame, without the excluded frames
+    answer : answer to the query
     stop : queried frame
-    request : options with the tolerances of a correct pose
+    request : options, including the tolerances of a correct pose
     """
     own = None if stop.pose is None else np.array(stop.pose)
     location = None if answer.location is None else answer.location.pose
@@ -335,7 +332,7 @@ def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict
 def _difference(
     pose: Transform | None, own: Floats | None, parent: str | None
 ) -> tuple[float, float] | None:
-    """Return metres and radians between two poses; None if they cannot be compared."""
+    """Return metres and radians between two poses; None if one is unknown or in another frame."""
     if pose is None or own is None or pose.parent_frame != parent:
         return None
     return pose_difference(np.array(pose.matrix), own)
@@ -345,12 +342,12 @@ def _is_within(off: tuple[float, float], request: NewMapCoverage) -> bool:
     return off[0] <= request.tolerance_m and math.degrees(off[1]) <= request.tolerance_deg
 
 
-#: Maximum distance between a pose of an answer and that of a match that suggests it, metres.
+#: Maximum distance in metres between a pose of an answer and the pose by a match that supports it.
 _SAME_POSE_M = 1.0
 
 
 def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
-    """Return the id of the match that suggests each pose, each once."""
+    """Return the ids of the matches that support some poses, without repetition."""
     frame_ids: list[str] = []
     for pose in poses:
         near = [
@@ -369,7 +366,7 @@ def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
 def plans_of(
     connection: Connection, row: MapRow, items: Sequence[dict[str, Any]], cell_m: float | None
 ) -> tuple[list[CoveragePlan], float]:
-    """Return the plans of queried frames with poses, and the width of their cells in metres."""
+    """Return the plans of queried frames with poses, and the cell width in metres."""
     outcomes = {item["frame"]: item["outcome"] for item in items}
     by_parent: dict[str, list[PathFrame]] = {}
     for stop in path_frames(connection, outcomes).values():

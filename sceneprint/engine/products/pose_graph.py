@@ -1,4 +1,4 @@
-"""Pose graphs of associations, as files for optimisers.
+"""Pose graphs of associations, as files for graph optimisers.
 
 frames, edges, joins  --pose_graph-->  PoseGraph  --graph_text-->  g2o, TUM, JSON
 """
@@ -22,9 +22,9 @@ from sceneprint.store.frame_queries import PathFrame
 from sceneprint.types import Floats
 from sceneprint_client.api.sessions import Graph, GraphEdge, GraphFormat, Vertex
 
-#: Deviations of an edge without a covariance, metres and radians.
+#: Standard deviations of an edge without a covariance, metres and radians.
 _DEVIATIONS = (0.05, math.radians(1.5))
-#: Deviations of odometry: a constant (metres, radians), plus a share of distance and rotation.
+#: Standard deviations of odometry: a constant (metres, radians) plus a share of distance and angle.
 _STEP, _SHARE = (0.005, math.radians(0.2)), 0.02
 
 MEDIA_TYPES = {"g2o": "text/x-g2o", "tum": "text/plain", "json": "application/json"}
@@ -37,7 +37,7 @@ class PoseGraph:
     Parameters
     ----------
     stops : vertices: the frames of each run in chronological order
-    poses : pose of each vertex; None if unknown
+    poses : pose (4, 4) of each vertex; None if unknown
     frames : parent frame of each pose
     edges : edges between indexes of `stops`
     kinds : kind of each edge: association or odometry
@@ -59,15 +59,15 @@ def pose_graph(
     Parameters
     ----------
     runs : frames of each session, in chronological order
-    items : items of the edges, whose frames must be in `runs`
-    joins : joins in the association's result
+    items : items of the edges; their frames must be in `runs`
+    joins : joins in the result of the association
     odometry : whether to add edges between consecutive frames with poses
     """
     stops = [stop for run in runs for stop in run]
     place = {stop.number: i for i, stop in enumerate(stops)}
     edges, kinds = [], []
     for item in items:
-        # T_to_from, so the matched frame is the first vertex
+        # the matched frame is the first vertex, since T is T_to_from
         T, c = np.array(item["T"], float).reshape(4, 4), item["covariance"]
         covariance = _diagonal(*_DEVIATIONS) if c is None else np.array(c).reshape(6, 6)
         ends = place[item["to"]], place[item["from"]]
@@ -101,7 +101,7 @@ def _diagonal(metres: float, radians: float) -> Floats:
 def _placed(
     stops: Sequence[PathFrame], edges: Sequence[PoseEdge], joins: Sequence[Mapping[str, Any]]
 ) -> tuple[list[Floats | None], list[str | None]]:
-    """Return the poses, moved to the most common parent frame by joins, and their parent frames."""
+    """Move poses to the most common parent frame by joins; return poses and parent frames."""
     counted = Counter(stop.parent for stop in stops if stop.pose is not None)
     parents = sorted((name for name in counted if name), key=lambda name: (-counted[name], name))
     into: dict[str, tuple[str, Floats]] = {}  # T_root_parent, by parent
@@ -127,7 +127,7 @@ def _placed(
 
 
 def _joined(parent: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, Floats]]:
-    """Return the parent frames that are joined to one, with T_parent_neighbour."""
+    """Return the neighbours of a parent frame by joins: name and T_parent_neighbour (4, 4)."""
     neighbours = []
     for one in joins:
         if one["transform"] is None or one["from_parent"] == one["to_parent"] or one.get("undone"):
@@ -143,7 +143,7 @@ def _joined(parent: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, 
 def _spread(
     poses: list[Floats | None], frames: list[str | None], edges: Sequence[PoseEdge]
 ) -> None:
-    """Set poses of frames without one by breadth-first search along the edges."""
+    """Set unknown poses by breadth-first search along the edges, in place."""
     near: dict[int, list[tuple[int, Floats]]] = {}
     for edge in edges:
         near.setdefault(edge.first, []).append((edge.second, edge.T))
@@ -159,10 +159,10 @@ def _spread(
 
 
 def graph_text(graph: PoseGraph, kind: GraphFormat) -> str:
-    """Return a graph as the text of a file.
+    """Return a graph as a text file.
 
-    A TUM trajectory contains the vertices with stamps and poses in the most common parent frame. In
-    g2o, vertices without a pose are at the origin.
+    A TUM trajectory contains the vertices with time stamps and poses in the most common parent
+    frame. In g2o, vertices without a pose are at the origin.
     """
     if kind == "json":
         return _json(graph).model_dump_json()
@@ -185,7 +185,7 @@ def _tum(graph: PoseGraph) -> str:
         if stamp is not None and pose is not None and frame == main
     ]
     comments = [
-        f"poses of the sensors' frames in {main or 'no frame'}, metres",
+        f"poses of sensor frames in {main or 'no frame'}, metres",
         f"{len(rows)} poses; {len(graph.stops) - len(rows)} frames without a stamp or a pose in "
         "this frame left out",
         f"t: {stamped}" if rows else "empty: no frame with a stamp has a pose",
@@ -195,8 +195,10 @@ def _tum(graph: PoseGraph) -> str:
 
 
 def _stamps(graph: PoseGraph) -> tuple[Sequence[float | None], str]:
-    """Return a stamp for each vertex, and its meaning: times if any vertex has one, else distinct
-    places in the session, else numbers of vertices.
+    """Return a time stamp for each vertex, and the meaning of the stamps.
+
+    Stamps are capture times if any vertex has one, else sequence numbers if they are distinct, else
+    vertex numbers.
     """
     times = [stop.captured_at for stop in graph.stops]
     if any(at is not None for at in times):

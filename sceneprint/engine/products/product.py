@@ -1,8 +1,8 @@
-"""Base classes of the products that jobs compute from maps.
+"""Base classes of products, which jobs compute from maps.
 
     request  --begin-->  queued job  --slices-->  items, files, result  --get | list_all-->  record
 
-A product defines its request, its steps and its result. Its job runs in slices; see `tasks`.
+A product defines a request, steps and a result. Its job runs in slices; see `tasks`.
 """
 
 from __future__ import annotations
@@ -34,30 +34,31 @@ Record = TypeVar("Record", bound=Product)
 
 
 class Numbered(Protocol):
-    """The record of an item, with its number in the job."""
+    """Record of an item that has its number in the job."""
 
     number: int
 
 
 Item = TypeVar("Item", bound=Numbered)
 
-#: Priority below uploads and re-encodings, so that slices run only when no other job waits.
+#: Priority below that of uploads and re-encodings: slices run only when no other job waits.
 BACKGROUND = REENCODING_PRIORITY - 1
-#: Maximum duration of a slice in seconds, for which an upload may have to wait.
+#: Maximum duration of a slice, seconds, by which it may delay uploads.
 SLICE_S = 3.0
 #: Number of items to read at once.
 _BLOCK = 500
 
 
 class Products(ABC, Generic[Request, Record]):
-    """The products of a kind in all maps.
+    """All products of a kind.
 
     Attributes
     ----------
     kind : kind of the jobs, such as coverage
-    record : class of the API record
+    record : class of the API records
     priority : priority of the jobs
-    item_count : field of a result with the number of items; other rows of the job follow them
+    item_count : field of a result with the number of items; further rows of the job follow the
+        items
     """
 
     kind: ClassVar[str]
@@ -73,35 +74,33 @@ class Products(ABC, Generic[Request, Record]):
 
         Raises
         ------
-        InvalidRequest : If the map lacks sessions or frames that the request names.
+        InvalidRequest : If the map lacks sessions or frames of the request.
         """
         raise NotImplementedError
 
     @abstractmethod
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice of a job: some of its steps, or the conclusion."""
+        """Run a slice of a job: some steps, or the conclusion."""
 
     def fields(self, job: JobRow) -> dict[str, Any]:
-        """Return the fields of a record that depend on the request of a job."""
+        """Return the record fields that depend on the request of a job."""
         return {"request": job.data or {}}
 
     def details(self, connection: Connection, job: JobRow) -> dict[str, Any]:
-        """Return the fields of a record that pages of records leave out."""
+        """Return the record fields that pages omit."""
         del connection, job
         return {}
 
     def check_removal(self, connection: Connection, job: JobRow) -> None:
-        """Raise Conflict if a map depends on a job."""
+        """Raise Conflict if a map depends on the result of a job."""
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
-        """Return whether files of a job show a deleted frame."""
+        """Return whether files of a job contain data of a deleted frame."""
         del connection, job
         return False
 
     def begin(self, map_name: str, request: Request) -> Record:
-        """Queue a job; raise UnknownMap if the map does not exist, and InvalidRequest as `start`
-        does.
-        """
+        """Queue a job; raise UnknownMap without the map, and InvalidRequest as `start` does."""
         with self._store.database.read() as connection:
             progress = self.start(connection, find_map(connection, map_name), request)
         data = request.model_dump(mode="json", exclude_unset=True)
@@ -114,7 +113,7 @@ class Products(ABC, Generic[Request, Record]):
         return record
 
     def restart(self, row: MapRow, request: Request) -> dict[str, Any]:
-        """Return the result of `start` for the current row of a map."""
+        """Return the initial progress, as `start` does, for the current row of a map."""
         with self._store.database.read() as connection:
             return self.start(connection, current_map(connection, row), request)
 
@@ -160,12 +159,12 @@ class Products(ABC, Generic[Request, Record]):
         collect_deleted_blobs(self._store, blobs)
 
     def forget(self) -> int:
-        """Delete the jobs whose files show deleted frames; return their number."""
+        """Delete jobs whose files contain data of deleted frames; return their number."""
         with self._store.database.read() as connection:
             jobs = queue.jobs_with_files(connection, self.kind)
             stale = [job.id for job in jobs if self.shows_deleted(connection, job)]
         for job_id in stale:
-            with suppress(UnknownJob):  # another process deleted the job
+            with suppress(UnknownJob):
                 self.remove(None, job_id)
         return len(stale)
 
@@ -174,7 +173,7 @@ class Products(ABC, Generic[Request, Record]):
 
         Parameters
         ----------
-        map_name : name of the map; None for any map
+        map_name : name of the map; None searches all maps
 
         Raises
         ------
@@ -191,8 +190,8 @@ class Products(ABC, Generic[Request, Record]):
     def unknown(self, job_id: str, where: str = "") -> UnknownJob:
         """Return the error for a job that does not exist or is not visible to the caller."""
         return UnknownJob(
-            f"There is no {self.record.noun} {job_id!r:.80}{where}. See GET /v1/jobs for the jobs "
-            "that exist."
+            f"There is no {self.record.noun} {job_id!r:.80}{where}. List the jobs with GET "
+            "/v1/jobs."
         )
 
     def record_of(self, job: JobRow, map_name: str | None, **details: Any) -> Record:
@@ -211,7 +210,7 @@ class Products(ABC, Generic[Request, Record]):
 
         Parameters
         ----------
-        what : name of the requested part, for the error
+        what : name of the requested part in the error
 
         Raises
         ------
@@ -248,7 +247,7 @@ class Products(ABC, Generic[Request, Record]):
     def items(
         self, connection: Connection, job: JobRow, first: int, limit: int
     ) -> list[dict[str, Any]]:
-        """Return items of a job with their numbers, even while the job runs."""
+        """Return up to `limit` items of a job from number `first`; the job may be running."""
         if job.result is not None:
             limit = max(min(limit, job.result[self.item_count] - first), 0)
         rows = queue.items_of(connection, job.number, first, limit)
@@ -258,11 +257,11 @@ class Products(ABC, Generic[Request, Record]):
         self, map_name: str, job_id: str, cursor: str | None, limit: int,
         records: Callable[[Connection, list[dict[str, Any]]], list[Item]],
     ) -> tuple[list[Item], str | None]:  # fmt: skip
-        """Return a page of the items of a job, and the cursor of the next page.
+        """Return the records of a page of items, and the cursor of the next page.
 
         Parameters
         ----------
-        records : function that returns the records of the items that pass a filter
+        records : function that filters items and converts them to records
 
         Raises
         ------
@@ -284,23 +283,23 @@ class Products(ABC, Generic[Request, Record]):
 
 
 class StepwiseProducts(Products[Request, Record]):
-    """Products whose jobs consist of equal steps, such as one for each frame."""
+    """Products whose jobs consist of equal steps, such as one step per frame."""
 
     @abstractmethod
     def step(
         self, task: LongJob, request: Request, progress: dict[str, Any]
     ) -> Sequence[dict[str, Any]]:
-        """Run one step, count skipped frames in `progress`, and return the items of the step."""
+        """Run the next step, update `progress`, and return the items of the step."""
 
     @abstractmethod
     def finish(
         self, task: LongJob, request: Request, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Conclude a job whose steps are done; `items` are new in its last slice."""
+        """Conclude a job after its last step; `items` are those of the last slice."""
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run at least one step, and as many as time allows; conclude after the last."""
+        """Run steps, at least one, while time allows; conclude the job after the last."""
         request: Request = self.record.request_type.model_validate(task.data)  # type: ignore[assignment]
         is_over = ends_within(is_over, SLICE_S)
         progress = dict(task.progress) or self.restart(task.of_map, request)

@@ -1,4 +1,4 @@
-"""Reconstructions: surfaces that workers fuse from the accepted matches of an answer.
+"""Reconstructions: surfaces fused from the accepted matches of an answer.
 
 StoredAnswer, NewReconstruction  --begin_for-->  job  --fused, in a worker-->  mesh.ply, Coverage
 """
@@ -67,7 +67,7 @@ Strength = Literal["strong", "weak"]
 
 @dataclass(frozen=True, eq=False)
 class JobView:
-    """A match to fuse, in the data of a job.
+    """A frame to fuse, as stored in a job.
 
     Parameters
     ----------
@@ -90,30 +90,28 @@ def fused(
 
     Parameters
     ----------
-    store : store with the matches' uploads and geometries
     views : one or more matches in the order of the ranking
     query : geometry of the query; None if it is not stored
-    own : view of the query if it is a stored frame
-    model_id : model whose geometries replace lost uploads
-    parent_frame : name of the query's sensor frame
+    own : view of the query if it is a stored frame, else None
+    model_id : model of the geometries to use instead of lost uploads
+    parent_frame : name of the sensor frame of the query
     as_of : time of the answer, seconds since 1970
 
     Returns
     -------
     coverage : figures of the surface and its views
-    ply : surface or cloud in the query's sensor frame, coloured by view
+    ply : surface or cloud in the sensor frame of the query, coloured by view
 
     Raises
     ------
     MissingDependency : If Open3D cannot be loaded.
-    UselessFrame : If no match can be fused, or their depth yields no surface.
-    InvalidRequest : If the voxels are too small for the memory.
+    UselessFrame : If no match can be fused, or the fused depth has no surface.
+    InvalidRequest : If the voxels are so small that memory does not suffice.
     """
-    # first, so that this error comes before those of unreadable views
     open3d("A reconstruction")
     p = FusionParameters(voxel_m=request.voxel_m)
     frames, parts, left_out = list[DepthFrame](), list[FusedView](), list[LeftOut]()
-    # a cloud has no depth image to fuse, but its explained share is computed below
+    # a cloud cannot be fused; only its explained share is computed
     if query is not None and request.include_query and isinstance(query.surface.camera, Intrinsics):
         frame, source = _own(store, query, own, model_id, as_of)
         frames.append(prepare_view(frame, p))
@@ -148,7 +146,7 @@ def fused(
         points=len(mesh.points),
         triangles=len(mesh.triangles) if as_mesh else 0,
     )
-    # the axes of a cloud's sensor are unknown
+    # the axes of the sensor of a cloud are unknown
     axes = ": x right, y down, z forward" if parent_frame.endswith(".optical") else ""
     comment = f"frame {parent_frame}{axes}, metres"
     colours = PALETTE[first % len(PALETTE)]
@@ -162,7 +160,7 @@ def fused(
 def _own(
     store: Store, query: Geometry, own: JobView | None, model_id: str, as_of: float
 ) -> tuple[DepthFrame, Source]:
-    """Return the query's depth at the finest stored resolution."""
+    """Return the depth image of the query at the finest stored resolution, and its source."""
     if own is not None:
         with suppress(NotFound, FrameError, DamagedBlob, UnreadableGeometry):
             frame, source = _read(store, own, model_id, as_of)
@@ -171,12 +169,12 @@ def _own(
 
 
 def _read(store: Store, view: JobView, model_id: str, as_of: float) -> tuple[DepthFrame, Source]:
-    """Return a match's uploaded depth or, if the upload is lost, that of its geometry.
+    """Return the depth image of a match and its source: the upload or, if lost, the geometry.
 
     Raises
     ------
     NotFound : If the map or the frame was deleted.
-    DamagedBlob, UnreadableGeometry : If both are lost.
+    DamagedBlob, UnreadableGeometry : If upload and geometry are lost.
     FrameError : If the frame is empty or not a depth image.
     """
     with store.database.read() as connection:
@@ -184,10 +182,10 @@ def _read(store: Store, view: JobView, model_id: str, as_of: float) -> tuple[Dep
         frame = living(row, find_frame(connection, row, view.frame_id))
         if frame.received_at > as_of:
             raise UnknownFrame(
-                f"Frame {frame.id} of map {row.name!r} was deleted, and a new frame has its id."
+                f"Frame {frame.id} of map {row.name!r} was deleted and replaced by a new frame."
             )
         blob = geometry_blobs(connection, [frame.number], model_id).get(frame.number)
-    if frame.kind == "cloud":  # do not decode a large cloud first
+    if frame.kind == "cloud":
         raise _no_image(view.frame_id)
     T = np.array(view.transform)
     try:
@@ -203,7 +201,7 @@ def _read(store: Store, view: JobView, model_id: str, as_of: float) -> tuple[Dep
 
 
 def _frame(geometry: Geometry, name: str, T: Floats) -> DepthFrame:
-    """Return the depth image of a geometry, with a pose."""
+    """Return the depth image of a geometry with the pose `T` (4, 4)."""
     surface = geometry.surface
     if not isinstance(surface.camera, Intrinsics):
         raise _no_image(name)
@@ -231,7 +229,7 @@ def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> Fuse
     )
 
 
-#: Names of a job's files: the geometry of the query, while the job runs, and the surface.
+#: Names of the files of a job: geometry of the query (until the end of the job), and surface.
 QUERY, MESH = "query.geometry", "mesh.ply"
 MEDIA_TYPE = "application/ply"
 #: Transform of the query to itself.
@@ -245,15 +243,15 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
     record = Reconstruction
 
     def begin_for(self, stored: StoredAnswer, request: NewReconstruction) -> Reconstruction:
-        """Queue a reconstruction, with a copy of the answer's data, since the answer may expire.
+        """Queue a reconstruction. The job copies the data of the answer, which may expire.
 
         Parameters
         ----------
-        request : selection of the matches, and options of the surface
+        request : selection of matches, and options of the surface
 
         Raises
         ------
-        InvalidRequest : If the answer lacks accepted matches or the requested frames.
+        InvalidRequest : If the answer has no accepted match, or the request names other frames.
         UnknownMap : If the map no longer exists.
         """
         chosen = _matches_to_fuse(stored.answer.matches, request)
@@ -271,7 +269,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
             if own is None
             else asdict(JobView(own.map, own.frame_id, None, None, _STILL)),
         }
-        # a job of several maps belongs to none, since readers of one would see the others
+        # a job of several maps belongs to no map, since readers of one map may not read the others
         of = names[0] if len(names) == 1 else None
         self._store.database.require_writable()
         while True:
@@ -290,16 +288,16 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
             return self.get(None, job.job_id)
 
     def fields(self, job: JobRow) -> dict[str, Any]:
-        """Return the fields of a record that the request of a job fills."""
+        """Return the record fields that depend on the request of a job."""
         data = job.data or {}
         return {name: data[name] for name in ("request", "query_id", "maps", "parent_frame")}
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
-        """Return whether a view of a job was deleted permanently."""
+        """Return whether a frame of a job was deleted permanently."""
         return not _is_current(connection, job)
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Fuse the views in one slice, which takes seconds for at most 32 views of bounded size."""
+        """Fuse all views in one slice of a few seconds."""
         del is_over
         data = task.data
         request = NewReconstruction.model_validate(data["request"])
@@ -319,7 +317,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
         )
 
     def _query_of(self, task: LongJob) -> Geometry | None:
-        """Return the geometry of the query; None if it is not stored or damaged."""
+        """Return the geometry of the query; None if it is damaged or not stored."""
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(QUERY)
         if file is not None:
@@ -350,8 +348,8 @@ def _matches_to_fuse(matches: Sequence[Match], request: NewReconstruction) -> li
         accepted = [match for match in accepted if match.validation.strength == "strong"]
         if not accepted:
             raise InvalidRequest(
-                "No accepted match has the strength `strong`. Use `any`.",
-                (("strength", "leaves no match"),),
+                "No accepted match has the strength `strong`. Use `strength` = `any`.",
+                (("strength", "excludes all matches"),),
             )
     return sorted(accepted, key=lambda match: match.rank)[: MOST_VIEWS - 1]
 
@@ -364,7 +362,7 @@ def _view(match: Match) -> JobView:
 
 
 def _is_current(connection: Connection, job: JobRow) -> bool:
-    """Return whether all views of a job exist or can be restored."""
+    """Return whether all frames of a job exist or can be restored."""
     data = job.data or {}
     views = [*data["views"], *([] if data["own"] is None else [data["own"]])]
     places = {(one["map"], one["frame_id"]) for one in views}

@@ -1,10 +1,10 @@
-"""Differences of two sessions of a map: surfaces that disappeared, and new ones.
+"""Differences of two sessions of a map: surfaces that disappeared, and new surfaces.
 
     frames of both sessions  --view_cells, merge_views-->  cells  --frame_verdicts-->  counts
     counts  --cell_states-->  same, gone, new, unseen
 
-A slice of a job fuses some frames into cells, or compares some frames with the cells of the other
-session. The state is stored in a file of the job.
+Each slice of a job fuses frames into cells, or compares frames with the cells of the other session.
+A file of the job stores the state between slices.
 """
 
 from __future__ import annotations
@@ -55,11 +55,11 @@ from sceneprint_client.api import sessions as api
 from sceneprint_client.api.sessions import Difference, DifferenceResult, NewDifference
 from sceneprint_client.surface_encoding import NO_SESSION
 
-#: Maximum number of cells of a session; a job with more restarts with cells of twice the width.
+#: Maximum number of cells of a session; with more, the job starts over with cells twice as wide.
 MOST_CELLS = 500_000
-#: Maximum number of cells of views in memory before they are merged.
+#: Maximum number of unmerged cells in memory.
 _HELD = 1_000_000
-#: Names of a job's files: the state of a running job, and the points.
+#: Names of the files of a job: the state of a running job, and the points of the result.
 STATE, POINTS = "state.npz", "points"
 
 Side = Literal["before", "after"]
@@ -94,9 +94,9 @@ def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -
         )
     if not shared:
         raise InvalidRequest(
-            f"Session {request.before!r:.80} has poses in {', '.join(before)!r:.200}, session "
-            f"{request.after!r:.80} in {', '.join(after)!r:.200}: they share no parent frame. "
-            "Associate the sessions: a strong join gives their poses one parent frame.",
+            f"Session {request.before!r:.80} has poses in {', '.join(before)!r:.200}, but session "
+            f"{request.after!r:.80} in {', '.join(after)!r:.200}, so they share no parent frame. "
+            "Associate the sessions: a strong join moves their poses to one parent frame.",
             (("after", "no parent frame in common"),),
         )
     return request.parent_frame or shared[0]
@@ -109,7 +109,7 @@ class Differences(Products[NewDifference, Difference]):
     record = Difference
 
     def start(self, connection: Connection, row: MapRow, request: NewDifference) -> dict[str, Any]:
-        """Return the initial progress with the frames to compare and their parent frame."""
+        """Return the initial progress with the frames to compare, and their parent frame."""
         parent = shared_parent(connection, row, request)
         frames = {
             side: _spread(
@@ -135,7 +135,7 @@ class Differences(Products[NewDifference, Difference]):
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
             file = queue.files_of(connection, task.job.number).get(STATE)
-        # outside of a transaction, since loading takes long
+        # slow, so before a transaction
         parameters = self._context.signers(row.model_id).model.parameters
         progress.setdefault("cell_m", cell_width(parameters.cloud.voxel_size))
         state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))
@@ -151,7 +151,7 @@ class Differences(Products[NewDifference, Difference]):
         return self._conclude(row, progress, state)
 
     def _fuse(self, row: MapRow, progress: dict[str, Any], state: _State, is_over: IsOver) -> None:
-        """Merge views of frames into the cells of their sessions, while time allows."""
+        """Fuse frames into the cells of their sessions, while time allows."""
         views: dict[Side, list[SessionCells]] = {side: [] for side in SIDES}
         cell_count = 0
         for side, number in _order(progress["frames"])[progress["done"] :]:
@@ -188,7 +188,7 @@ class Differences(Products[NewDifference, Difference]):
                 break
 
     def _posed(self, row: MapRow, number: int, parent: str) -> tuple[Geometry, Floats] | None:
-        """Return a frame's geometry and T_parent_sensor; None if lost or of another parent."""
+        """Return geometry and T_parent_sensor of a frame; None if lost or of another parent."""
         with self._store.database.read() as connection:
             stop = path_frames(connection, [number]).get(number)
             blob = geometry_blobs(connection, [number], row.model_id).get(number)
@@ -203,7 +203,7 @@ class Differences(Products[NewDifference, Difference]):
         return queue.JobFile(name, self._store.blobs.put(data), len(data), MEDIA_TYPE)
 
     def _conclude(self, row: MapRow, progress: dict[str, Any], state: _State) -> SliceResult:
-        """Return the end of a job, with the counts and the points of all cells by state."""
+        """Conclude a job with the counts and the points of all cells by state."""
         frames = progress["frames"]
         positions, states = {}, {}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
@@ -234,7 +234,7 @@ class Differences(Products[NewDifference, Difference]):
 
 
 class _State:
-    """The cells of both sessions, with counts of the verdicts on them."""
+    """Cells of both sessions, with counts of the verdicts on them."""
 
     def __init__(self) -> None:
         self.cells: dict[Side, SessionCells] = {side: {} for side in SIDES}
@@ -242,7 +242,7 @@ class _State:
 
     @classmethod
     def read(cls, data: bytes) -> _State:
-        """Return a state from the bytes of `data`."""
+        """Read a state from bytes of `data`."""
         state = cls()
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             for side in SIDES:
@@ -260,7 +260,7 @@ class _State:
         return state
 
     def data(self) -> bytes:
-        """Return the state as the bytes of a file; equal states have equal bytes."""
+        """Return the state as a file; equal states have equal bytes."""
         arrays: dict[str, Any] = {}
         for side in SIDES:
             cells, counts = self.cells[side], self.counts[side]
@@ -275,7 +275,7 @@ class _State:
 
 
 def _order(frames: dict[Side, list[int]]) -> list[tuple[Side, int]]:
-    """Return side and number of the frames of both sessions, in the order of the job."""
+    """Return session side and number of all frames, in the order of processing."""
     return [(side, number) for side in SIDES for number in frames[side]]
 
 
@@ -286,7 +286,7 @@ def _frames_of(job: JobRow) -> list[int]:
 
 
 def _spread(numbers: Sequence[int], most: int) -> list[int]:
-    """Return at most `most` of some numbers, evenly spaced."""
+    """Return up to `most` of the numbers, evenly spaced."""
     if len(numbers) <= most:
         return list(numbers)
     return [numbers[i * len(numbers) // most] for i in range(most)]

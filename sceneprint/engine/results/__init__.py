@@ -1,1 +1,1 @@
-"""The query log, and views of stored answers."""
+"""Query log, and inspection of stored answers."""

@@ -1,4 +1,4 @@
-"""Entries of the query log: a row with the outcome, and the answer as bytes.
+"""Entries of the query log: a row with the outcome, and the encoded answer.
 
 SentQuery, Answer | error  --query_row-->  NewQuery;  QueryRow  --query_record-->  QueryRecord
 StoredAnswer  --encode_answer-->  bytes  --decode_answer-->  StoredAnswer
@@ -30,17 +30,19 @@ from sceneprint_client.errors import kebab_case
 
 @dataclass(frozen=True, eq=False)
 class StoredAnswer:
-    """An answer with the data to inspect it and to repeat its query.
+    """An answer with the data to inspect it and to repeat the query.
 
     Parameters
     ----------
+    answer, query : answer, and options of the query
+    model_id : id of the model that signed the query
     vector : (D,) signature of the query
-    geometry : geometry of the query as bytes; None without validation
-    ranked : numbers of the frames of R, in its order
+    geometry : encoded geometry of the query; None without validation
+    ranked : frame numbers of R, in its order
     at : time of the answer, seconds since 1970
-    origin : robot, session and time of capture of an uploaded query
-    base : name of the robot's base frame, and T_base_query (4, 4); None if unknown
-    up : (3,) unit vector in the query's sensor frame; None if unknown
+    origin : robot, session and capture time of an uploaded query
+    base : name of the base frame of the robot, and T_base_query (4, 4); None if unknown
+    up : (3,) unit up vector in the sensor frame of the query; None if unknown
     """
 
     answer: Answer
@@ -55,19 +57,19 @@ class StoredAnswer:
     up: Floats | None = None
 
 
-#: Sizes of the head and the signature in bytes; the geometry follows them.
+#: Sizes of head and signature in bytes; these are followed by the geometry.
 _PARTS = struct.Struct("<II")
-#: Errors of `decode_answer` if the bytes are damaged.
+#: Errors that `decode_answer` raises for damaged bytes.
 DAMAGED = (ValueError, KeyError, TypeError, ValidationError, struct.error)
 
 
 def encode_answer(one: StoredAnswer) -> bytes:
-    """Return an answer as bytes."""
+    """Encode an answer as bytes."""
     head = json.dumps(
         {
             "answer": one.answer.model_dump(mode="json"),
-            # without the maps, which the answer contains, and without unset fields, since defaults
-            # of `validation` depend on the model
+            # omit the maps, which are in the answer, and unset fields: defaults of `validation`
+            # depend on the model
             "query": one.query.model_dump(
                 mode="json", include=set(Query.model_fields), exclude_unset=True
             ),
@@ -85,7 +87,7 @@ def encode_answer(one: StoredAnswer) -> bytes:
 
 
 def decode_answer(data: bytes) -> StoredAnswer:
-    """Return an answer from its bytes; raise one of DAMAGED if they are damaged."""
+    """Decode an answer; raise an error in DAMAGED if the bytes are damaged."""
     head_bytes, vector_bytes = _PARTS.unpack_from(data)
     begin = _PARTS.size + head_bytes
     head, end = json.loads(data[_PARTS.size : begin]), begin + vector_bytes
@@ -106,14 +108,14 @@ def decode_answer(data: bytes) -> StoredAnswer:
 
 @dataclass(frozen=True)
 class SentQuery:
-    """The request of a query.
+    """A query request.
 
     Parameters
     ----------
     maps : names of one or more maps to search
     robot, session : origin of the frame
     key_id : id of the caller's key
-    frame : stored frame that is the query; None for an upload
+    frame : stored frame that is queried; None for an upload
     at : time of the request, seconds since 1970
     """
 
@@ -130,7 +132,7 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
     """Return the row of a query that was answered, or that failed with an error."""
     several, frame = len(sent.maps) > 1, sent.frame
     row = NewQuery(
-        # rounded like times in JSON, so that filters by time match
+        # round the time as in JSON, so that filters by time match
         id=uuid.uuid4().hex, at=round(sent.at, 6), map=sent.maps[0],
         maps=tuple(sent.maps) if several else None, robot=sent.robot, session=sent.session,
         status="failed", cause=None, reason="", pose_parent=None, pose=None, confidence=None,
@@ -163,13 +165,13 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
 
 
 def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) -> QueryRecord:
-    """Return the API record of a row.
+    """Return the API record of a query.
 
     Parameters
     ----------
-    days : days from the query until its answer expires; kept answers do not expire
-    may_read : function that returns whether the caller may read a map. Otherwise the record lacks
-        the name of that map, unless it is the query's own, its frame, and the title
+    days : lifetime of answers; permanent answers do not expire
+    may_read : function that returns whether the caller may read a map. Of maps that the caller may
+        not read, the record omits names (except the map of the query), frames and the title
     """
     frame = pose = None
     if row.frame_id is not None and row.frame_map is not None and may_read(row.frame_map):
@@ -193,8 +195,8 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
 
 
 def unknown_query(query_id: str) -> UnknownQuery:
-    """Return the error for an answer that does not exist or is not visible to the caller."""
+    """Return the error for an answer that does not exist or that the caller may not read."""
     return UnknownQuery(
-        f"There is no answer {query_id!r:.80}: it never existed, or it expired. Send the query "
+        f"There is no answer {query_id!r:.80}. It never existed or has expired. Send the query "
         "again, without `keep=false`."
     )

@@ -1,10 +1,10 @@
-"""The query log: outcomes of queries, and their answers until they expire.
+"""Query log: outcomes of queries, and answers until they expire.
 
 NewQuery, StoredAnswer  --QueryLog.note, then a thread-->  row and file
 id  --QueryLog.find-->  StoredAnswer
 
-Logging neither delays a query nor makes it fail. Entries wait in memory while the database is not
-reachable; lost entries are logged and counted.
+Logging never delays or fails a query. While the database is unreachable, entries wait in memory;
+lost entries are logged and counted.
 """
 
 from __future__ import annotations
@@ -69,29 +69,30 @@ log = logging.getLogger(__name__)
 
 #: Format of query ids.
 _ID = re.compile(r"[0-9a-f]{32}")
-#: Seconds between commits of a process. The first query after a pause is written at once.
+#: Minimum seconds between commits of a process; the first query after a pause is written at once.
 GATHER_S = 0.1
-#: Maximum number of queries in one commit, and of waiting queries and the bytes of their geometry.
+#: Maximum number of queries per commit, number of waiting queries, and total size of their
+#: geometry.
 AT_ONCE, MOST_WAITING, MOST_WAITING_BYTES = 100, 10_000, 64 << 20
-#: Number of answers to store concurrently.
+#: Number of answers to write concurrently.
 AT_ONCE_PUT = 8
-#: Seconds between attempts to write waiting queries, and maximum wait when the log is closed.
+#: Seconds between attempts to write queries, and maximum wait in `close`.
 AGAIN_S, CLOSING_S = 2.0, 5.0
-#: Seconds that a reader waits until queries of this process are written.
+#: Maximum seconds that a reader waits for queries of this process to be written.
 PATIENCE_S = 10.0
-#: Seconds between removals, and maximum numbers of rows in one removal and in one commit.
+#: Seconds between removals, and maximum number of rows per removal and per commit.
 TIDY_S, TIDY_MOST, BLOCK = 60.0, 20_000, 100
-#: Maximum numbers of queries and of permanently stored answers of a map.
+#: Maximum number of queries, and of permanent answers, per map.
 MOST_QUERIES, MOST_KEPT = 100_000, 1000
-#: Seconds for which a file may exist without its row.
+#: Age in seconds from which a file without a row is removed.
 _ORPHAN_S = 60.0
-#: Share of the space for answers that a process fills between removals, and that a removal frees.
+#: Share of the space for answers that triggers a removal once written, and that a removal frees.
 _SHARE = 1 / 16
 
 
 @dataclass(eq=False)
 class _Waiting:
-    """A waiting query with its answer, and the size of the answer's geometry in bytes."""
+    """A query to be written, its answer, and the size of the geometry in bytes."""
 
     row: NewQuery
     answer: StoredAnswer | None
@@ -99,7 +100,7 @@ class _Waiting:
 
 
 class QueryLog:
-    """The queries of one store; safe to share between threads."""
+    """The query log of a store; safe to share between threads."""
 
     def __init__(self, store: Store, files: AnswerFiles, settings: Settings) -> None:
         self._store, self._files = store, files
@@ -108,24 +109,24 @@ class QueryLog:
         self._changed = threading.Condition()
         self._writer: threading.Thread | None = None
         self._queued = self._settled = self._lost = 0  # total numbers of queries
-        self._bytes_waiting = self._bytes_written = 0  # the latter since the last removal
+        self._bytes_waiting = self._bytes_written = 0  # written since the last removal
         self._flushing = self._closed = self._retrying = self._unstorable = False
         self._written_at = -GATHER_S
         self._tidied = time.monotonic()
 
     @property
     def lost(self) -> int:
-        """Number of queries that this process lost; its log has the reasons."""
+        """Number of queries that this process could not log."""
         return self._lost
 
     def note(
         self, row: NewQuery, answer: StoredAnswer | None = None, shown: Sequence[int] = ()
     ) -> None:
-        """Queue a query for the log, with its answer if there is room; never wait or raise.
+        """Queue a query for the log, with its answer if memory permits; never block or raise.
 
         Parameters
         ----------
-        shown : numbers of the frames in the answer
+        shown : frame numbers in the answer
         """
         if self._days == 0 or not (row.listed or (answer is not None and self._room > 0)):
             return
@@ -146,7 +147,7 @@ class QueryLog:
                 self._changed.notify_all()
 
     def flush(self, wait_s: float = PATIENCE_S) -> bool:
-        """Wait until all queued queries are written; return False after `wait_s` seconds."""
+        """Wait until queued queries are written; return False after `wait_s` seconds."""
         with self._changed:
             target = self._queued
             self._flushing = self._settled < target
@@ -154,7 +155,7 @@ class QueryLog:
             return self._changed.wait_for(lambda: self._settled >= target, wait_s)
 
     def close(self) -> None:
-        """Write the waiting queries, and accept no new ones."""
+        """Write the waiting queries, and accept no more queries."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -185,7 +186,7 @@ class QueryLog:
         return self._closed or self._flushing or len(self._waiting) >= AT_ONCE
 
     def _stored(self, batch: Sequence[_Waiting]) -> bool:
-        """Write a batch of queries; return False if they must be written again."""
+        """Write a batch of queries; return False if the batch must be retried."""
         loss_reason = None
         try:
             self._write_files(batch)
@@ -200,12 +201,12 @@ class QueryLog:
                 log.warning("queries wait to be logged", extra={"error": str(error)})
             self._retrying = True
             return False
-        except Exception:  # retrying would repeat a programming error
+        except Exception:  # a retry would repeat a programming error
             log.exception("queries cannot be logged")
             loss_reason = "an unexpected error"
         self._written_at = time.monotonic()
         with self._changed:
-            for one in batch[: len(self._waiting)]:  # none remain if the log was closed
+            for one in batch[: len(self._waiting)]:  # `close` may have emptied the list
                 self._waiting.popleft()
                 self._bytes_waiting -= one.size
             self._settled += len(batch)
@@ -219,14 +220,14 @@ class QueryLog:
         return True
 
     def _write_files(self, batch: Sequence[_Waiting]) -> None:
-        """Store the answers of a batch concurrently, since object stores are slow."""
+        """Write the answers of a batch concurrently, to hide the latency of object stores."""
         if self._store.database.read_only:
             return
         with ThreadPoolExecutor(AT_ONCE_PUT, "query-log-put") as pool:
             list(pool.map(self._write_file, [one for one in batch if one.answer is not None]))
 
     def _write_file(self, one: _Waiting) -> None:
-        if one.answer is None or one.row.bytes:  # an earlier attempt stored the answer
+        if one.answer is None or one.row.bytes:  # stored by an earlier attempt
             return
         data = encode_answer(one.answer)
         if len(data) > self._room:
@@ -234,7 +235,7 @@ class QueryLog:
         try:
             self._files.put(one.row.id, data)
         except (OSError, UnusableStore) as error:
-            if not self._unstorable:  # log only the first of several failures
+            if not self._unstorable:  # log only the first of consecutive failures
                 log.warning("answers cannot be stored", extra={"error": str(error)})
             self._unstorable = True
             return
@@ -243,7 +244,7 @@ class QueryLog:
 
     def _lose(self, count: int, reason: str) -> None:
         self._lost += count
-        # log only the first loss, and each tenfold increase
+        # log the first loss, and whenever the number of digits increases
         if len(str(self._lost)) > len(str(self._lost - count)) or self._lost == count:
             log.warning("queries lost", extra={"lost": self._lost, "error": reason})
 
@@ -251,13 +252,13 @@ class QueryLog:
         self, wanted: WantedQueries, names: Collection[str] | None, cursor: str | None, limit: int,
         may_read: Callable[[str], bool] = lambda _: True,
     ) -> Page[QueryRecord]:  # fmt: skip
-        """Return a page of queries, newest first, including all that this process has answered.
+        """Return a page of queries, newest first, including unwritten queries of this process.
 
         Parameters
         ----------
         wanted : filter of the queries, without maps
-        names : names of the maps, of which missing ones are ignored; None selects all
-        may_read : function that returns whether the caller may read a map; other names are left out
+        names : names of the maps; unknown names are ignored, and None selects all maps
+        may_read : see `query_record`
 
         Raises
         ------
@@ -283,7 +284,7 @@ class QueryLog:
             was deleted.
         """
         row = self._current(query_id)
-        if row is None:  # this or another process may not have written it yet
+        if row is None:  # perhaps not written yet
             self.flush()
             if not self._store.database.is_sqlite:
                 time.sleep(GATHER_S)
@@ -309,7 +310,7 @@ class QueryLog:
             raise unknown_query(query_id) from None
 
     def _data(self, row: QueryRow) -> bytes:
-        """Return the bytes of a stored answer; raise UnknownQuery if they are lost."""
+        """Return the encoded answer to a query; raise UnknownQuery if it is lost."""
         if row.kept_at is not None:
             with self._store.database.read() as connection:
                 data = read_kept(connection, row.number)
@@ -329,7 +330,7 @@ class QueryLog:
         return query_record(self.find_row(query_id), self._days, may_read)
 
     def keep(self, query_id: str, title: str | None) -> QueryRecord:
-        """Exempt an answer from expiry until it is released, and set its title.
+        """Make an answer permanent until `release`, and set its title.
 
         Raises
         ------
@@ -342,7 +343,7 @@ class QueryLog:
             if row.kept_at is None:
                 self._require_room(connection, row)
                 if not keep_answer(connection, row.number, data, read_clock(connection)):
-                    raise unknown_query(query_id)  # the answer was removed in the meantime
+                    raise unknown_query(query_id)
             set_title(connection, row.number, title)
             record_change(connection, "answer.kept", row.map, query_id)
         if row.kept_at is None:
@@ -354,14 +355,14 @@ class QueryLog:
         if count < MOST_KEPT and size + row.bytes <= self._room / 2:
             return
         raise QuotaExceeded(
-            f"Map {row.map!r} keeps {count} of at most {MOST_KEPT} answers, and all kept answers "
-            f"take {size} of at most {self._room // 2} bytes, so this answer was not kept. Release "
-            "kept answers with DELETE /v1/queries/{query_id}/keep, or ask the operator to raise "
-            "SCENEPRINT_QUERY_LOG_BYTES."
+            f"The answer cannot be kept: map {row.map!r} has {count} of at most {MOST_KEPT} kept "
+            f"answers, and the kept answers of all maps have {size} of at most {self._room // 2} "
+            "bytes. Release answers with DELETE /v1/queries/{query_id}/keep, or ask the operator "
+            "to raise SCENEPRINT_QUERY_LOG_BYTES."
         )
 
     def release(self, query_id: str) -> None:
-        """Let a permanent answer expire; raise UnknownQuery if it is not permanent."""
+        """Make a permanent answer expire again; raise UnknownQuery if it is not permanent."""
         row = self.find_row(query_id)
         if row.kept_at is None:
             raise unknown_query(query_id)
@@ -371,7 +372,7 @@ class QueryLog:
             record_change(connection, "answer.released", row.map, query_id)
 
     def remove_of_map(self, name: str) -> int:
-        """Remove the queries of a map in blocks, and return their number.
+        """Remove all queries of a map in blocks; return their number.
 
         Raises
         ------
@@ -383,7 +384,7 @@ class QueryLog:
         return self._remove(lambda c, limit: queries_of_map(c, number, limit))
 
     def tidy(self, *, now: bool = False) -> None:
-        """Call `remove_surplus` if it is due; log errors, after which a later call tries again."""
+        """Call `remove_surplus` every TIDY_S seconds, or with `now`; log errors."""
         if self._store.database.read_only:
             return
         if not now and time.monotonic() - self._tidied < TIDY_S:
@@ -395,10 +396,11 @@ class QueryLog:
             log.warning("query removal failed", extra={"error": str(error)})
 
     def remove_surplus(self) -> int:
-        """Remove expired and surplus queries, and the oldest answers if space is short; return the
-        number of removed ones.
+        """Remove expired and surplus queries, and the oldest answers if space is short.
+
+        Return the number of removed queries and answers.
         """
-        with self._store.database.read() as connection:  # the clocks of hosts may differ
+        with self._store.database.read() as connection:
             before = read_clock(connection) - DAY_S * self._days
         removed = self._remove(lambda c, limit: old_queries(c, before, limit))
         removed += self._remove(lambda c, limit: surplus_queries(c, MOST_QUERIES, limit))
@@ -421,8 +423,9 @@ class QueryLog:
         return removed + self._remove(oldest, drop_answers)
 
     def purge(self) -> int:
-        """Remove answers that show purged frames, and files without queries; return the number of
-        removed answers.
+        """Remove answers that contain purged frames, and files without a row.
+
+        Return the number of removed answers.
         """
         self.flush()
         removed, after = 0, 0
@@ -442,7 +445,7 @@ class QueryLog:
             after = batch[-1][0]
 
     def _sweep(self) -> None:
-        """Remove files without queries, which a killed process left."""
+        """Remove files without a row, left by killed processes."""
         before = time.time() - _ORPHAN_S
         names = iter([name for name, at in self._files.list() if at < before])
         while batch := list(islice(names, BLOCK)):
@@ -454,7 +457,7 @@ class QueryLog:
         self, find: Callable[[Connection, int], Sequence[int]],
         remove: Callable[[Connection, Sequence[int]], list[str]] = remove_queries,
     ) -> int:  # fmt: skip
-        """Remove rows in blocks, and then the files of their answers; return the number of rows."""
+        """Remove the rows that `find` returns, in blocks, then their files; return their number."""
         query_ids: list[str] = []
 
         def remove_rows(connection: Connection, numbers: Sequence[int]) -> None:
@@ -466,7 +469,7 @@ class QueryLog:
         return removed
 
     def _delete_files(self, query_ids: Sequence[str]) -> None:
-        """Remove files of answers; `_sweep` removes the remaining ones after an error."""
+        """Remove files of answers; after an error, `_sweep` removes the rest."""
         try:
             self._files.delete(query_ids)
         except (OSError, UnusableStore) as error:

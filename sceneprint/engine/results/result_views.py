@@ -1,10 +1,10 @@
-"""Views of stored answers: the request, points, similarities of the ranking, and match evidence.
+"""Inspection of stored answers: request, points, similarities, and evidence of matches.
 
 query id  --Inspection-->  Answer | StoredQuery | PLY | PNG | Similarities | MatchDetails
 query id, frame id  --Pairs-->  StoredPair  --load-->  geometries  --validated-->  PairValidation
 frame | query | match  --PointClouds-->  Output
 
-A match is validated again with the seed and the options of the query, so the result is the same.
+A match is validated again with the seed and the options of the query, which yields the same result.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ from sceneprint_client.api.results import (
     View,
 )
 
-#: Number of cached validations of about 1 kB, since a page requests several views of one match.
+#: Number of cached validations (about 1 kB each); a page requests several views of a match.
 _CACHE_SIZE = 64
 
 
@@ -85,10 +85,11 @@ class StoredPair:
 
     Parameters
     ----------
-    sensor : name of the match's sensor frame
-    blob : digest of the match's geometry
-    row, number : map and number of the match's frame
-    ups : up vectors in the sensors of query and match; None for unknown ones
+    stored, match : answer and match
+    sensor : name of the sensor frame of the match
+    blob : digest of the geometry of the match
+    row, number : map and number of the matched frame
+    ups : up vectors (3,) in the sensor frames of query and match; None if unknown
     """
 
     stored: StoredAnswer
@@ -128,7 +129,7 @@ class Pairs:
             raise _deleted(match)
         if frame.number not in blobs:
             raise errors.NotIndexed(
-                f"Map {match.map!r} has changed its model since the query, and frames of "
+                f"Map {match.map!r} has switched its model since the query, and signatures of "
                 "different models cannot be compared. Send the query again."
             )
         return StoredPair(
@@ -137,11 +138,11 @@ class Pairs:
         )  # fmt: skip
 
     def load(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
-        """Return the geometries of query and match; rebuild that of the match if it is damaged.
+        """Return the geometries of query and match; rebuild a damaged geometry of the match.
 
         Raises
         ------
-        DamagedBlob : If the match's upload is damaged too.
+        DamagedBlob : If the upload of the match is damaged as well.
         UnknownFrame : If the match was deleted.
         """
         query = geometry_of_query(pair.stored)
@@ -158,11 +159,11 @@ class Pairs:
         return query, read_geometry(artifact)
 
     def parameters(self, pair: StoredPair) -> ValidationParameters:
-        """Return the parameters of validation of the query's model."""
+        """Return the validation parameters of the model of the query."""
         return self._signers(pair.stored.model_id).model.parameters.validation
 
     def validated(self, pair: StoredPair, query: Geometry, match: Geometry) -> PairValidation:
-        """Return the validation of a match with the options of its query."""
+        """Validate a match with the options of its query; the result is cached."""
         p = self.parameters(pair)
         seed, options = pair.stored.query.seed, thresholds(pair.stored.query.validation, p)
         key = pair.stored.answer.query_id, pair.blob
@@ -175,7 +176,7 @@ class Pairs:
                     return guided
             validation = validate(query, match, seed, *options, ups=pair.ups)
             if validation.reason != pair.match.validation.reason and pair.stored.up is not None:
-                # the query validated it again without up vectors
+                # like the query, retry without up vectors
                 return validate_without_up(query, match, seed, options[0], pair.ups) or validation
             return validation
 
@@ -183,7 +184,7 @@ class Pairs:
 
 
 class _ValidationCache:
-    """The most recent validations; concurrent requests for the same one wait for it."""
+    """Cache of the latest validations; concurrent requests share one computation."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -209,7 +210,7 @@ class _ValidationCache:
 
 
 def check_geometry(stored: StoredAnswer, needs: str = "the stage") -> bytes:
-    """Return the bytes of a query's geometry; raise NotIndexed if it ran without validation."""
+    """Return the encoded geometry of a query; raise NotIndexed if it ran without validation."""
     if stored.geometry is None:
         raise errors.NotIndexed(
             f"Query {stored.answer.query_id} ran without validation, so its points were not "
@@ -219,7 +220,7 @@ def check_geometry(stored: StoredAnswer, needs: str = "the stage") -> bytes:
 
 
 def geometry_of_query(stored: StoredAnswer) -> Geometry:
-    """Return a query's geometry; raise NotIndexed if it ran without validation."""
+    """Return the geometry of a query; raise NotIndexed if it ran without validation."""
     return read_geometry(check_geometry(stored))
 
 
@@ -241,7 +242,7 @@ def _match_of(stored: StoredAnswer, frame_id: str, map_name: str | None) -> Matc
 
 
 class Inspection:
-    """Views of stored answers."""
+    """Data of stored answers for inspection."""
 
     def __init__(self, context: Context) -> None:
         self._store, self._signers, self._log = context.store, context.signers, context.query_log
@@ -254,8 +255,9 @@ class Inspection:
     def question(
         self, query_id: str, may_read: Callable[[str], bool] = lambda _: True
     ) -> StoredQuery:
-        """Return the request of a query, without names of maps that `may_read` refuses; raise
-        UnknownQuery if its answer is not stored.
+        """Return the request of a query; raise UnknownQuery if its answer is not stored.
+
+        It omits the names of maps for which `may_read` returns False.
         """
         stored, record = self._log.find(query_id), self._log.record(query_id, may_read)
         return StoredQuery(
@@ -266,13 +268,13 @@ class Inspection:
         )
 
     def preview(self, query_id: str, view: View = "depth", width: int = 320) -> bytes:
-        """Return a picture of the query frame as PNG.
+        """Return an image of the query frame as PNG.
 
         Raises
         ------
         UnknownQuery : If the answer is not stored.
         NotIndexed : If the query ran without validation.
-        InvalidRequest : If the view is `patches`, which are not stored.
+        InvalidRequest : If the view is `patches`, since patches of queries are not stored.
         """
         stored = self._log.find(query_id)
         if view == "patches":
@@ -285,8 +287,9 @@ class Inspection:
         return picture(colours, width, {"view": view, "model": stored.answer.model, **text})
 
     def cloud(self, query_id: str) -> bytes:
-        """Return the query's points and normals as PLY, in its sensor frame; see `preview` for
-        errors.
+        """Return the points and normals of the query as PLY, in its sensor frame.
+
+        See `preview` for errors.
         """
         stored = self._log.find(query_id)
         points, normals = points_of(geometry_of_query(stored).surface)
@@ -304,7 +307,7 @@ class Inspection:
             rows = frames_of(connection, numbers)
             vectors = stored_signatures(connection, rows, stored.model_id)
             names = {row.number: row.name for row in list_maps(connection)}
-        # without maps that were not searched, which the caller may not be allowed to read
+        # omit maps that were not searched, which the caller may not be permitted to read
         known = [
             n for n in numbers if n in vectors and names[rows[n].map_number] in stored.answer.maps
         ]
@@ -322,7 +325,7 @@ class Inspection:
         )
 
     def match(self, query_id: str, frame_id: str, map_name: str | None = None) -> MatchDetails:
-        """Validate a match again, and return it with the points and patches behind its figures.
+        """Validate a match again; return the result with the points and patches that support it.
 
         Parameters
         ----------
@@ -332,7 +335,7 @@ class Inspection:
         Raises
         ------
         UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `Pairs.find`.
-        DamagedBlob, UnreadableGeometry : If the match's geometry and upload are damaged.
+        DamagedBlob, UnreadableGeometry : If geometry and upload of the match are damaged.
         """
         pair = self.pairs.find(query_id, frame_id, map_name)
         stored, match, p = pair.stored, pair.match, self.pairs.parameters(pair)
@@ -361,12 +364,12 @@ class Inspection:
         self, query_id: str, frame_id: str, map_name: str | None = None,
         colour: OverlayColour = "source", by: OverlayTransform = "aligned",
     ) -> bytes:  # fmt: skip
-        """Return the points of a query and a match as PLY, in the sensor frame of the match.
+        """Return the points of query and match in one PLY file, in the sensor frame of the match.
 
         Parameters
         ----------
         colour : meaning of the colours: source, normal, or distance from the other surface
-        by : transform of the query's points: the aligned one, its best rival, or none
+        by : transform of the query points: that of the match, its best rival, or identity
 
         Raises
         ------
@@ -383,7 +386,7 @@ class Inspection:
                 what = "no transform" if by == "aligned" else "no rival"
                 raise errors.InvalidRequest(
                     f"Frame {frame_id} has {what} with query {query_id}: {v.reason}. Use "
-                    "transform=none to see both as they are.",
+                    "transform=none to draw both without a transform.",
                     (("transform", f"there is {what}"),),
                 )
             T = chosen
@@ -430,7 +433,7 @@ def _triples(rows: Floats) -> list[Triple]:
 
 
 class PointClouds:
-    """Points of frames, queries and matches as bytes; see `sceneprint.formats.export`."""
+    """Points of frames, queries and matches in binary; see `sceneprint.formats.export`."""
 
     def __init__(self, context: Context, pairs: Pairs) -> None:
         self._store, self._signers, self._log = context.store, context.signers, context.query_log
@@ -475,7 +478,7 @@ class PointClouds:
     ) -> Output[bytes]:  # fmt: skip
         """Return points, normals and patches of a query or a match in its own sensor frame.
 
-        With a transform, they include the distances of the points from the other surface.
+        With a transform, the result includes the distance of each point from the other surface.
 
         Parameters
         ----------
@@ -486,8 +489,8 @@ class PointClouds:
         Raises
         ------
         UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `Pairs.find`.
-        DamagedBlob : See `Pairs.load`; raised when the output is computed.
-        InvalidRequest : If there is no rival; raised when the output is computed.
+        DamagedBlob : See `Pairs.load`; raised by `Output.make`.
+        InvalidRequest : If the match has no rival; raised by `Output.make`.
         """
         pair = self._pairs.find(query_id, frame_id, map_name)
 
@@ -499,9 +502,9 @@ class PointClouds:
                 T = v.T_match_query if by == "aligned" else v.T_rival
             if by == "rival" and T is None:
                 raise errors.InvalidRequest(
-                    f"Frame {frame_id} has no rival with query {query_id}: {v.reason}. Use "
-                    "transform=aligned.",
-                    (("transform", "there is no rival"),),
+                    f"The match of frame {frame_id} with query {query_id} has no rival: "
+                    f"{v.reason}. Use transform=aligned.",
+                    (("transform", "the match has no rival"),),
                 )
             mine, other = (query, match) if side == "query" else (match, query)
             points, total = _some(mine, limit)
@@ -517,7 +520,7 @@ class PointClouds:
 
 
 def _some(geometry: Geometry, limit: int) -> tuple[Floats32, int]:
-    """Return at most `limit` points with normals (N, 6), and the number of all points."""
+    """Return up to `limit` points with normals (N, 6), and the total number of points."""
     every = sample_points(geometry.surface, 1)
     return np.ascontiguousarray(every[thinned(len(every), limit)]), len(every)
 

@@ -1,1 +1,1 @@
-"""Queries: retrieval, verification and answers."""
+"""Queries: retrieval, validation, and answers."""

@@ -1,4 +1,4 @@
-"""Answers to queries: the ranking R, the selections C and C_vld, the pose, and the status.
+"""Answers to queries: ranking R, selections C and C_vld, pose, and status.
 
 PreparedQuery, SearchedMaps  --answer-->  Answer
 PoseEstimate, matches, counts  --answer_status-->  Outcome
@@ -65,7 +65,7 @@ from sceneprint_client.api.query import Cause
 
 @dataclass
 class _Clock:
-    """Clock of the stages of a query, in milliseconds; times of a resumed stage add up."""
+    """Clock of the stages of a query, in milliseconds; a stage may be timed several times."""
 
     spent: dict[str, float]
     _since: float = field(default_factory=time.perf_counter)
@@ -78,7 +78,7 @@ class _Clock:
 
 @dataclass(frozen=True, eq=False)
 class SequenceFrame:
-    """An earlier frame of a sequence, with T_query_sensor (4, 4) by odometry."""
+    """An earlier frame of a sequence, with T_query_sensor (4, 4) from odometry."""
 
     prepared: PreparedQuery
     T: Floats
@@ -86,19 +86,19 @@ class SequenceFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """A frame of a query with its candidates and their matches.
+    """The search for one frame of a query: its candidates and their validations.
 
     Parameters
     ----------
-    searched : R of the frame
+    searched : ranking R of the frame
     selection : C; None if it was not requested
-    among, scales : distances within R, and the parameters of the selection
+    among, scales : (R, R) distances within R, and the parameters of the selection
     chosen : positions in R of the candidates: C, or the first frames of R
     checks : validations of the candidates that decide the pose, regardless of `k`
-    rows : rows of the frames in the answer, by number
+    rows : rows of the frames in the answer, by frame number
     matches : validated candidates that still exist
-    rivals : matches with frames beyond `chosen`, which show other places than the best pose
-    late : whether the deadline was reached before all rivals were validated
+    rivals : matches that are not candidates, at other places than the best pose
+    late : whether the deadline passed before all rivals were validated
     """
 
     prepared: PreparedQuery
@@ -118,22 +118,22 @@ def answer(
     store: Store, places: Sequence[SearchedMap], model: Model, prepared: PreparedQuery,
     query: Query, deadline: Deadline, earlier: Sequence[SequenceFrame] = (),
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
-    """Return the answer of some maps to a query, and the numbers of the frames of R.
+    """Answer a query; return the answer and the frame numbers of R.
 
     Parameters
     ----------
     places : one or more maps of one model
     prepared, query : frame and options of the query
-    earlier : earlier frames of the same sequence, which vote for the pose of `prepared`
+    earlier : earlier frames of the sequence, which vote for the pose of `prepared`
 
     Raises
     ------
     UnknownFrame : If the frame to explain does not exist.
-    InvalidRequest, InvalidPose : If the prior cannot be used.
+    InvalidRequest, InvalidPose : If the prior is not valid; see `prior_of`.
     """
     clock = _Clock({"prepare": round(prepared.prepare_ms, 2)})
     prior = prior_of(store, query, places)
-    # the last frame comes first, since a deadline should only cost votes of earlier frames
+    # search the last frame first, so that a deadline only excludes votes of earlier frames
     last = _attempt(store, places, model, prepared, query, deadline, prior, clock)
     before = [
         _attempt(store, places, model, one.prepared, query, deadline, prior) for one in earlier
@@ -158,7 +158,7 @@ def answer(
 
 
 class _StoredDatabase:
-    """Interface of `decide` to the store; it collects the validations in `attempts`."""
+    """Access of `decide` to the store; new validations are added to `attempts`."""
 
     def __init__(
         self, store: Store, attempts: Sequence[_Attempt], prior: PosePrior | None, model: Model,
@@ -225,7 +225,7 @@ def _attempt(
     store: Store, places: Sequence[SearchedMap], model: Model, prepared: PreparedQuery,
     query: Query, deadline: Deadline, prior: PosePrior | None, clock: _Clock | None = None,
 ) -> _Attempt:  # fmt: skip
-    """Search the maps for one frame of a query, and validate its candidates."""
+    """Search the maps for a frame of a query, and validate its candidates."""
     clock = clock or _Clock({})
     searched = search_maps(store, places, prepared, query, model)
     for place in places:
@@ -256,11 +256,10 @@ def _answer(
     store: Store, places: Sequence[SearchedMap], model: Model, last: _Attempt,
     estimate: PoseEstimate | None, query: Query, deadline: Deadline, clock: _Clock, earlier: int,
 ) -> tuple[Answer, tuple[int, ...]]:  # fmt: skip
-    """Return the answer for the last frame of a query, and the numbers of the frames of R."""
+    """Return the answer for the last frame of a sequence, and the frame numbers of its R."""
     prepared, searched, p = last.prepared, last.searched, model.parameters.validation
     ranking, checks = searched.ranking, _validate_more(store, last, query, deadline, p)
     clock.stage("validate")
-    # rejected rivals are not matches
     rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
     matches = [*(one for one in checks.matches if one.index in last.rows), *rivals_left]
     names = {place.row.number: place.row.name for place in places}
@@ -317,7 +316,7 @@ def _answer(
 def _listed_matches(
     candidates: Candidates, last: _Attempt, checks: Validated, rivals: Sequence[PairMatch], k: int
 ) -> list[Match]:
-    """Return the records of the candidates, of at most `k` accepted ones, and of the rivals."""
+    """Return the match records of the candidates and the rivals, with at most `k` accepted ones."""
     shown = listed([one for one in checks.matches if one.index in last.rows], k)
     hidden = {one.index for one in checks.matches} - {one.index for one in shown}
     order = candidates.ranking.indices.tolist()
@@ -329,7 +328,7 @@ def _listed_matches(
 def _validate_more(
     store: Store, last: _Attempt, query: Query, deadline: Deadline, p: ValidationParameters
 ) -> Validated:
-    """Return the validations of all candidates, and validate more of them if `k` requires it."""
+    """Validate further candidates if `k` requires it; return the validations of all candidates."""
     checks = last.checks
     accepted = sum(one.validation.status == "accepted" for one in checks.matches)
     rest = [position for position in last.chosen if position not in checks.chosen]
@@ -345,9 +344,9 @@ def _validate_more(
 def _selections(
     searched: Searched, query: Query, model: Model, sizes: Sequence[int]
 ) -> tuple[Ints64 | None, DiversityParameters | None, list[Selection | None]]:
-    """Return distances within R, the scales, and C of each size; Sec. III-D.
+    """Return the distances within R, the parameters, and a selection C of each size; Sec. III-D.
 
-    The selection is greedy, so a larger C contains the smaller ones.
+    The selection is greedy, so that a larger C contains the smaller ones.
     """
     if "diversify" not in query.stages:
         return None, None, [None for _ in sizes]
@@ -375,7 +374,7 @@ def _counts(
     checks: Validated,
     matches: Sequence[PairMatch],
 ) -> Counts:
-    """Return the number of frames of one map that reached each stage."""
+    """Count the frames of map number `i` that reached each stage."""
     part, hits = searched.parts[i], searched.hits[i]
     number = part.place.row.number
     statuses = [
@@ -402,15 +401,15 @@ def _version(place: SearchedMap) -> int:
     return place.view.number
 
 
-#: Minimum number of distinct planes in a distinctive frame.
+#: Minimum number of distinct planes for a distinctive frame.
 _FEWEST_PLANES = 4.0
-#: Ratio of distances to surfaces in the query and in its candidates that indicates a wrong scale.
+#: Ratio of surface distances in the query to those in the candidates that indicates a wrong scale.
 _OTHER_SCALE = 2.5
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The status of an answer, its reason, and the most likely cause of `not_found`."""
+    """Status of an answer, its reason, and the most likely cause of `not_found`."""
 
     status: AnswerStatus
     reason: str
@@ -421,14 +420,14 @@ def answer_status(
     query: Query, estimate: PoseEstimate | None, checks: Validated, matches: Sequence[PairMatch],
     counts: Counts, geometry: Geometry | None, p: ValidationParameters, *, posed: bool,
 ) -> Outcome:  # fmt: skip
-    """Return the status of an answer, with its reason and cause.
+    """Determine the status of an answer, with its reason and cause.
 
     Parameters
     ----------
     estimate : result of `decide`; None if no match has a pose
     checks : result of `validated`
     matches : validated candidates that still exist
-    counts : sums over all maps
+    counts : number of frames at each stage, summed over the maps
     geometry : geometry of the query; None without validation
     posed : whether an accepted match has a pose in the map
     """
@@ -450,7 +449,7 @@ def answer_status(
     if checks.late:
         explanation = (
             f"the deadline passed before a match was accepted: {counts.validated} of "
-            f"{len(checks.chosen)} candidates were validated. Allow more time"
+            f"{len(checks.chosen)} candidates were validated. Increase `deadline_ms`"
         )
         return Outcome("unvalidated", explanation, "deadline")
     cause, reason = _likeliest_cause(checks, matches, counts, geometry, p)
@@ -461,7 +460,7 @@ def _likeliest_cause(
     checks: Validated, matches: Sequence[PairMatch], counts: Counts, geometry: Geometry | None,
     p: ValidationParameters,
 ) -> tuple[Cause, str]:  # fmt: skip
-    """Return the most likely cause of `not_found`, and the next step as a sentence."""
+    """Return the most likely cause of `not_found`, and a text with the cause and the next step."""
     if not counts.passed:
         if counts.map:
             return "no_frames", "no frame of the map passes the filter. Widen the filter"
@@ -485,7 +484,7 @@ def _likeliest_cause(
 def _cause_in_view(
     geometry: Geometry, checks: Validated, p: ValidationParameters
 ) -> tuple[Cause, str] | None:
-    """Return a cause in the query frame itself, and the next step; None if there is none."""
+    """Return a cause in the query frame itself, with its text; None if the frame is good."""
     if len(geometry.patches) < p.minimum_patches:
         return (
             "too_little_in_view",
@@ -496,8 +495,8 @@ def _cause_in_view(
     if planes < _FEWEST_PLANES:
         return (
             "one_plane",
-            f"the frame shows {planes:.0f} planes, too few to distinguish places. Turn the sensor "
-            "towards furniture or a corner, and send another query",
+            f"the frame shows {planes:.0f} planes, too few to distinguish places. Turn the "
+            "sensor towards furniture or a corner, and send another query",
         )
     others = list(checks.geometries.values())
     if not others:
@@ -519,5 +518,5 @@ def _cause_in_view(
 
 
 def _distance(geometry: Geometry) -> float:
-    """Return the median distance of the patches from the sensor, metres."""
+    """Return the median distance of patches from the sensor, metres."""
     return float(np.median(np.linalg.norm(geometry.patches.means, axis=1)))

@@ -1,14 +1,14 @@
-"""Place of the indexes of all maps: a local folder, and optionally an object store of a fleet.
+"""Storage of indexes: a local folder, and optionally an object store that a fleet shares.
 
     builder  --share-->  PREFIX/index/MAP/  --sync-->  INDEXES/MAP/, which all other code reads
 
     MAP/SHA256.faiss        parts, see `sceneprint/index/part_files.py`
     MAP/0000000007.json     a manifest, written last and never replaced
-    index/.swept            mark of the last removal of indexes of deleted maps
+    index/.swept            date of the last removal of indexes of deleted maps
 
-The object store is used if SCENEPRINT_INDEX_URL is set. The folder is a cache of it, and fetched
-parts are verified. An empty manifest marks an index that was withdrawn; its number is not reused.
-Queries use the folder, even if the object store is not reachable.
+The object store is used if SCENEPRINT_INDEX_URL is set. The folder then caches it; downloaded parts
+are verified. An empty manifest marks a withdrawn index; its number is not reused. Queries use only
+the folder, so they do not depend on the object store.
 """
 
 from __future__ import annotations
@@ -54,18 +54,19 @@ from sceneprint.store.tables import MapRow
 log = logging.getLogger(__name__)
 
 _FOLDER, _SWEPT, _USED = "index/", "index/.swept", ".used"
-#: Seconds between checks for a newer index of a queried map, and after an error.
+#: Seconds between checks for a newer index of a queried map.
 LOOK_S = 30.0
-#: Age in seconds above which unlisted parts are removed, since others may be fetching newer ones.
+#: Age in seconds from which unlisted parts are removed; other hosts may still download younger
+#: ones.
 GRACE_S = 600.0
-#: Seconds after the last query during which the index of a map is not evicted.
+#: Seconds after its last query for which the index of a map is not evicted.
 IN_USE_S = 600.0
 
 
 class IndexPlace:
-    """The indexes of all maps; safe to share between threads.
+    """Indexes of all maps; safe to share between threads.
 
-    Methods that use the object store raise UnusableStore if it cannot be used.
+    Methods that use the object store raise UnusableStore if it is not accessible.
     """
 
     def __init__(self, store: Store, settings: Settings) -> None:
@@ -83,26 +84,26 @@ class IndexPlace:
 
     @property
     def is_shared(self) -> bool:
-        """Whether there is an object store that a fleet shares."""
+        """Whether the indexes are shared through an object store."""
         return self._store is not None
 
     def close(self) -> None:
-        """Stop fetching after the current block."""
+        """Stop downloads after the current block."""
         self._stop.set()
         self.finish()
 
     def finish(self) -> None:
-        """Wait until all indexes for queries are fetched."""
+        """Wait until all requested indexes are downloaded."""
         thread = self._thread
         if thread is not None:
             thread.join()
 
     def folder(self, row: MapRow) -> Path:
-        """Return the folder of the index of a map."""
+        """Return the local folder of the index of a map."""
         return index_folder(self._indexes, row)
 
     def head(self, row: MapRow) -> IndexManifest | None:
-        """Return the newest manifest of a map; None if there is none or it was withdrawn."""
+        """Return the newest manifest of a map; None without an index, or if it was withdrawn."""
         if self._store is not None:
             numbered = _numbered(self._list(row))
             return self._read(numbered[-1]) if numbered else None
@@ -112,20 +113,20 @@ class IndexPlace:
         return None
 
     def last_number(self, row: MapRow) -> int:
-        """Return the last number of a map's index in the object store, 0 if there is none."""
+        """Return the highest index number of a map in the object store; 0 without an index."""
         numbered = _numbered(self._list(row))
         return _number(numbered[-1]) or 0 if numbered else 0
 
     def stale_keys(self, row: MapRow, manifest: IndexManifest) -> frozenset[str]:
-        """Return the names of the parts with keys of segments that contain deleted frames."""
-        if manifest.revision < row.pruned_revision:  # rows of deleted frames were removed
+        """Return the names of the key files of segments that contain deleted frames."""
+        if manifest.revision < row.pruned_revision:  # the rows of deleted frames no longer exist
             return frozenset(manifest.keys)
         with self._database.read() as connection:
             deleted = deleted_since(connection, row.number, manifest.revision)
         gone, stale = np.fromiter(deleted, np.int64, len(deleted)), set(manifest.worn_keys)
         for name in manifest.keys if deleted else ():
             data = self._part(row, name)
-            # damaged keys may include deleted frames
+            # count damaged files too, since they may contain deleted frames
             is_sound = hashlib.sha256(data).hexdigest() == name.partition(".")[0]
             if not is_sound or np.isin(np.frombuffer(data, "<i8"), gone).any():
                 stale.add(name)
@@ -142,14 +143,14 @@ class IndexPlace:
     @contextmanager
     def turn(self, row: MapRow) -> Iterator[Callable[[], None] | None]:
         """Lock the index of a map against builders on other hosts; see `index_turn`."""
-        if self._store is None:  # builders of one host lock the folder
+        if self._store is None:  # builders on the same host lock the folder
             yield lambda: None
             return
         with index_turn(self._database, row.number) as mine:
             yield mine
 
     def share(self, row: MapRow, manifest: IndexManifest) -> bool:
-        """Store an index in the object store, if any; return False if its number exists already."""
+        """Upload an index to the object store, if any; return False if its number is in use."""
         if self._store is None:
             return True
         prefix = self._prefix(row)
@@ -158,7 +159,7 @@ class IndexPlace:
             if sizes.get(f"{prefix}{name}") != size:
                 self._store.put_file(f"{prefix}{name}", self.folder(row) / name)
         key, data = f"{prefix}{manifest.name}", seal(manifest)
-        # an earlier attempt whose response was lost may have stored the same manifest
+        # an earlier attempt without a response may have stored the same manifest
         return self._store.put(key, data, create=True) or self._store.get(key) == data
 
     def prune(self, row: MapRow, *, clean: bool = False) -> None:
@@ -166,13 +167,13 @@ class IndexPlace:
 
         Parameters
         ----------
-        clean : whether to remove all old versions now, instead of after GRACE_S
+        clean : whether to remove old versions at once, instead of after GRACE_S
         """
         listed = self._list(row)
         numbered = _numbered(listed)
         if self._store is None or not numbered:
             return
-        now = max(one.changed_at for one in listed)  # the time of the store's clock
+        now = max(one.changed_at for one in listed)  # by the clock of the object store
         before = math.inf if clean else now - GRACE_S
         fetchable = [one for one, after in pairwise(numbered) if after.changed_at >= before]
         needed = set[str]()
@@ -190,7 +191,10 @@ class IndexPlace:
             self.prune(row, clean=True)
 
     def remove_all_but(self, row: MapRow, head: IndexManifest | None) -> bool:
-        """Remove all versions of a map's index but one; return False if another process builds."""
+        """Remove all versions of the index of a map except `head`.
+
+        Return False without removal if another process is building the index.
+        """
         with self.turn(row) as mine:
             if mine is None:
                 return False
@@ -206,11 +210,12 @@ class IndexPlace:
         return [one for one, _ in manifests(folder)] == [number] or clear(folder, but=number)
 
     def sweep(self, *, now: bool = False) -> None:
-        """Remove indexes of deleted maps from the object store, on one host at a time.
+        """Remove indexes of deleted maps from the object store, at intervals, on one host at a
+        time.
 
         Parameters
         ----------
-        now : whether to ignore the interval since the last removal
+        now : whether to ignore the interval
         """
         if self._store is None:
             return
@@ -236,7 +241,7 @@ class IndexPlace:
                 log.info("index removed", extra={"folder": folder.name})
 
     def _known(self) -> dict[str, MapRow]:
-        """Return all maps by the names of their folders, including those of next models."""
+        """Return all maps by the names of their index folders, including folders of next models."""
         with self._database.read() as connection:
             rows = list_maps(connection)
         rows += [replace(r, model_id=r.next_model_id) for r in rows if r.next_model_id is not None]
@@ -246,7 +251,8 @@ class IndexPlace:
         return [one for one in self._indexes.glob("*") if is_index_folder(one.name)]
 
     def want(self, row: MapRow, version: IndexVersion | None) -> None:
-        """Fetch a newer index of a queried map in the background, if it is due.
+        """Check for a newer index of a queried map, at intervals, and download it in the
+        background.
 
         Parameters
         ----------
@@ -260,7 +266,7 @@ class IndexPlace:
             self._looked[folder.name] = time.monotonic()
             _mark_used(folder)
             if row.revision - since <= self._tail_frames:
-                return  # a newer version is not due yet
+                return
             self._wanted[folder.name] = row
             if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._fetch, daemon=True, name="index")
@@ -275,23 +281,24 @@ class IndexPlace:
                 _, row = self._wanted.popitem()
             try:
                 self.sync(row, needed=False)
-            except (OSError, SceneprintError, ValueError) as error:  # queries do not need it
+            except (OSError, SceneprintError, ValueError) as error:
                 log.warning("index not fetched", extra={"map": row.name, "error": str(error)})
 
     def sync(self, row: MapRow, *, needed: bool = True) -> IndexManifest | None:
-        """Fetch the newest index of a map into the folder, unless it exists.
+        """Download the newest index of a map to the folder, unless it is there.
 
         Parameters
         ----------
-        needed : whether to fetch it even if the cache has no room
+        needed : whether to download the index even if the cache is full
 
         Returns
         -------
-        manifest : manifest of the local version; None if there is none that the database confirms
+        manifest : manifest of the local version; None without a version consistent with the
+            database
 
         Raises
         ------
-        DamagedIndex : If the shared index is damaged; it is withdrawn, and workers rebuild it.
+        DamagedIndex : If the shared index is damaged. It is withdrawn, and workers rebuild it.
         """
         folder, manifest = self.folder(row), self.head(row)
         if self._store is None or manifest is None or manifest.model_id != row.model_id:
@@ -309,14 +316,14 @@ class IndexPlace:
             return None
         with folder_turn(folder) as mine:
             if not mine:
-                return None  # another process is fetching or building it
+                return None  # another process is downloading or building the index
             try:
-                # small parts first, since they are soon merged and removed from the object store
+                # download small parts first, since merges soon remove them from the object store
                 for name, size in sorted(manifest.files, key=lambda each: each[1]):
                     if not _is_here(folder, name, size):
                         self._get(self._store, folder, name, size)
             except UnusableStore:
-                remove_unneeded(folder)  # purges ignore unlisted parts
+                remove_unneeded(folder)  # since purges ignore unlisted parts
                 raise
             except (DamagedIndex, FileNotFoundError) as error:
                 remove_unneeded(folder)
@@ -326,17 +333,17 @@ class IndexPlace:
                         f"{self._store.url}: index {manifest.number} of map {row.name!r} is "
                         "damaged and was withdrawn. A worker will rebuild it."
                     ) from error
-                return None  # a newer version has replaced it
+                return None  # replaced by a newer version
             write_manifest(folder, manifest)
             keep_only(folder, {manifest.number})
         _mark_used(folder)
         return manifest
 
     def purge_local(self) -> None:
-        """Remove local indexes that have contained deleted frames since the last call.
+        """Remove local indexes that still contain the same deleted frames as at the last call.
 
-        A node without workers calls this in intervals of half the purge deadline, during which
-        workers publish an index without these frames.
+        Call this on nodes without workers, at intervals of half the purge deadline. Between two
+        calls, workers publish an index without these frames.
         """
         if self._store is None:
             return
@@ -351,17 +358,20 @@ class IndexPlace:
                     log.warning("purge incomplete", extra=extra)
 
     def _purge_folder(self, row: MapRow, folder: Path) -> None:
-        with suppress(UnusableStore, DamagedIndex):  # a newer index is optional
+        with suppress(UnusableStore, DamagedIndex):
             self.sync(row)
         number, path = manifests(folder)[0]
-        # by names of the parts with keys, which remain when more frames are removed
+        # compare names of key files, which do not change when further frames are deleted
         stale = self.stale_keys(row, read_manifest(path))
         if stale & self._stale.get(folder.name, frozenset()) or len(manifests(folder)) > 1:
             clear(folder, but=None if stale else number)
         self._stale[folder.name] = stale
 
     def _make_room(self, size: int, keep: Path) -> bool:
-        """Evict the least recently used indexes; return whether there is room for `size` bytes."""
+        """Evict the least recently used indexes, except `keep`, to make room for `size` bytes.
+
+        Return whether there is enough room.
+        """
         sizes = {o: sum(file.stat().st_size for file in o.glob("*.*")) for o in self._folders()}
         total = size + sum(sizes.values())
         for folder in sorted(sizes, key=_used_at):
@@ -404,7 +414,7 @@ class IndexPlace:
             return None
 
     def _delete(self, keys: Iterable[str]) -> None:
-        """Remove objects, manifests first, so that they list only existing parts."""
+        """Remove objects, manifests first, so that no manifest lists a missing part."""
         if self._store is not None:
             self._store.delete(*sorted(keys, key=lambda key: not key.endswith(".json")))
 
@@ -431,7 +441,7 @@ def _is_here(folder: Path, name: str, size: int) -> bool:
 
 
 def _mark_used(folder: Path) -> None:
-    """Set the time of last use of a local index, if it exists."""
+    """Set the last use of a local index to now, if the index exists."""
     with suppress(OSError):
         (folder / _USED).touch(PRIVATE_FILE)
 

@@ -1,9 +1,9 @@
-"""Readers of local indexes, which include all signatures of the database at the time of a query.
+"""Readers of local indexes, which add the signatures that an index does not contain yet.
 
-A `Reader` holds the newest version of a map's index and a tail of newer frames. It provides
-immutable `IndexView`s, and creates a new view when the map has changed. If there is no local index,
-all signatures are in the tail and are compared exactly until a worker publishes an index.
-Signatures with the metric L1 have no index.
+A `Reader` consists of the newest version of the index of a map and a tail of newer frames. It
+provides immutable `IndexView`s, and creates a new view when the map has changed. Without an index,
+all signatures are in the tail, and are compared exactly. Signatures with the metric L1 never have
+an index.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class IndexView:
-    """A map at one revision: a version of its index, and newer frames.
+    """The signatures of a map at a revision: a version of its index, and newer frames.
 
     Parameters
     ----------
     size : number of searchable frames
-    dead : deleted frames in the index or the tail
-    damaged : frames that were skipped because their signatures are damaged
+    dead : numbers of deleted frames in the index or the tail
+    damaged : numbers of frames without a readable signature
     version : version of the index; None without an index
     """
 
@@ -77,7 +77,7 @@ class IndexView:
         self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
         exact: bool = False,
     ) -> SearchHits:  # fmt: skip
-        """Return the nearest frames by exact distance; see `index.search`."""
+        """Return the `size` nearest frames, sorted by exact distance; see `index.search`."""
         return search(
             query, self.version, self.tail, size, metric=self.metric, dead=dead, among=among,
             exact=exact,
@@ -87,7 +87,7 @@ class IndexView:
         self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
         among: Keys | None = None,
     ) -> int:  # fmt: skip
-        """Return the number of frames before one in the order of exact distances, then of keys."""
+        """Count the frames nearer than frame `key` at `distance`; ties are sorted by key."""
         hits = self.search(query, max(self.size, 1), dead=dead, among=among, exact=True)
         same = (hits.distances == distance) & (hits.keys < key)
         return int(((hits.distances < distance) | same).sum())
@@ -97,7 +97,7 @@ class IndexView:
         return signatures_of(keys, self.version, self.tail)
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Return which frames (n,) are searchable."""
+        """Return a mask (n,) of the frames that the view contains."""
         included = self.tail.places.of(keys) >= 0
         if self.version is not None:
             included |= self.version.has(keys)
@@ -105,18 +105,19 @@ class IndexView:
         return alive
 
 
-#: Size of signatures in bytes up to which they are in memory. Larger tails are in a mapped file,
-#: whose pages the kernel can evict, since a map without an index may not fit in memory.
+#: Maximum size of signatures in memory, bytes. Larger tails are in a mapped file, whose pages the
+#: kernel can evict.
 IN_MEMORY = 256 << 20
 
 
 class AppendBuffer:
-    """A growing buffer of signatures by revision, whose returned tails never change.
+    """A growing buffer of signatures, sorted by revision; tails that it returned never change.
 
     Parameters
     ----------
     length : length of a signature in bytes
-    folder : folder for a mapped file; the system's temporary folder is the fallback
+    folder : folder for a mapped file; the fallback is the temporary folder of the system
+    capacity : initial capacity in signatures
     """
 
     def __init__(self, length: int, folder: Path, capacity: int = 64) -> None:
@@ -131,11 +132,11 @@ class AppendBuffer:
 
     @property
     def bytes_held(self) -> int:
-        """Memory in bytes that the kernel cannot evict."""
+        """Size in bytes of the memory that the kernel cannot evict."""
         return self._rows.nbytes if self._rows.nbytes <= IN_MEMORY else 0
 
     def reserve(self, more: int) -> None:
-        """Reserve capacity for more signatures, which avoids repeated copies.
+        """Reserve capacity for `more` signatures, to avoid repeated copies.
 
         Raises
         ------
@@ -144,25 +145,25 @@ class AppendBuffer:
         n = len(self)
         if n + more > self._capacity:
             length = self._rows.shape[1]
-            # double the capacity, but by at most IN_MEMORY bytes
+            # double the capacity, but add at most IN_MEMORY bytes
             step = min(self._capacity, max(IN_MEMORY // length, 64))
             capacity = max(n + more, self._capacity + step)
-            rows = self._allocate(capacity, length)  # this may fail, so it comes first
-            rows[:n] = self._rows[:n]  # views still use the old arrays
+            rows = self._allocate(capacity, length)  # first, since this may fail
+            rows[:n] = self._rows[:n]  # a copy, since views use the old array
             new = np.empty(capacity - n, np.int64)
             self._keys = np.concatenate([self._keys[:n], new])
             self._revisions = np.concatenate([self._revisions[:n], new])
             self._capacity, self._rows = capacity, rows
 
     def append(self, change: SignatureChange, row: Bytes) -> None:
-        """Append the signature of a frame that the buffer lacks."""
+        """Append the signature of a frame that is not in the buffer."""
         self.reserve(1)
         n = len(self)
         self._keys[n], self._revisions[n], self._rows[n] = change.number, change.revision, row
         self._places[change.number] = n
 
     def copy(self, after: int, without: Collection[int] = ()) -> AppendBuffer:
-        """Return a copy with the signatures after a revision, without some keys."""
+        """Copy the signatures after a revision, except those of the frames `without`."""
         n = len(self)
         selected = (self._revisions[:n] > after) & ~np.isin(self._keys[:n], list(without))
         places = np.flatnonzero(selected)
@@ -174,7 +175,7 @@ class AppendBuffer:
         return result
 
     def revision_of(self, key: int) -> int:
-        """Return the revision of a frame's signature; 0 if the frame is missing."""
+        """Return the revision of the signature of a frame; 0 if the frame is not in the buffer."""
         place = self._places.get(key)
         return 0 if place is None else int(self._revisions[place])
 
@@ -192,13 +193,13 @@ class AppendBuffer:
 
 
 def _nameless(folder: Path, size: int) -> mmap.mmap:
-    """Return a new mapped file of `size` bytes, which is removed with its last user."""
+    """Map a new temporary file of `size` bytes; raise UnusableStore if the disk is full."""
     failed: OSError | None = None
     for place in (folder, Path(tempfile.gettempdir())):
         try:
             make_folder(place)
             with tempfile.TemporaryFile(dir=place) as file:
-                # allocated now, since a full disk would kill the process when a page is written
+                # allocate now: on a full disk, a later write to a page would kill the process
                 os.posix_fallocate(file.fileno(), 0, size)
                 return mmap.mmap(file.fileno(), size)
         except OSError as error:
@@ -209,18 +210,16 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
     ) from failed
 
 
-#: Number of new frames above which a reader starts again with a newer index, if there is one.
+#: Number of new frames above which a reader restarts with a newer index instead of reading them.
 READ_MOST = 20_000
-#: Seconds between checks for a newer version, and until a damaged or unreadable version is
-#: tried again.
+#: Seconds between checks for a newer version, and until an unreadable version is tried again.
 _LOOK_S, _AGAIN_S = 1.0, 60.0
 
 
 def index_folder(indexes: Path, row: MapRow) -> Path:
     """Return the folder of the index of a map.
 
-    The name is unique to the map (even among maps with the same name), the model, since signatures
-    of models are not comparable, and the schema, so that versions of sceneprint can coexist.
+    The name is unique for each map (even for maps of the same name), model and schema version.
     """
     created = f"{row.number}-{round(1e6 * row.created_at):x}"
     return indexes / f"{row.name}-{created}-{row.model_id[:12]}.{SCHEMA_VERSION}"
@@ -232,7 +231,7 @@ _FOLDER_NAME = re.compile(
 
 
 def is_index_folder(name: str) -> bool:
-    """Return whether a name was created by `index_folder`."""
+    """Return whether a name is that of an index folder of any map."""
     return _FOLDER_NAME.fullmatch(name) is not None
 
 
@@ -241,10 +240,10 @@ Published = TypeVar("Published", IndexVersion, IndexManifest)
 
 
 def trusted(connection: Connection, row: MapRow, published: Published | None) -> Published | None:
-    """Return a version if it is consistent with the database, else None.
+    """Return a version of an index if it is consistent with the database, else None.
 
-    It is not if the database was restored to an earlier state, or rows of frames that were deleted
-    after the version have been removed.
+    It is inconsistent if the database was restored to an earlier state, or no longer has the rows
+    of frames that were deleted after the version.
     """
     if published is None or published.revision < row.pruned_revision:
         return None
@@ -260,20 +259,20 @@ class Reader:
         self._folder, self._model = folder, model
         self._looked = self._asked = time.monotonic()
         self._lock = threading.Lock()
-        self._unsound = 0, 0.0  # number of an unusable version, and time of the next attempt
+        self._unsound = 0, 0.0  # number of an unreadable version, and time of the next attempt
         self._begin(connection, row)
 
     def _begin(self, connection: Connection, row: MapRow) -> None:
-        """Start with the newest version and an empty tail."""
+        """Restart with the newest version and an empty tail."""
         self._tail = AppendBuffer(self._model.signature_bytes, self._folder.parent)
-        self._dead: dict[int, int] = {}  # revisions of frames that were deleted after the version
+        self._dead: dict[int, int] = {}  # frames deleted after the version, with their revision
         self._damaged: set[int] = set()
         version = self._newest(connection, row, None)
         self._publish(version, 0 if version is None else version.revision)
 
     @property
     def version(self) -> IndexVersion | None:
-        """Current version of the index."""
+        """Current version of the index; None without an index."""
         return self._view.version
 
     @property
@@ -282,7 +281,7 @@ class Reader:
         return self._tail.bytes_held
 
     def is_outdated(self) -> bool:
-        """Return whether there is another usable version."""
+        """Return whether another usable version exists."""
         number = self._newest_number()
         unsound, until = self._unsound
         return number not in (None, self._view.number) and (
@@ -290,15 +289,15 @@ class Reader:
         )
 
     def lost_index(self, idle_s: float) -> bool:
-        """Return whether the reader was idle for `idle_s` seconds and its index was removed."""
+        """Return whether the reader was idle for `idle_s` seconds, and its index was removed."""
         idle = time.monotonic() - self._asked > idle_s
         return idle and self._view.number > 0 and newest_number(self._folder) is None
 
     def view(self, connection: Connection, row: MapRow) -> IndexView:
-        """Return a view at the row's revision or later."""
+        """Return a view of the map at the revision of `row` or later."""
         self._asked = time.monotonic()
         behind = self._view.revision < row.revision
-        # a mere check for a newer version does not wait for the lock
+        # wait for the lock only to catch up, not to check for a newer version
         if (behind or self._is_time()) and self._lock.acquire(blocking=behind):
             try:
                 if self._view.revision < row.revision:
@@ -310,7 +309,7 @@ class Reader:
         return self._view
 
     def purge(self, connection: Connection, row: MapRow) -> None:
-        """Remove signatures of deleted frames from the tail, and switch to the newest version."""
+        """Switch to the newest version, and remove signatures of deleted frames from the tail."""
         with self._lock:
             if self._view.revision < row.revision:
                 self._catch_up(connection, row)
@@ -337,20 +336,19 @@ class Reader:
     def _take(self, change: SignatureChange) -> None:
         self._damaged.discard(change.number)
         if change.deleted:
-            self._dead[change.number] = change.revision  # a newer version may contain it
+            self._dead[change.number] = change.revision
         elif change.vector is None:
-            # the other frames remain searchable
             log.error("damaged signature skipped", extra={"frame_id": change.frame_id})
             self._damaged.add(change.number)
         elif self._tail.revision_of(change.number) < change.revision:
-            # otherwise, an interrupted call has already appended it
+            # else appended already, by an interrupted call
             if self._tail.revision_of(change.number):  # a damaged frame was signed again
                 self._tail = self._tail.copy(0, without={change.number})
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))
-            self._dead.pop(change.number, None)  # another model may have rejected the frame
+            self._dead.pop(change.number, None)  # another model had rejected the frame
 
     def _swap(self, connection: Connection, row: MapRow) -> None:
-        """Switch to another version if there is one, and keep newer frames as the tail."""
+        """Switch to another version if one is available; newer frames remain in the tail."""
         self._looked = time.monotonic()
         view = self._view
         if not self.is_outdated():
@@ -362,7 +360,7 @@ class Reader:
             version is None or version.number == view.number
             or not since <= version.revision <= view.revision
         ):  # fmt: skip
-            if version is not None and version.revision < since:  # a shared version may be older
+            if version is not None and version.revision < since:  # an older, shared version
                 self._unsound = version.number, time.monotonic() + _AGAIN_S
             return
         self._tail = self._tail.copy(version.revision)
@@ -390,7 +388,7 @@ class Reader:
         included = np.isin(deleted, tail.keys)
         if version is not None:
             included |= version.has(deleted)
-            both = int(version.has(tail.keys).sum())  # frames that were signed again
+            both = int(version.has(tail.keys).sum())  # frames signed again
         dead = frozenset(deleted[included].tolist())
         size = len(version or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)

@@ -1,4 +1,4 @@
-"""Queries: sign a frame with the model of the queried maps, and search the maps for it.
+"""Queries: signing of a frame with the model of the queried maps, and search of the maps.
 
 upload | stored frame, names of maps  -->  Answer
 """
@@ -58,16 +58,17 @@ from sceneprint_client.api.query import MOST_MAPS, MOST_OF_SEQUENCE, Localizatio
 
 T = TypeVar("T")
 
-#: Maximum number of attempts of a query while its maps switch models.
+#: Maximum number of attempts of a query whose maps switch models.
 TRIES = 5
 
 
 def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]) -> T:
-    """Run a query, and repeat it if one of its maps switched to another model in the meantime.
+    """Run a query; repeat it if one of its maps switched to another model meanwhile.
 
     Parameters
     ----------
-    ask : function that signs and answers the query with the model of the maps
+    maps : names of the maps
+    ask : function that answers the query with the model of the maps
 
     Raises
     ------
@@ -84,28 +85,28 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
             if now is None:
                 raise
         else:
-            # artifacts of the former model may have been removed during a successful query
+            # check even after success, since artifacts of the former model may have been removed
             now = _other_models(store, rows)
             if now is None:
                 return result
         rows = now
     raise Busy(
-        f"Map {', '.join(map(repr, maps))} kept changing its model during the query. Send the "
-        "query again."
+        f"Map {', '.join(map(repr, maps))} switched its model repeatedly during the query. Send "
+        "the query again."
     )
 
 
-def check_model(one: str, other: str) -> None:
-    """Raise ModelMismatch unless two ids of models are equal."""
-    if one != other:
+def check_model(first: str, second: str) -> None:
+    """Raise ModelMismatch if two model ids differ."""
+    if first != second:
         raise ModelMismatch(
-            f"Signatures of two models cannot be compared: {one[:12]} and {other[:12]}. Send the "
-            "query again."
+            f"Signatures of two models cannot be compared: {first[:12]} and {second[:12]}. Send "
+            "the query again."
         )
 
 
 def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
-    """Return the current rows if a map has another model now, else None."""
+    """Return the current rows of maps if a map has switched its model; None if no map has."""
     try:
         with store.database.read() as connection:
             rows_now = find_maps(connection, [row.name for row in rows])
@@ -126,7 +127,8 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     Parameters
     ----------
-    how : options of the comparison; its names of frames are ignored
+    a, b : frames
+    how : options of the comparison; its frame names are ignored
 
     Raises
     ------
@@ -182,7 +184,7 @@ def _compared(a: PreparedQuery, b: PreparedQuery, signer: Signer, how: Compariso
 
 
 def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Comparison) -> Signer:
-    """Return the signer of the stored frames' model, or, without any, of the requested model."""
+    """Return the signer of the model of the stored frames; without stored frames, that of `how`."""
     if not rows:
         return signers.of(read_model(how.model or PRESETS[0]))
     with store.database.read() as connection:
@@ -190,21 +192,22 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
     models = [f"{row.name} has {model_label(names[row.model_id], row.model_id)}" for row in rows]
     if len({row.model_id for row in rows}) > 1:
         raise InvalidRequest(
-            f"Frames of two models cannot be compared: map {' and map '.join(models)}. Compare "
-            "frames of maps that share a model, or upload one of them.",
+            "Frames of maps with different models cannot be compared: map "
+            f"{' and map '.join(models)}. Compare frames of maps with the same model, or upload "
+            "one of the frames.",
             (("frame_a", models[0]), ("frame_b", models[1])),
         )
     if how.model is not None and read_model(how.model).id != rows[0].model_id:
         raise InvalidRequest(
-            f"The stored frame was not signed with model {how.model!r}: map {models[0]}. "
-            "Omit `model`.",
+            f"The stored frame was not signed with the model {how.model!r}: map {models[0]}. Omit "
+            "`model`.",
             (("model", f"map {models[0]}"),),
         )
     return signers(rows[0].model_id)
 
 
 def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
-    """Return the names of the sensors' frames, derived from `a` and `b` if the ids are equal."""
+    """Return the names of the two sensor frames, with the ids `a` and `b` if the ids are equal."""
     ids = [x if one.frame is None else one.frame[1] for x, one in (("a", a), ("b", b))]
     if ids[0] == ids[1]:
         ids = ["a", "b"]
@@ -212,7 +215,7 @@ def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
 
 
 class Queries:
-    """Queries to one or more maps of one model."""
+    """Queries to one or more maps of the same model."""
 
     def __init__(self, context: Context) -> None:
         self._store, self._signers, self._readers = context.store, context.signers, context.readers
@@ -222,13 +225,14 @@ class Queries:
         self, maps: Sequence[str], data: bytes, meta: FrameMeta, query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Search maps for an uploaded frame, which is not stored; see `prepare_upload`.
+        """Search maps for an uploaded frame, without storing it; see `prepare_upload`.
 
         Parameters
         ----------
-        maps : names of the maps, each once
-        since : time of the request by `time.perf_counter`; None stands for the present
-        sent : entry of the query log; None leaves the query out of the log
+        maps : distinct names of the maps
+        query : options of the query
+        since : time of the request by `time.perf_counter`; None selects the current time
+        sent : request for the query log; None does not log the query
 
         Raises
         ------
@@ -249,18 +253,19 @@ class Queries:
         self, map_name: str, frames: Sequence[tuple[bytes, FrameMeta]], query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Localise the last frame of a sequence; the earlier frames vote for its pose.
+        """Localise the last frame of a sequence; earlier frames vote for its pose.
 
         Parameters
         ----------
-        frames : uploads and metadata in order of capture, with odometry as poses in a common
+        frames : uploads and metadata in chronological order, with odometry as poses in a common
             parent frame
-        query : options of the query of each frame
+        query : options for each frame
+        since, sent : see `upload`
 
         Raises
         ------
         UnknownMap : If the map does not exist.
-        InvalidRequest : If there are fewer than 2 frames or too many, or odometry is missing.
+        InvalidRequest : See `check_sequence`.
         """
         check_sequence([meta for _, meta in frames], query)
         deadline = Deadline(query.deadline_ms, since)
@@ -280,12 +285,12 @@ class Queries:
         self, maps: Sequence[str], frame: FrameName, query: Query, since: float | None = None,
         sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Search maps for a stored frame, excluding itself; see `prepare_stored` and `upload`."""
+        """Search maps for a stored frame, except itself; see `prepare_stored` and `upload`."""
         deadline = Deadline(query.deadline_ms, since)
 
         def ask(rows: list[MapRow]) -> Answer:
             self._check_models(rows)
-            self._signers(rows[0].model_id)  # loading takes long, so no connection is in use yet
+            self._signers(rows[0].model_id)  # slow, so before a connection is opened
             ready = prepare_stored(self._store, self._signers, frame.map, frame.frame_id, query)
             return self.answer(rows[: len(maps)], ready, query, deadline, sent=sent)
 
@@ -297,7 +302,7 @@ class Queries:
         self, maps: Sequence[str], stored: StoredAnswer, query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Repeat a query whose answer is stored; an upload need not be sent again.
+        """Repeat a query whose answer is stored, without sending its upload again.
 
         Parameters
         ----------
@@ -306,8 +311,8 @@ class Queries:
         Raises
         ------
         UnknownMap, UnknownFrame : If a map or the query's stored frame no longer exists.
-        NotIndexed : If validation is requested, but the upload was sent without it; or if a map has
-            another model than the stored signature.
+        NotIndexed : If validation is requested, but the upload was queried without it, or if a map
+            has another model than the stored signature.
         InvalidRequest : See `prepare_upload` and `prepare_stored`.
         """
         frame = stored.answer.frame
@@ -330,8 +335,8 @@ class Queries:
             for row in rows:
                 if row.model_id != stored.model_id:
                     raise NotIndexed(
-                        f"The query was not signed with the model of map {row.name!r}, and its "
-                        "upload is not stored. Send the frame again."
+                        f"The query was signed with another model than that of map {row.name!r}, "
+                        "and its upload is not stored. Send the frame again."
                     )
             return self.answer(rows, prepared, query, deadline, sent=sent)
 
@@ -341,7 +346,7 @@ class Queries:
         self, expected: Sequence[MapRow], prepared: PreparedQuery, query: Query, deadline: Deadline,
         earlier: Sequence[SequenceFrame] = (), sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Answer a prepared query from the current maps, and log it; see `answer`."""
+        """Answer a prepared query with the current state of its maps, and log it; see `answer`."""
         database = self._store.database
         with database.read() as connection:
             rows = find_maps(connection, [one.name for one in expected])
@@ -394,17 +399,17 @@ class Queries:
     def maps_of(
         self, query: SeveralQuery, may_read: Callable[[str], bool] = lambda _: True
     ) -> list[str]:
-        """Return the names of the maps that a query searches, each once.
+        """Return the distinct names of the maps that a query searches.
 
         Parameters
         ----------
-        query : query with names of maps, or `*` for all readable ones
+        query : query with map names; `*` selects all readable maps
         may_read : function that returns whether the caller may read a map
 
         Raises
         ------
-        UnknownMap : If a map does not exist or is not readable, or there are no maps.
-        InvalidRequest : If there are more maps than a query can search.
+        UnknownMap : If a map does not exist or is not readable, or no map is readable.
+        InvalidRequest : If there are more than MOST_MAPS maps.
         """
         if query.maps != "*":
             for name in query.maps:
@@ -414,7 +419,7 @@ class Queries:
         with self._store.database.read() as connection:
             names = [row.name for row in list_maps(connection) if may_read(row.name)]
         if not names:
-            raise UnknownMap("There is no map to search. Create one, or check the key's grants.")
+            raise UnknownMap("There is no map to search. Create a map, or check your grants.")
         if len(names) > MOST_MAPS:
             raise InvalidRequest(
                 f"There are {len(names)} maps, but a query can search at most {MOST_MAPS}. Specify "
@@ -438,7 +443,7 @@ class Queries:
 
 
 def check_sequence(metas: Sequence[FrameMeta], query: Query) -> None:
-    """Raise InvalidRequest unless frames can be queried as a sequence."""
+    """Raise InvalidRequest if the length or the odometry of a sequence is not valid."""
     check_localizes(query)
     if not 2 <= len(metas) <= MOST_OF_SEQUENCE:
         raise InvalidRequest(
@@ -449,23 +454,23 @@ def check_sequence(metas: Sequence[FrameMeta], query: Query) -> None:
     without = [i for i, meta in enumerate(metas) if meta.pose is None]
     parents = {meta.pose.parent_frame for meta in metas if meta.pose is not None}
     if without or len(parents) > 1:
-        what = f"frame {without[0]} has no pose" if without else "they have several parent frames"
+        what = f"frame {without[0]} has no pose" if without else "the parent frames differ"
         raise InvalidRequest(
-            f"The frames of a sequence need odometry, but {what}. Send each with `pose` in one "
-            "parent frame, such as odom.",
+            f"The frames of a sequence need odometry, but {what}. Send each frame with `pose` in "
+            "the same parent frame, such as odom.",
             (("metas", what),),
         )
 
 
 def _odometry(frame: PreparedQuery) -> Floats:
-    """Return T_odom_sensor of a frame of a sequence."""
+    """Return T_odom_sensor (4, 4) of a frame of a sequence."""
     if frame.pose is None:
         raise ValueError("a frame of a sequence without a pose")
     return frame.pose
 
 
 def check_localizes(query: Query) -> None:
-    """Raise InvalidRequest unless a query includes validation, which a pose needs."""
+    """Raise InvalidRequest if a query omits validation, which a pose requires."""
     if "validate" not in query.stages:
         raise InvalidRequest(
             "A pose requires validated matches. Omit `stages`, or include `validate`.",
@@ -474,7 +479,7 @@ def check_localizes(query: Query) -> None:
 
 
 def localization_of(answer: Answer) -> Localization:
-    """Return the pose and the confidence of a validated query to one map."""
+    """Convert the answer to a validated query of one map to a pose with its confidence."""
     accepted = [one for one in answer.matches if one.validation.status == "accepted"]
     status: LocalizationStatus = "not_found"
     if answer.status in ("found", "ambiguous"):
@@ -482,7 +487,7 @@ def localization_of(answer: Answer) -> Localization:
     location = answer.location
     best_pose = location if location is not None else next(iter(answer.alternatives), None)
     strength = location.strength if location is not None else None
-    if location is None and status == "found":  # the accepted matches have no poses
+    if location is None and status == "found":  # the accepted matches have no pose
         strength = accepted[0].validation.strength
     return Localization(
         status=status,

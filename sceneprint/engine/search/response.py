@@ -1,4 +1,4 @@
-"""API records of matches and poses, and explanations of the ranking.
+"""API records of matches and poses, and explanations of rankings.
 
 Candidates, Validated  --match_records | explain-->  Match | Explanation of each
 frame id, Searched, Validated  --why-->  ExplainedFrame
@@ -63,19 +63,19 @@ from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Unc
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """The candidates of a query with the data of their records.
+    """The candidates of a query, with the data that their records need.
 
     Parameters
     ----------
-    maps : names of the queried maps, by number
+    maps : names of the queried maps, by map number
     ranking : R, of frame numbers
     selection : C; None if diversification was not requested
-    rows : rows of the candidates by number, without frames that were deleted during the query
+    rows : rows of the candidates that still exist, by frame number
     unreadable : errors of unreadable artifacts, by frame number
-    untried : reason why the remaining candidates were not validated
-    query_frame : name of the query's sensor frame in transforms
-    covariance : parameters of the model that define free directions
-    base : name of the robot's base frame, and T_base_query (4, 4); None if unknown
+    untried : reason why the other candidates were not validated
+    query_frame : name of the sensor frame of the query
+    covariance : parameters that define free directions
+    base : name of the base frame of the robot, and T_base_query (4, 4); None if unknown
     """
 
     maps: dict[int, str]
@@ -89,7 +89,7 @@ class Candidates:
     base: tuple[str, Floats] | None = None
 
     def base_of(self, T_parent_query: Floats | None, parent: str) -> Transform | None:
-        """Return the pose of the robot's base; None if the base or the query's pose is unknown."""
+        """Return the pose of the robot base; None if the base or the query pose is unknown."""
         if self.base is None or T_parent_query is None:
             return None
         name, T_base_query = self.base
@@ -97,7 +97,7 @@ class Candidates:
 
 
 def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
-    """Return matches in their order, without accepted ones beyond the first `k`."""
+    """Return matches without the accepted matches beyond the first `k`."""
     accepted = [one.index for one in matches if one.validation.status == "accepted"]
     return [one for one in matches if one.index not in accepted[k:]]
 
@@ -105,7 +105,7 @@ def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
 def match_records(
     candidates: Candidates, chosen: Sequence[int], matches: Sequence[PairMatch]
 ) -> list[MatchRecord]:
-    """Return the records of the validated candidates in their order, then of the others by rank."""
+    """Return match records: first validated candidates in their order, then the others by rank."""
     position = {int(candidates.ranking.indices[i]): i for i in chosen}
     checks = {match.index: match.validation for match in matches}
     order = [*checks, *(number for number in position if number not in checks)]
@@ -124,7 +124,7 @@ def match_records(
 
 
 def location_record(candidates: Candidates, estimate: PoseEstimate | None) -> LocationRecord | None:
-    """Return the pose of the query; None if none was found."""
+    """Return the API record of the pose of the query; None without a pose."""
     if estimate is None or estimate.average is None:
         return None
     average, (number, _, parent) = estimate.average, estimate.parent.partition(" ")
@@ -148,7 +148,7 @@ def location_record(candidates: Candidates, estimate: PoseEstimate | None) -> Lo
 def alternative_records(
     candidates: Candidates, estimate: PoseEstimate | None
 ) -> list[AlternativeRecord]:
-    """Return the alternative poses of an ambiguous answer."""
+    """Return the API records of the alternative poses of an ambiguous answer."""
     if estimate is None:
         return []
     number, _, parent = estimate.parent.partition(" ")
@@ -165,7 +165,7 @@ def alternative_records(
 
 
 def evidence_record(evidence: PlaceEvidence | None) -> EvidenceRecord | None:
-    """Return the API record of the evidence for a pose, with numbers rounded to three decimals."""
+    """Return the API record of the evidence for a pose, rounded to three decimals."""
     if evidence is None:
         return None
     rounded = {
@@ -229,7 +229,7 @@ def _match(
 def uncertainty_record(
     covariance: Floats | None, method: Method, p: CovarianceParameters
 ) -> Uncertainty | None:
-    """Return the API record of a covariance (6, 6), with the directions that it leaves free."""
+    """Return the API record of a covariance (6, 6), including its free directions."""
     if covariance is None:
         return None
     free = [
@@ -274,7 +274,7 @@ def validation_record(v: PairValidation) -> ValidationRecord:
 def explain(
     candidates: Candidates, checks: Validated, among: Ints64 | None, p: DiversityParameters | None
 ) -> list[Explanation]:
-    """Return for each frame of R the last stage that it reached, and the reason.
+    """Explain for each frame of R which stage it reached last, and why.
 
     Parameters
     ----------
@@ -291,13 +291,13 @@ def explain(
 
 
 def figures(v: ValidationRecord) -> str:
-    """Return a validation as one line of text: status, reason and figures."""
+    """Format a validation as one line: status, reason and figures."""
     if v.residual is None:
         return f"{v.status}: {v.reason}"
     share = v.free_space_violations
     violations = "unknown" if share is None else f"{share:.3g}"
     return (
-        f"{v.status}: {v.reason} (the directions disagree by {v.residual.translation_m:.3g} m, "
+        f"{v.status}: {v.reason} (the two directions differ by {v.residual.translation_m:.3g} m, "
         f"{v.residual.rotation_deg:.3g} deg; overlap {v.overlap:.3g}, by planes "
         f"{v.plane_overlap:.3g}; violations {violations}; ambiguity "
         f"{v.ambiguity:.3g})"
@@ -310,7 +310,7 @@ def _each(
 ) -> Iterator[Explanation]:  # fmt: skip
     chosen = set(checks.chosen)
     for position, number in enumerate(candidates.ranking.indices.tolist()):
-        if number not in candidates.rows:  # the frame was deleted during the query
+        if number not in candidates.rows:  # deleted during the query
             continue
         stage: Stage = "retrieve"
         outcome: Outcome = "not_selected"
@@ -325,7 +325,7 @@ def _each(
         elif among is not None and left is not None:
             reason = _not_selected(candidates, checks, among, position, float(left[position]))
         else:
-            reason = f"not among the first {len(chosen)} of the ranking, which were the candidates"
+            reason = f"not a candidate: these were the first {len(chosen)} frames of the ranking"
         yield Explanation(
             frame_id=candidates.rows[number].id,
             map=candidates.maps[candidates.rows[number].map_number],
@@ -342,7 +342,7 @@ def _each(
 def _not_selected(
     candidates: Candidates, checks: Validated, among: Ints64, position: int, gain: float
 ) -> str:
-    """Return why a frame was not selected: its most similar selected frame, and its gain."""
+    """Return the reason why a frame was not selected, with its most similar selected frame."""
     own = among[position, list(checks.chosen)]
     nearest = checks.chosen[int(np.argmin(own))]
     row = candidates.rows.get(int(candidates.ranking.indices[nearest]))
@@ -357,7 +357,7 @@ def _not_selected(
 
 @dataclass(frozen=True, eq=False)
 class ExplainedQuery:
-    """An answered query, for the explanation of one frame."""
+    """An answered query with the data to explain one frame."""
 
     store: Store
     searched: retrieval.Searched
@@ -370,11 +370,11 @@ class ExplainedQuery:
 
 
 def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
-    """Explain at which stage a frame dropped out, and how it would align.
+    """Explain at which stage a query rejected a frame, and how the frame would align.
 
     Raises
     ------
-    UnknownFrame : If no queried map has the frame.
+    UnknownFrame : If the frame is not in the queried maps.
     """
     part, row = _locate_frame(case, frame_id)
     absent = _absent(case, part, row)
@@ -391,18 +391,18 @@ def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     rank = retrieval.rank_among_all(case.searched, case.prepared, row.number, int(distance[0]))
     at = np.flatnonzero(case.searched.ranking.indices == row.number).tolist()
     passes = part.among is None or row.number in part.among
-    # an approximate index does not report which frames it compared
+    # infer misses of an approximate index, which does not report the frames that it compared
     missed = not at and passes and not case.searched.exact and rank <= case.searched.size
     selected = bool(at) and at[0] in case.checks.chosen
     validation, T = _aligned(case, part, row)
     if missed:
         lost: Lost | None = "shortlist"
-        reason = f"the index missed it, although its rank is {rank}; query with `exact`"
+        reason = f"the approximate index missed it, although its rank is {rank}; query with `exact`"
     else:
         lost, reason = _lost(case, row, rank, passes, bool(at), selected)
     early = lost not in (None, "validation")
     if early and validation is not None and validation.status != "skipped":
-        reason += f"; aligned only for this explanation, it is {figures(validation)}"
+        reason += f"; validated only for this explanation, it is {figures(validation)}"
     return ExplainedFrame(
         frame_id=row.id,
         map=name,
@@ -427,7 +427,10 @@ def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
 
 
 def _locate_frame(case: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSearch, FrameRow]:
-    """Return the frame and the search of its map, preferring maps in which it can be found."""
+    """Find a frame in the queried maps; return the search of its map, and its row.
+
+    If several maps have a frame of this id, prefer a map whose search can return it.
+    """
     parts, own = case.searched.parts, case.prepared.frame
     candidates, missing = [], None
     with case.store.database.read() as connection:
@@ -438,7 +441,6 @@ def _locate_frame(case: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSea
                 missing = error
     if missing is not None and not candidates:
         raise missing
-    # another map may have a deleted frame with the same id, or the query itself
     return min(
         candidates,
         key=lambda one: (
@@ -451,10 +453,10 @@ def _locate_frame(case: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSea
 def _absent(
     case: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[Lost, str] | None:
-    """Return why a frame is excluded from the search; None if it is included."""
+    """Return the stage and the reason why the search excludes a frame; None if it does not."""
     view, prepared = part.place.view, case.prepared
     if prepared.frame is not None and prepared.frame[0] == row.number:
-        return "query", "it is the query itself, which queries exclude"
+        return "query", "it is the queried frame, which the search excludes"
     if row.state != FrameState.INDEXED:
         return "state", f"it is {row.state}: {row.state.sentence}"
     if row.number in view.damaged:
@@ -468,7 +470,7 @@ def _absent(
 def _lost(
     case: ExplainedQuery, row: FrameRow, rank: int, passes: bool, ranked: bool, selected: bool
 ) -> tuple[Lost | None, str]:
-    """Return the stage at which a frame dropped out, and the reason."""
+    """Return the stage at which a query rejected a frame (None for a match), and the reason."""
     size, checks = len(case.searched.ranking), case.checks
     if not passes:
         return "filter", "it does not pass the filter"
@@ -477,13 +479,13 @@ def _lost(
     if not selected:
         return "selection", (
             f"its rank is {rank}, and it is not among the {len(checks.chosen)} candidates; query "
-            "with more `candidates`, or with `explain` to see which candidate it resembles"
+            "with more `candidates`, or with `explain` to get the most similar candidate"
         )
     status = {match.index: match.validation for match in checks.matches}.get(row.number)
     shown = {match.index for match in listed(checks.matches, case.query.k)}
     if status is not None and row.number not in shown:
         return "turn", (
-            "more than `k` matches are accepted, and others are listed before it; "
+            "more than `k` matches are accepted, and `k` others precede it; "
             f"{figures(validation_record(status))}"
         )
     if status is not None and status.status == "accepted":
@@ -500,7 +502,7 @@ def _lost(
 def _aligned(
     case: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[ValidationRecord | None, np.ndarray | None]:
-    """Return the validation of a frame and its transform; validate it now if the query did not."""
+    """Return the validation of a frame, and its transform; if necessary, validate it now."""
     geometry = case.prepared.geometry
     if geometry is None:
         return None, None

@@ -1,4 +1,4 @@
-"""Retrieval: the ranking R of the frames of all queried maps, Sec. III-C.
+"""Retrieval: ranking R of the frames of all queried maps, Sec. III-C.
 
 maps  --Readers.view-->  IndexViews  --search_maps-->  Searched
 """
@@ -40,14 +40,15 @@ from sceneprint.types import Bytes, Floats, Geometry
 from sceneprint_client.api import Filter, FrameMeta, FrameName, Query
 from sceneprint_client.api.frames import Kind
 
-#: Memory of all tails in bytes above which the readers of least recently queried maps are closed.
+#: Maximum total size of tails in bytes; beyond it, readers of the least recently queried maps are
+#: closed.
 HELD_BYTES = 1 << 30
-#: Seconds between searches for readers of deleted maps.
+#: Seconds between checks for readers of deleted maps.
 _TIDY_S = 10.0
 
 
 class Readers:
-    """The readers of all queried maps, with indexes from `place`."""
+    """Readers of all queried maps; safe to share between threads."""
 
     def __init__(self, signers: Signers, place: IndexPlace) -> None:
         self._signers, self._place = signers, place
@@ -57,7 +58,7 @@ class Readers:
         self._tidied = time.monotonic()
 
     def view(self, connection: Connection, row: MapRow) -> IndexView:
-        """Return a view of a map at the row's revision or later."""
+        """Return a view of a map at the revision of `row` or later."""
         reader = self._reader(connection, row)
         if time.monotonic() - self._tidied >= _TIDY_S:
             self.tidy(connection)
@@ -65,17 +66,17 @@ class Readers:
 
     def _reader(self, connection: Connection, row: MapRow) -> Reader:
         with self._lock:
-            if self._history != self._database.history:  # a restored database reuses revisions
+            if self._history != self._database.history:  # restored databases reuse revisions
                 self._history = self._database.history
                 self._open.clear()
             open_key, reader = self._open.get(row.name, (None, None))
             key = (row.number, row.model_id)
-            if reader is None or open_key != key:  # a new map, or another model
+            if reader is None or open_key != key:  # new map or model
                 model = self._signers(row.model_id).model
                 reader = Reader(connection, row, self._place.folder(row), model)
                 self._open[row.name] = (key, reader)
             self._open.move_to_end(row.name)
-            # the least recently queried first, but never the current one
+            # close the least recently queried readers, but never the current one
             held_bytes = sum(one.bytes_held for _, one in self._open.values())
             while len(self._open) > 1 and held_bytes > HELD_BYTES:
                 _, (_, oldest) = self._open.popitem(last=False)
@@ -90,7 +91,7 @@ class Readers:
             self._open.pop(name, None)
 
     def purge(self, connection: Connection) -> None:
-        """Remove deleted frames from memory, except those in the newest indexes."""
+        """Remove deleted frames from memory, except from the newest indexes."""
         self.tidy(connection)
         with self._lock:
             readers = list(self._open.items())
@@ -101,9 +102,9 @@ class Readers:
                 reader.purge(connection, row)
 
     def tidy(self, connection: Connection) -> None:
-        """Close the readers of maps that another process deleted or switched to another model.
+        """Close readers of maps that another process deleted or switched to another model.
 
-        Their deleted files occupy disk space and file descriptors while they are mapped.
+        While mapped, their deleted files occupy disk space and file descriptors.
         """
         statement = select(maps.c.name, maps.c.number, maps.c.model_id)
         rows = {row.name: (row.number, row.model_id) for row in connection.execute(statement)}
@@ -112,7 +113,7 @@ class Readers:
             for name in [name for name, (key, _) in self._open.items() if rows.get(name) != key]:
                 del self._open[name]
             for name, (_, reader) in list(self._open.items()) if self._place.is_shared else ():
-                if reader.lost_index(IN_USE_S):  # mapped files still occupy disk space
+                if reader.lost_index(IN_USE_S):
                     del self._open[name]
 
 
@@ -122,17 +123,18 @@ class PreparedQuery:
 
     Parameters
     ----------
-    model_id : id of the model that signed it
+    model_id : id of the model of the signature
     vector : (D,) signature
     geometry : geometry; None without validation
-    origin : robot, session and time of capture
-    frame : number and id of a stored frame, which queries exclude; None for an upload
-    prepare_ms : duration of the preparation
+    origin : robot, session and capture time
+    frame : number and id of a stored frame, which the search excludes; None for an upload
+    prepare_ms : duration of the preparation, milliseconds
     home : map of the stored frame
-    base : name of the robot's base frame, and T_base_query (4, 4); None if unknown
-    artifact : `geometry` as bytes
-    up : (3,) unit vector in the sensor frame; None if unknown
-    pose : (4, 4) T_parent_sensor of an upload, which is the odometry of a sequence
+    base : name of the base frame of the robot, and T_base_query (4, 4); None if unknown
+    artifact : encoded `geometry`
+    kind : kind of the frame
+    up : (3,) unit up vector in the sensor frame; None if unknown
+    pose : (4, 4) T_parent_sensor of an upload, the odometry of a sequence
     """
 
     model_id: str
@@ -164,8 +166,7 @@ def prepare_upload(
     Raises
     ------
     FrameError : See `read_upload`; UselessFrame if the frame has too few surfaces to sign.
-    InvalidRequest : If the filter needs the session and the time of the frame, and `meta` lacks
-        one; or see `read_upload`.
+    InvalidRequest : See `check_origin` and `read_upload`.
     """
     start = time.perf_counter()
     at = None if meta.captured_at is None else meta.captured_at.timestamp()
@@ -179,7 +180,7 @@ def prepare_upload(
             signer.model.id, vector, None, origin, None, _since(start), base=base, kind=kind, up=up
         )
     signature, seen = prepare(read.frame, signer)
-    # read back from its artifact, so that a stored frame gets the same answer
+    # decode the artifact again: it is rounded, and a stored frame must get the same answer
     artifact = write_geometry(seen)
     return PreparedQuery(
         signature.model_id, signature.vector, read_geometry(artifact), origin, None, _since(start),
@@ -190,14 +191,13 @@ def prepare_upload(
 def prepare_stored(
     store: Store, signers: Signers, map_name: str, frame_id: str, query: Query
 ) -> PreparedQuery:
-    """Load a stored frame; rebuild a damaged signature or artifact from its upload.
+    """Load a stored frame as a query; rebuild a damaged signature or artifact from its upload.
 
     Raises
     ------
     UnknownMap, UnknownFrame : If the map or the frame does not exist.
-    InvalidRequest : If the frame has no signature; or if the filter needs the session and the time
-        of the frame, and it lacks one.
-    DamagedBlob : If a damaged frame cannot be rebuilt because its upload is damaged too.
+    InvalidRequest : If the frame is not indexed; see also `check_origin`.
+    DamagedBlob : If the upload is damaged as well.
     """
     start = time.perf_counter()
     with store.database.read() as connection:
@@ -245,7 +245,10 @@ def prepare_stored(
 
 
 def check_origin(origin: QueryOrigin, query: Query) -> QueryOrigin:
-    """Return the origin of a query; raise InvalidRequest if its filter needs more."""
+    """Return the origin of a query frame.
+
+    Raise InvalidRequest if the filter has `not_within_s`, but session or time is unknown.
+    """
     if query.filter is not None and query.filter.not_within_s is not None:
         missing = [name for name in ("session", "captured_at") if getattr(origin, name) is None]
         if missing:
@@ -262,7 +265,7 @@ def _since(start: float) -> float:
     return 1e3 * (time.perf_counter() - start)
 
 
-#: Expected seconds to validate the first candidate; for later ones, the longest time so far.
+#: Assumed duration of the first validation, seconds; later, it is the longest so far.
 FIRST_S = 0.03
 
 
@@ -271,8 +274,8 @@ class Deadline:
 
     Parameters
     ----------
-    milliseconds : duration from `since`; None for no deadline
-    since : time of the request by `time.perf_counter`; None stands for the present
+    milliseconds : duration from `since`; None for no limit
+    since : time of the request by `time.perf_counter`; None selects the current time
     """
 
     def __init__(self, milliseconds: int | None, since: float | None = None) -> None:
@@ -282,7 +285,7 @@ class Deadline:
         self.reached: bool | None = None if milliseconds is None else False
 
     def allows(self) -> bool:
-        """Return whether another candidate can probably be validated in time; call it for each."""
+        """Return whether another validation is expected to end in time; call this before each."""
         if self._ends is None:
             return True
         now = time.perf_counter()
@@ -295,7 +298,7 @@ class Deadline:
 
 @dataclass(frozen=True, eq=False)
 class SearchedMap:
-    """A queried map: its row, and a view of its frames at one revision."""
+    """A queried map: its row, and a view of its signatures."""
 
     row: MapRow
     view: IndexView
@@ -307,8 +310,8 @@ class MapSearch:
 
     Parameters
     ----------
-    dead : excluded frames: deleted ones, and the query itself
-    among : frames that pass the filter; None without a filter
+    dead : numbers of excluded frames: deleted frames, and the queried frame
+    among : numbers of the frames that pass the filter; None without a filter
     size : number of searchable frames
     """
 
@@ -325,13 +328,14 @@ class MapSearch:
 
 @dataclass(frozen=True, eq=False)
 class Searched:
-    """The ranking R and its sources.
+    """Ranking R and the searches that yielded it.
 
     Parameters
     ----------
-    hits : results of the searches, in the same order
+    parts : searches of the maps
+    hits : results of `parts`
     ranking : R, of frame numbers
-    owners : (r,) indexes into `parts` of the frames of R
+    owners : (r,) index into `parts` for each frame of R
     size : requested length of R
     """
 
@@ -343,11 +347,11 @@ class Searched:
 
     @property
     def exact(self) -> bool:
-        """Whether every frame that passes the filter was compared."""
+        """Whether all frames that pass the filter were compared."""
         return all(one.exact for one in self.hits)
 
     def signatures(self) -> Bytes:
-        """Return the stored signatures (r, D) of the frames of R."""
+        """Return the signatures (r, D) of the frames of R."""
         keys = self.ranking.indices.astype(np.int64)
         first = self.parts[0].place.view
         if len(self.parts) == 1 or not len(keys):
@@ -385,7 +389,7 @@ def search_maps(
     keys = np.concatenate([one.keys for one in hits])
     all_distances = np.concatenate([one.distances for one in hits])
     owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
-    first = np.lexsort((keys, all_distances))[:size]  # ties keep the order of uploads
+    first = np.lexsort((keys, all_distances))[:size]  # ties in upload order
     distances = all_distances[first]
     shares = similarity(distances, model.unrelated_distance)
     return Searched(parts, hits, Ranking(keys[first].astype(np.intp), distances, shares),
@@ -393,7 +397,7 @@ def search_maps(
 
 
 def rank_among_all(searched: Searched, prepared: PreparedQuery, number: int, distance: int) -> int:
-    """Return the exact rank, from 1, of a frame among all frames that pass the filter."""
+    """Return the exact rank, from 1, of a frame at `distance` among all that pass the filter."""
     return 1 + sum(
         part.place.view.nearer(prepared.vector, number, distance, dead=part.dead, among=part.among)
         for part in searched.parts
@@ -404,7 +408,7 @@ def _part(store: Store, place: SearchedMap, prepared: PreparedQuery, query: Quer
     view, own = place.view, prepared.frame
     dead = view.dead if own is None else view.dead | {own[0]}
     itself = prepared.home is not None and prepared.home.number == place.row.number
-    size = max(view.size - itself, 0)  # the view may lack the query, if it was just deleted
+    size = max(view.size - itself, 0)
     among = None
     if query.filter is not None:
         among = _among(store, place, dead, prepared, query.filter)
@@ -414,7 +418,7 @@ def _part(store: Store, place: SearchedMap, prepared: PreparedQuery, query: Quer
 def _among(
     store: Store, place: SearchedMap, dead: frozenset[int], prepared: PreparedQuery, filters: Filter
 ) -> Keys:
-    """Return the frames of a view that pass a filter; the database may be newer than the view."""
+    """Return the numbers of the frames in a view, except `dead`, that pass a filter."""
     view = place.view
     with store.database.read() as connection:
         numbers = passing_frames(connection, place.row.number, filters, prepared.origin)

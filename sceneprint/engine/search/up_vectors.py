@@ -1,6 +1,6 @@
-"""Up vectors in the sensors of frames and in parent frames, and axes of plans.
+"""Up vectors in sensor frames and in parent frames, and axes of plans.
 
-frame numbers  --known_ups-->  unit vectors in the frames' sensors
+frame numbers  --known_ups-->  unit vectors in the sensor frames
 map, frames of one parent frame  --parent_axes-->  PlanAxes
 """
 
@@ -19,26 +19,26 @@ from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api.coverage import UpSource
 
-#: Maximum angle between up vectors that agree.
+#: Maximum angle between agreeing up vectors, radians.
 AGREE = math.radians(10.0)
-#: Minimum number of frames to estimate the up vector of a parent frame, since one may be wrong.
+#: Minimum number of frames to estimate the up vector of a parent frame.
 _FEWEST = 3
 
 
 def known_ups(connection: Connection, numbers: Iterable[int]) -> dict[int, Floats]:
-    """Return the known up vectors in the sensors of frames.
+    """Return the known up vectors in the sensor frames.
 
-    A frame without its own up vector inherits that of its parent frame if its pose is known: the
-    map's setting, or the consensus of the frames in that parent frame.
+    A frame with a pose but without an up vector inherits the up vector of its parent frame: the
+    setting of the map, or the consensus of the frames in the parent frame.
 
     Parameters
     ----------
-    numbers : numbers of frames; more frames improve the consensus
+    numbers : frame numbers; more frames improve the consensus
 
     Returns
     -------
-    ups : (3,) unit vectors by frame number, without frames whose own up vector contradicts that of
-        the parent frame if the latter is uncertain
+    ups : (3,) unit vectors by frame number, without frames whose up vector contradicts an uncertain
+        up vector of the parent frame
     """
     groups: dict[tuple[int, str | None], list[FrameUp]] = {}
     for one in frame_ups(connection, numbers):
@@ -47,7 +47,7 @@ def known_ups(connection: Connection, numbers: Iterable[int]) -> dict[int, Float
 
 
 def parent_up(connection: Connection, numbers: Iterable[int]) -> Floats | None:
-    """Return the up vector of a parent frame: the map's setting, or the consensus of its frames.
+    """Return the up vector of a parent frame: the setting of the map, or the consensus of frames.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def _of_parent(group: Sequence[FrameUp]) -> dict[int, Floats]:
 
 
 def _shared_up(group: Sequence[FrameUp]) -> tuple[Floats | None, bool]:
-    """Return the up vector of a parent frame, and whether it outweighs that of a single frame."""
+    """Return the up vector of a parent frame, and whether it overrides those of single frames."""
     if group[0].map_up is not None:
         return np.array(group[0].map_up), True
     ups = [
@@ -92,13 +92,13 @@ def _shared_up(group: Sequence[FrameUp]) -> tuple[Floats | None, bool]:
     return mean_direction(np.stack(ups), AGREE), True
 
 
-#: Approximate number of frames to estimate the vertical.
+#: Approximate number of frames to estimate an up vector.
 _UP_FRAMES = 200
 
 
 @dataclass(frozen=True, eq=False)
 class PlanAxes:
-    """The axes of a plan of a parent frame.
+    """Axes of the plan of a parent frame.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ class PlanAxes:
 
 
 def plan_axes(up: Floats) -> Floats:
-    """Return the axes (2, 3) of a plan; the first follows x, or y if x is nearly vertical."""
+    """Return the axes (2, 3) of a plan; right is along x, or y if x is nearly vertical."""
     along = np.eye(3)[int(abs(up[0]) > 0.9)]
     right = along - (along @ up) * up
     right /= np.linalg.norm(right)
@@ -119,14 +119,14 @@ def plan_axes(up: Floats) -> Floats:
 
 
 def upright(poses: Floats, clouds: Sequence[bool]) -> Floats:
-    """Return the axis (3,) of a parent frame, or its opposite, nearest to the sensors' up axes.
+    """Return the signed coordinate axis (3,) of a parent frame nearest to the up axes of sensors.
 
-    Sensors are assumed to be upright: up is -y of a camera and z of a scanner.
+    Sensors are assumed to be upright: up is -y of a camera, and z of a scanner.
 
     Parameters
     ----------
     poses : (n, 4, 4) T_parent_sensor
-    clouds : (n,) whether each frame is a point cloud
+    clouds : (n,) mask of point clouds
     """
     own = np.where(np.array(clouds)[:, None], poses[:, :3, 2], -poses[:, :3, 1])
     mean = own.mean(axis=0)
@@ -136,12 +136,12 @@ def upright(poses: Floats, clouds: Sequence[bool]) -> Floats:
 
 
 def parent_axes(connection: Connection, row: MapRow, numbers: Sequence[int]) -> PlanAxes:
-    """Return the axes of a plan of the parent frame of some frames."""
+    """Return the axes of the plan of the parent frame that contains some frames."""
     numbers = numbers[:: max(len(numbers) // _UP_FRAMES, 1)]
     if (up := parent_up(connection, numbers)) is not None:
         return PlanAxes(plan_axes(up), "frames" if row.up is None else "map")
     stops = [stop for stop in path_frames(connection, numbers).values() if stop.pose is not None]
-    if not stops:  # all frames were deleted in the meantime
+    if not stops:  # all frames were deleted
         return PlanAxes(np.eye(3)[:2], "cameras")
     poses = np.array([stop.pose for stop in stops])
     return PlanAxes(plan_axes(upright(poses, [stop.is_cloud for stop in stops])), "cameras")

@@ -1,9 +1,9 @@
-"""Validation of candidates, and the pose of the query from its matches and nearby frames.
+"""Validation of candidates, and pose of the query from matches and nearby frames.
 
 query Geometry, candidates  --validated-->  Validated  --placed-->  PoseEstimate
 
-Candidates are validated in order until enough are accepted or the deadline is reached, Sec. III-E.
-The poses that they suggest are checked against the frames of the map near these poses.
+Candidates are validated in order until enough are accepted or the deadline passes, Sec. III-E. The
+poses that they imply are checked against the frames of the map near these poses.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from sceneprint_client.api.query import FARTHEST_PRIOR, LEAST_DEVIATION, MOST_DE
 
 #: Default number of candidates to validate for the pose of a query.
 CANDIDATES = 10
-#: Limits that also apply when a caller sets another one: those for frames without known free
-#: space, and for frames with little overlap.
+#: Limits for frames without free space or with little overlap, by the limit that a caller sets;
+#: they get the same value.
 _ALSO_SET = {
     "residual_m": ("apart_m",),
     "residual_rad": ("apart_rad",),
@@ -69,7 +69,7 @@ class Validated:
     matches : results of `associate` for the validated candidates
     unreadable : errors of unreadable artifacts, by frame number
     untried : reason why the other candidates were not validated
-    late : whether the deadline was reached before all were validated; None without a deadline
+    late : whether the deadline passed before enough were validated; None without a deadline
     geometries : geometries of the first validated candidates, by frame number
     """
 
@@ -84,7 +84,7 @@ class Validated:
 def thresholds(
     options: ValidationOptions | None, p: ValidationParameters
 ) -> tuple[ValidationParameters, Mode]:
-    """Return the model's parameters with the options of a query, and the mode of validation."""
+    """Apply the options of a query to validation parameters; return parameters and mode."""
     if options is None:
         return p, "full"
     own = options.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
@@ -100,16 +100,17 @@ def validated(
     known: Mapping[int, PairValidation] | None = None, *, k: int = VERDICT_MATCHES,
     guided: bool = True, retry: bool = True,
 ) -> Validated:  # fmt: skip
-    """Validate candidates in their order until `k` are accepted.
+    """Validate candidates in order until `k` are accepted or the deadline passes.
 
     Parameters
     ----------
     chosen : positions in R of the candidates
     geometry : geometry of the query; None without validation
-    up : (3,) up vector in the query's sensor frame; None if unknown
-    known : validations of an earlier pass, by frame number
-    k : number of accepted matches after which to stop
-    guided : whether earlier matches may predict the transforms of later candidates
+    up : (3,) up vector in the sensor frame of the query; None if unknown
+    known : validations to reuse, by frame number
+    k : number of accepted matches after which validation stops
+    guided : whether earlier matches predict transforms of later candidates
+    retry : see `associate`
     """
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
@@ -123,11 +124,11 @@ def validated(
     loaded: dict[int, Geometry] = {}
 
     def open_geometry(number: int) -> Geometry | None:
-        if number not in blobs:  # the frame was deleted during the query
+        if number not in blobs:  # deleted during the query
             return None
-        try:  # one at a time, since 200 geometries take 125 MB
+        try:  # only one, since 200 geometries have 125 MB
             geometry_of = store.geometries.read(blobs[number])
-        except (DamagedBlob, UnreadableGeometry) as error:  # the other frames suffice for an answer
+        except (DamagedBlob, UnreadableGeometry) as error:
             unreadable[number] = str(error)
             return None
         if len(loaded) < CANDIDATES:
@@ -152,14 +153,14 @@ def validated(
     return Validated(chosen, matches, unreadable, untried, late, loaded)
 
 
-#: Maximum number of frames near each suggested pose; the search radius grows if there are fewer.
+#: Number of frames to find near each implied pose; the search radius grows until there are enough.
 _NEAR_FRAMES = 48
-#: Maximum number of places around which frames are searched.
+#: Maximum number of places to search frames around.
 _MOST_PLACES = 24
 
 
 def numbers_of(model: Model, query: Query) -> LocalizationParameters:
-    """Return the model's parameters of localisation with the options of a query."""
+    """Return the localisation parameters of a model, with the options of a query."""
     p = LocalizationParameters.of(model.answer)
     p = replace(p, confidence=query.confidence, voted_only=query.validation is not None)
     return replace(p, rivals=0) if _is_paper(query) else p
@@ -174,19 +175,20 @@ def placed(
     rows: Mapping[int, FrameRow],
     query_frames: Sequence[QueryFrame], prior: PosePrior | None, model: Model, query: Query,
 ) -> PoseEstimate | None:  # fmt: skip
-    """Return the pose of a query by its matches and the map's frames near the suggested poses.
+    """Estimate the pose of a query from its matches, and the frames near the poses that they imply.
 
     Parameters
     ----------
     geometries : loaded geometries of candidates, by frame number
     rows : rows of the candidates, by frame number
-    prior : prior pose of the robot, with a parent from `parent_key`
-    query : options of the query; with options of validation, a pose needs the vote of a match, and
-        the mode `paper` ignores the map's other frames
+    query_frames : frames of the query with their matches
+    prior : prior pose of the robot; its parent is a key of `parent_key`
+    query : options of the query; with validation options, a pose requires the vote of a match, and
+        the mode `paper` ignores the other frames of the map
 
     Returns
     -------
-    estimate : None if no match has a pose and there is no prior
+    estimate : pose; None if no match has a pose and there is no prior
     """
     poses = {number: np.array(row.pose) for number, row in rows.items() if row.pose is not None}
     parents = {number: parent_key(rows[number]) for number in poses}
@@ -210,7 +212,7 @@ def placed(
             try:
                 return store.geometries.read(near[number].geometry)
             except (DamagedBlob, UnreadableGeometry):
-                return None  # the other frames suffice
+                return None
 
         stack = np.array(at_poses).reshape(-1, 4, 4)
         first = [i for i, number in enumerate(numbers) if number in loaded]
@@ -221,7 +223,7 @@ def placed(
 
 
 def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PosePrior | None:
-    """Return the prior of a query; raise InvalidRequest or InvalidPose if it cannot be used."""
+    """Return the prior of a query; raise InvalidRequest or InvalidPose if it is not valid."""
     prior = query.prior
     if prior is None:
         return None
@@ -246,27 +248,27 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
     row, name = places[0].row, str(prior.pose.parent_frame)
     with store.database.read() as connection:
         joined = find_joins(connection, row.number).get(name)
-        if joined is not None:  # stored poses are relative to the root frame
+        if joined is not None:  # convert to the root frame, as stored poses are
             name, T = joined.root, joined.T @ T
             covariance = transform_covariance(covariance, joined.T[:3, :3], np.zeros(3))
         if not has_parent_frame(connection, row.number, name):
             raise InvalidRequest(
                 f"No frame of map {row.name!r} has a pose in the parent frame {name!r} of the "
-                "prior. Use a parent frame of the map; `sceneprint frames` lists the frames with "
-                "their poses.",
+                "prior. Use a parent frame of the map; `sceneprint frames` lists frames with their "
+                "poses.",
                 (("prior.pose.parent_frame", "not of this map"),),
             )
     return PosePrior(f"{row.number} {name}", T, covariance)
 
 
-#: Minimum eigenvalue of a correlation matrix; smaller ones are rounding errors.
+#: Minimum eigenvalue of a correlation matrix; smaller eigenvalues are rounding errors.
 _LEAST_EIGENVALUE = 1e-12
 
 
 def _prior_covariance(prior: Prior) -> Floats:
-    """Return the covariance (6, 6) of a prior, metres before radians.
+    """Return the covariance (6, 6) of a prior: translation in metres, then rotation in radians.
 
-    It is diagonal if only deviations are given. Raise InvalidRequest if it is not symmetric and
+    It is diagonal if the prior has only deviations. Raise InvalidRequest if it is not symmetric and
     positive definite, or a deviation is out of range.
     """
     if prior.covariance is None:
@@ -276,7 +278,7 @@ def _prior_covariance(prior: Prior) -> Floats:
     variances = np.diag(covariance)
     if (variances > 0).all():
         deviations = np.sqrt(variances)
-        # with a tolerance, since the root of a rounded square differs
+        # tolerate rounding of squares
         within = LEAST_DEVIATION * (1 - 1e-9), MOST_DEVIATION * (1 + 1e-9)
         if deviations.min() < within[0] or deviations.max() > within[1]:
             raise InvalidRequest(
@@ -286,7 +288,7 @@ def _prior_covariance(prior: Prior) -> Floats:
                 "covariance, which contains their squares, or omit `prior`.",
                 (("prior.covariance", "deviations out of range"),),
             )
-        # no entry may exceed the largest variance; this also prevents overflows below
+        # reject entries above the largest variance, which also prevents overflows below
         if np.abs(covariance).max() <= variances.max():
             correlation = covariance / np.outer(deviations, deviations)
             if (
@@ -304,7 +306,7 @@ def _prior_covariance(prior: Prior) -> Floats:
 def nearest_first(
     store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior, p: MapParameters
 ) -> list[int]:
-    """Return candidates (positions in R), those near a prior first."""
+    """Sort candidates (positions in R): first those near a prior, then the others."""
     with store.database.read() as connection:
         viewpoints = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
     posed = {one.number: one for one in viewpoints}
@@ -317,14 +319,14 @@ def nearest_first(
 
 
 def parent_key(row: FrameRow | FrameViewpoint) -> str:
-    """Return a unique key of a parent frame: the map's number, a space and the frame's name."""
+    """Return a unique key of a parent frame: map number, space, and frame name."""
     return f"{row.map_number} {row.pose_parent}"
 
 
 def _near_frames(
     store: Store, searched: Searched, parent: str, at: Floats, p: MapParameters
 ) -> dict[int, PlacedFrame]:
-    """Return searchable frames in a parent frame near poses (n, 4, 4), by number."""
+    """Return searchable frames in a parent frame near the poses `at` (n, 4, 4), by frame number."""
     number, _, name = parent.partition(" ")
     part = next(one for one in searched.parts if one.place.row.number == int(number))
     cells = np.unique(np.round(at[:, :3, 3] / p.cell), axis=0, return_index=True)[1]

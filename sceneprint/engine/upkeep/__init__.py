@@ -1,1 +1,1 @@
-"""Tasks of workers between jobs: publication of indexes, purges and repairs."""
+"""Upkeep: tasks of workers between jobs, such as publishing indexes, purges and repairs."""

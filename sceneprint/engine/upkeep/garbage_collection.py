@@ -3,9 +3,9 @@
 blobs  --collect_blobs-->  removed, or doomed during a snapshot
 doomed blobs  --collect_doomed_blobs-->  removed
 
-With an object store, writers do not wait for removals: one transaction dooms the blobs, they are
-removed, and another transaction clears the marks. A new reference to a doomed blob waits for the
-end of its removal (`ObjectBlobs.holds`).
+With an object store, writers do not wait for removals: one transaction marks the blobs as doomed,
+the blobs are removed, and another transaction clears the marks. A new reference to a doomed blob
+waits for the end of its removal (`ObjectBlobs.holds`).
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from sceneprint.store.frames import referred_blobs, refers_to
 
 log = logging.getLogger(__name__)
 
-#: Number of blobs to check and remove at once. Writers wait during the check, and in a folder also
-#: during the removal.
+#: Number of blobs to check and remove at once. Writers wait during the check and, with a folder of
+#: blobs, during the removal.
 SWEPT_AT_ONCE = 200
-#: Seconds to wait for a removal by another process.
+#: Maximum seconds to wait for a removal by another process.
 _PATIENCE_S = 5.0
-#: Name of a file in quarantine.
+#: Name of a quarantined blob.
 _BLOB = re.compile("blob-([0-9a-f]{64})")
 #: Number of doomed blobs to read at once.
 _LEFT_AT_ONCE = 1_000
 
 
 def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
-    """Remove those of some blobs that are unreferenced.
+    """Remove the unreferenced blobs among `blobs`.
 
     The check is a write transaction, so that no upload can add a reference meanwhile. During a
-    snapshot or a removal by another process, blobs are only doomed, and `collect_doomed_blobs`
-    removes them later.
+    snapshot or a removal by another process, blobs are only marked as doomed;
+    `collect_doomed_blobs` removes them later.
 
     Raises
     ------
-    UnusableStore : If some blobs could not be removed; they are doomed.
+    UnusableStore : If some blobs could not be removed. They are doomed.
     """
     store.geometries.forget(blobs)
     if not blobs:
@@ -58,7 +58,7 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
 
 
 def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
-    """Remove unreferenced blobs in a transaction; return False if they are only doomed for now."""
+    """Remove unreferenced blobs in one transaction; return False if they were only doomed."""
     with store.database.write() as connection, store.blobs.removing() as allowed:
         if not allowed:
             doom(connection, block)
@@ -70,16 +70,16 @@ def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
 
 
 def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
-    """Remove unreferenced blobs after a transaction that dooms them; see `_remove_in_turn`."""
+    """Doom unreferenced blobs in a transaction, then remove them; see `_remove_in_turn`."""
     with suppress(StoreLocked):
-        store.blobs.wait_for_removal(seconds=_PATIENCE_S)  # otherwise blobs stay doomed
+        store.blobs.wait_for_removal(seconds=_PATIENCE_S)
     with ExitStack() as removal:
         with store.database.write() as connection:
             if not removal.enter_context(store.blobs.removing()):
                 doom(connection, block)
                 return False
             referred = referred_blobs(connection, block)
-            # younger marks may belong to a removal that lost its lock but still runs
+            # leave younger marks, whose removal may still be running without its lock
             clear_doomed(connection, [*referred], before=time.time() - LONGEST_S)
             unreferenced = [blob for blob in block if blob not in referred]
             at = doom(connection, unreferenced)
@@ -92,7 +92,7 @@ def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
 
 
 def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:
-    """Collect blobs after a committed deletion; log errors instead of raising them."""
+    """Call `collect_blobs` after a committed deletion; log errors instead of raising them."""
     try:
         collect_blobs(store, blobs)
     except UnusableStore as error:
@@ -100,7 +100,7 @@ def collect_deleted_blobs(store: Store, blobs: Sequence[str]) -> None:
 
 
 def collect_quarantined(store: Store, folder: Path) -> int:
-    """Remove quarantined blobs that are unreferenced, and return their number.
+    """Remove the unreferenced blobs in quarantine; return their number.
 
     Parameters
     ----------
@@ -122,13 +122,13 @@ def collect_quarantined(store: Store, folder: Path) -> int:
 def collect_doomed_blobs(
     store: Store, before: float | None = None, seconds: float = math.inf
 ) -> int:
-    """Remove doomed blobs that remain after a snapshot or after the death of a process.
+    """Remove doomed blobs, which remain after a snapshot or after a process was killed.
 
     Parameters
     ----------
-    before : time before which blobs must be doomed, seconds since 1970, since another process may
-        be removing younger ones; None selects all
-    seconds : duration after which the rest remains
+    before : remove only blobs doomed before this time (seconds since 1970), since another process
+        may be removing the others; None selects all
+    seconds : time after which no further block is started
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Housekeeping of workers between jobs: indexes, switches of models, and removal of old data."""
+"""Housekeeping of workers between jobs: indexes, model switches, and removal of old data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sceneprint.store.events import number_events
 
 
 def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
-    """Return the object that purges deleted frames.
+    """Create the object that purges deleted frames.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
 
 
 class Housekeeping:
-    """The housekeeping of one process; any number of processes may run it."""
+    """Housekeeping tasks; several processes may run them at the same time."""
 
     def __init__(self, context: Context) -> None:
         settings, store, bell = context.settings, context.store, context.bell
@@ -51,9 +51,9 @@ class Housekeeping:
         self.purging = purging_of(context, self.upkeep)
 
     def run(self) -> int:
-        """Run all tasks that are due, and return the number of published indexes."""
+        """Run the tasks that are due; return the number of published indexes."""
         store = self._context.store
-        number_events(store.database)  # in case that no reader does this
+        number_events(store.database)  # for events that nobody has read
         self.reencodings.run()
         self.retention.run()
         published = self.upkeep.run()

@@ -1,4 +1,4 @@
-"""Publication of indexes for maps with many new or deleted frames, and verification of indexes."""
+"""Publication and verification of indexes, for maps with many new or deleted frames."""
 
 from __future__ import annotations
 
@@ -47,20 +47,20 @@ from sceneprint.types import Bytes
 
 log = logging.getLogger(__name__)
 
-#: Seconds for which a step verifies indexes, while jobs wait.
+#: Seconds for which a step verifies indexes; meanwhile, jobs wait.
 STEP_S = 0.25
-#: Name of the file whose date is the start of the last round of any worker.
+#: Name of the file whose modification time is the start of the last verification round.
 _STAMP = ".scrubbed"
-#: Maximum seconds between checks for old deletions that an index lacks.
+#: Maximum seconds between checks for old deletions that an index does not contain.
 AGING_S = 3600.0
-#: Seconds until the next attempt after another host built an index, or an error of a shared one.
+#: Seconds until the next attempt, after a shared index failed or was built by another host.
 ELSEWHERE_S = 30.0
-#: Name of the file in the folder of an index with the times of the last and the next purge.
+#: Name of the file in an index folder whose times are those of the last and the next purge.
 _PURGED = ".rest"
 
 
 class Scrubber:
-    """Verification of all indexes of the machine in rounds, each by one worker.
+    """Verification of all indexes of the machine in rounds; one worker runs each round.
 
     Parameters
     ----------
@@ -73,11 +73,12 @@ class Scrubber:
         self._looked = -pause_s
 
     def step(self, folders: Sequence[Path]) -> Path | None:
-        """Verify indexes for STEP_S seconds; start a round if it is due.
+        """Verify indexes for STEP_S seconds, if a round is running or due.
 
         Returns
         -------
-        folder : folder of a damaged file, which was removed, so its index must be rebuilt
+        folder : index folder from which a damaged file was removed, so that the index must be
+            rebuilt; None without damage
         """
         if self._round is None and self._is_time():
             self._round = chain.from_iterable(map(scrub, folders))
@@ -90,7 +91,7 @@ class Scrubber:
                 return None
             if damaged is not None:
                 log.error("damaged index file removed", extra={"path": str(damaged)})
-                damaged.unlink(missing_ok=True)  # readers skip the versions that list it
+                damaged.unlink(missing_ok=True)  # readers skip versions with missing files
                 return damaged.parent
         return None
 
@@ -99,24 +100,25 @@ class Scrubber:
             return False
         self._looked = time.monotonic()
         stamp = self._indexes / _STAMP
-        with suppress(OSError):  # no round was started yet
+        with suppress(OSError):
             if time.time() - stamp.stat().st_mtime < self._pause_s:
                 return False
         try:
             make_folder(self._indexes)
             stamp.touch(PRIVATE_FILE)
         except OSError:
-            return False  # an index could not be rebuilt either
+            return False
         return True
 
 
 class Upkeep:
-    """Publication and verification of the indexes of one machine.
+    """Publication and verification of the indexes of a machine.
 
     Parameters
     ----------
-    settings : settings with the maximum number of unindexed frames, the interval of verification,
-        and the days after which deletions are forgotten, so that older indexes must be rebuilt
+    settings : maximum number of unindexed frames, interval of verification, and lifetime of rows of
+        deleted frames
+    place : storage of the indexes
     """
 
     def __init__(
@@ -127,8 +129,7 @@ class Upkeep:
         self._elsewhere: dict[int, float] = {}  # time of the next attempt, by map
         # number and revision of the published index, by map and model
         self._published: dict[tuple[int, str], tuple[int, int]] = {}
-        # inodes of verified parts by name, by map and model; verifying all parts for each version
-        # would take longer than writing it
+        # inodes of verified parts by name, by map and model, to verify each part only once
         self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
         self._metrics: dict[str, Metric | None] = {}
         self._scrubber = Scrubber(settings.indexes, settings.index_check_interval_s)
@@ -137,18 +138,17 @@ class Upkeep:
         self._aged = dict[tuple[int, str], float]()
 
     def run(self) -> int:
-        """Publish indexes that are due, run a step of verification, and return the number of
-        published indexes.
+        """Publish the indexes that are due, and run a step of verification.
 
-        Errors of single indexes are logged. They affect no answer, since queries read unindexed
-        frames from the database.
+        Return the number of published indexes. Errors of single indexes are logged; queries read
+        the unindexed frames from the database.
         """
         with self._store.database.read() as connection:
             rows = list_maps(connection)
         rows = [row for row in rows if self._metric(row.model_id) == "l2"]
         with self._store.database.read() as connection:
             due = [row for row in rows if self._is_due(connection, row)]
-        # without maps that another host has just handled
+        # skip maps that another host has just handled
         now, due_at = time.monotonic(), self._elsewhere
         published = sum(self._try_publish(row) for row in due if now >= due_at.get(row.number, 0.0))
         self._place.remove_unknown()
@@ -159,20 +159,20 @@ class Upkeep:
         return published
 
     def rebuild(self, row: MapRow) -> IndexVersion:
-        """Build and publish the index of a map without reuse of earlier ones.
+        """Build the index of a map from scratch, and publish it.
 
         Raises
         ------
         UnknownMap : If the map no longer exists.
-        InvalidRequest : If the map has no indexed frame, or its model has no index.
+        InvalidRequest : If the map has no indexed frames, or its metric has no index.
         BusyIndex : If another process is building the index.
         OSError : If the index cannot be written; the former one remains.
         """
         if self._signers(row.model_id).model.metric != "l2":
             raise InvalidRequest(
-                f"Map {row.name!r} has no index to rebuild, because its model stores full Fisher "
-                "vectors, and queries compare all of them. If the map is too large for that, "
-                "switch its model with `sceneprint reencode`."
+                f"Map {row.name!r} has no index, because its model stores full Fisher vectors, and "
+                "queries compare all of them. If this takes too long, switch the model with "
+                "`sceneprint reencode`."
             )
         version = self._publish(row, force=True, rebuild=True)
         if version is None:
@@ -182,13 +182,14 @@ class Upkeep:
         return version
 
     def publish_next(self, row: MapRow) -> IndexVersion | None:
-        """Publish the index of a map's next model before the switch, if it is due.
+        """Publish the index of the next model of a map before the switch, if the map is large
+        enough.
 
-        Errors of writing are logged, and the map switches without an index.
+        Errors of writing are logged; the map then switches without an index.
 
         Returns
         -------
-        version : newest index of the next model; None if there is none
+        version : newest index of the next model; None without an index
 
         Raises
         ------
@@ -218,22 +219,21 @@ class Upkeep:
     def _try_publish(self, row: MapRow, *, force: bool = False) -> bool:
         try:
             if force and self._place.is_shared:
-                self._place.sync(row)  # fetches damaged parts again
+                self._place.sync(row)  # downloads removed parts again
                 return False
             return self._publish(row, force=force) is not None
         except UnknownMap:
-            return False  # the map was deleted in the meantime
+            return False
         except (OSError, SceneprintError, ValueError) as error:
             log.error("index publication failed", extra={"map": row.name, "error": str(error)})
-            if self._place.is_shared:  # frequent attempts would be too expensive
+            if self._place.is_shared:
                 self._elsewhere[row.number] = time.monotonic() + ELSEWHERE_S
             return False
 
     def _metric(self, model_id: str) -> Metric | None:
-        """Return the metric of a model, without an index for L1.
+        """Return the metric of a model; None if another version of sceneprint stored the model.
 
-        None if another version of sceneprint stored the model and maintains the indexes of its
-        maps.
+        That version then maintains the indexes of its maps.
         """
         if model_id not in self._metrics:
             self._metrics[model_id] = None
@@ -244,25 +244,26 @@ class Upkeep:
     def _is_due(self, connection: Connection, row: MapRow) -> bool:
         number, since = self._published.get((row.number, row.model_id), (None, 0))
         if not self._place.is_shared and newest_number(self._place.folder(row)) != number:
-            since = 0  # another process published or removed the index
+            since = 0  # unknown: another process published or removed the index
         return self._is_outdated(connection, row, since)
 
     def _is_outdated(self, connection: Connection, row: MapRow, since: int) -> bool:
-        """Return whether an index at a revision lacks too many frames or deletions, or is soon too
-        old to be updated.
+        """Return whether an index at revision `since` must be updated.
+
+        It must if it lacks too many frames or deletions, or will soon be too old to be updated.
         """
         if since < row.pruned_revision:
             since = 0
         if since and self._is_aging(connection, row, since):
             return True
-        if row.revision - since <= self._tail_frames:  # avoids the counts
+        if row.revision - since <= self._tail_frames:  # avoids counting rows
             return False
         return count_indexed(connection, row.number, since) > self._tail_frames or (
             count_gone(connection, row.number, since) > self._tail_frames
         )
 
     def _is_aging(self, connection: Connection, row: MapRow, since: int) -> bool:
-        """Return whether an index lacks a deletion whose row has reached half of its lifetime."""
+        """Return whether an index lacks a deletion whose row is past half of its lifetime."""
         key = (row.number, row.model_id)
         if row.revision == since or time.monotonic() < self._aged.get(key, 0):
             return False
@@ -273,7 +274,7 @@ class Upkeep:
         return False
 
     def purge(self, row: MapRow) -> bool:
-        """Remove all bytes of deleted frames from the local and the shared index of a map.
+        """Rewrite the local and the shared index of a map without bytes of deleted frames.
 
         Returns
         -------
@@ -283,7 +284,7 @@ class Upkeep:
         ------
         UnknownMap : If the map no longer exists; its index is removed soon.
         BusyIndex : If another process is building the index, possibly with deleted frames.
-        OSError, UnusableStore : If the index cannot be written; the former one remains.
+        OSError, UnusableStore : If the index cannot be written; the former index remains.
         """
         if self._metric(row.model_id) == "l1":
             return False
@@ -298,7 +299,7 @@ class Upkeep:
         done = True
         if stale and not empty:
             done = self._publish(row, force=True, clean=True) is not None
-        if done and older:  # also remove files that a killed builder left behind
+        if done and older:  # also removes files of killed builders
             head = None if empty else self._place.head(row)
             done = self._place.remove_all_but(row, head)
         if not done:
@@ -313,29 +314,34 @@ class Upkeep:
         self._place.sweep(now=now)
 
     def postpone_purge(self, row: MapRow, seconds: float) -> None:
-        """Postpone the next purge of a map's index in all processes."""
+        """Postpone the next purge of the index of a map by `seconds`, for all processes."""
         now = time.time()
-        with suppress(OSError):  # the index was removed in the meantime
+        with suppress(OSError):
             mark = self._place.folder(row) / _PURGED
             mark.touch(PRIVATE_FILE)
             os.utime(mark, (now, now + seconds))
 
     def is_purge_due(self, row: MapRow) -> bool:
-        """Return whether the index of a map may be purged again; see `postpone_purge`."""
+        """Return whether the index of a map may be purged; see `postpone_purge`."""
         try:
             times = (self._place.folder(row) / _PURGED).stat()
         except OSError:
             return True
-        return not times.st_atime <= time.time() < times.st_mtime  # the clock may be set back
+        return not times.st_atime <= time.time() < times.st_mtime  # also if the clock was set back
 
     def _publish(
         self, row: MapRow, *, force: bool = False, rebuild: bool = False, clean: bool = False
     ) -> IndexVersion | None:
-        """Publish the index of a map if it is due or forced; return None without publication."""
+        """Publish the index of a map if it is outdated or with `force`; return None if not
+        published.
+
+        With `rebuild` or `clean`, do not reuse earlier parts at all, or not those with deleted
+        frames.
+        """
         if not force and self._is_up_to_date(row):
             return None
         with self._place.turn(row) as require:
-            if require is None:  # another host is building it
+            if require is None:  # another host is building the index
                 self._elsewhere[row.number] = time.monotonic() + ELSEWHERE_S
                 return None
             if not rebuild:
@@ -361,19 +367,19 @@ class Upkeep:
         self, row: MapRow, share: Callable[[IndexManifest], bool], *, force: bool,
         rebuild: bool, clean: bool,
     ) -> IndexVersion | None:  # fmt: skip
-        model = self._signers(row.model_id).model  # no transaction may be open here
+        model = self._signers(row.model_id).model  # before the transaction
         after, damaged = self._place.last_number(row), list[int]()
         with self._store.database.read() as connection:
-            allow(connection, 0)  # the connection is idle while the index is built
+            allow(connection, 0)  # no time limit, since the connection is idle during the build
             now = find_map(connection, row.name)
             if row.model_id == now.next_model_id and is_complete(connection, now):
-                now = replace(now, model_id=row.model_id)  # the map is about to switch
+                now = replace(now, model_id=row.model_id)
             if (now.number, now.model_id) != (row.number, row.model_id):
-                return None  # the map was replaced or has switched; the next call tries again
+                return None  # the map was replaced or has switched its model
             previous = trusted(connection, now, None if rebuild else self._newest(now, model))
             since = 0 if previous is None else previous.revision
             if not force and not self._is_outdated(connection, now, since):
-                return None  # another worker was first
+                return None  # already built by another worker
             if previous is None and count_indexed(connection, now.number, 0) == 0:
                 if not rebuild:
                     return None
@@ -396,7 +402,7 @@ class Upkeep:
         return version
 
     def _is_up_to_date(self, row: MapRow) -> bool:
-        """Return whether the newest index of a map needs no update, according to its manifest."""
+        """Return whether the newest index of a map, by its manifest, needs no update."""
         head = self._place.head(row)
         with self._store.database.read() as connection:
             now = replace(find_map(connection, row.name), model_id=row.model_id)
@@ -407,7 +413,7 @@ class Upkeep:
             return not self._is_outdated(connection, now, since)
 
     def _newest(self, row: MapRow, model: Model) -> IndexVersion | None:
-        """Return the newest sound local index, without verifying its parts again."""
+        """Return the newest sound local index; do not verify parts again."""
         sound = self._verified.get((row.number, row.model_id))
         version = newest(self._place.folder(row), row.model_id, model.signature_bytes, sound=sound)
         if version is not None:
@@ -418,7 +424,7 @@ class Upkeep:
 def _blocks(
     connection: Connection, row: MapRow, since: int, damaged: list[int]
 ) -> Iterator[tuple[NDArray[np.int64], Bytes]]:
-    """Yield keys and signatures of frames since a revision, and add damaged frames to `damaged`."""
+    """Yield keys and signatures since a revision; add damaged frames to `damaged`."""
     for block in changes_since(connection, row, since):
         damaged += [one.number for one in block if one.vector is None and not one.deleted]
         signed = [(one.number, one.vector) for one in block if one.vector is not None]

@@ -1,12 +1,12 @@
-"""Retention of frames, and purges that remove all bytes of deleted frames.
+"""Retention of frames, and purges of all bytes of deleted frames.
 
 maps with `retention_days`  --Retention.run-->  old frames are deleted permanently, with events
 frames deleted or redundant for some days  --Retention.run-->  their rows and jobs are removed
 
-Searches exclude a deleted frame immediately. Its rows and blobs are removed when its deletion
-cannot be undone any more. A purge removes the remaining data: blobs of killed processes, products
-and answers that show the frame, its signature in local indexes and readers, and pages and log of
-SQLite. On PostgreSQL, VACUUM removes dead rows.
+Searches exclude a deleted frame at once. Its rows and blobs are removed when its deletion can no
+longer be undone. A purge removes the remaining data: blobs of killed processes, products and
+answers that contain the frame, its signature in local indexes and readers, and free pages and the
+log of SQLite. On PostgreSQL, VACUUM removes dead rows.
 """
 
 from __future__ import annotations
@@ -49,19 +49,22 @@ from sceneprint.store.tables import MapRow
 
 log = logging.getLogger(__name__)
 
-#: Maximum number of frames to delete in one commit, for which writers wait about 20 ms.
+#: Maximum number of frames to delete in one commit (about 20 ms).
 AT_ONCE = 100
-#: Maximum duration of a call in seconds, since jobs wait in the meantime.
+#: Maximum duration of a call, seconds; meanwhile, jobs wait.
 TURN_S = 2.0
-#: Seconds between checks after all old frames were deleted.
+#: Seconds between checks for old frames.
 LOOK_S = 60.0
-#: Reason for the deletion, in events.
+#: Reason of the deletion in events.
 REASON = "retention"
 
 
 class Retention:
-    """Deletion of old frames, and removal of rows of deleted and redundant frames after
-    `rows_days`; any number of processes may run it.
+    """Deletion of old frames, and removal of rows; several processes may run it at the same time.
+
+    Parameters
+    ----------
+    rows_days : age in days at which rows of deleted and redundant frames are removed
     """
 
     def __init__(self, store: Store, rows_days: float) -> None:
@@ -69,14 +72,13 @@ class Retention:
         self._next = 0.0
 
     def run(self, now: float | None = None) -> int:
-        """Delete old frames and rows if it is due, and return their number.
+        """Delete old frames and rows, at most every LOOK_S seconds; return their number.
 
-        Errors are logged, and a later call tries again.
+        Errors are logged; a later call retries.
 
         Parameters
         ----------
-        now : seconds since 1970; None reads the clock of the database, since that of a host may be
-            wrong
+        now : current time, seconds since 1970; None reads the clock of the database
         """
         if time.monotonic() < self._next:
             return 0
@@ -94,7 +96,7 @@ class Retention:
             return 0
 
     def _old_frames(self, at: float | None) -> Iterator[int]:
-        """Delete old frames, and yield the size of each block."""
+        """Delete old frames in blocks, and yield the size of each block."""
         with self._store.database.read() as connection:
             rows = aging_maps(connection)
         for row in rows:
@@ -102,7 +104,7 @@ class Retention:
                 yield count
 
     def _ended_rows(self, at: float | None) -> Iterator[int]:
-        """Remove old rows, and yield the size of each block."""
+        """Remove old rows in blocks, and yield the size of each block."""
         with self._store.database.read() as connection:
             before = (read_clock(connection) if at is None else at) - self._rows_s
             rows = maps_with_ended(connection, before)
@@ -119,7 +121,7 @@ class Retention:
         """Delete a block of the oldest frames of a map, and return its size."""
         if row.retention_days is None:
             return 0
-        with self._store.database.read() as connection:  # usually none is due, so do not lock
+        with self._store.database.read() as connection:  # usually none, so avoid a write lock
             now = read_clock(connection) if at is None else at
             if not old_frames(connection, row.number, now - DAY_S * row.retention_days, 1):
                 return 0
@@ -137,16 +139,16 @@ class Retention:
 
 
 class MemoryPurging:
-    """Removal of deleted maps and frames from the memory of this process."""
+    """Removal of data of deleted maps and frames from the memory of this process."""
 
     def __init__(self, context: Context) -> None:
         self._context, self._every_s = context, context.settings.purge_deadline_s / 2
         self._purged = time.monotonic()
 
     def run(self) -> None:
-        """Release deleted maps, and deleted frames if it is due."""
+        """Release deleted maps and, at intervals, deleted frames."""
         context, readers = self._context, self._context.readers
-        context.query_log.tidy()  # in case that this node has no worker
+        context.query_log.tidy()  # for nodes without workers
         with context.store.database.read() as connection:
             if time.monotonic() - self._purged < self._every_s:
                 readers.tidy(connection)
@@ -158,24 +160,23 @@ class MemoryPurging:
             readers.purge(connection)
 
 
-#: Seconds for which blobs of a deletion are left to the deleting process.
+#: Age in seconds from which doomed blobs are removed here instead of by the deleting process.
 _YOUNG_S = 60.0
-#: Maximum seconds to remove doomed blobs, since jobs wait in the meantime.
+#: Maximum duration of removing doomed blobs, seconds; meanwhile, jobs wait.
 _SWEEP_S = 20.0
-#: Pause before the next purge of an index, as a multiple of the duration of the last one, so that
-#: frequent deletions from a large map do not occupy the workers.
+#: Pause before the next purge of an index, as a multiple of the duration of the last purge.
 PAUSE = 10.0
 
 
 @dataclass(frozen=True)
 class Purged:
-    """Numbers of removed objects.
+    """Number of objects that a purge removed or rebuilt.
 
     Parameters
     ----------
-    blobs : doomed blobs and files in quarantine
-    answers, products : answers and products that showed deleted frames
-    indexes : indexes that were rebuilt
+    blobs : doomed and quarantined blobs
+    answers, products : answers and products that contained deleted frames
+    indexes : rebuilt indexes
     """
 
     blobs: int
@@ -185,11 +186,11 @@ class Purged:
 
 
 class Purging:
-    """Purge of deleted frames on this node; any number of processes may run it.
+    """Purge of deleted frames on a node; several processes may run it at the same time.
 
     Parameters
     ----------
-    purge_s : maximum seconds between a deletion and the removal of the last byte
+    purge_s : maximum seconds from a deletion to the removal of the last byte
     quarantine : folder of quarantined blobs
     """
 
@@ -200,11 +201,11 @@ class Purging:
         self._store, self._upkeep, self._log = store, upkeep, query_log
         self._tombstones, self._quarantine = tombstones, quarantine
         self._products = products
-        self._every_s = purge_s / 2  # so that deletions just after a purge are also in time
+        self._every_s = purge_s / 2  # half, since a deletion may follow just after a purge
         self._next = time.monotonic() + self._every_s
 
     def run(self) -> Purged | None:
-        """Purge deleted frames if it is due; log errors, after which a later call tries again."""
+        """Purge deleted frames if due, else return None; log errors."""
         if time.monotonic() < self._next:
             return None
         self._next = time.monotonic() + self._every_s
@@ -213,12 +214,12 @@ class Purging:
         return self._all(before, self._upkeep.is_purge_due, seconds=min(_SWEEP_S, self._every_s))
 
     def now(self) -> Purged:
-        """Purge all deleted frames now, so that no deletion can be undone any more.
+        """Purge all deleted frames; no deletion can be undone afterwards.
 
         Raises
         ------
         BusyIndex : If another process is building an index that must be rebuilt.
-        StoreError, OSError : If something cannot be removed, after the removal of the rest.
+        StoreError, OSError : If something cannot be removed; raised after the rest was removed.
         """
         failed: list[Exception] = []
         purged = self._all(None, lambda _: True, failed)
@@ -234,7 +235,7 @@ class Purging:
             try:
                 return do()
             except (UnknownMap, UnknownJob):
-                return 0  # a map or a product was deleted in the meantime
+                return 0
             except (SceneprintError, OSError, ValueError) as error:
                 level = logging.INFO if isinstance(error, BusyIndex) else logging.ERROR
                 log.log(level, "purge incomplete", extra={"error": str(error)})

@@ -1,4 +1,4 @@
-"""Repair of frames: new signatures from uploads, and replacement of lost uploads."""
+"""Repair of frames: signatures rebuilt from uploads, and lost uploads replaced."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ log = logging.getLogger(__name__)
 
 #: Priority of repair jobs, above that of new uploads.
 PRIORITY = 5
-#: Minimum seconds between repairs of a frame, so that queries of an irreparable frame do not
-#: occupy the workers.
+#: Minimum seconds between repairs of a frame, since a repair may fail each time.
 PAUSE_S = 600.0
 #: Maximum number of frames that one query schedules for repair.
 MOST = 16
@@ -40,11 +39,11 @@ _LOST = re.compile(r"its upload is (lost|damaged): .* upload it again to heal")
 
 
 def reason_of_loss(condition: Condition, *, found: bool) -> str:
-    """Return the `reason` of a frame whose upload is missing or damaged.
+    """Return the text for `reason` of a frame whose upload is lost or damaged.
 
     Parameters
     ----------
-    found : whether queries can find the frame
+    found : whether the frame is indexed
     """
     what = "lost" if condition == "missing" else "damaged"
     but = "it can be found, but not signed again" if found else "it cannot be signed"
@@ -52,20 +51,19 @@ def reason_of_loss(condition: Condition, *, found: bool) -> str:
 
 
 def is_known_loss(reason: str | None) -> bool:
-    """Return whether the reason of a frame contains that of `reason_of_loss`."""
+    """Return whether the reason of a frame contains a text of `reason_of_loss`."""
     return reason is not None and _LOST.search(reason) is not None
 
 
 def without_loss(reason: str | None) -> str | None:
-    """Return a reason without the text of `reason_of_loss`; None if nothing else is left."""
+    """Remove the text of `reason_of_loss` from a reason; return None if nothing remains."""
     return _LOST.sub("", reason or "").rstrip("; ") or None
 
 
 def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: str) -> int:
-    """Queue jobs that sign frames with damaged artifacts or signatures again.
+    """Queue jobs that sign damaged frames again; skip frames with a pending or recent job.
 
-    Queries still find the frames in the meantime. Errors are only logged, since queries call this.
-    Frames whose repair is pending or recent are skipped.
+    Until then, queries can still find the frames. Errors are logged instead of raised.
 
     Returns
     -------
@@ -74,8 +72,8 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
     if not numbers or store.database.read_only:
         return 0
     try:
-        with store.database.read() as connection:  # usually no repair is due, so do not lock
-            # a random sample, so that irreparable frames do not prevent other repairs
+        with store.database.read() as connection:  # usually none is due: avoid a write lock
+            # sample randomly, so that irreparable frames do not prevent other repairs
             sample = random.sample(list(numbers), min(MOST, len(numbers)))
             due = _due(connection, sample, model_id)
         if not due:
@@ -98,12 +96,12 @@ def rebuild_frame(store: Store, signer: Signer, frame: FrameRow) -> tuple[Bytes,
 
     Returns
     -------
-    vector : signature
-    artifact : bytes of the geometry, equal to the bytes that were stored
+    vector : (D,) signature
+    artifact : encoded geometry, equal to the damaged original
 
     Raises
     ------
-    DamagedBlob : If the upload is lost or damaged too.
+    DamagedBlob : If the upload is lost or damaged as well.
     FrameError : If the frame cannot be signed.
     """
     read = read_stored(store.blobs.get(frame.blob), frame, store.decoders)
@@ -116,7 +114,7 @@ def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[
     now, due = time.time(), []
     for number in dict.fromkeys(numbers):
         job = latest_job(connection, REENCODE, number, model_id)
-        # a job may be in the future after the clock was set back
+        # absolute difference, since a job may be in the future after the clock was set back
         busy = job is not None and (not job.state.over or abs(now - job.created_at) < PAUSE_S)
         if number not in frames or busy or is_known_loss(frames[number].reason):
             continue
@@ -135,17 +133,17 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
 
     Returns
     -------
-    blobs : blobs that may be unreferenced now; none if the upload was sound
+    blobs : blobs that may be unreferenced now; empty if the stored upload is sound
     """
     try:
         with store.database.read() as connection:
             row = find_map(connection, map_name)
             frame = find_frame(connection, row, frame_id)
-    except UnknownFrame:  # the map was created again in the meantime
+    except UnknownFrame:
         return []
     if store.database.read_only or frame.state == FrameState.DELETED:
         return []
-    store.blobs.wait_for_removal(frame.blob)  # a removal may have started before the commit
+    store.blobs.wait_for_removal(frame.blob)  # which may have started before the commit
     if not is_known_loss(frame.reason) and store.blobs.condition(frame.blob) == "sound":
         return []
     while True:
@@ -154,7 +152,7 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
             now = frames_of(connection, [frame.number]).get(frame.number)
             if now is None:
                 return [blob, frame.blob]
-            if store.blobs.holds(blob):  # a deletion may have removed the blob
+            if store.blobs.holds(blob):  # not removed by a deletion
                 renew_upload(connection, now.number, blob, len(data), without_loss(now.reason))
                 artifacts = geometry_blobs(connection, [now.number], row.model_id)
                 break
