@@ -1,8 +1,8 @@
 """The store: a database of maps, frames, signatures and jobs, and the blobs that it refers to.
 
 All other data on disk is a cache. Functions take the connection of a transaction, so that related
-changes are committed together. `Store` combines both parts and a cache of geometry artifacts: a
-robot's query is mostly aligned with the same ten to twenty frames as its previous query.
+changes are committed together. `Store` also caches geometry artifacts, since consecutive queries of
+a robot are mostly aligned with the same ten to twenty frames.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-#: Ratio of a frame's memory to that of its arrays. Cached samples, plane weights and symmetries add
-#: up to 0.2.
+#: Ratio of the memory of a cached geometry to that of its arrays. Derived samples, plane weights
+#: and symmetries need up to 20 %.
 _OVERHEAD = 1.25
 
 
@@ -60,9 +60,9 @@ class _Entry:
 
 
 class GeometryCache:
-    """Cache of geometry artifacts in memory, which threads may share.
+    """Cache of geometry artifacts in memory; safe to share between threads.
 
-    The least recently used entries are removed first. Keys are hashes of the content, so entries
+    The least recently used entries are evicted first. Keys are hashes of the content, so entries
     are never stale.
 
     Parameters
@@ -77,7 +77,7 @@ class GeometryCache:
         self._bytes = 0
 
     def read(self, digest: str) -> Geometry:
-        """Return the artifact with a digest. Callers must not change it.
+        """Return a geometry by the digest of its artifact. Callers must not change it.
 
         Raises
         ------
@@ -92,7 +92,7 @@ class GeometryCache:
         geometry = read_geometry(self._blobs.get(digest))
         entry = _Entry(geometry, int(_OVERHEAD * _array_bytes(geometry)), time.monotonic())
         with self._lock:
-            self._remove(digest)  # another thread may have read the blob in the meantime
+            self._remove(digest)  # in case that another thread has added it
             self._entries[digest] = entry
             self._bytes += entry.size
             while self._bytes > self._most_bytes:
@@ -131,7 +131,7 @@ def _array_bytes(geometry: Geometry) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Store:
-    """Open database with its blobs.
+    """An open database with its blobs.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ class Store:
 
     @cached_property
     def seals(self) -> OpaqueIds:
-        """Cipher for row numbers that clients see."""
+        """Cipher of the row numbers in public ids and cursors."""
         return OpaqueIds(self.database)
 
     def close(self) -> None:
@@ -170,8 +170,8 @@ def open_store(
 ) -> Store:
     """Open a store, and create the database and the blobs if both are missing.
 
-    The blob folder of an existing database is never created: its disk may not be mounted yet, and
-    would later hide data that was written to the new folder.
+    The blob folder of an existing database is never created: if its disk is not mounted yet, the
+    mount would later hide the new folder.
 
     Parameters
     ----------
@@ -180,12 +180,12 @@ def open_store(
 
     Raises
     ------
-    UnusableStore, NewerSchema : If `open_database` or `open_blobs` raises the error.
+    UnusableStore, NewerSchema : See `open_database` and `open_blobs`.
     """
     new = not is_read_only(url) and not database_exists(url)
     if isinstance(blobs, Path):
         FolderBlobs(blobs, make=new)
-    if new:  # the database and the blobs may be in different folders
+    if new:
         _make_folder_of(url)
     database = open_database(url)
     try:
@@ -202,14 +202,13 @@ def open_blobs(
 ) -> Blobs:
     """Open the blobs of a database.
 
-    If the object store is unreachable, this succeeds, and requests fail until the store is
-    reachable again.
+    This succeeds even if the object store is unreachable; requests then fail until it is reachable.
 
     Parameters
     ----------
     blobs : folder, or URL of an object store
     make : whether to create a missing folder
-    claim : whether to mark an unclaimed prefix or folder as this database's
+    claim : whether to mark an unclaimed prefix or folder as owned by this database
 
     Raises
     ------
@@ -218,9 +217,9 @@ def open_blobs(
     may_mark = claim and not database.read_only
     if isinstance(blobs, Path):
         folder = FolderBlobs(blobs, make=make)
-        # two databases of a server may be configured with the same folder by mistake
+        # detect two databases of a server that use the same folder by mistake
         if not database.is_sqlite and blobs.is_dir():
-            may_mark &= os.access(blobs, os.W_OK)  # readers may mount it read-only
+            may_mark &= os.access(blobs, os.W_OK)  # false for a read-only mount
             BucketOwner.of_folder(blobs).claim(OpaqueIds(database).owner, anew=may_mark)
         return folder
     objects = open_objects(blobs)
@@ -243,7 +242,7 @@ def open_blobs(
 
 
 def _make_folder_of(url: str) -> None:
-    """Create the folder of a new SQLite file. Opening the database reports errors of other URLs."""
+    """Create the folder of a SQLite file; ignore other URLs, whose errors appear later."""
     with suppress(ArgumentError, ValueError):
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite" and parsed.database:

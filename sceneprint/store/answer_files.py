@@ -1,7 +1,7 @@
 """Files of stored answers by query id: in a folder, or in an object store of a fleet.
 
-The database determines which files are needed (`query_rows`). Files are not synced to disk, since
-the loss of an answer loses no data.
+The database records which files are needed (`query_rows`). Files are not synced to disk, since
+answers are not essential data.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from sceneprint.store.blobs.object_store import ObjectBlobs
 
 
 class AnswerFiles(ABC):
-    """Stored answers by query id, which several processes share.
+    """Stored answers by query id, shared by several processes.
 
-    Methods raise OSError or UnusableStore if the folder or the object store cannot be used.
+    Methods raise OSError or UnusableStore if the folder or the object store is not accessible.
     """
 
     @abstractmethod
@@ -34,7 +34,7 @@ class AnswerFiles(ABC):
 
     @abstractmethod
     def delete(self, query_ids: Sequence[str]) -> None:
-        """Remove answers, and ignore missing answers."""
+        """Remove answers; ignore missing answers."""
 
     @abstractmethod
     def list(self) -> Iterator[tuple[str, float]]:
@@ -65,7 +65,7 @@ class AnswerFolder(AnswerFiles):
         """See AnswerFiles; unfinished files of killed processes are included."""
         with suppress(FileNotFoundError), os.scandir(self._folder) as entries:
             for entry in entries:
-                with suppress(FileNotFoundError):  # another process has removed the file
+                with suppress(FileNotFoundError):
                     yield entry.name, entry.stat(follow_symlinks=False).st_mtime
 
 

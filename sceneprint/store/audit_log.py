@@ -4,7 +4,7 @@
     record_change                -->  a line for a change without an event
     record_refusal               -->  a line for a refused request
 
-Lines are never edited. Old lines are removed, and the oldest lines of tenants with too many.
+Lines are never edited. Expired lines are removed, and the oldest lines of a tenant with too many.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class AuditRow:
 
 @dataclass(frozen=True)
 class AuditFilter:
-    """Conditions on the lines of a list; None matches every line.
+    """Conditions on audit lines; None matches all lines.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def record_refusal(
     connection: Connection, actor: Actor, tenant: str, map_name: str | None, target: str | None,
     request_id: str, **data: Any,
 ) -> None:  # fmt: skip
-    """Write a line for a refused request, whose unchecked texts are cleaned and truncated."""
+    """Write a line for a refused request; its unvalidated texts are cleaned and truncated."""
     texts = {"map": map_name, "target": target}
     for name, text in texts.items():
         if text is not None:
@@ -103,7 +103,7 @@ def list_lines(
     connection: Connection, wanted: AuditFilter, limit: int, *, before: int | None = None,
     after: int | None = None,
 ) -> list[AuditRow]:  # fmt: skip
-    """Return lines, the newest first. With `after`, return later lines, the oldest first."""
+    """Return lines, newest first; with `after`, the lines after that number, oldest first."""
     order = audit.c.number.desc() if after is None else audit.c.number
     statement = select(audit).order_by(order).limit(limit)
     if after is not None:
@@ -128,8 +128,9 @@ def surplus_lines(
 
     Parameters
     ----------
-    before : time before which lines are old, seconds since 1970. If a clock was set back, an old
-        line behind a younger one stays until both are old
+    before : time before which lines are expired, seconds since 1970. Removal stops at the first
+        younger line, in case that a clock was set back
+    limit : maximum number of returned lines
     most_lines : maximum number of lines per tenant
     """
     oldest = connection.execute(

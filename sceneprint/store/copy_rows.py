@@ -1,4 +1,4 @@
-"""Read the rows of a map for a copy in another store, and write the rows of a copy."""
+"""Rows of map copies: read them in the original store, and write them in that of the copy."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState, JobState
 
-#: Number of rows that are read at once.
+#: Number of rows to read at once.
 _BLOCK = 200
-#: Columns of a frame that are copied. The other columns are specific to the store.
+#: Columns of a frame to copy. The other columns are specific to a store.
 COPIED_COLUMNS = (
     "content_id", "blob", "bytes", "intrinsics", "depth_scale", "depth_along_ray", "robot",
     "session", "captured_at", "tags", "pose_parent", "pose", "sent_parent", "sent_pose",
@@ -46,7 +46,7 @@ COLUMNS: tuple[Column[Any], ...] = (
 
 
 def copied_rows(connection: Connection, row: MapRow) -> Iterator[Row[Any]]:
-    """Yield `COLUMNS` of the indexed frames of a map, in the order of upload."""
+    """Yield `COLUMNS` of the indexed frames of a map, in upload order."""
     statement = _signed(select(*COLUMNS), row).order_by(frames.c.received_at, frames.c.number)
     options = {"stream_results": True}
     with closing(connection.execute(statement, execution_options=options)) as rows:
@@ -68,21 +68,21 @@ def has_artifact(connection: Connection, row: MapRow, digest: str) -> bool:
 
 
 def model_of(connection: Connection, model_id: str) -> tuple[str, bytes]:
-    """Return the name and the file of a model of a map."""
+    """Return the name of a stored model, and its file."""
     statement = select(models.c.name, models.c.content).where(models.c.id == model_id)
     name, content = connection.execute(statement).one()
     return name, bytes(content)
 
 
 def living_rows(connection: Connection, row: MapRow) -> dict[str, FrameRow]:
-    """Return all frames of a map that are not deleted, by id."""
+    """Return all frames of a map, except deleted frames, by id."""
     own = frames.c.map_number == row.number, frames.c.state != FrameState.DELETED
     rows = connection.execute(select(frames).where(*own)).mappings()
     return {one["id"]: frame_row(one) for one in rows}
 
 
 def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
-    """Set the creation time of a copied map to that of the original, and return the map."""
+    """Set the creation time of a map to `created_at`, and return the map."""
     own = update(maps).where(maps.c.number == row.number)
     connection.execute(own.values(created_at=created_at))
     return find_map(connection, row.name)
@@ -90,7 +90,7 @@ def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
 
 @dataclass(frozen=True, eq=False)
 class CopiedFrame:
-    """Frame of the original map.
+    """A frame of the original map.
 
     Parameters
     ----------
@@ -103,12 +103,12 @@ class CopiedFrame:
 
 
 def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame]) -> None:
-    """Add a few hundred indexed frames in a few statements; queries find them after the commit.
+    """Add up to a few hundred indexed frames to a copy.
 
     Parameters
     ----------
     connection : writing transaction
-    copies : frames, none of which exists in the map unless it is deleted
+    copies : frames that the map does not have, or only as deleted frames
     """
     deleted = select(frames.c.id).where(
         frames.c.map_number == row.number, frames.c.id.in_([one.id for one in copies])
@@ -151,5 +151,5 @@ def edit_copied(connection: Connection, row: MapRow, frame: FrameRow, copied: Co
 
 
 def numbers_in_blocks(rows: Sequence[FrameRow]) -> list[list[int]]:
-    """Return the numbers of frames in blocks."""
+    """Split the numbers of frames into blocks."""
     return [list(some) for some in blocks([one.number for one in rows])]

@@ -1,4 +1,4 @@
-"""Open the database, migrate it to the schema of this version, and run transactions.
+"""The database: opening, migration to the schema of this version, and transactions.
 
 URL  --open_database-->  Database  --read | write-->  Connection
 """
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 
 _FOLDER = Path(migrations.__file__).parent
-#: Lines of a file in `migrations/versions` that state its revision and the previous one.
+#: Lines of a file in `migrations/versions` that state its revision and its predecessor.
 _REVISIONS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
-#: Option of a connection: whether its transaction writes to single maps, concurrently with others.
+#: Connection option: whether the transaction writes to single maps, concurrently with others.
 MAPS_OPTION = "sceneprint_maps"
-#: Maximum number of concurrent writers of single maps in a process; each needs a connection.
+#: Maximum number of concurrent writers of single maps in a process.
 MAP_WRITERS = 8
 
 
@@ -60,7 +60,7 @@ def migration_config() -> Config:
 
 @cache
 def known_revisions() -> tuple[str, frozenset[str]]:
-    """Return the revision of this version, and all revisions that it can upgrade from."""
+    """Return the schema revision of this version, and all revisions that it can migrate from."""
     parents: dict[str, str] = {}
     for path in _FOLDER.glob("versions/*.py"):
         names = dict(_REVISIONS.findall(path.read_text(encoding="utf-8")))
@@ -71,7 +71,7 @@ def known_revisions() -> tuple[str, frozenset[str]]:
 
 
 def revision_of(connection: Connection) -> str | None:
-    """Return the revision of a database; None if it has no schema."""
+    """Return the schema revision of a database; None without a schema."""
     if not inspect(connection).has_table("alembic_version"):
         return None
     statement = "SELECT version_num FROM alembic_version"
@@ -81,7 +81,7 @@ def revision_of(connection: Connection) -> str | None:
 
 @dataclass(frozen=True)
 class SchemaRange:
-    """Schema of a store, and the revisions whose processes may use it.
+    """Schema revision of a store, and the revisions that may write to it.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class SchemaRange:
     def allows(self, own: str) -> bool:
         """Return whether a process of revision `own` may use the store.
 
-        Revisions are numbers of four digits, so their order is that of texts.
+        Revisions have four digits, so they can be compared as texts.
         """
         return self.revision == own or (
             self.revision.isdecimal() and self.least <= own < self.revision
@@ -106,7 +106,7 @@ def schema_range_of(connection: Connection) -> SchemaRange | None:
     revision = revision_of(connection)
     if revision is None:
         return None
-    if not inspect(connection).has_table(schema_range.name):  # a database of another program
+    if not inspect(connection).has_table(schema_range.name):  # database of another program
         return SchemaRange(revision, revision)
     return SchemaRange(revision, connection.execute(select(schema_range)).scalar_one())
 
@@ -134,7 +134,7 @@ def _check_schema(engine: Engine, row: Any) -> None:
 
 
 def create_schema(connection: Connection) -> None:
-    """Create all tables of this version in an empty database, and record its revision."""
+    """Create all tables of this version in an empty database, and record the revision."""
     head, _ = known_revisions()
     metadata.create_all(connection, checkfirst=False)
     if connection.dialect.name == "postgresql":
@@ -149,7 +149,7 @@ def create_schema(connection: Connection) -> None:
     connection.execute(text("INSERT INTO alembic_version VALUES (:head)"), {"head": head})
 
 
-#: Schemes of URLs of a server. Hosting providers issue URLs with the short schemes.
+#: Schemes of PostgreSQL URLs. Hosting providers issue URLs with the short schemes.
 _SERVERS = ("postgresql", "postgres", "postgresql+psycopg")
 
 
@@ -158,17 +158,17 @@ def database_url(url_text: str) -> URL:
 
     Raises
     ------
-    UnusableStore : If the URL is not that of such a database. The message repeats only its scheme.
+    UnusableStore : If the URL is not valid. The message contains only its scheme.
     """
     kind = url_text.partition(":")[0]
     try:
         if kind in _SERVERS:
-            if url_text.count("@") > 1:  # SQLAlchemy would parse a part of the password as host
+            if url_text.count("@") > 1:  # SQLAlchemy would parse part of the password as the host
                 raise ValueError("an @ in a password")
             return make_url(url_text).set(drivername="postgresql+psycopg")
         url = make_url(url_text)
         is_sqlite = url.get_backend_name() == "sqlite"
-    # ValueError is raised for a port that is not a number and may be a part of a password
+    # ValueError: the port, possibly part of a password, is not a number
     except (ArgumentError, ValueError):
         raise UnusableStore(
             f"The database URL that starts with {kind!r:.80} is not valid. Set "
@@ -190,7 +190,7 @@ _migrating = threading.Lock()
 
 
 def migrate(database: Database) -> None:
-    """Migrate a database to the schema of this version in one transaction; other processes wait.
+    """Migrate a database to the schema of this version, in one transaction.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def migrate(database: Database) -> None:
             f"{database.shown} has schema {current}, but this version needs {head}, and the file "
             "is read-only. Open it once from a writable disk, or use the version that wrote it."
         )
-    with database.write(unchecked=True) as connection:  # another process may migrate first
+    with database.write(unchecked=True) as connection:
         current = current_revision(connection)
         if current is None:
             create_schema(connection)
@@ -218,11 +218,11 @@ def migrate(database: Database) -> None:
             config = migration_config()
             config.attributes["connection"] = connection
             if not database.is_sqlite:
-                # wait for writers without a turn; later writers see the new schema
+                # wait for writers without a turn
                 connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
             with _migrating:
                 command.upgrade(config, "head")
-            # `unchecked` turned this check off during the migration
+            # check foreign keys, which `unchecked` has turned off
             if (
                 database.is_sqlite
                 and connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None
@@ -235,7 +235,7 @@ def migrate(database: Database) -> None:
 
 
 def current_revision(connection: Connection) -> str | None:
-    """Return the revision of a database; None if it has no schema.
+    """Return the schema revision of a database; None without a schema.
 
     For a later schema that this version may use, return the revision of this version.
 
@@ -257,16 +257,17 @@ def current_revision(connection: Connection) -> str | None:
 
 
 class Database:
-    """Transactions on a database, which threads but not processes may share.
+    """Transactions on a database; safe to share between threads, but not between processes.
 
     Parameters
     ----------
-    sealed : database file if it is read-only
+    engine : SQLAlchemy engine
+    sealed : database file if it is read-only, else None
     """
 
     def __init__(self, engine: Engine, sealed: ReadOnlyFile | None = None) -> None:
         self._engine, self._sealed = engine, sealed
-        # readers see a single snapshot; in SQLite this is true for all transactions
+        # readers use one snapshot, as all transactions of SQLite do
         self._readers = engine if self.is_sqlite else engine.execution_options(
             isolation_level="REPEATABLE READ", postgresql_readonly=True
         )  # fmt: skip
@@ -274,17 +275,16 @@ class Database:
         self._writers = engine if self.is_sqlite else engine.execution_options(
             isolation_level="AUTOCOMMIT"
         )  # fmt: skip
-        # only one writer of this process waits at the database; the others wait here, so that they
-        # occupy no connections
+        # one writer of this process waits at the database; the others wait here without connections
         self._turns, self._map_turns = ThreadTurns(1), ThreadTurns(MAP_WRITERS)
         file = None if sealed is not None else self.file
         self._line = None if file is None else WriterLine(file.parent)
-        self._held = False  # another process has held the lock for longer than BUSY_S
+        self._held = False  # whether another process has held the lock for longer than BUSY_S
         self._guarded = False
         self._schema = postgres.KnownSchema(self._check_schema)
         #: Timeline of the PostgreSQL server at the last connection; None for SQLite. A promoted
-        #: standby starts a new timeline and may lack the last commits, so caches of rows of the
-        #: former timeline must be dropped.
+        #: standby starts a new timeline and may lack the last commits, so cached rows of the former
+        #: timeline are invalid.
         self.history: str | None = None
         if not self.is_sqlite:
             event.listen(engine, "connect", self._note_history)
@@ -299,7 +299,7 @@ class Database:
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether the database is a file of this machine, with one writer at a time."""
+        """Whether the database is SQLite: a local file with one writer at a time."""
         return self.dialect == "sqlite"
 
     @property
@@ -329,11 +329,11 @@ class Database:
             raise self._sealed.refusal()
 
     def guard_schema(self) -> None:
-        """Make each later `write` check that this version may use the schema."""
+        """Make all later calls of `write` check that this version may use the schema."""
         self._guarded = True
 
     def require_schema(self) -> None:
-        """Raise NewerSchema if a later version has migrated the store in the meantime."""
+        """Raise NewerSchema if a later version has migrated the store to an incompatible schema."""
         if self._guarded:
             with self.read() as connection:
                 require_schema(connection)
@@ -356,16 +356,15 @@ class Database:
 
         Parameters
         ----------
-        unchecked : whether to turn off SQLite's foreign key checks, so that tables can be rebuilt;
-            on PostgreSQL, to wait longer for the turn and for statements
-        turn : whether other writers wait until the commit. Without a turn on PostgreSQL, change
-            only locked rows, and record no events. SQLite ignores the parameter
-        map_number : number of the map, if the transaction writes to a single map. On PostgreSQL,
-            writers of other maps then do not wait: do not change rows that maps share, and record
-            events with `record_event`
-        single : whether the transaction is a single statement. For a single map, PostgreSQL then
-            waits for the turn, executes and commits the statement in one round trip. SQLite
-            ignores the parameter
+        unchecked : whether to turn off foreign key checks in SQLite, so that tables can be rebuilt,
+            and to extend the time limits on PostgreSQL
+        turn : whether other writers wait until the commit. Without a turn, change only locked rows,
+            and record no events. SQLite ignores the parameter
+        map_number : number of the only map that the transaction writes to. On PostgreSQL, writers
+            of other maps then do not wait. Do not change rows that maps share, and record events
+            with `record_event`
+        single : whether the transaction is a single statement. With `map_number`, PostgreSQL then
+            waits for the turn, executes and commits in one round trip. SQLite ignores the parameter
 
         Raises
         ------
@@ -373,7 +372,7 @@ class Database:
         StoreLocked : If another process has been writing for longer than BUSY_S. Later writers then
             wait for HELD_S only, until one succeeds.
         StoreFull : If the disk is full.
-        NewerSchema : If another version migrated the store beyond what this process may write.
+        NewerSchema : See `require_schema`.
         UnusableStore : If the database cannot be written for another reason.
         """
         self.require_writable()
@@ -404,7 +403,7 @@ class Database:
     def write_maps(self, map_numbers: Collection[int], wait_s: float) -> Iterator[Connection]:
         """Run a transaction of a single statement that writes to several maps on PostgreSQL.
 
-        Only one thread of a process may do so at a time. See `write`.
+        Only one thread of a process may call this at a time. See `write`.
 
         Parameters
         ----------
@@ -413,12 +412,11 @@ class Database:
         Raises
         ------
         MapsInUse : If a map is still in use after `wait_s`; nothing is written.
-        ReadOnlyStore and others : If `write` raises the error.
+        ReadOnlyStore and others : See `write`.
         """
         self.require_writable()
         turn_s = postgres.HELD_S if self._held else BUSY_S
-        # the statement takes no turn among the threads of this process: it serves many tenants, and
-        # would wait for maps that they use
+        # take no turn among the threads of this process: the statement would wait for their maps
         with self._note_locks(), self.explained(), self._writers.connect() as connection:
             with self._write_single(connection, map_numbers, turn_s, wait_s) as writing:
                 yield writing
@@ -441,7 +439,7 @@ class Database:
     @contextmanager
     def _write_out_of_turn(self) -> Iterator[Connection]:
         """Run a transaction without a turn on PostgreSQL."""
-        # a migration waits for this lock
+        # lock the schema, for which a migration waits
         checks = (f"{postgres.SCHEMA} FOR KEY SHARE",) if self._guarded else ()
         with self.explained(), self._writers.begin() as connection:
             row = postgres.begin(connection, *checks)
@@ -451,7 +449,7 @@ class Database:
 
     @contextmanager
     def _take_thread_turn(self, turns: ThreadTurns, wait_s: float) -> Iterator[None]:
-        """Take a turn among the threads of this process."""
+        """Wait for a turn among the threads of this process; raise StoreLocked after `wait_s`."""
         tenant = current_tenant()
         if not turns.acquire(tenant, wait_s):
             raise StoreLocked(
@@ -466,7 +464,7 @@ class Database:
 
     @contextmanager
     def _note_locks(self) -> Iterator[None]:
-        """Shorten the wait of later writers after the lock could not be taken."""
+        """Shorten the wait of later writers after a writer timed out; see `write`."""
         try:
             yield
         except StoreLocked:
@@ -477,7 +475,7 @@ class Database:
     def _write_in_turn(
         self, connection: Connection, wait_s: float, map_number: int | None, unchecked: bool
     ) -> Iterator[Connection]:
-        """Run a transaction in its turn, committed at the end."""
+        """Run a transaction that takes a turn, and commit it at the end."""
         options: dict[str, Any] = {
             "sceneprint_write": wait_s,
             "sceneprint_line": self._line,
@@ -485,11 +483,11 @@ class Database:
         }
         if unchecked and self.is_sqlite:
             options["sceneprint_unchecked"] = True
-            connection.detach()  # a connection without checks must not return to the pool
+            connection.detach()  # a connection without checks must not be reused
         writing = connection.execution_options(**options)
         with writing.begin():
             checked, row = self._guarded and not unchecked, None
-            if not self.is_sqlite:  # in SQLite, the transaction has the turn
+            if not self.is_sqlite:  # in SQLite, the transaction itself is the turn
                 schema = postgres.SCHEMA if checked else None
                 row = postgres.take_turn(writing, wait_s, schema, map_number)
             self._held = False
@@ -503,7 +501,7 @@ class Database:
         _check_schema(self._engine, row)
 
     def shrink_log(self) -> bool:
-        """Empty SQLite's log, which may hold deleted data; return False if readers prevent it."""
+        """Empty the log of SQLite, which may contain deleted data; return False if it is in use."""
         if not self.is_sqlite or self.read_only:
             return True
         with self.explained():
@@ -520,8 +518,8 @@ class Database:
     def driver_connection(self) -> psycopg.Connection[Any]:
         """Return a new connection to PostgreSQL that commits each statement immediately.
 
-        Session state such as LISTEN and session locks needs a separate connection. The caller must
-        close it, and execute its statements within `explained`.
+        It is for session state, such as LISTEN and session locks. The caller must close it, and
+        execute statements within `explained`.
 
         Raises
         ------
@@ -545,9 +543,9 @@ class Database:
     def close(self) -> None:
         """Close all connections; connections in use are closed when they are returned."""
         pool = self._engine.pool
-        self._engine.dispose()  # connections in use are left to the garbage collector
+        self._engine.dispose()
         event.listen(pool, "checkin", _close_connection)
-        pool.dispose()  # closes connections that were returned in the meantime
+        pool.dispose()  # closes connections that were returned meanwhile
         if self._line is not None:
             self._line.close()
 
@@ -567,7 +565,7 @@ def database_exists(url: str) -> bool:
     try:
         parsed = database_url(url)
     except UnusableStore:
-        return False  # opening the database reports the error
+        return False  # the error appears when the database is opened
     if parsed.get_backend_name() == "sqlite":
         return parsed.database is not None and Path(parsed.database).is_file()
     database = reach_database(url)

@@ -1,4 +1,4 @@
-"""Translate system and database errors to errors of the store, and wait for a starting server.
+"""Translation of system and database errors to store errors, and the wait for a starting server.
 
 OSError | error of SQLite or PostgreSQL  -->  StoreFull, ReadOnlyStore, StoreLocked or
 UnusableStore
@@ -24,7 +24,7 @@ from sqlalchemy.exc import TimeoutError as AllInUse
 
 from sceneprint.errors import ReadOnlyStore, StoreAway, StoreFull, StoreLocked, UnusableStore
 
-#: Free space below which a failed write counts as a write to a full disk, bytes.
+#: Free space in bytes below which a failed write is attributed to a full disk.
 NO_ROOM = 1 << 20
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -34,7 +34,7 @@ def unusable(what: str, error: OSError) -> UnusableStore:
 
     Parameters
     ----------
-    what : beginning of the message, with the path
+    what : prefix of the message, with the path
     error : system error
     """
     text = f"{what} ({error.strerror})."
@@ -67,7 +67,7 @@ def fault_of(engine: Engine, error: Exception) -> UnusableStore | None:
             f"{database_label(engine.url)}: All connections of this process are in use. "
             "Try again later."
         )
-    driver = sys.modules.get("psycopg")  # only PostgreSQL imports it
+    driver = sys.modules.get("psycopg")  # imported only for PostgreSQL
     if driver is None or not isinstance(error, driver.Error):
         return None
     return explain_error(engine.url, error, isinstance(error, driver.OperationalError))
@@ -111,7 +111,7 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
 
 
 def _turned_read_only(path: str | None) -> bool:
-    """Return whether the disk of a file is read-only; SQLite only reports a disk I/O error."""
+    """Return whether the disk of a file is read-only, which SQLite reports as an I/O error."""
     try:
         return path is not None and bool(os.statvfs(Path(path).parent).f_flag & os.ST_RDONLY)
     except OSError:
@@ -127,7 +127,7 @@ def _no_room(path: str | None) -> bool:
 
 
 def _database_message(error: DBAPIError) -> str:
-    """Return the message of an error as one line, since it may quote a long statement."""
+    """Return the message of an error on one line."""
     return " ".join(str(error.orig).split())
 
 
@@ -166,20 +166,19 @@ _FAULTS: dict[str, tuple[type[UnusableStore], str]] = {
         "The connection was lost. Check that the server runs. The service tries again.",
     ),
     "28": (UnusableStore, "Check user and password in SCENEPRINT_DATABASE_URL, and pg_hba.conf."),
-    "3D000": (UnusableStore, "Create the database, or set SCENEPRINT_DATABASE_URL to another one."),
+    "3D000": (UnusableStore, "Create the database, or correct SCENEPRINT_DATABASE_URL."),
     "URL": (UnusableStore, "Correct SCENEPRINT_DATABASE_URL."),
     "plan": (
         StoreLocked,
-        "The tables were changed in the meantime. Nothing was stored. Try again.",
+        "The tables were changed meanwhile. Nothing was stored. Try again.",
     ),
-    # the tables existed when this process started
     "42P01": (UnusableStore, "Tables are missing. Restore the database from a copy."),
     "42501": (UnusableStore, "The user does not own the tables. Make it their owner."),
     "58": (UnusableStore, "The server cannot use its files. Check its log."),
-    "XX001": (UnusableStore, "The server's files are damaged. Restore a bundle or a backup."),
+    "XX001": (UnusableStore, "Files of the server are damaged. Restore a bundle or a backup."),
     "XX002": (UnusableStore, "An index of the server is damaged. REINDEX the database."),
 }
-#: Patterns of connection errors for which retries are useless, with SQLSTATE or name in `_FAULTS`.
+#: Patterns of permanent connection errors, with their key in `_FAULTS`.
 _REFUSALS = {
     r"database .+ does not exist": "3D000",
     r"authentication failed|no pg_hba\.conf entry|role .+ does not exist|no password": "28000",
@@ -197,7 +196,7 @@ def explain_error(url: URL, error: object, broken: bool) -> UnusableStore | None
     Parameters
     ----------
     error : error of psycopg
-    broken : whether the connection is broken, so that other statements would fail too
+    broken : whether the connection is broken
     """
     message = " ".join(str(error).split()).rstrip(".")
     state = getattr(error, "sqlstate", None) or ""
@@ -212,16 +211,16 @@ def explain_error(url: URL, error: object, broken: bool) -> UnusableStore | None
 
 
 def is_conflict(error: UnusableStore) -> bool:
-    """Return whether PostgreSQL aborted a transaction in favour of another, as in a deadlock."""
+    """Return whether PostgreSQL aborted a transaction because of a conflict, such as a deadlock."""
     cause = error.__cause__
     state = getattr(getattr(cause, "orig", cause), "sqlstate", None)
     return state is not None and str(state).startswith("40")
 
 
 def is_of_old_plan(error: object) -> bool:
-    """Return whether a statement was prepared for tables whose columns have changed.
+    """Return whether an error is that of a prepared statement whose tables have changed.
 
-    The SQLSTATE of this error is unspecific, and its text is in the server's language.
+    The SQLSTATE of this error is unspecific, and its text depends on the locale of the server.
     """
     diagnosis = getattr(error, "diag", None)
     return getattr(diagnosis, "source_function", None) == "RevalidateCachedQuery"
@@ -231,7 +230,7 @@ log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-#: Seconds that a starting process waits for its server.
+#: Maximum seconds that a starting process waits for its server.
 PATIENCE_S = 60.0
 #: Seconds between attempts to connect.
 AGAIN_S = 1.0
@@ -241,14 +240,14 @@ def open_patiently(
     attempt: Callable[[], T], patience_s: float = PATIENCE_S,
     may_go_on: Callable[[float], bool] | None = None,
 ) -> T:  # fmt: skip
-    """Return the result of an attempt, which is repeated while the server is unreachable.
+    """Call `attempt` until the server is reachable, and return the result.
 
     Parameters
     ----------
     attempt : function that opens the store
-    patience_s : maximum seconds to wait
-    may_go_on : function that takes a number of seconds, waits for that time, and returns whether to
-        retry; by default, retry until `patience_s`
+    patience_s : maximum duration of all attempts, seconds
+    may_go_on : function that waits for a number of seconds, and returns whether to retry; default:
+        sleep, and always retry
 
     Raises
     ------

@@ -1,10 +1,9 @@
-"""Delete frames and maps, and record the blobs that must be removed.
+"""Deletion of frames and maps, and records of the blobs to remove.
 
-A deletion that can be undone leaves tombstones (see `tombstones`): frames with their uploads,
-signatures and metadata that are excluded from searches, lists and counts. After the purge of a
-frame, a bare row remains for some days, so that readers learn of the deletion from its revision.
-The same transaction records the blobs as doomed, so that they are removed even if this process
-dies.
+A deletion that can be undone leaves tombstones (see `tombstones`): complete frames that are
+excluded from searches, lists and counts. After the purge of a frame, a bare row remains for some
+days, so that readers learn of the deletion from its revision. The same transaction records the
+blobs as doomed, so that they are removed even if this process is killed.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ from sceneprint.store.tables import (
 from sceneprint.store.tenants import save_turns
 from sceneprint_client.api import FrameState, JobState
 
-#: Columns that a purge clears: all metadata except that of the camera.
+#: Columns that a purge clears: all metadata except the camera parameters.
 _PURGED = (
     "reason", "robot", "session", "captured_at", "pose_parent", "pose", "pose_x", "pose_y",
     "pose_z", "sent_parent", "sent_pose", "base_frame", "base", "novelty", "up", "name",
@@ -82,13 +81,13 @@ def delete_frames(
     Parameters
     ----------
     connection : writing transaction
-    numbers : numbers of at most a few hundred frames of the map; deleted frames are ignored
-    reason : data of the events if no user requested the deletion
+    numbers : up to a few hundred frame numbers; deleted frames are ignored
+    reason : reason in the events, if no user requested the deletion
     deletion : number of the deletion for the tombstones; None purges the frames immediately
 
     Returns
     -------
-    blobs : doomed blobs, to sweep after the commit
+    blobs : doomed blobs, to be collected after the commit
     """
     c = frames.c
     existing = c.number.in_(numbers), c.state != FrameState.DELETED
@@ -100,7 +99,7 @@ def delete_frames(
     cancel_jobs(connection, jobs.c.frame_number.in_(living))
     redundant = [one.number for one in rows if one.state == FrameState.REDUNDANT]
     add_usage(connection, row.number, len(redundant) - len(rows), 0)
-    # each frame gets its own revision, because readers continue after their last revision
+    # one revision per frame, because readers continue after their last revision
     last = next_revision(connection, row.number, len(living))
     connection.execute(
         update(frames)
@@ -116,7 +115,7 @@ def delete_frames(
         connection,
         [event_values("frame.deleted", row.name, one.id, None, data) for one in rows],
     )
-    # a redundant frame has no upload and cannot be restored
+    # purge redundant frames: without uploads, they cannot be restored
     return purge_frames(connection, row.number, living if deletion is None else redundant)
 
 
@@ -125,7 +124,7 @@ def purge_frames(connection: Connection, map_number: int, numbers: Sequence[int]
 
     Returns
     -------
-    blobs : doomed blobs, to sweep after the commit
+    blobs : doomed blobs, to be collected after the commit
     """
     if not numbers:
         return []
@@ -144,21 +143,21 @@ def purge_frames(connection: Connection, map_number: int, numbers: Sequence[int]
 
 
 def without_content(frame: FrameRow) -> FrameRow:
-    """Return a deleted frame without the columns that a purge clears; others are unchanged."""
+    """Return a frame; if it is deleted, without the columns that a purge clears."""
     if frame.deletion is None:
         return frame
     bare: dict[str, Any] = dict.fromkeys(_PURGED)
     return replace(frame, tags=[], **bare)
 
 
-#: Number of tombstones that are purged in one transaction.
+#: Maximum number of tombstones to purge in one transaction.
 PURGED_AT_ONCE = 100
 
 
 def oldest_tombstones(
     connection: Connection, map_number: int, limit: int = PURGED_AT_ONCE
 ) -> list[tuple[int, int, float]]:
-    """Return the number, bytes and deletion time of the oldest tombstones of a map."""
+    """Return frame number, size in bytes and deletion time of the oldest tombstones of a map."""
     c = frames.c
     statement = select(c.number, c.bytes, c.ended_at).where(
         c.map_number == map_number, c.deletion.is_not(None)
@@ -168,7 +167,7 @@ def oldest_tombstones(
 
 
 def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> list[str]:
-    """Check a map's quota, and purge the oldest tombstones if they use too much of it.
+    """Check the quota of a map; if tombstones exceed it, purge the oldest ones.
 
     Parameters
     ----------
@@ -177,11 +176,11 @@ def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = Tru
 
     Returns
     -------
-    blobs : doomed blobs, to sweep after the commit
+    blobs : doomed blobs, to be collected after the commit
 
     Raises
     ------
-    QuotaExceeded : If the quota would be exceeded even without tombstones; none is purged.
+    QuotaExceeded : If the quota is exceeded even without tombstones; none is purged.
     """
     require_room(connection, row, size, new=new)
     blobs: list[str] = []
@@ -197,7 +196,7 @@ def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = Tru
 
 
 def remove_map(connection: Connection, row: MapRow) -> list[str]:
-    """Remove a map with all its rows.
+    """Remove a map and all its rows.
 
     Returns
     -------
@@ -234,7 +233,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
     return blobs
 
 
-#: Number of rows that one commit removes; other writers wait approximately 30 ms.
+#: Number of rows to remove in one commit (about 30 ms).
 BLOCK = 500
 
 
@@ -243,12 +242,13 @@ def remove_in_blocks(
     remove: Callable[[Connection, Sequence[int]], None], most: float = math.inf,
     block: int = BLOCK,
 ) -> int:  # fmt: skip
-    """Remove rows in blocks, one per commit, so that other writers get their turns.
+    """Remove rows in blocks of one commit each, so that other writers can write in between.
 
     Parameters
     ----------
-    find : function that returns the numbers of rows to remove, up to a limit; it is called without
-        the lock, because it usually returns none
+    database : database of the rows
+    find : function that returns up to a number of rows to remove. It is called outside of write
+        transactions, because it usually returns no rows
     remove : function that removes the rows
     most : maximum number of rows; the last block may exceed it
 
@@ -270,16 +270,16 @@ def remove_in_blocks(
 
 
 def doom(connection: Connection, blobs: Iterable[str]) -> float:
-    """Record at most a few thousand blobs that may have to be removed.
+    """Record up to a few thousand blobs as doomed, that is, to be removed if unreferenced.
 
-    Existing records get the new time, so that the process that wrote them cannot clear them.
+    Existing records get the new time, so that the process that wrote them does not clear them.
 
     Returns
     -------
     at : time of the records, seconds since 1970
     """
     at = time.time()
-    # the order prevents deadlocks between writers of two maps that doom the same blobs
+    # sort, to prevent deadlocks between writers of two maps that doom the same blobs
     if rows := [{"blob": blob, "at": at} for blob in sorted(set(blobs))]:
         connection.execute(_replace_time(dialect_insert(connection, doomed)), rows)
     return at
@@ -290,9 +290,9 @@ def _replace_time(new: Any) -> Any:
 
 
 def doom_found(connection: Connection, *statements: Select[tuple[str]]) -> None:
-    """Record all blobs that the statements select; see `doom`."""
+    """Record all blobs that some statements select as doomed; see `doom`."""
     blobs = union(*statements).subquery()
-    # without WHERE, SQLite would parse the ON of ON CONFLICT as that of a join
+    # WHERE is necessary: otherwise, SQLite would parse ON CONFLICT as the condition of a join
     rows = select(blobs.c[0], literal(time.time(), Float)).where(true())
     new = dialect_insert(connection, doomed).from_select(["blob", "at"], rows)
     connection.execute(_replace_time(new))
@@ -301,7 +301,7 @@ def doom_found(connection: Connection, *statements: Select[tuple[str]]) -> None:
 def doomed_blobs(
     connection: Connection, limit: int, before: float | None = None, after: str = ""
 ) -> list[str]:
-    """Return up to `limit` doomed blobs in order, after `after` and recorded before `before`."""
+    """Return up to `limit` doomed blobs, sorted, after `after` and doomed before `before`."""
     statement = (
         select(doomed.c.blob).where(doomed.c.blob > after).order_by(doomed.c.blob).limit(limit)
     )
@@ -314,14 +314,14 @@ def clear_doomed(
     connection: Connection, blobs: Sequence[str], at: float | None = None,
     before: float | None = None,
 ) -> None:  # fmt: skip
-    """Clear the records of blobs that were removed, or have references again.
+    """Clear the records of doomed blobs that were removed, or are referenced again.
 
     Parameters
     ----------
     connection : writing transaction of all maps
-    blobs : at most a few hundred blobs
-    at : time of the records to clear; None clears records of any time
-    before : time from which records are not cleared
+    blobs : up to a few hundred blobs
+    at : clear only records of this time
+    before : clear only records before this time
     """
     if not blobs:
         return
@@ -337,7 +337,7 @@ def clear_doomed(
 
 #: Seconds of a day.
 DAY_S = 86_400.0
-#: Condition with a literal value, because planners do not match bound values to a partial index.
+#: Condition with a literal value: planners do not match bound values to a partial index.
 _LIVING: ColumnElement[bool] = frames.c.state != literal_column("'deleted'")
 
 
@@ -348,7 +348,7 @@ def aging_maps(connection: Connection) -> list[MapRow]:
 
 
 def old_frames(connection: Connection, map_number: int, before: float, limit: int) -> list[int]:
-    """Return the numbers of a map's frames that were received before a time, the oldest first."""
+    """Return up to `limit` numbers of frames of a map received before a time, oldest first."""
     statement = (
         select(frames.c.number).where(_old(map_number, before)).order_by(frames.c.received_at)
     )
@@ -356,7 +356,7 @@ def old_frames(connection: Connection, map_number: int, before: float, limit: in
 
 
 def count_old_frames(connection: Connection, map_number: int, before: float) -> int:
-    """Return the number of a map's frames that were received before a time."""
+    """Count the frames of a map that were received before a time."""
     return count_rows(connection, _old(map_number, before))
 
 
@@ -364,13 +364,13 @@ def _old(map_number: int, before: float) -> ColumnElement[bool]:
     return and_(frames.c.map_number == map_number, frames.c.received_at < before, _LIVING)
 
 
-# Rows of frames that were deleted, rejected or redundant for some days. Readers of a map's
-# signatures learn of deletions from these rows. The map stores the greatest revision of a removed
-# row; a reader at an earlier revision must start again.
+# Rows of frames that have been deleted, rejected or redundant for some days. Readers of signatures
+# learn of deletions from these rows. The map stores the greatest revision of a removed row; readers
+# at earlier revisions must restart.
 
 
 def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
-    """Return the maps with frames that ended before a time."""
+    """Return the maps with frames that were deleted or redundant before a time."""
     ended = (
         select(frames.c.number).where(_ended(maps.c.number, state, before)).exists()
         for state in ROOMLESS
@@ -379,9 +379,10 @@ def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
 
 
 def remove_ended(connection: Connection, map_number: int, before: float, limit: int) -> int:
-    """Remove the rows of a map's frames that ended before a time, with their jobs.
+    """Remove rows and jobs of the frames of a map that were deleted or redundant before a time.
 
-    Restorable frames, frames in a surface, and frames with an unfinished job are not removed.
+    Rows that are still needed remain: of restorable frames, of frames in a surface, and of frames
+    with an unfinished job.
 
     Parameters
     ----------
@@ -411,7 +412,7 @@ def remove_ended(connection: Connection, map_number: int, before: float, limit: 
 
 
 def newest_deletion(connection: Connection, map_number: int, before: float) -> int:
-    """Return the revision of a map's newest frame deleted before a time; 0 if there is none."""
+    """Return the highest revision among frames deleted before a time; 0 without such frames."""
     statement = (
         select(frames.c.revision)
         .where(_ended(map_number, FrameState.DELETED, before))
@@ -429,7 +430,7 @@ def _ended(
 
 
 def _unreferred() -> list[ColumnElement[bool]]:
-    """Return the conditions under which the row of a frame is no longer needed."""
+    """Return the conditions for rows of frames that are no longer needed."""
     unfinished = select(jobs.c.number).where(
         jobs.c.frame_number == frames.c.number,
         jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),

@@ -1,12 +1,12 @@
-"""Events report changes in order. Each event is written in the transaction of its change.
+"""Events: reports of changes, in order, each written in the transaction of the change.
 
     writer of all maps  --record_event-->  events  <--number_events--  pending_events  <--  writer
     of a map
 
-Numbers are in commit order, so a reader of all events up to a number never misses a smaller number.
-Writers of all maps run one at a time and assign numbers themselves. Writers of single maps commit
-concurrently, so their events are pending until a process numbers the committed events. The pending
-events of a map are in commit order, since its writers take turns.
+Numbers are in commit order, so that a reader never misses an event with a smaller number. Writers
+of all maps run one at a time and assign numbers themselves. Writers of single maps commit
+concurrently, so their events are pending until a process numbers them. The pending events of a map
+are in commit order, since its writers take turns.
 """
 
 from __future__ import annotations
@@ -55,14 +55,15 @@ def record_event(
     details: Mapping[str, Any] | None = None,
     **data: Any,
 ) -> None:
-    """Write an event, and a line of the audit log if an actor made the change.
+    """Write an event, and an audit line if the change was made by an actor.
 
     Parameters
     ----------
     connection : transaction of the change
-    kind : one of `KINDS` of the API
+    kind : event kind, from `KINDS` of the API
     map_name, frame_id, job_id : changed objects
-    details : data for the audit log only
+    details : data only for the audit line
+    data : data of the event, depending on its kind
     """
     record_events(connection, [event_values(kind, map_name, frame_id, job_id, data)], details)
 
@@ -71,13 +72,13 @@ def record_events(
     connection: Connection, rows: Sequence[dict[str, Any]],
     details: Mapping[str, Any] | None = None,
 ) -> None:  # fmt: skip
-    """Write events and their lines of the audit log; see `record_event`.
+    """Write events and audit lines; see `record_event`.
 
     Parameters
     ----------
     connection : transaction of the changes
     rows : columns of each event, see `event_values`
-    details : data of each line for the audit log only
+    details : data only for the audit lines
     """
     connection.execute(insert(events_table(connection)), rows)
     append_lines(
@@ -94,24 +95,24 @@ def record_events(
     )  # fmt: skip
 
 
-#: Kinds of events that the reader of a frame discovers but does not cause.
+#: Kinds of events whose cause is not the actor who reads a frame.
 _DISCOVERIES = frozenset(("frame.damaged",))
 
 
 def events_table(connection: Connection) -> Table:
-    """Return the table for the events of a writer."""
+    """Return the event table for the transaction of a connection: pending or numbered events."""
     of_maps = connection.get_execution_options().get(MAPS_OPTION)
     return pending_events if of_maps else events
 
 
-#: Maximum seconds to wait for another process that is numbering events.
+#: Maximum seconds to wait while another process numbers events.
 NUMBERING_S = 1.0
 
 
 def number_events(database: Database) -> None:
-    """Assign numbers to the committed events before they are read.
+    """Assign numbers to pending events; call this before reading events.
 
-    If this is not possible, for example in a read-only database, the pending events appear later.
+    If this is not possible, for example in a read-only database, they remain pending.
     """
     if not database.read_only:
         with suppress(UnusableStore):
@@ -119,7 +120,7 @@ def number_events(database: Database) -> None:
 
 
 def _number_pending(database: Database) -> None:
-    """Assign numbers to the committed events. Raise UnusableStore if this is not possible now."""
+    """Assign numbers to pending events. Raise UnusableStore if this is not possible now."""
     if database.is_sqlite:
         return
     with database.read() as connection:
@@ -132,13 +133,13 @@ def _number_pending(database: Database) -> None:
 
 
 def anchor_of_now(database: Database, map_name: str) -> str:
-    """Return the last event of a map as an anchor that identifies the current state of the map.
+    """Return an anchor of the current state of a map, derived from its last event.
 
     The anchor covers all changes that were committed before this call.
 
     Raises
     ------
-    UnusableStore : If the pending events cannot be numbered now.
+    UnusableStore : If pending events cannot be numbered now.
     """
     _number_pending(database)
     with database.read() as connection:
@@ -152,10 +153,10 @@ def anchor_of_now(database: Database, map_name: str) -> str:
 
 
 def holds_anchor(connection: Connection, anchor: str) -> bool:
-    """Return whether an anchor marks the current state, or an earlier state of the same history.
+    """Return whether the event of an anchor is in the history of the database.
 
-    A database that was restored to an earlier state assigns the same numbers again, but to events
-    with other times and frames.
+    After a restore to an earlier state, the same number may belong to an event of another time or
+    frame.
     """
     number = anchor_number(anchor)
     if number is None:
@@ -172,7 +173,7 @@ def _fingerprint(number: int, at: float, frame_id: str | None) -> str:
 
 @dataclass(frozen=True)
 class EventRow:
-    """Event; see the table for the fields."""
+    """A row of the table `events`."""
 
     number: int
     at: float
@@ -185,15 +186,15 @@ class EventRow:
 
 @dataclass(frozen=True)
 class EventFilter:
-    """Conditions on the events of a list, and the caller's permissions.
+    """Conditions on events, including the permissions of the caller.
 
     Parameters
     ----------
     maps : names of the selected maps; None selects all maps, and events without a map
-    kinds : prefixes of kinds, one of which must match; empty selects all kinds
-    of_maps : whether events without a map are excluded
-    since : time of the caller's first access, seconds since 1970; events of maps that were deleted
-        before are hidden, even if another map has the same name. None shows them
+    kinds : prefixes of kinds, of which one must match; empty selects all kinds
+    of_maps : whether to exclude events without a map
+    since : time of the first access by the caller, seconds since 1970. Events of maps deleted
+        earlier are hidden, even if another map has the same name. None hides no events
     """
 
     maps: frozenset[str] | None = None
@@ -202,26 +203,25 @@ class EventFilter:
     since: float | None = None
 
     def __call__(self, event: EventRow) -> bool:
-        """Return whether the caller requested an event and may see it."""
+        """Return whether the caller has requested an event and may read it."""
         return self.sees(event) and (not self.kinds or event.kind.startswith(self.kinds))
 
     def sees(self, event: EventRow) -> bool:
-        """Return whether the caller may see an event of any kind."""
+        """Return whether the caller may read an event, regardless of its kind."""
         if self.maps is None:
             return event.map is not None or not self.of_maps
         return event.map in self.maps
 
 
 def newest_number(connection: Connection) -> int:
-    """Return the number of the newest event; 0 if there are no events."""
+    """Return the number of the newest event; 0 without events."""
     return int(connection.execute(select(func.max(events.c.number))).scalar() or 0)
 
 
 def newest_seen(connection: Connection, wanted: EventFilter) -> int:
-    """Return the number of the newest event of any kind that the caller may see; 0 if there is
-    none.
+    """Return the number of the newest event, of any kind, that the caller may read, or 0.
 
-    Positions in the list are reported as this number, since hidden events do not change it.
+    This number represents a position in the list, since it does not reveal hidden events.
     """
     if wanted.maps is not None:
         beginnings = _beginnings(connection, wanted)
@@ -243,9 +243,9 @@ def list_events(
     connection: Connection, wanted: EventFilter, *, after: int = 0, before: int | None = None,
     limit: int = 1000, newest_first: bool = False,
 ) -> list[EventRow]:  # fmt: skip
-    """Return the events between two numbers, which are excluded.
+    """Return the events between the numbers `after` and `before`, both excluded.
 
-    Call `number_events` first to include the events of writers of single maps.
+    Call `number_events` first to include pending events.
     """
     order = events.c.number.desc() if newest_first else events.c.number
     statement = select(events).where(events.c.number > after).order_by(order).limit(limit)
@@ -261,14 +261,14 @@ def list_events(
     return [EventRow(**row) for row in connection.execute(statement).mappings()]
 
 
-#: Maximum number of maps with a beginning in a statement, whose depth SQLite limits.
+#: Maximum number of maps with a beginning in a statement, since SQLite limits the depth.
 _MOST_BEGINNINGS = 500
 #: Condition with a literal value for the partial index; see `_LIVING` of `deletion`.
 _DELETED: ColumnElement[bool] = events.c.kind == literal_column("'map.deleted'")
 
 
 def _beginnings(connection: Connection, wanted: EventFilter) -> dict[str, int]:
-    """Return the last hidden event of each map whose name a deleted map had before the access."""
+    """Return the last hidden event of each map whose name a deleted map had; see `EventFilter`."""
     if wanted.since is None or wanted.maps is None:
         return {}
     statement = (
@@ -280,7 +280,7 @@ def _beginnings(connection: Connection, wanted: EventFilter) -> dict[str, int]:
 
 
 def _of_maps(names: Collection[str], beginnings: Mapping[str, int]) -> ColumnElement[bool]:
-    """Return the condition for events of some maps, after the beginnings of these maps."""
+    """Return the condition for events of some maps, after their `_beginnings`."""
     whole = events.c.map.in_(sorted(set(names) - beginnings.keys()))
     if len(beginnings) > _MOST_BEGINNINGS:
         last = max(beginnings.values())
@@ -299,9 +299,9 @@ def anchor_number(anchor: str) -> int | None:
 
 
 def removal_floors(connection: Connection, most_events: int) -> dict[str | None, int]:
-    """Return the number of the newest surplus event of each map with too many events.
+    """Return the number of the newest surplus event of each map that has too many events.
 
-    The key None stands for the events without a map and of deleted maps, whose total is limited.
+    The key None stands for events without a map or of deleted maps; their total is limited.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def removal_floors(connection: Connection, most_events: int) -> dict[str | None,
     """
     oldest = connection.execute(select(func.min(events.c.number))).scalar()
     if oldest is None or newest_number(connection) - oldest < most_events:
-        return {}  # the total number of events does not exceed the limit
+        return {}
     numbers: dict[str | None, int] = {}
     for name in (*_names(connection), None):
         condition = _of(name)
@@ -327,16 +327,16 @@ def removal_floors(connection: Connection, most_events: int) -> dict[str | None,
 
 
 def removal_floor(connection: Connection, wanted: EventFilter, most_events: int, after: int) -> int:
-    """Return the number up to which requested events may have been removed; 0 if none were.
+    """Return the number up to which events of a filter may have been removed; 0 if none were.
 
     Parameters
     ----------
-    wanted : filter, whose kinds are ignored
+    wanted : filter; its kinds are ignored
     most_events : maximum number of events per map
-    after : position of the reader; a smaller result may be returned as 0
+    after : position of the reader; results up to it may be returned as 0
     """
     if newest_number(connection) - most_events <= after:
-        return 0  # no map can have too many events after that position
+        return 0  # too few events after that position
     numbers = removal_floors(connection, most_events)
     if wanted.maps is None:
         return max(numbers.values(), default=0)
@@ -351,27 +351,26 @@ def removal_floor(connection: Connection, wanted: EventFilter, most_events: int,
 
 
 def _former_floors(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
-    """Yield 0, and the result of `removal_floor` for each deleted map.
+    """Yield 0, and the removal floor of each deleted map.
 
-    The events of deleted maps are removed together, but a reader behind the last event of a map has
-    missed nothing.
+    Events of deleted maps have a common floor, but the last event of a map limits it for readers of
+    that map.
     """
     yield 0
     for name in names:
         last = last_event(connection, name)
         left = select(events.c.number).where(events.c.map == name).limit(1)
-        # the common floor does not apply to a map whose last event has been removed
         yield last if connection.execute(left).first() is None else min(floor, last)
 
 
 def surplus_events(
     connection: Connection, most_events: int, anchors: Collection[int], limit: int
 ) -> list[int]:
-    """Return the numbers of events to remove, map by map, the oldest first.
+    """Return the numbers of events to remove, map by map, oldest first.
 
-    An index is valid while its anchor exists, which is the last event of its map at the time of the
-    build. The anchors of existing indexes are therefore not removed, nor is the newest surplus
-    event of each map, which an index under construction may use.
+    An index is valid while its anchor exists, the last event of its map at the time of the build.
+    Therefore, anchors of existing indexes are not removed, nor is the newest surplus event of each
+    map, which may become the anchor of an index in construction.
 
     Parameters
     ----------
@@ -403,24 +402,24 @@ def _names(connection: Connection) -> list[str]:
 
 
 def _of(name: str | None) -> ColumnElement[bool]:
-    """Return the condition for events of a map; None selects events of no existing map."""
+    """Return the condition for events of a map; None selects the events of no existing map."""
     if name is not None:
         return events.c.map == name
     return or_(events.c.map.is_(None), events.c.map.not_in(select(maps.c.name)))
 
 
-# Former maps by name, with the number of the last event, and the quota, which the next map with the
-# name inherits.
+# Former maps by name, with the number of their last event, and their quota, which the next map of
+# the same name inherits.
 
 #: Maximum number of former maps without a quota.
 MOST_FORMER = 10_000
 
 
 def record_former_map(connection: Connection, row: MapRow) -> None:
-    """Record the quotas and the last event of a removed map, after that event was recorded.
+    """Record the quotas and the last event of a removed map; call this after that event.
 
-    The record replaces an earlier one of the same name. Of the records without quotas, only the
-    newest `MOST_FORMER` are kept.
+    The record replaces an earlier record of the same name. Of the records without quotas, only the
+    newest `MOST_FORMER` remain.
     """
     last = select(func.max(events.c.number)).where(events.c.map == row.name)
     connection.execute(delete(former_maps).where(former_maps.c.name == row.name))
@@ -445,7 +444,7 @@ def record_former_map(connection: Connection, row: MapRow) -> None:
 
 
 def inherit_quota(connection: Connection, name: str) -> dict[str, float | None]:
-    """Return the quota of the former map with a name, and remove it from the former map."""
+    """Take over the quota of the former map of a name: return it, and remove it there."""
     statement = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
     row = connection.execute(statement.where(former_maps.c.name == name)).mappings().first()
     connection.execute(delete(former_maps).where(former_maps.c.name == name))
@@ -453,7 +452,7 @@ def inherit_quota(connection: Connection, name: str) -> dict[str, float | None]:
 
 
 def last_event(connection: Connection, name: str) -> int:
-    """Return the number of a deleted map's last event, or a lower bound if it is not recorded."""
+    """Return the number of the last event of a deleted map, or a lower bound if unknown."""
     number = connection.execute(
         select(former_maps.c.number).where(former_maps.c.name == name)
     ).scalar()

@@ -1,4 +1,4 @@
-"""Select frames of a map by their metadata: filters, lists, sessions and paths."""
+"""Selection of frames by their metadata: filters, lists, sessions and paths."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ from sceneprint_client.api.listing import FrameListing, Run, Stamp
 
 _NONE: NDArray[np.int64] = np.empty(0, np.int64)
 
-#: Order in which the frames of a session were captured: by time, then by position in the session,
-#: then by upload. All lists, paths and graphs of a session use it.
+#: Capture order of the frames of a session: by time, then by sequence number, then by upload. All
+#: lists, paths and graphs of a session use it.
 CAPTURE_ORDER: tuple[ColumnElement[Any], ...] = (
     frames.c.captured_at.is_(None), frames.c.captured_at,
     frames.c.sequence.is_(None), frames.c.sequence, frames.c.number,
@@ -55,7 +55,7 @@ CAPTURE_ORDER: tuple[ColumnElement[Any], ...] = (
 
 @dataclass(frozen=True)
 class CapturePosition:
-    """Position of a frame in `CAPTURE_ORDER`; see the table for the fields."""
+    """Position of a frame in `CAPTURE_ORDER`, by columns of the table `frames`."""
 
     number: int
     captured_at: float | None
@@ -78,7 +78,7 @@ def _after_capture(last: CapturePosition) -> ColumnElement[bool]:
 
 @dataclass(frozen=True)
 class QueryOrigin:
-    """Robot, session and time (seconds since 1970) of a query, if known."""
+    """Robot, session and capture time (seconds since 1970) of a query; None if unknown."""
 
     robot: str | None
     session: str | None
@@ -94,7 +94,7 @@ def passing_frames(
     ----------
     origin : origin of the query, with session and time if the filter excludes its surroundings
     """
-    # a single text is much faster than 100,000 rows
+    # one text is much faster than 100,000 rows
     listed = func.aggregate_strings(cast(frames.c.number, String), ",")
     numbers = connection.execute(
         select(listed).where(
@@ -109,7 +109,7 @@ def passing_frames(
 def _common_conditions(
     wanted: Filter | FrameListing | Run, tags: Sequence[str] = ()
 ) -> list[ColumnElement[bool]]:
-    """Return conditions on robot, session, tags and time, which are false for null columns."""
+    """Return conditions on robot, session, tags and time; they are false for unknown values."""
     c, conditions = frames.c, list[ColumnElement[bool]]()
     for column, names in ((c.robot, wanted.robot), (c.session, wanted.session)):
         if isinstance(names, str):
@@ -146,7 +146,7 @@ def _conditions(map_number: int, wanted: Filter, origin: QueryOrigin) -> list[Co
 
 
 def _elsewhere(origin: QueryOrigin, seconds: float) -> ColumnElement[bool]:
-    """Return the condition for frames of other sessions, or captured long before or after."""
+    """Return the condition for frames of other sessions, or captured more than `seconds` apart."""
     if origin.session is None or origin.captured_at is None:
         raise ValueError("the query has no session or no time")
     apart = [
@@ -160,9 +160,9 @@ def _elsewhere(origin: QueryOrigin, seconds: float) -> ColumnElement[bool]:
     return or_(*apart)
 
 
-# Lists of frames, a page at a time.
+# Lists of frames in pages.
 
-#: States of frames in a list by default.
+#: States of frames that lists include by default.
 _LIVING = tuple(state for state in FrameState if state != FrameState.DELETED)
 
 
@@ -170,19 +170,19 @@ def list_frames(
     connection: Connection, map_number: int, beyond: CapturePosition | None, limit: int,
     wanted: FrameListing,
 ) -> list[FrameRow]:  # fmt: skip
-    """Return frames of a map in upload order, its reverse, or the order of capture.
+    """Return frames of a map in upload order, in its reverse, or in capture order.
 
     Parameters
     ----------
-    beyond : position of the last frame of the previous page, by its number unless the list is in
-        the order of capture; None for the first page
+    beyond : position of the last frame of the previous page, of which only the number matters
+        except in capture order; None for the first page
     limit : maximum number of frames
     wanted : conditions; deleted frames are excluded unless requested
     """
     states = _LIVING if wanted.state is None else (wanted.state,)
-    # A page of a large map is read in one of two ways: in the order of numbers until the page is
-    # full, if most frames match or another index selects few; or by the index that covers all
-    # conditions. "+ 0" rules out the first way for SQLite.
+    # SQLite can read a page in two ways: in the order of numbers until the page is full, which is
+    # best if most frames match or another index selects few frames; or by the index that covers all
+    # conditions. "+ 0" rules out the first way.
     number: ColumnElement[Any] = frames.c.number + 0 if _is_narrow(wanted) else frames.c.number
     numbers: Select[Any] = select(frames.c.number).where(
         frames.c.map_number == map_number,
@@ -210,7 +210,7 @@ def list_frames(
 
 
 def count_listed(connection: Connection, map_number: int, wanted: FrameListing, after: int) -> int:
-    """Return the number of frames that `list_frames` returns in upload order after a number."""
+    """Count the frames of a list in upload order after frame number `after`."""
     states = _LIVING if wanted.state is None else (wanted.state,)
     return count_rows(
         connection, frames.c.map_number == map_number, frames.c.state.in_(states),
@@ -220,7 +220,7 @@ def count_listed(connection: Connection, map_number: int, wanted: FrameListing, 
 
 def _is_narrow(wanted: FrameListing) -> bool:
     if wanted.tag or wanted.content_id is not None or wanted.find is not None:
-        return False  # these conditions have separate indexes
+        return False  # conditions with separate indexes
     named = (wanted.captured_after, wanted.captured_before, wanted.parent_frame, wanted.has_pose)
     rare = wanted.state not in (None, FrameState.INDEXED)
     return bool(wanted.robot or wanted.session or wanted.name or rare) or any(
@@ -229,7 +229,7 @@ def _is_narrow(wanted: FrameListing) -> bool:
 
 
 def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnElement[bool]]:
-    """Return the conditions of the frames of a list."""
+    """Return the conditions on the frames of a list."""
     c, conditions = frames.c, _common_conditions(wanted, wanted.tag)
     if wanted.received_after is not None:
         conditions.append(c.received_at >= wanted.received_after.timestamp())
@@ -246,7 +246,7 @@ def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnEle
     if wanted.find is not None:
         conditions.append(_begins_any(map_number, wanted.find))
     if wanted.state == FrameState.DELETED and conditions:
-        conditions.append(c.deletion.is_(None))  # tombstones must not reveal their metadata
+        conditions.append(c.deletion.is_(None))  # do not reveal metadata of tombstones
     return conditions
 
 
@@ -257,19 +257,19 @@ def _begins_any(map_number: int, prefix: str) -> ColumnElement[bool]:
         select(frames.c.number).where(own, *_begins(column, prefix)).correlate(None)
         for column in (frames.c.id, frames.c.name)
     ]
-    # the index of sessions starts with the state
+    # include the state, with which the index of sessions starts
     living = frames.c.state.in_(_LIVING)
     ways.append(select(frames.c.number).where(own, living, *_begins(frames.c.session, prefix)))
     return frames.c.number.in_(union(*ways))
 
 
 def _begins(column: Column[Any], prefix: str) -> list[ColumnElement[bool]]:
-    """Return the conditions for texts that start with a prefix, as a range that indexes support."""
+    """Return conditions for texts that start with a prefix, as a range that indexes support."""
     head = prefix.rstrip(_LAST)
     if not head:
         return [column >= prefix]
     above = ord(head[-1]) + 1
-    if above in _SURROGATES:  # surrogates are not characters
+    if above in _SURROGATES:
         above = _SURROGATES.stop
     return [column >= prefix, column < head[:-1] + chr(above)]
 
@@ -290,8 +290,9 @@ class RunSummary:
     robot, session : names, or None if unknown
     states : number of frames by state
     posed : number of frames with a pose
-    first, last : range of the capture times, seconds since 1970
-    parents : number of poses by parent frame
+    first, last : first and last capture time, seconds since 1970
+    parents : number of frames with a pose, by parent frame
+    tags : number of frames by tag
     """
 
     robot: str | None
@@ -348,7 +349,7 @@ def list_runs(
         .join_from(frames, frame_tags, number == frames.c.number)
         .where(*of_page)
         .group_by(*key, tag)
-        .order_by(tag)  # the order of tags with equal counts
+        .order_by(tag)
     )
     for session, robot, name, count in connection.execute(tagged):
         runs[session, robot].tags[name] += count
@@ -358,7 +359,7 @@ def list_runs(
 def count_run(
     connection: Connection, map_number: int, run: Run
 ) -> list[tuple[str | None, str | None, int]]:
-    """Return the robot, parent frame and number of frames of each part of a session."""
+    """Count the frames of a session by robot and parent frame."""
     groups = connection.execute(
         select(frames.c.robot, frames.c.pose_parent, func.count())
         .where(*_of_session(map_number, run))
@@ -369,9 +370,9 @@ def count_run(
 
 
 def stamps_of_run(connection: Connection, map_number: int, run: Run) -> Stamp | None:
-    """Return the kind of stamps for a run's poses: times or positions in the session.
+    """Return the kind of time stamps for the poses of a run: times or sequence numbers.
 
-    Return None if the frames have neither. Only the clock `taken` leaves a choice.
+    Return None if the frames have neither. The choice exists only for the clock `taken`.
     """
     if run.clock != "taken":
         return run.clock
@@ -389,18 +390,17 @@ def stamps_of_run(connection: Connection, map_number: int, run: Run) -> Stamp | 
 def poses_of_run(
     connection: Connection, map_number: int, run: Run, stamp: Stamp
 ) -> tuple[list[tuple[str, float, list[list[float]]]], int]:
-    """Return posed frames of a run, sorted by stamp. Of frames with equal stamps, only one counts.
+    """Return the poses of a run, sorted by time stamp, with one frame per stamp.
 
     Parameters
     ----------
-    run : run; if `most` is set, at most that many evenly spaced frames are returned, whose rows an
-        index selects
+    run : run; if `most` is set, only that many evenly spaced frames are returned
     stamp : kind of stamp from `stamps_of_run`; `received` selects all posed frames in upload order
 
     Returns
     -------
-    poses : id of the frame, stamp (seconds since 1970, or position), and T_parent_sensor
-    count : total number of such frames
+    poses : frame id, stamp (seconds since 1970, or sequence number), and T_parent_sensor (4, 4)
+    count : number of frames without the limit `most`
     """
     c = frames.c
     at = {"captured": c.captured_at, "sequence": c.sequence, "received": c.received_at}[stamp]
@@ -418,7 +418,7 @@ def poses_of_run(
     if run.most is not None and run.most < count:
         place = (func.row_number().over(order_by=first.c.order) - 1).label("place")
         placed = select(first.c.number, place).subquery()
-        # selects the `most` multiples of (count - 1) / (most - 1), rounded up, from 0 to count - 1
+        # select the multiples of (count - 1) / (most - 1), rounded up
         even = (placed.c.place * (run.most - 1)) % (count - 1) < run.most - 1
         chosen = select(placed.c.number).where(even)
     poses = select(c.id, at, c.pose).where(c.number.in_(chosen)).order_by(*order)
@@ -426,7 +426,7 @@ def poses_of_run(
 
 
 def _posed(map_number: int, run: Run) -> list[ColumnElement[bool]]:
-    """Return the conditions for a run's frames with a pose in its parent frame."""
+    """Return the conditions for frames of a run with a pose in the parent frame of the run."""
     return [
         *_of_session(map_number, run),
         frames.c.pose_parent == run.parent_frame,
@@ -439,17 +439,18 @@ def _of_session(map_number: int, run: Run) -> list[ColumnElement[bool]]:
     return [*own, *_common_conditions(run)]
 
 
-# Frames of sessions in the order of capture, for jobs that associate them.
+# Frames of sessions in capture order, for products.
 
 
 @dataclass(frozen=True)
 class PathFrame:
-    """Frame of a run with the values that associations need.
+    """A frame of a run, with the values that products need.
 
     Parameters
     ----------
-    robot, session, captured_at, name, sequence : metadata, or None if unknown
-    pose : T_parent_sensor, or None
+    robot, session, captured_at, name, sequence : metadata; None if unknown
+    parent : parent frame of the pose
+    pose : T_parent_sensor (4, 4); None if unknown
     is_cloud : whether the frame is a point cloud
     """
 
@@ -473,7 +474,7 @@ class PathFrame:
 def numbers_of_session(
     connection: Connection, map_number: int, session: str, robot: str | None
 ) -> list[int]:
-    """Return the numbers of the indexed frames of a session in the order of capture."""
+    """Return the numbers of the indexed frames of a session in capture order."""
     c = frames.c
     statement = select(c.number).where(
         c.map_number == map_number, c.state == FrameState.INDEXED, c.session == session
@@ -484,7 +485,7 @@ def numbers_of_session(
 
 
 def parents_of_session(connection: Connection, map_number: int, session: str) -> dict[str, int]:
-    """Return the number of a session's indexed frames by parent frame of their poses."""
+    """Count the indexed frames of a session with a pose by parent frame."""
     c = frames.c
     counts = select(c.pose_parent, func.count()).where(*_posed_in(map_number, session))
     groups = connection.execute(counts.group_by(c.pose_parent).order_by(c.pose_parent))
@@ -494,7 +495,7 @@ def parents_of_session(connection: Connection, map_number: int, session: str) ->
 def posed_in_session(
     connection: Connection, map_number: int, session: str, parent: str
 ) -> list[int]:
-    """Return the numbers of a session's indexed, posed frames of a parent frame, as captured."""
+    """Return the numbers of the indexed frames of a session in a parent frame, in capture order."""
     own = (*_posed_in(map_number, session), frames.c.pose_parent == parent)
     return list(
         connection.execute(select(frames.c.number).where(*own).order_by(*CAPTURE_ORDER)).scalars()
@@ -510,7 +511,7 @@ def _posed_in(map_number: int, session: str) -> list[ColumnElement[bool]]:
 
 
 def any_purged(connection: Connection, numbers: Iterable[int]) -> bool:
-    """Return whether any frame was removed, or deleted without the possibility of a restore."""
+    """Return whether any frame was removed, or can no longer be restored."""
     own = set(numbers)
     existing = select(frames.c.number).where(not_purged())
     return len(own) > sum(1 for _ in rows_among(connection, existing, frames.c.number, own))
@@ -519,9 +520,9 @@ def any_purged(connection: Connection, numbers: Iterable[int]) -> bool:
 def numbers_of_runs(
     connection: Connection, map_number: int, session: str | None, robot: str | None
 ) -> list[int]:
-    """Return the numbers of the indexed frames of a map, of a session or a robot.
+    """Return the numbers of the indexed frames of a map, or of a session or a robot.
 
-    The order is by run, time and upload; frames without a time are last.
+    They are sorted by run, time and upload; frames without a time are last.
     """
     c = frames.c
     statement = select(c.number).where(c.map_number == map_number, c.state == FrameState.INDEXED)
@@ -534,7 +535,7 @@ def numbers_of_runs(
 
 
 def path_frames(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
-    """Return indexed frames by number."""
+    """Return the indexed frames among some frames, by number."""
     statement = select(
         frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
         frames.c.pose_parent, frames.c.pose, frames.c.cloud.is_not(null()), frames.c.name,
@@ -548,13 +549,13 @@ def path_frames(connection: Connection, numbers: Iterable[int]) -> dict[int, Pat
 
 @dataclass(frozen=True)
 class FrameUp:
-    """Stored up vectors of a frame and its map.
+    """Stored up vectors of a frame and of its map.
 
     Parameters
     ----------
-    parent, pose : parent frame and T_parent_sensor, 4 rows of 4; None without a pose
-    up : unit vector in the sensor's axes from the upload
-    map_up : unit vector in the parent frames of the map
+    parent, pose : parent frame and T_parent_sensor (4, 4); None without a pose
+    up : (3,) unit vector in the sensor frame, as uploaded; None if unknown
+    map_up : (3,) unit vector in the parent frames of the map; None if unknown
     """
 
     number: int
@@ -566,7 +567,7 @@ class FrameUp:
 
 
 def frame_ups(connection: Connection, numbers: Iterable[int]) -> list[FrameUp]:
-    """Return the up vectors of existing frames that have a vector or a pose."""
+    """Return the up vectors of existing frames that have an up vector or a pose."""
     c = frames.c
     statement = (
         select(c.number, c.map_number, c.pose_parent, c.pose, c.up, maps.c.up.label("map_up"))
@@ -577,7 +578,7 @@ def frame_ups(connection: Connection, numbers: Iterable[int]) -> list[FrameUp]:
 
 
 def positions_of_map(connection: Connection, map_number: int) -> dict[str, NDArray[np.float64]]:
-    """Return the positions of a map's indexed frames: (n, 3) per parent frame, metres."""
+    """Return the positions (n, 3) of the indexed frames of a map by parent frame, metres."""
     c = frames.c
     statement = select(c.pose_parent, c.pose_x, c.pose_y, c.pose_z).where(
         c.map_number == map_number, c.state == FrameState.INDEXED, c.pose_x.is_not(None)
@@ -585,7 +586,7 @@ def positions_of_map(connection: Connection, map_number: int) -> dict[str, NDArr
     positions: dict[str, list[NDArray[np.float64]]] = {}
     for rows in connection.execute(statement).partitions(
         10_000
-    ):  # arrays need much less memory than rows
+    ):  # convert blocks to arrays, which need less memory than rows
         parents = np.array([row[0] for row in rows], object)
         at = np.array([row[1:] for row in rows], np.float64)
         for parent in dict.fromkeys(parents):
@@ -602,7 +603,7 @@ def has_parent_frame(connection: Connection, map_number: int, parent: str) -> bo
     return connection.execute(statement.limit(1)).first() is not None
 
 
-# Sizes of a map, and samples of its frames, which indexes provide.
+# Sizes of maps, and samples of frames.
 
 _WITH_UPLOAD = tuple(state for state in FrameState if state not in ROOMLESS)
 
@@ -610,10 +611,10 @@ _WITH_UPLOAD = tuple(state for state in FrameState if state not in ROOMLESS)
 def frames_with_uploads(
     connection: Connection, map_number: int, most: int
 ) -> tuple[list[int], int]:
-    """Return the numbers of evenly spaced frames with uploads, and the count of all such frames."""
+    """Return up to `most` evenly spaced frames with uploads, and the number of all such frames."""
     own = (frames.c.map_number == map_number) & frames.c.state.in_(_WITH_UPLOAD)
     total = count_rows(connection, own)
-    # "+ 0" makes SQLite use the index of states, which avoids reading rows
+    # "+ 0" makes SQLite use the index of states, so that it reads no rows
     place = (func.row_number().over(order_by=frames.c.number + 0) - 1).label("place")
     listed = select(frames.c.number, place).where(own).subquery()
     step = max(-(-total // most), 1)
@@ -622,17 +623,17 @@ def frames_with_uploads(
 
 
 def sample_frames(connection: Connection, most: int) -> list[int]:
-    """Return the numbers of a sample of the frames of all maps with uploads, the oldest first.
+    """Return the numbers of a sample of the frames with uploads of all maps, oldest first.
 
     Parameters
     ----------
-    most : maximum number of frames; fewer are returned if some were deleted
+    most : size of the sample, which is smaller if some frames were deleted
     """
     ends = select(func.min(frames.c.number), func.max(frames.c.number))
     first, last = connection.execute(ends).one()
     if first is None:
         return []
-    # each number is a search in the index, whereas counting would read all frames
+    # look up numbers in the index, since counting would read all frames
     numbers = {first + (last - first) * place // max(most - 1, 1) for place in range(most)}
     nearest = set()
     for number in numbers:
@@ -644,17 +645,17 @@ def sample_frames(connection: Connection, most: int) -> list[int]:
 
 
 def count_uploads(connection: Connection) -> int:
-    """Return the number of frames of all maps that have an upload."""
+    """Count the frames with uploads of all maps."""
     return count_rows(connection, frames.c.state.in_(_WITH_UPLOAD))
 
 
 def bytes_of_files(connection: Connection) -> int:
-    """Return the total size of the files of all jobs, bytes."""
+    """Return the total size of the files of all jobs in bytes."""
     return int(connection.execute(select(func.sum(job_files.c.bytes))).scalar() or 0)
 
 
 def stored_sizes(connection: Connection, numbers: Sequence[int]) -> tuple[int, int, list[str]]:
-    """Return the bytes of uploads and of signatures of frames, and the blobs of their artifacts."""
+    """Return the bytes of the uploads and signatures of frames, and the digests of artifacts."""
     sizes = rows_among(connection, select(frames.c.bytes), frames.c.number, numbers)
     uploads = sum(row.bytes for row in sizes)
     statement = select(func.length(signatures.c.vector), signatures.c.geometry)

@@ -1,4 +1,4 @@
-"""Change existing frames and maps, and find references to blobs."""
+"""Changes of existing frames and maps, and references to blobs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from sceneprint_client.api import FrameState
 
 
 def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
-    """Set a failed frame to received again, with its new upload."""
+    """Return a failed frame to the state `received`, with new values such as its upload."""
     _update_usage(connection, number, FrameState.RECEIVED, values["bytes"])
     connection.execute(
         update(frames)
@@ -49,12 +49,12 @@ def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> 
 def renew_upload(
     connection: Connection, number: int, blob: str, size: int, reason: str | None
 ) -> None:
-    """Replace the upload of a frame by one with the same content.
+    """Replace the upload of a frame by another file with the same content.
 
     Parameters
     ----------
     blob, size : digest and size of the new upload
-    reason : new reason for the frame's state
+    reason : new reason of the state of the frame
     """
     _update_usage(connection, number, None, size)
     connection.execute(
@@ -65,7 +65,7 @@ def renew_upload(
 def set_state(
     connection: Connection, number: int, state: FrameState, reason: str | None = None
 ) -> None:
-    """Set a frame to a state without searches; a deleted frame remains deleted."""
+    """Set the state of a frame that is not searched; a deleted frame remains deleted."""
     ended_at = None
     if state == FrameState.REDUNDANT:
         _update_usage(connection, number, state, None)
@@ -80,7 +80,7 @@ def set_state(
 def delete_frame(
     connection: Connection, row: MapRow, frame: FrameRow, deletion: int | None = None
 ) -> list[str]:
-    """Delete one frame; see `delete_frames` for parameters and result.
+    """Delete a frame; see `delete_frames` for parameters and result.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def delete_frame(
 
 
 def not_purged() -> ColumnElement[bool]:
-    """Return the condition for frames that exist or can be restored."""
+    """Return the condition for frames that exist or that can be restored."""
     return or_(frames.c.state != FrameState.DELETED, frames.c.deletion.is_not(None))
 
 
@@ -102,7 +102,7 @@ def refers_to(connection: Connection, blob: str) -> bool:
 
 
 def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
-    """Return the blobs that a row of any table refers to, of at most a thousand blobs."""
+    """Return the referenced blobs among up to a thousand blobs."""
     has_upload = or_(frames.c.state.not_in(ROOMLESS), frames.c.deletion.is_not(None))
     referring = (
         (frames.c.blob, has_upload),
@@ -116,7 +116,7 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
 
 
 def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:
-    """Return the number of frames in each state, of one map or of all."""
+    """Count the frames of a map by state; None counts those of all maps."""
     counts = select(frames.c.state, func.count()).group_by(frames.c.state).order_by(frames.c.state)
     if map_number is not None:
         counts = counts.where(frames.c.map_number == map_number)
@@ -126,7 +126,7 @@ def count_states(connection: Connection, map_number: int | None = None) -> dict[
 def _update_usage(
     connection: Connection, number: int, state: FrameState | None, size: int | None
 ) -> None:
-    """Update the usage of the map for a frame's new state and size.
+    """Update the usage of a map before the state or the size of a frame changes.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def _update_usage(
 
 
 def relax_novelty(connection: Connection, number: int, novelty: float | None) -> None:
-    """Set the smaller of two novelty thresholds for an unsigned frame. None accepts every frame."""
+    """Lower the novelty threshold of an unsigned frame to `novelty`; None removes the threshold."""
     weaker: ColumnElement[bool] = frames.c.novelty.is_not(None)
     if novelty is not None:
         weaker = frames.c.novelty > novelty
@@ -162,7 +162,7 @@ def relax_novelty(connection: Connection, number: int, novelty: float | None) ->
 def write_frame(
     connection: Connection, row: MapRow, frame: FrameRow, values: Mapping[str, Any]
 ) -> FrameRow:
-    """Change columns of a frame's metadata, including the columns and tags for searches.
+    """Change metadata columns of a frame, together with the columns and tags for searches.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""API keys, which are stored as hashes, and requests with an `Idempotency-Key`."""
+"""API keys, stored as hashes, and results of requests with an `Idempotency-Key`."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ from sceneprint_client.api.admin import Scope
 if TYPE_CHECKING:
     from sceneprint.store.database import Database
 
-#: Prefix with which scanners recognise a leaked key, for example in a public file.
+#: Prefix of secrets, by which scanners recognise leaked keys.
 PREFIX = "sp_"
 
 
 @dataclass(frozen=True)
 class KeyRow:
-    """API key; times are seconds since 1970.
+    """An API key; times are seconds since 1970.
 
     Parameters
     ----------
-    id : identifier that is never reused, unlike the name
+    id : identifier, which is never reused, unlike the name
     name : unique name
-    grants : scope by name of a map; `*` stands for all maps
-    created_at, expires_at : times of creation and expiry; None if the key does not expire
+    grants : scope by map name; `*` stands for all maps
+    created_at, expires_at : times of creation and expiry; None for no expiry
     tenant : owner of the key
-    previous_until : end of validity of the secret before the last rotation; None if it is invalid
-    last_used_at : time of the last use, to the hour; None if the key was never used
+    previous_until : time until which the previous secret is valid; None if it is invalid
+    last_used_at : time of the last use, within an hour; None if the key was never used
     """
 
     id: str
@@ -66,7 +66,7 @@ def create_key(
     connection: Connection, name: str, grants: Mapping[str, Scope],
     expires_at: float | None = None, tenant: str | None = None,
 ) -> str:  # fmt: skip
-    """Create a key, and return its secret, which is not stored; see KeyRow for the parameters.
+    """Create a key, and return its secret; see KeyRow for the parameters.
 
     Without `tenant`, the key belongs to a tenant with the name of the key.
 
@@ -93,9 +93,9 @@ def create_key(
 
 
 def find_key(connection: Connection, secret: str) -> KeyRow | None:
-    """Return the key with a secret, even if the key has expired; None if the secret is unknown.
+    """Return the key of a secret, even if the key has expired; None for an unknown secret.
 
-    For the secret before the last rotation, the returned key expires together with this secret.
+    For the previous secret of a key, `expires_at` is the expiry of that secret.
     """
     digest = _digest(secret)
     row = connection.execute(_select_keys().where(keys.c.digest == digest)).mappings().first()
@@ -110,16 +110,16 @@ def find_key(connection: Connection, secret: str) -> KeyRow | None:
 
 
 def rotate_key(connection: Connection, name: str, overlap_s: float) -> str:
-    """Replace the secret of a key, and return the new secret; the grants do not change.
+    """Replace the secret of a key, and return the new secret.
 
-    The current secret remains valid for the overlap. If an earlier secret is still valid, that one
-    remains valid instead, and the current secret expires. Thus the loss of a reply with a new
-    secret does not invalidate the secret in use.
+    The current secret remains valid for the overlap. If an earlier secret is still valid, it
+    remains valid instead, and the current secret expires: the response with the current secret may
+    have been lost.
 
     Parameters
     ----------
     connection : writing transaction
-    overlap_s : duration of the overlap, seconds; 0 invalidates all former secrets
+    overlap_s : duration of the overlap, seconds; 0 invalidates all old secrets
 
     Raises
     ------
@@ -159,7 +159,7 @@ def find_named_key(connection: Connection, name: str) -> KeyRow:
 def list_keys(
     connection: Connection, after: str | None = None, limit: int | None = None
 ) -> list[KeyRow]:
-    """Return keys sorted by name, after the name `after`; return all keys by default."""
+    """Return up to `limit` keys after the name `after`, sorted by name; default: all keys."""
     statement = _select_keys().order_by(keys.c.name).limit(limit)
     if after is not None:
         statement = statement.where(keys.c.name > after)
@@ -198,38 +198,38 @@ def _digest(secret: str) -> str:
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
-#: Seconds after a recorded use of a key for which further uses are not recorded.
+#: Minimum seconds between recorded uses of a key.
 USED_S = 3600.0
 
 
 class KeyUses:
-    """Uses of keys, which are collected in memory and written in batches; threads may share it."""
+    """Uses of keys, collected in memory and written in batches; safe to share between threads."""
 
     def __init__(self) -> None:
         self._due: dict[str, float] = {}
         self._lock = threading.Lock()
 
     def note(self, key: KeyRow) -> None:
-        """Record a use of a key, unless the database has a recent one."""
+        """Record a use of a key, unless the last recorded use is less than USED_S ago."""
         now = time.time()
         if key.last_used_at is None or not 0 <= now - key.last_used_at < USED_S:
             with self._lock:
                 self._due[key.id] = now
 
     def write(self, database: Database) -> None:
-        """Write the recorded uses; if this fails, they are lost."""
+        """Write the recorded uses; after an error, they are lost."""
         with self._lock:
             due, self._due = self._due, {}
         if not due or database.read_only:
             return
-        # the order prevents deadlocks between processes that write the same keys
+        # sort, to prevent deadlocks between processes that write the same keys
         rows = [{"key_id": key_id, "at": at} for key_id, at in sorted(due.items())]
         statement = update(keys).where(keys.c.id == bindparam("key_id"))
         with database.write(turn=False) as connection:
             connection.execute(statement.values(last_used_at=bindparam("at")), rows)
 
 
-# Requests with an `Idempotency-Key`, whose results are stored in the transaction of their effect.
+# Requests with an `Idempotency-Key`: results are stored in the transaction of the effect.
 
 #: Seconds for which the result of a request remains stored.
 RESULT_S = 86_400.0
@@ -237,12 +237,13 @@ RESULT_S = 86_400.0
 
 @dataclass(frozen=True)
 class IdempotentRequest:
-    """Request that must take effect only once.
+    """A request that must take effect only once.
 
     Parameters
     ----------
-    actor : name of the caller's API key, or ""
-    fingerprint : 64 digits that identify route and content
+    actor : name of the API key of the caller; "" without a key
+    key : `Idempotency-Key` of the request
+    fingerprint : hash (64 digits) of route and content
     """
 
     actor: str
@@ -250,11 +251,11 @@ class IdempotentRequest:
     fingerprint: str
 
     def stored_result(self, connection: Connection) -> dict[str, Any] | None:
-        """Return the result of the same request of this actor within `RESULT_S`; None without one.
+        """Return the result of an earlier identical request within `RESULT_S`; None without one.
 
         Raises
         ------
-        IdempotencyConflict : If the actor used the key for another request within that time.
+        IdempotencyConflict : If the actor used the key for a different request within that time.
         """
         row = connection.execute(
             select(idempotency.c.fingerprint, idempotency.c.data).where(
@@ -274,19 +275,18 @@ class IdempotentRequest:
         return data
 
     def columns(self, data: dict[str, Any]) -> dict[str, Any]:
-        """Return the columns of `idempotency` for a result."""
+        """Return the columns of the table `idempotency` for a result."""
         own = {"actor": self.actor, "key": self.key, "fingerprint": self.fingerprint}
         return {**own, "data": data, "created_at": time.time()}
 
     def store(self, connection: Connection, data: dict[str, Any]) -> None:
         """Store the result, in the transaction of the effect.
 
-        This is a single statement, because other writers wait. It replaces a stored result that is
-        older than a day or belongs to a deleted map.
+        This replaces a result that is older than RESULT_S or belongs to a deleted map.
 
         Raises
         ------
-        Overtaken : If a transaction on another map has stored a result for the key in the meantime.
+        Overtaken : If a transaction on another map has stored a result for the key meanwhile.
         """
         values, own = self.columns(data), ("actor", "key")
         replaceable = or_(
@@ -305,15 +305,15 @@ class IdempotentRequest:
 
 
 class Overtaken(Exception):
-    """Error for a transaction that must be repeated: another one stored the same row first."""
+    """Error if another transaction stored the same row first; repeat the transaction."""
 
 
-#: Number of results that one transaction removes; other writers wait in the meantime.
+#: Number of results to remove in one transaction.
 _REMOVED_AT_ONCE = 5_000
 
 
 def remove_old_requests(database: Database) -> int:
-    """Remove results older than a day in short transactions, and return their number."""
+    """Remove results older than RESULT_S, in short transactions; return their number."""
     old = idempotency.c.created_at <= time.time() - RESULT_S
     some = select(idempotency.c.actor, idempotency.c.key).where(old).limit(_REMOVED_AT_ONCE)
     removed = 0

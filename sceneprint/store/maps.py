@@ -1,4 +1,4 @@
-"""Insert and find maps, models and frames, check quotas, and read poses."""
+"""Maps, models and frames: insertion, lookup, quotas, and poses."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from sceneprint_client.api import FrameState
 
 
 def find_map(connection: Connection, name: str) -> MapRow:
-    """Return the map with a name. Raise UnknownMap if it does not exist."""
+    """Return a map by name. Raise UnknownMap if it does not exist."""
     row = connection.execute(_map_of_name(), {"name": name}).first()
     if row is None:
         raise unknown_map(name)
@@ -66,7 +66,7 @@ def _map_of_name() -> Select[Any]:
 
 
 def current_map(connection: Connection, former: MapRow) -> MapRow:
-    """Return the current row of a map. Raise UnknownMap if it was deleted, even if replaced."""
+    """Return the current row of a map. Raise UnknownMap if it was deleted or replaced."""
     row = find_map(connection, former.name)
     if row.number != former.number:
         raise unknown_map(former.name)
@@ -74,7 +74,7 @@ def current_map(connection: Connection, former: MapRow) -> MapRow:
 
 
 def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
-    """Return the maps with these names, in order. Raise UnknownMap if one does not exist."""
+    """Return maps in the order of their names. Raise UnknownMap if a map does not exist."""
     if len(names) == 1:
         return [find_map(connection, names[0])]
     selected = connection.execute(select(maps).where(maps.c.name.in_(names))).mappings()
@@ -89,12 +89,12 @@ def unknown_map(name: str) -> UnknownMap:
     """Return the error for a map that does not exist or is hidden from the caller."""
     return UnknownMap(
         f"There is no map {name!r:.80}. List the maps with `sceneprint maps` or GET /v1/maps, "
-        "or create it."
+        "or create the map."
     )
 
 
 def map_of_number(connection: Connection, number: int) -> MapRow:
-    """Return the map with a number, which must exist."""
+    """Return an existing map by number."""
     return map_row(connection.execute(select(maps).where(maps.c.number == number)).mappings().one())
 
 
@@ -109,13 +109,13 @@ def add_map(
     connection: Connection, name: str, title: str | None, model_id: str,
     limits: Mapping[str, object] | None = None,
 ) -> MapRow:  # fmt: skip
-    """Create a map, whose name must be unused.
+    """Insert a map with an unused name.
 
     Parameters
     ----------
     connection : writing transaction
-    limits : values of `quota_frames`, `quota_bytes`, `retention_days` and `up`. Quotas that are not
-        set are those of the former map with the name, so that a user who may delete and create maps
+    limits : values of `quota_frames`, `quota_bytes`, `retention_days` and `up`. Unset quotas are
+        inherited from the former map of the same name, so that users who may delete and create maps
         cannot remove a quota
     """
     connection.execute(
@@ -129,9 +129,9 @@ def add_map(
 
 
 def next_revision(connection: Connection, map_number: int, count: int = 1) -> int:
-    """Reserve consecutive revisions of a map, and return the last one.
+    """Reserve consecutive revisions of a map, and return the last revision.
 
-    A revision is a change to the searched frames. Revisions are in commit order.
+    Each change to the searched frames has a revision. Revisions are in commit order.
     """
     own = update(maps).where(maps.c.number == map_number)
     raised = own.values(revision=maps.c.revision + count).returning(maps.c.revision)
@@ -149,7 +149,7 @@ def store_model(connection: Connection, model_id: str, name: str, content: bytes
 
 
 def model_content(connection: Connection, model_id: str) -> bytes:
-    """Return the file of a model that a map refers to."""
+    """Return the file of a stored model."""
     return bytes(
         connection.execute(select(models.c.content).where(models.c.id == model_id)).scalar_one()
     )
@@ -160,18 +160,18 @@ def model_names(connection: Connection) -> dict[str, str]:
     return {row.id: row.name for row in connection.execute(select(models.c.id, models.c.name))}
 
 
-# Usage and quotas of a map. Frames count unless they are deleted or redundant. Bytes are those of
-# uploads, including tombstones, pending signatures that robots computed, and archives until their
-# import ends. Signatures, artifacts and indexes of the service do not count. Two columns of the map
-# store the sums. Each transaction updates them in the map's turn, so quotas are exact.
+# Usage and quotas of a map. Frames count unless they are deleted or redundant. The bytes of uploads
+# count, including those of tombstones, of pending signatures computed by robots, and of archives
+# until their import ends. Signatures, artifacts and indexes of the service do not count. Two
+# columns of the map store the sums. Writers update them in their turn, so quotas are exact.
 
-#: States of frames without an upload, which do not count.
+#: States of frames that do not count, since they have no upload.
 ROOMLESS = (FrameState.DELETED, FrameState.REDUNDANT)
 
 
 @dataclass(frozen=True)
 class MapUsage:
-    """Numbers of frames and bytes that count against a map's quota."""
+    """Number of frames and bytes that count against the quota of a map."""
 
     frames: int
     bytes: int
@@ -184,7 +184,7 @@ def map_usage(connection: Connection, map_number: int) -> MapUsage:
 
 
 def add_usage(connection: Connection, map_number: int, new_frames: int, new_bytes: int) -> None:
-    """Add numbers of frames and bytes, which may be negative, to the usage of a map."""
+    """Add frames and bytes to the usage of a map; negative numbers subtract."""
     connection.execute(
         update(maps)
         .where(maps.c.number == map_number)
@@ -195,7 +195,7 @@ def add_usage(connection: Connection, map_number: int, new_frames: int, new_byte
 
 
 def counted_usage(connection: Connection, map_number: int) -> MapUsage:
-    """Compute the usage of a map from all its frames; `map_usage` must return the same."""
+    """Compute the usage of a map from its frames, to verify `map_usage`."""
     statement = select(func.count(), func.coalesce(func.sum(frames.c.bytes), 0)).where(
         frames.c.map_number == map_number, frames.c.state.not_in(ROOMLESS)
     )
@@ -210,15 +210,14 @@ def counted_usage(connection: Connection, map_number: int) -> MapUsage:
 
 
 def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> None:
-    """Check that a map's quota allows another frame, or a larger upload of a frame.
+    """Check that the quota of a map allows another frame, or a larger upload of a frame.
 
-    Tombstones do not count here, since `make_room` purges as many as necessary.
+    Tombstones do not count here, since `make_room` can purge them.
 
     Parameters
     ----------
-    connection : transaction that adds the frame, or a reading transaction for an early check
     size : number of additional bytes
-    new : whether the frame does not count yet
+    new : whether the frame is additional, that is, not counted yet
 
     Raises
     ------
@@ -247,7 +246,7 @@ def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = 
 
 
 def tombstone_bytes(connection: Connection, map_number: int) -> int:
-    """Return the total size of the uploads of a map's tombstones, bytes."""
+    """Return the total size of the uploads of tombstones of a map in bytes."""
     c = frames.c
     statement = select(func.coalesce(func.sum(c.bytes), 0)).where(
         c.map_number == map_number, c.deletion.is_not(None)
@@ -258,13 +257,13 @@ def tombstone_bytes(connection: Connection, map_number: int) -> int:
 def add_frame(
     connection: Connection, map_number: int, values: dict[str, Any], frame_id: str | None = None
 ) -> FrameRow:
-    """Insert a received frame.
+    """Insert a frame in the state `received`.
 
     Parameters
     ----------
     connection : writing transaction
-    values : columns except number, id, state and times
-    frame_id : id that is unused in the map; default: a new id
+    values : columns, except number, id, state and times
+    frame_id : unused id; default: a new id
     """
     if frame_id is None:
         frame_id = uuid.uuid4().hex
@@ -280,19 +279,19 @@ def add_frame(
 def received_values(
     connection: Connection, map_number: int, frame_id: str, values: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the columns of a frame that has just been received; see `add_frame`."""
+    """Return the columns of a new frame; see `add_frame`."""
     state, at = FrameState.RECEIVED, now(connection)
     own = {"id": frame_id, "map_number": map_number, "state": state, "received_at": at}
     return {**own, **values, **position(values["pose"])}
 
 
 def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
-    """Return the columns with the position of a frame, which searches use."""
+    """Return the position columns of a frame, which are for searches."""
     return {f"pose_{axis}": None if pose is None else pose[i][3] for i, axis in enumerate("xyz")}
 
 
 def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
-    """Return the frame with an id in a map, even if it is deleted.
+    """Return a frame of a map by id, even if it is deleted.
 
     Raises
     ------
@@ -301,7 +300,7 @@ def find_frame(connection: Connection, row: MapRow, frame_id: str) -> FrameRow:
     frame = _first(connection, frames.c.map_number == row.number, frames.c.id == frame_id)
     if frame is None:
         raise UnknownFrame(
-            f"There is no frame {frame_id!r:.80} in map {row.name!r}. List them with "
+            f"There is no frame {frame_id!r:.80} in map {row.name!r}. List the frames with "
             f"GET /v1/maps/{row.name}/frames."
         )
     return frame
@@ -319,19 +318,19 @@ def frames_of_content(connection: Connection, map_number: int, content_id: str) 
 
 
 def living_frame(connection: Connection, map_number: int, frame_id: str) -> FrameRow | None:
-    """Return the frame with an id in a map; None if it does not exist or is deleted."""
+    """Return a frame of a map by id; None if it does not exist or is deleted."""
     existing = frames.c.state != FrameState.DELETED
     return _first(connection, frames.c.map_number == map_number, frames.c.id == frame_id, existing)
 
 
 def frame_of(connection: Connection, number: int) -> FrameRow:
-    """Return the frame with a number, which must exist."""
+    """Return an existing frame by number."""
     row = connection.execute(select(frames).where(frames.c.number == number)).mappings().one()
     return frame_row(row)
 
 
 def frames_of(connection: Connection, numbers: Iterable[int]) -> dict[int, FrameRow]:
-    """Return frames by number, except deleted frames."""
+    """Return the frames with these numbers, except deleted frames, by number."""
     rows = rows_of_statement(connection, _frames_of_numbers, numbers)
     return {row.number: row for row in frame_rows(rows)}
 
@@ -343,9 +342,9 @@ def _frames_of_numbers(dialect: str) -> Select[Any]:
 
 
 def free_id(connection: Connection, map_number: int, frame_id: str) -> None:
-    """Replace the id of a deleted frame, so that the id can be reused.
+    """Assign a new id to a deleted frame, so that its id can be reused.
 
-    A tombstone can then no longer be restored.
+    The frame can then no longer be restored.
     """
     deleted = frames.c.state == FrameState.DELETED
     own = update(frames).where(frames.c.map_number == map_number, frames.c.id == frame_id, deleted)
@@ -358,13 +357,13 @@ def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow
 
 
 def write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
-    """Insert the tags of a frame that has none."""
+    """Insert the tags of a frame without tags."""
     if rows := [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]:
         connection.execute(insert(frame_tags), rows)
 
 
 def geometry_blobs(connection: Connection, numbers: Iterable[int], model_id: str) -> dict[int, str]:
-    """Return the blobs of the geometry artifacts of frames, by number."""
+    """Return the digests of the geometry artifacts of frames by frame number."""
     rows = rows_of_statement(connection, _geometry_of_numbers, numbers, model_id=model_id)
     return {row.frame_number: row.geometry for row in rows}
 
@@ -376,13 +375,13 @@ def _geometry_of_numbers(dialect: str) -> Select[Any]:
     return select(signatures.c.frame_number, signatures.c.geometry).where(own, among)
 
 
-# Frames by position. A query reads hundreds of poses, mostly the same ones as the previous query.
-# Parsed poses are cached by their stored text, so entries are never stale. An entry has 800 bytes.
+# Frames by position. A query reads hundreds of poses, mostly the same as the previous query. Parsed
+# poses are cached by their stored text, so entries (800 bytes each) are never stale.
 
 
 @lru_cache(8192)
 def _pose_of_text(text: str) -> Floats:
-    """Parse T_parent_sensor (4, 4) from its stored text; the array is shared and read-only."""
+    """Parse T_parent_sensor (4, 4) from stored text; the array is shared and read-only."""
     pose = np.array(json.loads(text), np.float64)
     pose.flags.writeable = False
     return pose
@@ -390,7 +389,7 @@ def _pose_of_text(text: str) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PlacedFrame:
-    """Posed frame: number, T_parent_sensor (4, 4), artifact, whether it is a cloud, and tags."""
+    """A frame with a pose: number, T_parent_sensor (4, 4), artifact, kind, and tags."""
 
     number: int
     pose: Floats
@@ -403,7 +402,7 @@ def placed_frames(
     connection: Connection, map_number: int, parent: str, model_id: str,
     centre: Sequence[float], within: float, most: int,
 ) -> list[PlacedFrame]:  # fmt: skip
-    """Return indexed frames of a parent frame near a point, the nearest first.
+    """Return indexed frames in a parent frame near a point, nearest first.
 
     Parameters
     ----------
@@ -450,7 +449,7 @@ def _placed_frames() -> Select[Any]:
 
 @dataclass(frozen=True, eq=False)
 class FrameViewpoint:
-    """Viewpoint of a frame with its pose T_parent_sensor (4, 4); see the table for the fields."""
+    """Viewpoint of a frame, with its pose T_parent_sensor (4, 4)."""
 
     number: int
     map_number: int
@@ -460,7 +459,7 @@ class FrameViewpoint:
 
 
 def viewpoints_among(connection: Connection, numbers: Iterable[int]) -> list[FrameViewpoint]:
-    """Return the viewpoints of the frames with these numbers, except frames without a pose."""
+    """Return the viewpoints of some frames, except frames without a pose."""
     return [
         FrameViewpoint(number, of_map, parent, _pose_of_text(pose), is_cloud)
         for number, of_map, parent, pose, is_cloud in rows_of_statement(

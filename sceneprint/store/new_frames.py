@@ -1,10 +1,9 @@
-"""Insert new frames with their jobs, events and audit lines. Most uploads write nothing else.
+"""Insertion of new frames with their jobs, events and audit lines, the usual effect of an upload.
 
     [NewFrame, ...]  --receive_frames-->  ids of the inserted frames
 
-Other writers wait meanwhile. On PostgreSQL, one statement inserts frames of several maps, which
-share its overhead and the wait for the disk. SQLite has no round trips and uses one statement per
-table and frame.
+On PostgreSQL, one statement inserts frames of several maps, so that they share round trips and the
+wait for the disk. SQLite has no round trips, and uses one statement per table and frame.
 """
 
 from __future__ import annotations
@@ -68,16 +67,16 @@ from sceneprint.store.tables import (
 
 @dataclass(frozen=True, eq=False)
 class NewFrame:
-    """Frame that is inserted if its map does not have the content.
+    """A frame to insert unless its map has the content.
 
     Parameters
     ----------
-    row : row of the map when last read
+    row : row of the map, as last read
     values : columns, see `add_frame`
     priority : priority of the job that signs the frame
-    kept : columns of the row of `idempotency`; only on PostgreSQL
+    kept : columns of a row of `idempotency`; only on PostgreSQL
     frame_id, job_id : new ids
-    context : context variables of the upload's request
+    context : context variables of the request
     """
 
     row: MapRow
@@ -90,12 +89,12 @@ class NewFrame:
 
     @property
     def content(self) -> tuple[int, str]:
-        """Number of the map and id of the content, whose combination is unique."""
+        """Unique key of the content: map number and content id."""
         return self.row.number, self.values["content_id"]
 
     @property
     def tags(self) -> list[str]:
-        """Tags of the frame without duplicates."""
+        """Distinct tags of the frame."""
         return sorted(set(self.values["tags"]))
 
     @property
@@ -105,7 +104,7 @@ class NewFrame:
                 "size": self.values["bytes"], "content": self.values["content_id"]}  # fmt: skip
 
     def rows(self, connection: Connection) -> dict[str, dict[str, Any]]:
-        """Return the columns of the frame, its job and event, and of optional rows, by table."""
+        """Return the columns of all rows to insert (frame, job, event, optional rows) by table."""
         number = self.row.number
         job = self.context.run(job_values, connection, "sign", self.priority)
         event = event_values("frame.received", self.row.name, self.frame_id, self.job_id, {})
@@ -120,22 +119,22 @@ class NewFrame:
 
 
 def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
-    """Insert frames whose content their maps do not have, and queue jobs to sign them.
+    """Insert frames unless their maps have the content, and queue jobs to sign them.
 
     Parameters
     ----------
     connection : transaction that writes to the maps
-    new : frames; of frames with the same map and content, the first one is inserted
+    new : frames; of several frames with the same map and content, only the first is inserted
 
     Returns
     -------
-    ids : ids of the inserted frames. The other frames are not inserted, because the map was deleted
-        or renamed, its quota does not allow all its frames, it has the content, or (on PostgreSQL)
-        the idempotency key has a result; `add_frame` and its checks determine the reason
+    ids : ids of the inserted frames. A frame is not inserted if its map was deleted or renamed, has
+        the content, or lacks room for all its frames, or (on PostgreSQL) if the idempotency key has
+        a result. The caller must determine the reason
 
     Raises
     ------
-    IntegrityError : If a writer of another map is storing a result for the same idempotency key.
+    IntegrityError : If another map stores a result for the same idempotency key concurrently.
     """
     of_content = dict[tuple[int, str], NewFrame]()
     for one in new:
@@ -162,7 +161,7 @@ def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
 
 
 def _insert_on_sqlite(connection: Connection, one: NewFrame) -> bool:
-    """Insert a frame on SQLite, and return whether it was inserted."""
+    """Insert a frame on SQLite unless its map has the content; return whether it was inserted."""
     if connection.execute(_count_frame(), one.room).first() is None:
         return False
     rows = one.rows(connection)
@@ -177,7 +176,7 @@ def _insert_on_sqlite(connection: Connection, one: NewFrame) -> bool:
 
 @cache
 def _count_frame() -> ReturningUpdate[tuple[int]]:
-    """Return the statement that counts a frame if its map and quota allow the insertion."""
+    """Return a statement that adds a frame to the usage of its map, if the quota allows it."""
     number, size = bindparam("map_number", type_=WHOLE), bindparam("size", type_=WHOLE)
     content = bindparam("content", type_=TEXT)
     alike = frames.c.map_number == number, frames.c.content_id == content
@@ -195,7 +194,7 @@ def _count_frame() -> ReturningUpdate[tuple[int]]:
 
 
 def _room_conditions(n: Any, size: Any) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
-    """Return the conditions for maps whose quota allows `n` more frames and `size` more bytes."""
+    """Return the conditions for maps with room for `n` more frames and `size` more bytes."""
     return (
         or_(maps.c.quota_frames.is_(None), maps.c.used_frames + n <= maps.c.quota_frames),
         or_(maps.c.quota_bytes.is_(None), maps.c.used_bytes + size <= maps.c.quota_bytes),
@@ -206,29 +205,28 @@ def _counted(n: Any, size: Any) -> dict[str, Any]:
     return {"used_frames": maps.c.used_frames + n, "used_bytes": maps.c.used_bytes + size}
 
 
-# One statement for many frames on PostgreSQL. Keys such as `frame_<column>` name the columns of the
-# records. Values that the server can derive are not sent, because parsing them took a fifth of the
-# time.
+# Statement for many frames on PostgreSQL. Its records have keys such as `frame_<column>`. Values
+# that the server can derive are not sent, which saves a fifth of the time.
 
-#: Columns whose value is the time of the statement.
+#: Columns with the time of the statement.
 _STAMPED = frozenset(("frame_received_at", "job_run_after", "job_created_at"))
-#: Columns whose value is the same for all new frames.
+#: Columns with the same value for all new frames.
 _FIXED = frozenset(
     ("frame_state", "job_kind", "job_model_id", "job_state", "job_attempts", "job_failures",
      "job_token", "event_kind")
 )  # fmt: skip
-#: Columns whose value equals that of another column.
+#: Columns with the value of another column.
 _SAME = {
     "job_map_number": "frame_map_number", "event_frame_id": "frame_id", "event_job_id": "job_id",
     "line_at": "event_at", "line_tenant": "job_tenant", "line_action": "event_kind",
     "line_map": "event_map", "line_target": "frame_id", "line_data": "event_data",
 }  # fmt: skip
-#: Optional rows of a new frame, each with the column that is null if the row is missing.
+#: Optional rows of a new frame, with the column that is null without the row.
 _OPTIONAL = {"line": "actor", "kept": "key"}
 
 
 def _keys(names: Mapping[str, Iterable[str]]) -> Iterator[tuple[str, str, str]]:
-    """Yield the table, the name and the key of each column."""
+    """Yield table, column name and record key of each column."""
     return ((of, name, f"{of}_{name}") for of, columns in names.items() for name in columns)
 
 
@@ -252,8 +250,8 @@ def _insert_frames(
     Parameters
     ----------
     columns : names of the columns of each row
-    fixed : values of columns that are equal for all frames, by key
-    tagged : whether any frame has a tag
+    fixed : values that are equal for all frames, by key
+    tagged : whether any frame has tags
     """
     of = {"frame": frames, "job": jobs, "event": event_table, "line": audit, "kept": idempotency}
     tables = {name: (of[name], names) for name, names in columns}
@@ -288,7 +286,7 @@ _Tables = dict[str, tuple[Table, tuple[str, ...]]]
 
 
 def _records(tables: _Tables) -> TableValuedAlias:
-    """Return the records of `_record` as rows."""
+    """Return a table expression for the records of `_record`."""
     names = {of: columns for of, (_, columns) in tables.items()}
     columns = [
         column(key, _kind(tables[of][0].c[name].type))
@@ -302,15 +300,15 @@ def _records(tables: _Tables) -> TableValuedAlias:
 
 
 def _kind(kind: TypeEngine[Any]) -> TypeEngine[Any]:
-    """Return the type of a record's column without its length, so that long values are errors."""
+    """Return the type of a record column, without its length, so that long values raise errors."""
     return TEXT if isinstance(kind, String) else kind
 
 
 def _lacking(records: TableValuedAlias, *, kept: bool) -> CTE:
-    """Return the records whose map does not have the content, and whose key has no result.
+    """Return the records without a stored frame of the same content or a result for the key.
 
-    Each content is looked up as the next entry of one index, because a cached plan may date from a
-    time when the tables were empty and all indexes seemed equally good.
+    Each lookup reads the next entry of one index: a cached plan may date from a time when the
+    tables were empty, and all indexes seemed equally good.
     """
     key = frames.c.map_number, frames.c.content_id
     own = records.c.frame_map_number, records.c.frame_content_id
@@ -329,7 +327,7 @@ def _lacking(records: TableValuedAlias, *, kept: bool) -> CTE:
 
 
 def _count_frames(lacking: CTE) -> CTE:
-    """Count the records of each unchanged map whose quota allows them, and return these maps."""
+    """Return an UPDATE of the usage of all maps with room for their records, returning the maps."""
     each = lacking.c.frame_map_number, lacking.c.event_map
     size = cast(func.sum(lacking.c.size), BigInteger)
     more = select(*each, func.count().label("n"), size.label("size")).group_by(*each).cte("more")
@@ -346,7 +344,7 @@ def _insert_rows(
     of: str, tables: _Tables, fixed: dict[str, Any], lacking: CTE, source: FromClause,
     *conditions: ColumnElement[bool], **more: ColumnElement[Any],
 ) -> Insert:  # fmt: skip
-    """Return the INSERT statement of a row for each frame of a source, in record order."""
+    """Return the INSERT of a row of one table for each frame of a source, in record order."""
     table, names = tables[of]
 
     def value(name: str) -> ColumnElement[Any]:

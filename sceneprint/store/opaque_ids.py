@@ -1,8 +1,8 @@
-"""Encrypt row numbers for clients, as ids of events and as cursors of pages.
+"""Encryption of row numbers that clients receive, as event ids and as cursors of pages.
 
-Rows are numbered across all maps, so plain numbers and their gaps would reveal the activity in
-other maps. A seal is a number encrypted with AES-SIV (RFC 5297) and the store's secret. Seals are
-deterministic, and seals of different numbers are unrelated.
+Rows are numbered across all maps, so plain numbers would reveal the activity in other maps. A seal
+is a number encrypted with AES-SIV (RFC 5297) and the secret of the store. Seals are deterministic;
+seals of different numbers are unrelated.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from sceneprint.store.tables import secrets
 
 #: Kinds of rows. A seal is valid for only one kind.
 Kind = Literal["audit", "deletion", "event", "frame", "job", "query"]
-#: Position before all rows; no row has number 0, so it needs no seal.
+#: Position before all rows, in place of a seal of the number 0.
 START = "0"
 #: Position in a list that is sorted by time: seconds since 1970, and the number of a row.
 _MOMENT = struct.Struct(">dQ")
 
 
 class OpaqueIds:
-    """Cipher for the row numbers of one store."""
+    """Cipher of the row numbers of a store."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def seal(self, kind: Kind, number: int) -> str:
-        """Return 48 digits that represent a number; START for 0."""
+        """Encrypt a number as 48 hexadecimal digits; return START for 0."""
         if number == 0:
             return START
         return self._cipher.encrypt(number.to_bytes(8, "big"), [kind.encode()]).hex()
 
     def open(self, kind: Kind, seal: str) -> int | None:
-        """Return the number of a seal; None if this store did not issue the seal."""
+        """Decrypt a seal; return None if this store did not issue it."""
         if seal == START:
             return 0
         if not re.fullmatch(r"[0-9a-f]{48}", seal):
@@ -55,11 +55,11 @@ class OpaqueIds:
         return int.from_bytes(plain, "big")
 
     def event(self, event_id: str, place: str = "after") -> int:
-        """Return the number of the event with an id; 0 for START, the position before all events.
+        """Return the number of an event by its id; 0 for START.
 
         Raises
         ------
-        InvalidRequest : If the id is not that of an event of this store.
+        InvalidRequest : If this store did not issue the id.
         """
         number = self.open("event", event_id)
         if number is None:
@@ -71,7 +71,7 @@ class OpaqueIds:
         return number
 
     def row(self, kind: Kind, cursor: str | None) -> int | None:
-        """Return the number of the last row of the previous page; None for the first page.
+        """Return the number of the last row of the previous page from a cursor; None without one.
 
         Raises
         ------
@@ -85,19 +85,19 @@ class OpaqueIds:
         return number
 
     def next_cursor(self, kind: Kind, numbers: Sequence[int], limit: int) -> str | None:
-        """Return the cursor of the page after `limit` rows; None if there are no more rows."""
+        """Return the cursor of the page after the first `limit` rows; None without further rows."""
         return self.seal(kind, numbers[limit - 1]) if len(numbers) > limit else None
 
     def next_moment(
         self, kind: Kind, moments: Sequence[tuple[float, int]], limit: int
     ) -> str | None:
-        """Return the cursor after `limit` rows of a list sorted by time and number, or None."""
+        """Like `next_cursor`, for a list sorted by time and number."""
         if len(moments) <= limit:
             return None
         return self._cipher.encrypt(_MOMENT.pack(*moments[limit - 1]), [kind.encode()]).hex()
 
     def moment(self, kind: Kind, cursor: str | None) -> tuple[float, int] | None:
-        """Return the time and number of the previous page's last row; None for the first page.
+        """Return time and number of the last row of the previous page; None for the first page.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class OpaqueIds:
 
     @property
     def owner(self) -> str:
-        """Return 32 digits that identify the store without revealing its secret."""
+        """Return the public name of the store: 32 digits that do not reveal its secret."""
         return owner_of(self._secret)
 
     @cached_property
@@ -138,7 +138,7 @@ class OpaqueIds:
 
 
 def row_of(cursor: str | None) -> int | None:
-    """Return the position of a cursor that is not encrypted.
+    """Return the row number of an unencrypted cursor; None for the first page.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """Joins of parent frames, and the resulting poses of frames.
 
-A join transforms poses from one parent frame to another. A frame with an uploaded pose in a joined
-parent frame has a pose in the root of that parent frame, where its joins end. The uploaded pose is
-also stored.
+A join transforms poses from one parent frame to another. Following the joins from a parent frame
+leads to its root. The stored pose of a frame is relative to the root; the uploaded pose is stored
+too.
 
     join_parent, undo_joins  -->  rows of joins  --find_joins-->  roots  -->  poses of frames
 """
@@ -26,7 +26,7 @@ from sceneprint_client.api import FrameState
 
 @dataclass(frozen=True, eq=False)
 class ParentJoin:
-    """Joined parent frame, its root, and T_root_parent (4, 4)."""
+    """A joined parent frame, its root, and T_root_parent (4, 4)."""
 
     parent: str
     root: str
@@ -35,7 +35,7 @@ class ParentJoin:
 
 @dataclass(frozen=True)
 class ParentRun:
-    """Number of indexed frames in one parent frame and session, and the first frame's number."""
+    """A session in one parent frame: number of indexed frames, and number of the first frame."""
 
     parent: str
     session: str | None
@@ -45,14 +45,14 @@ class ParentRun:
 
 
 def find_joins(connection: Connection, map_number: int) -> dict[str, ParentJoin]:
-    """Return the joins from a map's parent frames to their roots, by parent frame."""
+    """Return the joins of a map from parent frames to their roots, by parent frame."""
     c = parent_joins.c
     stands = c.map_number == map_number, c.undone_at.is_(None)
     rows = connection.execute(select(c.parent, c.towards, c.transform).where(*stands))
     steps = {row.parent: (row.towards, np.array(row.transform)) for row in rows}
     joins = {}
     for parent, (root, T) in steps.items():
-        while root in steps:  # this loop ends, because a join leads from one root to another
+        while root in steps:  # ends, because joins have no cycles
             root, onwards = steps[root]
             T = onwards @ T
         joins[parent] = ParentJoin(parent, root, T)
@@ -60,14 +60,14 @@ def find_joins(connection: Connection, map_number: int) -> dict[str, ParentJoin]
 
 
 def is_joined_by(connection: Connection, map_number: int, job_id: str) -> bool:
-    """Return whether a join that an association proposed is in effect."""
+    """Return whether a join by an association is in effect."""
     c = parent_joins.c
     stands = c.map_number == map_number, c.job_id == job_id, c.undone_at.is_(None)
     return connection.execute(select(c.parent).where(*stands)).first() is not None
 
 
 def undone_pairs(connection: Connection, map_number: int) -> list[set[str]]:
-    """Return the current roots of the two parent frames of each undone join."""
+    """Return the two parent frames of each undone join, as their current roots."""
     c, joins = parent_joins.c, find_joins(connection, map_number)
     undone = select(c.parent, c.towards).where(c.map_number == map_number, c.undone_at.is_not(None))
     return [{_root(joins, name) for name in row} for row in connection.execute(undone)]
@@ -78,7 +78,7 @@ def _root(joins: Mapping[str, ParentJoin], name: str) -> str:
 
 
 def posed_runs(connection: Connection, map_number: int) -> list[ParentRun]:
-    """Return the sessions of a map's posed, indexed frames, in the order of their first frames."""
+    """Return the sessions of a map with poses, by parent frame, in the order of first frames."""
     c, first = frames.c, func.min(frames.c.number)
     run = (c.pose_parent, c.session, c.robot)
     statement = select(*run, func.count(), first).where(
@@ -89,7 +89,7 @@ def posed_runs(connection: Connection, map_number: int) -> list[ParentRun]:
 
 
 def count_poses(connection: Connection, map_number: int) -> tuple[int, int]:
-    """Return the number of posed, indexed frames of a map, and that of their parent frames."""
+    """Return the number of indexed frames with a pose, and the number of their parent frames."""
     c = frames.c
     statement = select(func.count(c.pose_x), func.count(c.pose_parent.distinct())).where(
         c.map_number == map_number, c.state == FrameState.INDEXED, c.pose_x.is_not(None)
@@ -99,43 +99,44 @@ def count_poses(connection: Connection, map_number: int) -> tuple[int, int]:
 
 
 def root_columns(connection: Connection, frame: FrameRow) -> dict[str, Any]:
-    """Return the columns with the pose in the root, if a join applies and has not been applied."""
+    """Return the pose columns of a frame after joins that have not been applied; else nothing."""
     if frame.pose is None or frame.pose_parent is None or frame.sent_parent is not None:
         return {}  # the joins have already been applied
-    one = find_joins(connection, frame.map_number).get(frame.pose_parent)
-    return {} if one is None else _columns(frame.pose_parent, frame.pose, one)
+    join = find_joins(connection, frame.map_number).get(frame.pose_parent)
+    return {} if join is None else _columns(frame.pose_parent, frame.pose, join)
 
 
-def _columns(parent: str, sent: Any, one: ParentJoin | None) -> dict[str, Any]:
-    """Return the columns of a frame with its uploaded pose transformed by a join."""
-    if one is None:
+def _columns(parent: str, sent: Any, join: ParentJoin | None) -> dict[str, Any]:
+    """Return the pose columns of a frame whose uploaded pose a join transforms."""
+    if join is None:
         return {"pose_parent": parent, "pose": sent, "sent_parent": None, "sent_pose": None}
-    moved = (one.T @ np.array(sent)).tolist()
-    return {"pose_parent": one.root, "pose": moved, "sent_parent": parent, "sent_pose": sent}
+    moved = (join.T @ np.array(sent)).tolist()
+    return {"pose_parent": join.root, "pose": moved, "sent_parent": parent, "sent_pose": sent}
 
 
-def join_parent(connection: Connection, map_number: int, one: ParentJoin, job_id: str) -> bool:
-    """Transform all poses in a root, and in parent frames joined to it, to another root.
+def join_parent(connection: Connection, map_number: int, join: ParentJoin, job_id: str) -> bool:
+    """Move all poses that are relative to a root to another root.
 
     Parameters
     ----------
     connection : writing transaction of the map
-    one : join of two roots
-    job_id : id of the association that proposed the join
+    map_number : number of the map
+    join : join of two roots
+    job_id : id of the association that found the join
 
     Returns
     -------
     joined : False if one of the roots is already joined, and nothing was written
     """
     before = find_joins(connection, map_number)
-    if one.parent in before or one.root in before:
+    if join.parent in before or join.root in before:
         return False
     c = parent_joins.c
-    ends = c.map_number == map_number, c.parent == one.parent, c.towards == one.root
-    connection.execute(delete(parent_joins).where(*ends))  # removes an undone join
+    ends = c.map_number == map_number, c.parent == join.parent, c.towards == join.root
+    connection.execute(delete(parent_joins).where(*ends))  # an undone join
     connection.execute(
         insert(parent_joins).values(
-            map_number=map_number, parent=one.parent, towards=one.root, transform=one.T.tolist(),
+            map_number=map_number, parent=join.parent, towards=join.root, transform=join.T.tolist(),
             job_id=job_id, joined_at=time.time(),
         )
     )  # fmt: skip
@@ -144,7 +145,7 @@ def join_parent(connection: Connection, map_number: int, one: ParentJoin, job_id
 
 
 def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
-    """Undo the joins that an association proposed, in a writing transaction of the map.
+    """Undo the joins by an association, in a write transaction of the map.
 
     Returns
     -------
@@ -161,7 +162,7 @@ def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
 
 
 def _move_frames(connection: Connection, map_number: int, before: Mapping[str, ParentJoin]) -> None:
-    """Recompute the poses of frames whose root has changed from the uploaded poses."""
+    """Recompute poses from uploaded poses, for all frames whose root has changed."""
     now = find_joins(connection, map_number)
     changed = [name for name in {*before, *now} if _root(before, name) != _root(now, name)]
     f = frames.c
@@ -169,11 +170,11 @@ def _move_frames(connection: Connection, map_number: int, before: Mapping[str, P
         f.map_number == map_number,
         f.pose_x.is_not(None),
         f.pose_parent.in_(changed) | f.sent_parent.in_(changed),
-    )  # this includes deleted frames, which may be restored
+    )  # including deleted frames, which may be restored
     moved = []
     for number, parent, pose, sent_parent, sent_pose in connection.execute(affected).all():
         sent = (parent, pose)
-        if sent_parent in changed:  # other frames were copied from a map with a different join
+        if sent_parent in changed:
             sent = (sent_parent, sent_pose)
         values = _columns(*sent, now.get(sent[0]))
         moved.append({"own": number, **values, **position(values["pose"])})
@@ -183,4 +184,4 @@ def _move_frames(connection: Connection, map_number: int, before: Mapping[str, P
     columns = [name for name in moved[0] if name != "own"]
     named = own.values({name: bindparam(name, type_=f[name].type) for name in columns})
     connection.execute(named, moved)
-    note_edits(connection, [one["own"] for one in moved], map_number)
+    note_edits(connection, [row["own"] for row in moved], map_number)

@@ -1,4 +1,4 @@
-"""Rows of queries, with the searched maps, the sender, the outcome, and the stored answer.
+"""Rows of queries: searched maps, sender, outcome, and stored answer.
 
 NewQuery, ...  --add_queries-->  rows and events in one commit  --list_queries-->  QueryRow, ...
 """
@@ -66,24 +66,26 @@ class _Query:
 
 @dataclass(frozen=True)
 class NewQuery(_Query):
-    """Query that was answered or failed.
+    """A query to store, answered or failed.
 
     Parameters
     ----------
     at : time of arrival, seconds since 1970
     map : name of the map to which the row belongs
     maps : names of all searched maps; None if only `map` was searched
-    robot, session : sender and run, if known
-    status, cause, reason : values of the answer; or `failed`, the type of the error, and its text
-    pose_parent, pose : parent frame, and x, y, z, qx, qy, qz, qw of T_parent_query, if found
+    robot, session : sender and run; None if unknown
+    status, cause, reason : values of the answer; or `failed`, the type and the text of the error
+    pose_parent, pose : parent frame, and x, y, z, qx, qy, qz, qw of T_parent_query; None without a
+        pose
     confidence : confidence of that pose, or of the best alternative
     alternatives : number of other poses that the evidence supports
-    kind : kind of the query frame, if it was decoded
-    frame_map, frame_id : map and id of the query frame, if it is a stored frame
-    key_id : id of the request's key
-    listed : whether the history contains the query, and an event reports it
+    milliseconds : duration of the query
+    kind : kind of the query frame; None if it was not decoded
+    frame_map, frame_id : map and id of a stored query frame; None for an upload
+    key_id : id of the key of the request
+    listed : whether lists and events report the query
     bytes : size of the stored answer; 0 if it is not stored
-    shown : numbers of the frames in the answer
+    shown : frame numbers in the answer
     """
 
     key_id: str | None
@@ -94,14 +96,14 @@ class NewQuery(_Query):
 
 @dataclass(frozen=True)
 class QueryRow(_Query):
-    """Stored query; see NewQuery for the other fields.
+    """A stored query; see NewQuery for the other fields.
 
     Parameters
     ----------
-    key : name of the key; None without a key, or if the key was revoked
+    key : name of the key; None without a key or after its revocation
     bytes : size of the stored answer; 0 if it is not stored
-    kept_at : time at which the answer was marked as kept; None if it expires
-    title : title of a kept answer
+    kept_at : time from which the answer is permanent; None if it expires
+    title : title of a permanent answer
     """
 
     number: int
@@ -122,7 +124,7 @@ _ROW = select(
     select(maps.c.name).where(maps.c.number == _c.map_number).scalar_subquery().label("map"),
     select(keys.c.name).where(keys.c.id == _c.key_id).scalar_subquery().label("key"),
 )
-#: Condition with a literal value, because planners do not match bound values to a partial index.
+#: Condition with a literal value: planners do not match bound values to a partial index.
 _STORED: ColumnElement[bool] = literal_column("bytes > 0")
 #: Kind of the event that reports a query.
 EVENT = "query.answered"
@@ -132,7 +134,7 @@ _REPORTED = ("status", "robot", "session", "cause", "support", "milliseconds")
 def add_queries(connection: Connection, new: Sequence[NewQuery]) -> None:
     """Store queries, and an event for each listed query.
 
-    Queries of a map that was deleted or replaced after their arrival are ignored.
+    Queries whose map was deleted or replaced since are ignored.
     """
     names = sorted({one.map for one in new})
     statement = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
@@ -165,7 +167,7 @@ def _event(one: NewQuery) -> dict[str, Any]:
             "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
         }
     own = one.frame_id if one.frame_map == one.map else None
-    # events are sorted by their own time, not by the time of the query
+    # the time of the event, by which events are sorted, not the time of the query
     return {
         "at": time.time(), "kind": EVENT, "map": one.map, "frame_id": own, "job_id": None,
         "data": data,
@@ -174,15 +176,15 @@ def _event(one: NewQuery) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class WantedQueries:
-    """Conditions on the queries of a list.
+    """Conditions on queries.
 
     Parameters
     ----------
     map_numbers : numbers of the selected maps; None selects all maps
-    statuses : statuses, one of which must match; empty matches all
+    statuses : statuses, of which one must match; empty matches all
     robot : sender; None matches all
-    since, until : half-open interval of the arrival, seconds since 1970
-    kept : whether only kept answers match
+    since, until : half-open interval of the time of arrival, seconds since 1970
+    kept : whether only queries with permanent answers match
     """
 
     map_numbers: tuple[int, ...] | None = None
@@ -196,12 +198,12 @@ class WantedQueries:
 def list_queries(
     connection: Connection, wanted: WantedQueries, before: tuple[float, int] | None, limit: int
 ) -> list[QueryRow]:
-    """Return queries, the newest first.
+    """Return queries, newest first.
 
     Parameters
     ----------
     before : time and number of the last row of the previous page
-    limit : maximum number
+    limit : maximum number of queries
     """
     statement = _ROW.where(*_conditions(wanted))
     if before is not None:
@@ -214,7 +216,7 @@ def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
     yield _c.kept_at.is_not(None) if wanted.kept else or_(_c.listed, _c.kept_at.is_not(None))
     numbers = wanted.map_numbers
     if numbers is not None:
-        # "+ 0" rules out the indexes of maps, because the index of the robot selects fewer rows
+        # "+ 0" rules out the indexes of maps, since the index of robots selects fewer rows
         own = _c.map_number if wanted.robot is None else _c.map_number + 0
         yield own == numbers[0] if len(numbers) == 1 else own.in_(numbers)
     if wanted.statuses:
@@ -230,7 +232,7 @@ def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
 def count_statuses(
     connection: Connection, since: float, map_number: int | None = None
 ) -> dict[int, dict[str, int]]:
-    """Return the number of listed queries since a time by map and status; None counts all maps."""
+    """Count the listed queries since a time by map number and status; None counts all maps."""
     statement = select(_c.map_number, _c.status, func.count().label("n"))
     statement = statement.where(_c.listed, _c.at >= since).group_by(_c.map_number, _c.status)
     if map_number is not None:
@@ -242,19 +244,19 @@ def count_statuses(
 
 
 def find_query(connection: Connection, query_id: str) -> QueryRow | None:
-    """Return the query with an id, or None."""
+    """Return a query by id; None if it does not exist."""
     row = connection.execute(_ROW.where(_c.id == query_id)).mappings().first()
     return None if row is None else QueryRow(**row)
 
 
 def read_kept(connection: Connection, number: int) -> bytes | None:
-    """Return the kept answer of a query, or None."""
+    """Return the permanent answer to a query; None if it is not permanent."""
     answer: bytes | None = connection.execute(select(_c.answer).where(_c.number == number)).scalar()
     return answer
 
 
 def is_current(connection: Connection, row: QueryRow) -> bool:
-    """Return whether the searched maps, and the stored frame that was the query, still exist."""
+    """Return whether the searched maps and the stored query frame, if any, still exist."""
     names = set(row.searched)
     statement = select(maps.c.name).where(maps.c.name.in_(names), maps.c.created_at <= row.at)
     if len(connection.execute(statement).all()) < len(names):
@@ -271,28 +273,28 @@ def is_current(connection: Connection, row: QueryRow) -> bool:
     )  # fmt: skip
     number = connection.execute(own).scalar()
     shown = connection.execute(select(_c.shown).where(_c.number == row.number)).scalar()
-    return number is not None and number in (shown or [])  # another frame may have the id now
+    return number is not None and number in (shown or [])  # the id may belong to another frame now
 
 
 def keep_answer(connection: Connection, number: int, data: bytes, at: float) -> bool:
-    """Store an answer in the database, and so in its backups; return False if it has expired."""
+    """Make an answer permanent by storing it in the database; return False if it has expired."""
     own = update(queries).where(_c.number == number, _STORED)
     return connection.execute(own.values(answer=data, kept_at=at)).rowcount == 1
 
 
 def set_title(connection: Connection, number: int, title: str | None) -> None:
-    """Set the title of a kept answer."""
+    """Set the title of a permanent answer."""
     connection.execute(update(queries).where(_c.number == number).values(title=title))
 
 
 def release_answer(connection: Connection, number: int) -> None:
-    """Mark an answer as expiring."""
+    """Make a permanent answer expire again."""
     expired = {"answer": None, "kept_at": None, "title": None}
     connection.execute(update(queries).where(_c.number == number).values(expired))
 
 
 def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
-    """Return the number of kept answers of a map, and the total bytes of those of all maps."""
+    """Return the number of permanent answers of a map, and the bytes of those of all maps."""
     counts = func.count(), func.coalesce(func.sum(_c.bytes), 0)
     statement = select(*counts).where(_c.kept_at.is_not(None))
     of_map = select(maps.c.number).where(maps.c.name == map_name).scalar_subquery()
@@ -300,11 +302,11 @@ def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
     return int(count), int(connection.execute(statement).one()[1])
 
 
-# Removal of old and surplus queries, of the oldest answers, and of answers with deleted frames.
+# Removal of expired and surplus queries, of the oldest answers, and of answers with deleted frames.
 
 
 def old_queries(connection: Connection, before: float, limit: int) -> list[int]:
-    """Return the numbers of the oldest queries before a time, except kept ones."""
+    """Return the numbers of the oldest queries before a time; skip permanent answers."""
     spent = select(_c.number).where(_c.at < before, _c.kept_at.is_(None))
     return list(connection.execute(spent.order_by(_c.at, _c.number).limit(limit)).scalars())
 
@@ -312,7 +314,7 @@ def old_queries(connection: Connection, before: float, limit: int) -> list[int]:
 def surplus_queries(connection: Connection, most: int, limit: int) -> list[int]:
     """Return the numbers of the oldest queries of maps with more than `most` queries."""
     span = connection.execute(select(func.max(_c.number) - func.min(_c.number))).scalar()
-    if (span or 0) < most:  # in this usual case, no count is necessary
+    if (span or 0) < most:  # usual case; avoids a count
         return []
     counts = select(_c.map_number, func.count()).group_by(_c.map_number)
     numbers: list[int] = []
@@ -324,13 +326,13 @@ def surplus_queries(connection: Connection, most: int, limit: int) -> list[int]:
 
 
 def queries_of_map(connection: Connection, map_number: int, limit: int) -> list[int]:
-    """Return the numbers of some queries of a map."""
+    """Return the numbers of up to `limit` queries of a map."""
     own = select(_c.number).where(_c.map_number == map_number).limit(limit)
     return list(connection.execute(own).scalars())
 
 
 def remove_queries(connection: Connection, numbers: Sequence[int]) -> list[str]:
-    """Remove at most a few hundred queries, and return the ids of those with a stored answer."""
+    """Remove up to a few hundred queries; return the ids of those with a stored answer."""
     own = among(connection, _c.number, numbers)
     stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
     connection.execute(delete(queries).where(own))
@@ -338,33 +340,33 @@ def remove_queries(connection: Connection, numbers: Sequence[int]) -> list[str]:
 
 
 def stored_bytes(connection: Connection) -> int:
-    """Return the total size of the stored answers, bytes."""
+    """Return the total size of stored answers in bytes."""
     total = connection.execute(select(func.sum(_c.bytes)).where(_STORED)).scalar()
     return int(total or 0)
 
 
 def oldest_answers(connection: Connection, limit: int) -> list[tuple[int, int]]:
-    """Return the number and bytes of each of the oldest answers, except kept ones."""
+    """Return query number and bytes of the oldest answers, except permanent answers."""
     statement = select(_c.number, _c.bytes).where(_STORED, _c.kept_at.is_(None))
     rows = connection.execute(statement.order_by(_c.at, _c.number).limit(limit))
     return [(row.number, row.bytes) for row in rows]
 
 
 def shown_frames(connection: Connection, after: int, limit: int) -> list[tuple[int, list[int]]]:
-    """Return the next stored answers by number, each with the numbers of its frames."""
+    """Return query number and frame numbers of the next stored answers after number `after`."""
     statement = select(_c.number, _c.shown).where(_STORED, _c.number > after)
     rows = connection.execute(statement.order_by(_c.number).limit(limit))
     return [(row.number, row.shown or []) for row in rows]
 
 
 def unpurged_frames(connection: Connection, numbers: set[int]) -> set[int]:
-    """Return the numbers of the frames that exist or can be restored."""
+    """Return the numbers of the frames among `numbers` that exist or can be restored."""
     statement = select(frames.c.number).where(not_purged())
     return {row.number for row in rows_among(connection, statement, frames.c.number, numbers)}
 
 
 def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
-    """Remove at most a few hundred answers and their unlisted queries, and return the ids."""
+    """Remove up to a few hundred answers, and their queries if unlisted; return the query ids."""
     own = among(connection, _c.number, numbers)
     stored = list(connection.execute(select(_c.id).where(own, _STORED)).scalars())
     connection.execute(delete(queries).where(own, ~_c.listed))
@@ -374,6 +376,6 @@ def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
 
 
 def stored_among(connection: Connection, query_ids: Sequence[str]) -> set[str]:
-    """Return the ids, of at most a thousand, whose answers are stored in files."""
+    """Return those of up to a thousand query ids whose answers are stored in files."""
     statement = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
     return set(connection.execute(statement).scalars())

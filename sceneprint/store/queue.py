@@ -1,18 +1,17 @@
-"""Queue of jobs in the database, so that a frame and its job are written in one commit.
+"""Queue of jobs, a table of the database, so that a frame and its job are stored in one commit.
 
     enqueue  -->  queued  --claim-->  running  --finish | fail-->  over, or queued again
 
 Tenants take turns: a claim selects the tenant whose last claim is oldest, and its due job with the
-highest priority. Between two jobs of a tenant, each other tenant gets at most one job per
-concurrently claiming worker. Upkeep without a tenant, such as the re-encoding of a map, waits for
-all other jobs.
+highest priority. Upkeep without a tenant, such as the re-encoding of a map, waits for all other
+jobs.
 
-A claim is a lease: if the worker does not renew it in time, another worker gets the job. Each claim
-has a greater token than the previous one, and results with an older token are refused. A job may
+A claim is a lease: if the worker does not renew it in time, another worker can claim the job. The
+token of a job increases with each claim, and results with an older token are refused. A job may
 therefore run twice, but takes effect only once.
 
-On PostgreSQL, claims and renewals wait for no turn (`write(turn=False)`), so that a thousand
-workers do not delay uploads. Locks of the job's row order them:
+On PostgreSQL, claims and renewals take no turn (`write(turn=False)`), so that a thousand workers do
+not delay uploads. Locks of the row of the job order them:
 
 - two claims: SKIP LOCKED makes each continue with the next job; a row that changed before it was
   locked is checked again, and skipped if it is no longer due;
@@ -77,26 +76,26 @@ from sceneprint_client.api import JobState
 
 @dataclass(frozen=True)
 class ListedJob:
-    """Job with the names of its frame and map."""
+    """A job, with the names of its frame and its map."""
 
     job: JobRow
     frame_id: str | None
     map_name: str | None
-    followed_by: str | None  # id of the latest job of the same frame and kind, if later
+    followed_by: str | None  # id of the latest later job of the same frame and kind
 
 
 def list_jobs(
     connection: Connection, before: int | None, limit: int, state: JobState | None,
     kind: str | None = None, map_names: Collection[str] | None = None,
 ) -> list[ListedJob]:  # fmt: skip
-    """Return jobs, the newest first.
+    """Return jobs, newest first.
 
     Parameters
     ----------
     before : number of the last job of the previous page
     limit : maximum number of jobs
     state, kind : conditions; None matches all jobs
-    map_names : names of the selected maps, without jobs that have no map; None selects all
+    map_names : names of the selected maps, which excludes jobs without a map; None selects all jobs
     """
     last = _later_job().scalar_subquery()
     statement = (
@@ -122,7 +121,7 @@ def list_jobs(
 
 
 def _later_job() -> Select[tuple[str]]:
-    """Return the query of the latest later job with the frame, kind and model of a job."""
+    """Return a subquery for the latest later job with the same frame, kind and model as a job."""
     later = jobs.alias()
     return (
         select(later.c.id)
@@ -137,7 +136,7 @@ def _later_job() -> Select[tuple[str]]:
 
 
 def find_job(connection: Connection, job_id: str) -> JobRow:
-    """Return the job with an id. Raise UnknownJob if it does not exist."""
+    """Return a job by id. Raise UnknownJob if it does not exist."""
     row = connection.execute(select(jobs).where(jobs.c.id == job_id)).mappings().first()
     if row is None:
         raise unknown_job(job_id)
@@ -145,7 +144,7 @@ def find_job(connection: Connection, job_id: str) -> JobRow:
 
 
 def job_of_number(connection: Connection, number: int) -> JobRow | None:
-    """Return the job with a number; None if it was removed."""
+    """Return a job by number; None if it was removed."""
     row = connection.execute(select(jobs).where(jobs.c.number == number)).mappings().first()
     return None if row is None else job_row(row)
 
@@ -153,15 +152,15 @@ def job_of_number(connection: Connection, number: int) -> JobRow | None:
 def unknown_job(job_id: str) -> UnknownJob:
     """Return the error for a job that does not exist or is hidden from the caller."""
     return UnknownJob(
-        f"There is no job {job_id!r:.80}. Check the id, which the upload returned. The deletion of "
-        "a map also deletes its jobs."
+        f"There is no job {job_id!r:.80}. Check the id in the response to the upload. The deletion "
+        "of a map also deletes its jobs."
     )
 
 
 def latest_job(
     connection: Connection, kind: str, frame_number: int, model_id: str | None = None
 ) -> JobRow | None:
-    """Return the latest job of a frame with a kind and model."""
+    """Return the latest job of a frame with a kind and a model; None without such a job."""
     row = connection.execute(
         select(jobs)
         .where(
@@ -175,7 +174,7 @@ def latest_job(
 
 
 def signing_jobs(connection: Connection, frame_numbers: list[int]) -> dict[int, str]:
-    """Return the latest `sign` job of each frame, which excludes re-encodings."""
+    """Return the id of the latest job of the kind `sign` of each frame, by frame number."""
     statement = select(jobs.c.frame_number, jobs.c.id).where(jobs.c.kind == "sign")
     rows = rows_among(
         connection, statement.order_by(jobs.c.number), jobs.c.frame_number, frame_numbers
@@ -187,9 +186,9 @@ def count_jobs(
     connection: Connection, map_number: int | None = None,
     states: Collection[JobState] | None = None,
 ) -> dict[str, int]:  # fmt: skip
-    """Return the number of jobs by state, of one map or of all maps.
+    """Count the jobs of a map, or of all maps, by state.
 
-    A dead job that was retried does not count, but its latest retry does.
+    Of a retried dead job, only the latest retry counts.
     """
     counts = select(jobs.c.state, func.count()).group_by(jobs.c.state)
     if map_number is not None:
@@ -209,31 +208,31 @@ def count_jobs(
 
 
 def waiting_by_tenant(connection: Connection) -> dict[str, int]:
-    """Return the number of queued jobs by tenant, for tenants with queued jobs."""
+    """Count the queued jobs by tenant, for tenants with queued jobs."""
     counts = select(jobs.c.tenant, func.count()).where(jobs.c.state == JobState.QUEUED)
     return {row[0]: row[1] for row in connection.execute(counts.group_by(jobs.c.tenant))}
 
 
 def read_clock(connection: Connection) -> float:
-    """Return the current time of the database's clock, seconds since 1970."""
+    """Return the current time by the clock of the database, seconds since 1970."""
     if connection.dialect.name == "sqlite":
         return time.time()
     return float(connection.execute(select(now(connection))).scalar_one())
 
 
-#: States of jobs that are not over.
+#: States of unfinished jobs.
 PENDING = (JobState.QUEUED, JobState.RUNNING)
 #: Number of failures after which a job is dead.
 MAXIMUM_FAILURES = 3
-#: Number of attempts after which a job is dead. It is greater, because a worker may die for another
-#: reason than its job: frequent restarts of a machine must not make a frame fail.
+#: Number of attempts after which a job is dead. It exceeds MAXIMUM_FAILURES, because a worker may
+#: die for reasons other than its job, such as frequent restarts of a machine.
 MAXIMUM_ATTEMPTS = 10
-#: Highest priority of upkeep, which no user requested.
+#: Highest priority of upkeep jobs.
 UPKEEP = -10
-#: Seconds before the second attempt. The pause quadruples with each failure.
+#: Pause before the second attempt, seconds. It quadruples with each failure.
 BACKOFF_S = 2.0
-#: Longest pause of a job, and longest lease, seconds. A job with a later time was written before
-#: the clock was set back, and is due immediately.
+#: Maximum pause of a job, and maximum lease, seconds. Later times were written before the clock was
+#: set back, so the job is due immediately.
 LONGEST_PAUSE_S, LONGEST_LEASE_S = 60.0, 3600.0
 
 
@@ -242,13 +241,13 @@ def enqueue(
     model_id: str | None = None, *, map_number: int | None = None,
     data: dict[str, Any] | None = None,
 ) -> JobRow:  # fmt: skip
-    """Queue a job in the transaction of the change that requires it.
+    """Queue a job, in the transaction of the change that requires it.
 
     Parameters
     ----------
     connection : writing transaction
     kind, frame_number, priority, model_id, data : columns of the table
-    map_number : number of the map, for a job that is not about a single frame
+    map_number : number of the map, for a job without a frame
     """
     map_column: Any = map_number
     if frame_number is not None:
@@ -260,7 +259,7 @@ def enqueue(
 
 
 def due_in_s(connection: Connection) -> float | None:
-    """Return the seconds until the next job is due, without a lock; None if there are no jobs."""
+    """Return the seconds until the next job is due, without a lock; None if no job is queued."""
     waiting = select(func.min(jobs.c.run_after)).where(jobs.c.state == JobState.QUEUED)
     silent = select(func.min(jobs.c.leased_until)).where(jobs.c.state == JobState.RUNNING)
     scalars = [connection.execute(one).scalar() for one in (waiting, silent)]
@@ -269,7 +268,7 @@ def due_in_s(connection: Connection) -> float | None:
 
 
 def has_due(connection: Connection) -> bool:
-    """Return whether a job can be claimed or must be declared dead, without a lock."""
+    """Return whether a job can be claimed or must be marked as dead, without a lock."""
     at = now(connection)
     early, late = jobs.c.run_after <= at, jobs.c.run_after > at + LONGEST_PAUSE_S
     waiting = and_(jobs.c.state == JobState.QUEUED, or_(early, late))
@@ -279,12 +278,12 @@ def has_due(connection: Connection) -> bool:
 
 
 def _lease_over(at: ColumnElement[float]) -> ColumnElement[bool]:
-    """Return the condition for leases that have expired, or were granted by a later clock."""
+    """Return the condition for leases that have expired, or began before the clock was set back."""
     return or_(jobs.c.leased_until < at, jobs.c.leased_until > at + LONGEST_LEASE_S)
 
 
 def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
-    """Claim the next job, which is queued or has an expired lease.
+    """Claim the next job that is queued or has an expired lease; return None without such a job.
 
     Parameters
     ----------
@@ -295,11 +294,11 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     waiting = _waiting(at)
     silent = jobs.c.state == JobState.RUNNING, _lease_over(at)
     place = None
-    for one in _tenants_due(connection, *waiting):  # all jobs of a tenant may be locked
+    for one in _tenants_due(connection, *waiting):  # continue if all jobs of a tenant are locked
         place = _lock_first(connection, one.turn, *waiting, jobs.c.tenant == one.tenant)
         if place is not None:
             break
-    # a job of a silent worker, of which there are few, is locked only if it is next
+    # prefer a job with an expired lease if it precedes; there are few such jobs
     other = _first_of_few(connection, *silent)
     if other is not None and (place is None or other < place):
         own = jobs.c.number == other.number
@@ -319,12 +318,12 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     return job_row(row)
 
 
-#: Aliases of the table, which are created only once, since each takes a millisecond.
+#: Aliases of the table, created only once, since each takes a millisecond.
 _FIRST, _LATER, _TURNS = (jobs.alias() for _ in range(3))
 
 
 class _Place(NamedTuple):
-    """Position of a job in the order of claims, where the smallest position is next."""
+    """Position of a job in the order of claims, lowest first."""
 
     upkeep: bool
     turn: int  # latest turn of its tenant
@@ -335,10 +334,9 @@ class _Place(NamedTuple):
 
 
 def _lock_first(connection: Connection, turn: int, *due: ColumnElement[bool]) -> _Place | None:
-    """Lock and return the first due job of a tenant; None if other workers have locked all of them.
+    """Lock the first due job of a tenant; return None if other workers have locked all of them.
 
-    Jobs with fewer attempts come first, so that a job whose worker dies repeatedly does not block
-    the others.
+    Jobs with fewer attempts come first, so that a job that kills workers does not block others.
     """
     row = connection.execute(
         select(jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant)
@@ -351,7 +349,7 @@ def _lock_first(connection: Connection, turn: int, *due: ColumnElement[bool]) ->
 
 
 def _first_of_few(connection: Connection, *due: ColumnElement[bool]) -> _Place | None:
-    """Return the first due job of all tenants, after reading all due jobs."""
+    """Return the first due job of all tenants, by reading all due jobs."""
     statement = select(
         jobs.c.priority, jobs.c.attempts, jobs.c.number, jobs.c.tenant, *_turns_of(jobs.c.tenant)
     ).where(*due, jobs.c.attempts < MAXIMUM_ATTEMPTS)
@@ -371,19 +369,19 @@ def _latest(*turns: int | None) -> int:
 
 
 def _is_upkeep(tenant: str, priority: int) -> bool:
-    """Return whether a job is upkeep, which waits for all jobs that users requested."""
+    """Return whether a job is upkeep, which has precedence over no other job."""
     return tenant == NOBODY and priority <= UPKEEP
 
 
 def _turns_of(tenant: ColumnElement[str]) -> tuple[Label[int | None], Label[int | None]]:
-    """Return the latest turns of a tenant's jobs and of its removed jobs."""
+    """Return the latest turn among the jobs of a tenant, and among its removed jobs."""
     of_jobs = select(func.max(_TURNS.c.turn)).where(_TURNS.c.tenant == tenant)
     saved = select(tenants.c.turn).where(tenants.c.name == tenant)
     return of_jobs.scalar_subquery().label("of_jobs"), saved.scalar_subquery().label("saved")
 
 
 class _TenantDue(NamedTuple):
-    """Tenant with a due job, where the smallest one is next."""
+    """A tenant with a due job, sorted by precedence, lowest first."""
 
     upkeep: bool
     turn: int  # latest turn
@@ -394,7 +392,7 @@ class _TenantDue(NamedTuple):
 def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_TenantDue]:
     """Return the tenants with a due job, in the order of claims.
 
-    The index is read once for each tenant with a queued job, independent of the number of jobs.
+    The cost depends on the number of tenants with queued jobs, not on the number of jobs.
     """
     names = (
         select(func.min(_FIRST.c.tenant).label("tenant"))
@@ -430,7 +428,7 @@ def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_Ten
 
 
 def has_waiting_before(connection: Connection, held: JobRow) -> bool:
-    """Return whether a job of another tenant or a higher priority precedes the next slice."""
+    """Return whether a waiting job precedes the next slice of a running job."""
     return any(
         one.tenant != held.tenant or one.priority > held.priority
         for one in _tenants_due(connection, *_waiting(now(connection)))
@@ -440,7 +438,7 @@ def has_waiting_before(connection: Connection, held: JobRow) -> bool:
 
 def _waiting(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
     """Return the conditions for queued jobs that are due."""
-    # "+ 0.0" makes SQLite use the index with the order, instead of sorting all due jobs
+    # "+ 0.0" makes SQLite use the sorted index instead of sorting all due jobs
     due_at = jobs.c.run_after + 0.0
     return jobs.c.state == JobState.QUEUED, or_(due_at <= at, due_at > at + LONGEST_PAUSE_S)
 
@@ -453,18 +451,18 @@ def _last_turn(connection: Connection) -> int:
 
 
 def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
-    """Extend a lease. Raise LostLease if another worker holds the job, or the job is over."""
+    """Renew a lease for `lease_s` seconds. Raise LostLease if the job is no longer held."""
     _hold(connection, held, leased_until=now(connection) + lease_s)
 
 
 def check_held(connection: Connection, held: JobRow) -> None:
-    """Check that a claim is the latest, in the transaction that stores a part of its work.
+    """Check that a worker still holds a job, in the transaction that stores part of its work.
 
     Raises
     ------
     LostLease : If another worker holds the job, or the job is over.
     """
-    # the lock until the commit prevents claims by other workers if the lease has expired
+    # lock the job until the commit, so that no other worker claims it if the lease has expired
     own = select(jobs.c.number).where(*_own(held)).with_for_update()
     if connection.execute(own).first() is None:
         raise _lost(held)
@@ -474,11 +472,11 @@ def finish(
     connection: Connection, held: JobRow, state: JobState, error: str | None = None,
     traceback: str | None = None, **values: object,
 ) -> None:  # fmt: skip
-    """End a job, in the transaction that stores its results; `values` are other columns.
+    """End a job, in the transaction that stores its results; `values` are further columns.
 
     Raises
     ------
-    LostLease : If `renew` raises the error.
+    LostLease : See `renew`.
     """
     _hold(
         connection, held, state=state, error=error, traceback=traceback, leased_until=None,
@@ -489,7 +487,7 @@ def finish(
 def requeue_slice(
     connection: Connection, held: JobRow, progress: dict[str, Any], after_s: float = 0.0
 ) -> None:
-    """Queue a long job for its next slice behind waiting jobs, and reset its attempts.
+    """Queue the next slice of a long job behind waiting jobs, and reset its attempts.
 
     Parameters
     ----------
@@ -501,7 +499,7 @@ def requeue_slice(
     ------
     LostLease : If another worker holds the job, or the job is over.
     """
-    # with zero attempts, the job's small number would put it before later jobs again
+    # one attempt, not zero, so that the job does not precede later jobs
     _hold(
         connection, held, state=JobState.QUEUED, attempts=1, failures=0,
         leased_until=None, worker=None, run_after=now(connection) + after_s, progress=progress,
@@ -509,13 +507,13 @@ def requeue_slice(
 
 
 def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> JobState:
-    """Queue a failed job for another attempt, or declare it dead.
+    """Queue a failed job for another attempt, or mark it as dead; return its new state.
 
     Raises
     ------
     LostLease : If another worker holds the job, or the job is over.
     """
-    # the death of an earlier worker may have been counted after the claim
+    # read the count again: the death of an earlier worker may have been counted since the claim
     stored = select(jobs.c.failures).where(jobs.c.number == held.number)
     failures = (connection.execute(stored).scalar() or 0) + 1
     if failures >= MAXIMUM_FAILURES or held.attempts >= MAXIMUM_ATTEMPTS:
@@ -529,12 +527,12 @@ def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> Jo
 
 
 def pause_s(failures: int) -> float:
-    """Return the pause before the next attempt of a job after some failures, seconds."""
+    """Return the pause in seconds before the next attempt of a job after some failures."""
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
 def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> None:
-    """Return a job that was not started to the queue, as if it had not been claimed.
+    """Return a claimed job to the queue without counting the attempt.
 
     Parameters
     ----------
@@ -543,7 +541,7 @@ def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> N
 
     Raises
     ------
-    LostLease : If `renew` raises the error.
+    LostLease : See `renew`.
     """
     _hold(
         connection, held, state=JobState.QUEUED, attempts=held.attempts - 1,
@@ -552,19 +550,19 @@ def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> N
 
 
 def _hold(connection: Connection, held: JobRow, **values: object) -> None:
-    """Change a job. Raise LostLease if its claim is not the latest."""
+    """Change columns of a job. Raise LostLease if the worker no longer holds the job."""
     changed = connection.execute(update(jobs).where(*_own(held)).values(**values))
     if changed.rowcount != 1:
         raise _lost(held)
 
 
 def _own(held: JobRow) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions for a job that a claim holds."""
+    """Return the conditions under which a worker still holds a job."""
     return (
         jobs.c.number == held.number,
         jobs.c.token == held.token,
         jobs.c.state == JobState.RUNNING,
-        # a promoted standby without the claim may issue its token again
+        # a promoted standby that lacks the claim may issue its token again
         jobs.c.worker == held.worker,
     )
 
@@ -577,13 +575,13 @@ def _lost(held: JobRow) -> LostLease:
 
 
 def has_exhausted(connection: Connection) -> bool:
-    """Return whether `dead_letter` would declare a job dead, without a lock."""
+    """Return whether `dead_letter` would mark a job as dead, without a lock."""
     statement = select(jobs.c.number).where(*_out_of_tries(now(connection))).limit(1)
     return connection.execute(statement).first() is not None
 
 
 def dead_letter(connection: Connection) -> list[JobRow]:
-    """Declare jobs dead whose workers repeatedly stopped responding, and return these jobs."""
+    """Mark jobs as dead whose workers stopped responding in all attempts; return these jobs."""
     at = now(connection)
     rows = connection.execute(
         update(jobs)
@@ -600,19 +598,19 @@ def dead_letter(connection: Connection) -> list[JobRow]:
 def fail_dead_worker(
     connection: Connection, job_id: str, token: int, error: str, traceback: str, *, counts: bool
 ) -> JobRow | None:
-    """Queue the job of a dead worker again, or declare it dead, before the lease expires.
+    """Queue the job of a dead worker again, or mark it as dead, before the lease expires.
 
     Parameters
     ----------
     connection : writing transaction
     error, traceback : description of the worker's death
-    counts : whether the job may have caused the death, so that the attempt counts as a failure
+    counts : whether the attempt counts as a failure, since the job may have caused the death
 
     Returns
     -------
     job : changed job; None if the job is over, or another worker has claimed it
     """
-    # the lock is necessary, since claims wait for no turn
+    # lock the job, since claims take no turn
     locked = select(jobs).where(jobs.c.id == job_id).with_for_update()
     row = connection.execute(locked).mappings().first()
     if row is None or JobState(row["state"]).over:
@@ -642,7 +640,7 @@ def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
 
 
 def cancel(connection: Connection, job: JobRow) -> None:
-    """Cancel a job; a worker that is running it will fail to store its result.
+    """Cancel a job; a worker that runs it cannot store its result.
 
     Raises
     ------
@@ -654,7 +652,7 @@ def cancel(connection: Connection, job: JobRow) -> None:
 
 
 def cancel_jobs(connection: Connection, *which: ColumnElement[bool]) -> None:
-    """Cancel the queued and running jobs that meet some conditions."""
+    """Cancel the queued and running jobs that satisfy some conditions."""
     connection.execute(
         update(jobs)
         .where(*which, jobs.c.state.in_(PENDING))
@@ -674,20 +672,21 @@ def requeue_job(connection: Connection, job: JobRow) -> None:
     )  # fmt: skip
 
 
-# Results of long jobs: items, which slices append, and files.
+# Results of long jobs: items and files.
 
-#: Number of rows that are inserted at once.
+#: Number of rows to insert at once.
 _BLOCK = 500
 
 
 @dataclass(frozen=True)
 class JobFile:
-    """File of a job.
+    """A file of a job.
 
     Parameters
     ----------
     name : unique name within the job, such as mesh.ply
-    blob : digest of the content, which must exist
+    blob : digest of the content, whose blob must exist
+    bytes : size of the file
     """
 
     name: str
@@ -721,7 +720,7 @@ def items_of(
 
 
 def add_files(connection: Connection, job_number: int, files: Iterable[JobFile]) -> None:
-    """Add files to a job, and replace files with the same names."""
+    """Add files to a job; replace files of the same names."""
     for one in files:
         remove_parts(connection, job_number, items=False, files=[one.name])
         connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
@@ -730,7 +729,7 @@ def add_files(connection: Connection, job_number: int, files: Iterable[JobFile])
 
 
 def _count_archive(connection: Connection, job_number: int, size: int) -> None:
-    """Add the size of an archive to the usage of its import's map."""
+    """Add the size of the archive of an import to the usage of its map."""
     own = select(jobs.c.map_number).where(jobs.c.number == job_number)
     map_number: Any = own.scalar_subquery()
     add_usage(connection, map_number, 0, size)
@@ -744,14 +743,14 @@ def files_of(connection: Connection, job_number: int) -> dict[str, JobFile]:
 
 
 def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
-    """Return the jobs of a kind that have files, the oldest first."""
+    """Return the jobs of a kind that have files, oldest first."""
     having = jobs.c.number.in_(select(job_files.c.job_number)), jobs.c.kind == kind
     rows = connection.execute(select(jobs).where(*having).order_by(jobs.c.number)).mappings()
     return [job_row(row) for row in rows]
 
 
 def finished_with_file(connection: Connection, name: str) -> list[int]:
-    """Return the numbers of finished jobs that still have a file with a name."""
+    """Return the numbers of finished jobs that have a file of a name."""
     over = jobs.c.state.in_([state for state in JobState if state.over])
     statement = (
         select(jobs.c.number)
@@ -765,7 +764,7 @@ def remove_parts(
     connection: Connection, job_number: int, *, items: bool = True,
     files: Iterable[str] | None = None,
 ) -> list[str]:  # fmt: skip
-    """Remove items and files of a job.
+    """Remove items and files from a job.
 
     Parameters
     ----------
@@ -774,7 +773,7 @@ def remove_parts(
 
     Returns
     -------
-    blobs : blobs of the removed files, to sweep after the commit
+    blobs : blobs of the removed files, to be collected after the commit
     """
     if items:
         connection.execute(delete(job_items).where(job_items.c.job_number == job_number))
@@ -791,17 +790,17 @@ def remove_parts(
 
 
 def replace_result(connection: Connection, job: JobRow, result: dict[str, Any]) -> JobRow:
-    """Replace the result of a finished job, and return the job."""
+    """Replace the result of a finished job; return the changed job."""
     own = update(jobs).where(jobs.c.number == job.number).values(result=result)
     return job_row(connection.execute(own.returning(jobs)).mappings().one())
 
 
 def remove_job(connection: Connection, job: JobRow) -> list[str]:
-    """Remove a job with its items and files; a worker that is running it loses its lease.
+    """Remove a job with its items and files; a worker that runs it loses its lease.
 
     Returns
     -------
-    blobs : blobs of the removed files, to sweep after the commit
+    blobs : blobs of the removed files, to be collected after the commit
     """
     blobs = remove_parts(connection, job.number)
     save_turns(connection, job.tenant)

@@ -1,4 +1,4 @@
-"""Open databases and blobs for inspection, without writing or creating anything."""
+"""Read-only access to databases and blobs for inspection, which creates and writes nothing."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from sceneprint.store.sqlite import begin_sqlite
 
 @contextmanager
 def inspect_database(url: str) -> Iterator[Database]:
-    """Open a database that may be in use, without leaving changes, logs or locks.
+    """Open a database, which may be in use, without leaving changes, logs or locks.
 
     Raises
     ------
-    UnusableStore : If there is no database, its schema is older, or a process wrote to an unlocked
-        file in the meantime, so that the data may be wrong.
+    UnusableStore : If there is no database, its schema is older, or another process wrote to the
+        file while it was read without locks, so that the data may be wrong.
     NewerSchema : If a later version of sceneprint wrote the database.
     """
     parsed = database_url(url)
@@ -39,7 +39,7 @@ def inspect_database(url: str) -> Iterator[Database]:
     elif parsed.get_backend_name() == "sqlite":
         engine, alone = create_engine(parsed), False
     else:
-        engine, alone = open_postgres(parsed), False  # callers only `read`
+        engine, alone = open_postgres(parsed), False
     before = None if path is None else _state(path)
     database = Database(engine)
     try:
@@ -79,7 +79,7 @@ def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
             "SCENEPRINT_DATABASE_URL."
         )
     wal, shm = _beside(path, "-wal"), _beside(path, "-shm")
-    # without a log, no process has opened the file; reading a log would create a missing log index
+    # without a log, no process uses the file; with one, reading would create a missing log index
     alone = not wal.exists()
     how = "&immutable=1" if alone else "&readonly_shm=1" if shm.exists() else ""
 
@@ -87,7 +87,7 @@ def _open_engine(url: URL, path: Path) -> tuple[Engine, bool]:
         connection = sqlite3.connect(
             f"{path.as_uri()}?mode=ro{how}", uri=True, timeout=30.0, check_same_thread=False
         )
-        connection.isolation_level = None  # transactions begin where `begin_sqlite` says
+        connection.isolation_level = None  # `begin_sqlite` begins transactions
         return connection
 
     engine = create_engine(url, creator=connect)
@@ -133,7 +133,7 @@ def inspect_blobs(place: Path | str, database: Database) -> Iterator[Blobs]:
 
 
 def require_folder(place: Path) -> None:
-    """Check that a folder of blobs exists: its disk may not be mounted.
+    """Check that a folder of blobs exists, that is, that its disk is mounted.
 
     Raises
     ------

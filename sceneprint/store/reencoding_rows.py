@@ -1,8 +1,7 @@
-"""Re-encoding of a map: frames without a signature of the next model, their jobs, and the switch.
+"""Re-encoding of maps: frames without a signature of the next model, their jobs, and the switch.
 
-Until the switch, searches use the current signature of each frame, and the signature of the next
-model is stored beside it. Signatures and jobs of models that a map does not use are removed in
-blocks.
+Until the switch, searches use the signatures of the current model; those of the next model are
+stored beside them. Signatures and jobs of models that a map does not use are removed in blocks.
 """
 
 from __future__ import annotations
@@ -19,23 +18,23 @@ from sceneprint.store.queue import PENDING, UPKEEP, enqueue, read_clock
 from sceneprint.store.tables import MapRow, frames, jobs, maps, signatures
 from sceneprint_client.api import FrameState, JobState
 
-#: Kind of the jobs that sign an indexed frame with the next model.
+#: Kind of the jobs that sign indexed frames with the next model.
 REENCODE = "reencode"
 PRIORITY = UPKEEP
-#: Numbers of rows that one transaction queues and removes; writers wait for less than a second.
+#: Number of jobs to queue, and of rows to remove, in one transaction (less than a second).
 QUEUED_AT_ONCE, REMOVED_AT_ONCE = 2000, 50
 
 
 @dataclass(frozen=True)
 class SwitchProgress:
-    """Progress of a map's re-encoding.
+    """Progress of the re-encoding of a map.
 
     Parameters
     ----------
-    done : number of frames that the next model has signed
+    done : number of frames with a signature of the next model
     left : number of frames that wait for a signature
-    failed : number of frames that the next model cannot sign, and that the switch will reject
-    dead : number of frames with a dead job, for which the switch waits
+    failed : number of frames that the next model cannot sign; the switch rejects them
+    dead : number of frames with a dead job; they block the switch
     """
 
     done: int
@@ -45,7 +44,7 @@ class SwitchProgress:
 
 
 def begin_reencoding(connection: Connection, row: MapRow, model_id: str) -> None:
-    """Start the re-encoding of a map with a stored model."""
+    """Start to re-encode a map with a stored model."""
     connection.execute(
         update(maps).where(maps.c.number == row.number).values(next_model_id=model_id)
     )
@@ -59,7 +58,7 @@ def cancel_reencoding(connection: Connection, row: MapRow) -> None:
 
 
 def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
-    """Return the progress of a map's re-encoding."""
+    """Return the progress of the re-encoding of a map."""
     lacks = and_(_indexed(row), ~_signed(row.next_model_id))
 
     def count(*conditions: ColumnElement[bool]) -> int:
@@ -69,7 +68,7 @@ def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
     def over(state: JobState, *conditions: ColumnElement[bool]) -> int:
         ended = select(frames.c.number).join(jobs, jobs.c.frame_number == frames.c.number)
         own = ended.where(jobs.c.state == state, _for_next(row), lacks, *conditions).distinct()
-        return len(connection.execute(own).all())  # an index selects these few rows by state
+        return len(connection.execute(own).all())
 
     every, lacking = count(_indexed(row)), count(lacks)
     failed = over(JobState.FAILED)
@@ -78,7 +77,7 @@ def switch_progress(connection: Connection, row: MapRow) -> SwitchProgress:
 
 
 def is_pending(connection: Connection, row: MapRow) -> bool:
-    """Return whether a job for the next model of a map is waiting or running."""
+    """Return whether a job for the next model of a map is queued or running."""
     statement = (
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)
@@ -91,7 +90,7 @@ def is_pending(connection: Connection, row: MapRow) -> bool:
 def unqueued_frames(
     connection: Connection, row: MapRow, after: int, *, again: bool = False
 ) -> list[int]:
-    """Return the numbers of frames without a signature of the next model and without a job for it.
+    """Return the numbers of frames without a signature of the next model or a job for it.
 
     Parameters
     ----------
@@ -123,7 +122,7 @@ def enqueue_all(connection: Connection, row: MapRow, numbers: list[int]) -> None
 
 
 def is_complete(connection: Connection, row: MapRow) -> bool:
-    """Return whether every indexed frame has a signature of the next model, or a failed job."""
+    """Return whether all indexed frames have a signature of the next model, or a failed job."""
     lacking = exists().where(
         _indexed(row), ~_signed(row.next_model_id), ~_has_job(row, (JobState.FAILED,))
     )
@@ -131,7 +130,7 @@ def is_complete(connection: Connection, row: MapRow) -> bool:
 
 
 def frames_signed_by(connection: Connection, row: MapRow, revision: int) -> list[int]:
-    """Return the numbers of frames indexed up to a revision that the next model has signed."""
+    """Return the numbers of frames indexed up to a revision with a signature of the next model."""
     statement = select(frames.c.number).where(
         _indexed(row), frames.c.revision <= revision, _signed(row.next_model_id)
     )
@@ -139,7 +138,7 @@ def frames_signed_by(connection: Connection, row: MapRow, revision: int) -> list
 
 
 def raise_revisions(connection: Connection, row: MapRow, numbers: list[int]) -> None:
-    """Assign the next revisions of the map to indexed frames, so that indexes read them again."""
+    """Assign new revisions to indexed frames, so that indexes read them again."""
     for number in numbers:
         revision = next_revision(connection, row.number)
         connection.execute(
@@ -148,7 +147,7 @@ def raise_revisions(connection: Connection, row: MapRow, numbers: list[int]) -> 
 
 
 def switch_model(connection: Connection, row: MapRow) -> list[str]:
-    """Replace the model of a map by the next model after all frames are signed.
+    """Replace the model of a map by the next model, once all frames are signed.
 
     Frames with a failed job are rejected. Frames that the former model rejected are signed again.
 
@@ -171,7 +170,7 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
     rejected = {one.number: one for one in failed}
     for number, one in rejected.items():
         set_state(connection, number, FrameState.REJECTED, one.error)
-        # readers and indexes may have the frame from an earlier time when the map had this model
+        # new revisions, since readers and indexes may still have the frame from an earlier switch
         raise_revisions(connection, row, [number])
         record_event(connection, "frame.rejected", row.name, one.id, one.job_id)
     for number, frame_id in former:
@@ -209,7 +208,7 @@ def _for_next(row: MapRow) -> ColumnElement[bool]:
 
 
 def _has_job(row: MapRow, states: tuple[JobState, ...]) -> ColumnElement[bool]:
-    own = jobs.alias("own")  # the surrounding query may use `jobs` too
+    own = jobs.alias("own")  # an alias, since the outer query may use `jobs`
     return exists().where(
         own.c.frame_number == frames.c.number, own.c.kind == REENCODE,
         own.c.model_id == row.next_model_id, own.c.state.in_(states),

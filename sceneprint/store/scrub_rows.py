@@ -1,8 +1,8 @@
-"""Progress of the scrub, which checks all stored bytes: one row for all workers.
+"""Progress of the scrub, which verifies all stored bytes: one row for all workers.
 
-A pass reads all frames in the order of their numbers, in slices. A worker that claims a slice sets
-the time at which the next slice is due, which limits the rate for all workers together. If the
-worker dies, another one reads the slice again.
+A pass reads all frames in slices, in the order of their numbers. A worker that claims a slice sets
+the time at which the next slice is due, which limits the rate of all workers together. If the
+worker dies, another worker repeats the slice.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SLICE_S, PASS_S = 4.0, 86_400.0
 
 @dataclass(frozen=True)
 class ScrubRow:
-    """Progress of a scrub; see the table for the fields."""
+    """Progress of the scrub: the row of the table `scrubs`."""
 
     number: int
     position: int
@@ -43,7 +43,7 @@ def read_scrub(connection: Connection) -> ScrubRow | None:
 
 
 def claim_slice(connection: Connection) -> ScrubRow | None:
-    """Claim the next slice in a writing transaction; return None if it is not due."""
+    """Claim the next slice in a write transaction; return None if no slice is due."""
     now, row = read_clock(connection), read_scrub(connection)
     if row is None:
         row = ScrubRow(1, 0, now + SLICE_S, now, None, 0, 0, 0)
@@ -59,18 +59,18 @@ def claim_slice(connection: Connection) -> ScrubRow | None:
 
 
 def next_frames(connection: Connection, position: int, count: int) -> list[int]:
-    """Return the numbers of the next frames after a position, at most `count`."""
+    """Return the numbers of up to `count` frames after a position."""
     statement = select(frames.c.number).where(frames.c.number > position)
     return list(connection.execute(statement.order_by(frames.c.number).limit(count)).scalars())
 
 
 def record_slice(connection: Connection, row: ScrubRow, *, finished: bool) -> None:
-    """Record the result of a slice in a writing transaction.
+    """Record the result of a slice in a write transaction.
 
     Parameters
     ----------
     row : row of `claim_slice` with the position and the counts after the slice
-    finished : whether there are no more frames; the next pass then starts when it is due
+    finished : whether the slice is the last of the pass
     """
     if finished:
         now = read_clock(connection)

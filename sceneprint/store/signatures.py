@@ -1,4 +1,4 @@
-"""Store and read signatures, and read changes to the searched frames since a map revision."""
+"""Signatures of frames, and changes to the searched frames since a revision of the map."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ from sceneprint_client.api import FrameState, JobState
 
 @dataclass(frozen=True)
 class StoredSignature:
-    """Result of signing a frame.
+    """The result of signing a frame.
 
     Parameters
     ----------
     vector : bytes of the signature
     geometry : blob of the artifact
-    n_patches, n_pairs : numbers of patches and pairs per level
+    n_patches, n_pairs : number of patches, and of ordered pairs, per level
     """
 
     model_id: str
@@ -63,9 +63,9 @@ class StoredSignature:
 
 @dataclass(frozen=True)
 class SignatureChange:
-    """Change of a frame: it was indexed, or is no longer searched.
+    """A change of a frame: it was indexed, or is no longer searched.
 
-    `vector` is None if the frame is not searched, or if its signature is damaged. `deleted` is True
+    `vector` is None if the frame is not searched, or its signature is damaged. `deleted` is True
     for deleted frames, and for frames that a new model of the map has rejected.
     """
 
@@ -77,8 +77,8 @@ class SignatureChange:
 
 
 def index_frame(connection: Connection, frame: FrameRow, signature: StoredSignature) -> int:
-    """Store a signature, index its frame, and return the map's revision."""
-    # after a return to a former model, its signature may still exist
+    """Store a signature, index its frame, and return the new revision of the map."""
+    # a signature may exist after a return to a former model
     _write_signature(connection, frame, signature)
     mark_edited(connection, frame.number)  # a surface may contain the frame
     revision = next_revision(connection, frame.map_number)
@@ -99,7 +99,7 @@ def index_frame(connection: Connection, frame: FrameRow, signature: StoredSignat
 def index_claimed_frame(
     connection: Connection, job: JobRow, frame: FrameRow, map_name: str, signature: StoredSignature
 ) -> bool:
-    """End a job and index its frame in one statement, which saves round trips on PostgreSQL.
+    """End a job and index its frame by one statement, to save round trips to PostgreSQL.
 
     Parameters
     ----------
@@ -107,8 +107,9 @@ def index_claimed_frame(
 
     Returns
     -------
-    done : False if nothing was written: on SQLite, and if the job is no longer held, the map has or
-        gets another model, or the parent frame is joined. The caller must check the reason
+    done : False if nothing was written: on SQLite, or if the worker no longer holds the job, the
+        map has or gets another model, or the parent frame is joined. The caller determines the
+        reason
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -169,10 +170,10 @@ def _index_claimed(events_name: str) -> TextClause:
 
 
 def replace_signature(connection: Connection, frame: FrameRow, signature: StoredSignature) -> bool:
-    """Replace a damaged or missing signature of an indexed frame, which remains searchable.
+    """Replace a damaged or missing signature of an indexed frame.
 
-    If a signature of the map's current model changes, the frame gets the map's next revision, so
-    that readers and indexes read it again.
+    If it is of the current model and changes, the frame gets the next revision of the map, so that
+    readers and indexes read it again.
 
     Returns
     -------
@@ -188,7 +189,7 @@ def replace_signature(connection: Connection, frame: FrameRow, signature: Stored
     is_searched = connection.execute(searched).scalar_one() == signature.model_id
     if is_searched:  # the artifact may have been lost
         note_edit(connection, frame.number, frame.map_number)
-    # readers skip frames with a wrong checksum, so the checksum must be equal too
+    # compare the checksum too, since readers skip frames with a wrong checksum
     if before is not None and tuple(before) == (signature.vector, crc32(signature.vector)):
         return False
     if is_searched:
@@ -209,7 +210,7 @@ def _write_signature(connection: Connection, frame: FrameRow, signature: StoredS
 
 
 def put_signatures(connection: Connection, new: Sequence[tuple[int, StoredSignature]]) -> None:
-    """Store the signatures of frames, by number, that have no signatures of these models."""
+    """Insert signatures by frame number; the frames must lack signatures of these models."""
     rows = [
         {
             "frame_number": number, "model_id": one.model_id, "vector": one.vector,
@@ -224,7 +225,7 @@ def put_signatures(connection: Connection, new: Sequence[tuple[int, StoredSignat
 def changes_since(
     connection: Connection, row: MapRow, revision: int, limit: int = 256
 ) -> Iterator[list[SignatureChange]]:
-    """Yield blocks of changes to frames after a revision, in order, of `limit` changes each."""
+    """Yield the changes after a revision in order, in blocks of up to `limit`."""
     while True:
         rows = connection.execute(
             select(frames.c.number, frames.c.id, frames.c.revision, frames.c.state,
@@ -257,7 +258,7 @@ def _change(
 def count_indexed(
     connection: Connection, map_number: int, revision: int, most: int | None = None
 ) -> int:
-    """Return the number of a map's frames that were indexed after a revision, at most `most`."""
+    """Count the frames of a map that were indexed after a revision, up to `most`."""
     newer = (
         select(frames.c.number)
         .where(
@@ -271,13 +272,13 @@ def count_indexed(
 
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:
-    """Return the numbers of a map's frames that were removed from searches after a revision."""
+    """Return the numbers of the frames of a map that left the search after a revision."""
     statement = select(frames.c.number).where(*_deletion_conditions(map_number, revision))
     return frozenset(connection.execute(statement).scalars())
 
 
 def count_gone(connection: Connection, map_number: int, revision: int) -> int:
-    """Return the count of a map's frames that were removed from searches after a revision."""
+    """Count the frames of a map that left the search after a revision."""
     return count_rows(connection, *_deletion_conditions(map_number, revision))
 
 
@@ -290,7 +291,7 @@ def _deletion_conditions(map_number: int, revision: int) -> tuple[ColumnElement[
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
-    """Return the signature of a frame, or None. Raise DamagedSignature for a wrong checksum."""
+    """Return the signature of a frame, or None. Raise DamagedSignature if it is damaged."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     statement = select(signatures.c.vector, signatures.c.checksum).where(own)
     row = connection.execute(statement).first()
@@ -307,7 +308,7 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
 def patch_counts(
     connection: Connection, number: int, model_id: str
 ) -> tuple[list[int], list[int]] | None:
-    """Return the numbers of patches and of ordered pairs per level, the finest first, or None."""
+    """Return the number of patches, and of ordered pairs, per level, finest first; or None."""
     statement = select(signatures.c.n_patches, signatures.c.n_pairs).where(
         signatures.c.frame_number == number, signatures.c.model_id == model_id
     )
@@ -318,7 +319,7 @@ def patch_counts(
 def stored_signatures(
     connection: Connection, numbers: Iterable[int], model_id: str
 ) -> dict[int, bytes]:
-    """Return the signatures of frames by number, except missing or damaged signatures."""
+    """Return the signatures of frames by frame number, except missing or damaged signatures."""
     statement = select(signatures.c.frame_number, signatures.c.vector, signatures.c.checksum)
     own = statement.where(signatures.c.model_id == model_id)
     rows = rows_among(connection, own, signatures.c.frame_number, numbers)
@@ -329,7 +330,7 @@ def stored_signatures(
 
 
 def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tuple[int, str]]:
-    """Return frame and model of signatures that belong to neither model of a map, after a frame."""
+    """Return frame number and model of obsolete signatures of a map, after frame number `after`."""
     rows = connection.execute(
         select(signatures.c.frame_number, signatures.c.model_id)
         .join(frames, frames.c.number == signatures.c.frame_number)
@@ -344,7 +345,7 @@ def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tu
 
 
 def remove_signature(connection: Connection, number: int, model_id: str) -> list[str]:
-    """Remove the signature of a frame for a model, and return its blobs."""
+    """Remove the signature of a frame by a model; return the blobs that it referred to."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     blobs = list(connection.execute(select(signatures.c.geometry).where(own)).scalars())
     connection.execute(delete(signatures).where(own))

@@ -1,4 +1,4 @@
-"""Configure SQLite connections, begin transactions, and let writers wait."""
+"""SQLite: connections, transactions, and the order of writers."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from sqlalchemy.exc import ArgumentError, OperationalError
 from sceneprint.atomic_files import PRIVATE_FILE
 from sceneprint.errors import ReadOnlyStore, UnusableStore
 
-# Read-only SQLite files, which are on a read-only disk or belong to another user.
+# Read-only SQLite files: on a read-only disk, or of another user.
 #
-# SQLite reads a database with a log (`-wal`) only with the index of the log (`-shm`), which it
+# To read a database with a log (`-wal`), SQLite needs the index of the log (`-shm`), which it
 # cannot create on a read-only disk. Without a log, the file is complete and is read without locks.
-# Another process may still write to it, for example through another mount, so the file is checked
-# after each transaction.
+# Another process may still write to it, for example through another mount, so each transaction
+# checks the file at its end.
 
 
 def read_only_file(url: URL) -> Path | None:
-    """Return the file of a SQLite database if it exists and the file or its folder is read-only."""
+    """Return the file of a SQLite database if the file or its folder is read-only, else None."""
     name = url.database or ""
     if url.get_backend_name() != "sqlite" or name in ("", ":memory:") or name.startswith("file:"):
         return None
@@ -51,11 +51,11 @@ class ReadOnlyFile:
         self._path = path
 
     def connect(self) -> sqlite3.Connection:
-        """Open the file with locks if it has a log, else without locks.
+        """Open the file; use locks only if it has a log.
 
         Raises
         ------
-        UnusableStore : If the file was not closed, so that it needs a recovery, which would write.
+        UnusableStore : If the file was not closed, so that it needs a recovery, that is, a write.
         """
         has_log, has_index = self._log(), self._beside("-shm").exists()
         if (has_log and not has_index) or self._beside("-journal").exists():
@@ -69,7 +69,7 @@ class ReadOnlyFile:
     def state(self) -> tuple[object, ...]:
         """Return values that change if another process writes during a transaction."""
         if self._log():
-            return ()  # the locks of SQLite protect the transaction
+            return ()  # the transaction has locks
         try:
             status = self._path.stat()
         except OSError:
@@ -77,11 +77,11 @@ class ReadOnlyFile:
         return status.st_mtime_ns, status.st_size, status.st_ino
 
     def check(self, before: object) -> None:
-        """Check at the end of a transaction that no process has written in the meantime.
+        """Check at the end of a transaction that no process has written to the file.
 
         Raises
         ------
-        UnusableStore : If a process has written to the file.
+        UnusableStore : If `state` has changed from `before`.
         """
         if self.state() != before:
             raise UnusableStore(
@@ -96,7 +96,7 @@ class ReadOnlyFile:
         )
 
     def _log(self) -> bool:
-        """Return whether the log has content, or was just created."""
+        """Return whether the log has content or is new."""
         try:
             size = self._beside("-wal").stat().st_size
         except OSError:
@@ -107,11 +107,11 @@ class ReadOnlyFile:
         return self._path.with_name(self._path.name + end)
 
 
-#: Seconds that a writer waits for another writer, and after another writer has timed out.
+#: Maximum seconds that a writer waits for others, and after another writer has timed out.
 BUSY_S, HELD_S = 10.0, 0.1
-#: Seconds between attempts to take the lock, and maximum seconds in the line for it.
+#: Seconds between attempts to acquire the lock, and maximum seconds in the line for it.
 LOOK_S, LINE_S = 0.0005, 1.0
-#: Seconds that emptying the log waits for readers; writers wait in the meantime.
+#: Maximum seconds that emptying the log waits for readers; meanwhile, writers wait.
 SHRINKING_S = 0.5
 
 
@@ -120,10 +120,9 @@ def open_sqlite(url: URL) -> tuple[Engine, ReadOnlyFile | None]:
     path, sealed = read_only_file(url), None
     if path is not None:
         sealed = ReadOnlyFile(path)
-        # each transaction opens the file again, with or without locks
+        # open the file for each transaction, with or without locks
         engine = create_engine(url, creator=sealed.connect, poolclass=NullPool)
     else:
-        # in WAL mode, readers never wait
         engine = create_engine(url, connect_args={"timeout": BUSY_S}, pool_size=16, max_overflow=-1)
         event.listen(engine, "do_connect", _create_file)
     event.listen(engine, "connect", configure_sqlite if sealed is None else configure_read_only)
@@ -134,12 +133,12 @@ def open_sqlite(url: URL) -> tuple[Engine, ReadOnlyFile | None]:
 def _create_file(_dialect: Any, _record: Any, arguments: list[Any], _named: Any) -> None:
     """Create a missing file that only this user can read; SQLite copies the mode to the log.
 
-    The file is not opened, because closing it would release this process's locks on it.
+    The file is not opened, because closing it would release the locks of this process on it.
     """
     path = arguments[0] if arguments else ""
     if path in ("", ":memory:") or path.startswith("file:"):
         return
-    with suppress(OSError):  # the file exists, or SQLite reports why it cannot be created
+    with suppress(OSError):  # SQLite reports errors later
         os.mknod(path, stat.S_IFREG | PRIVATE_FILE)
 
 
@@ -150,7 +149,7 @@ def configure_sqlite(connection: Any, _record: Any) -> None:
         "journal_mode = WAL",
         "synchronous = FULL",  # an acknowledged commit survives a power failure
         "foreign_keys = ON",
-        "secure_delete = ON",  # deleted data is overwritten, even in free pages
+        "secure_delete = ON",  # deleted data is overwritten
         f"busy_timeout = {_milliseconds(BUSY_S)}",
         "cache_size = -32000",
     ):
@@ -158,9 +157,9 @@ def configure_sqlite(connection: Any, _record: Any) -> None:
 
 
 def shrink_log(connection: Any) -> bool:
-    """Empty the log after a checkpoint; return False if another process prevents it.
+    """Empty the log by a checkpoint; return False if another process prevents it.
 
-    Without this, the log contains former versions of pages until they are overwritten.
+    Otherwise, the log contains old versions of pages until they are overwritten.
     """
     connection.execute(f"PRAGMA busy_timeout = {_milliseconds(SHRINKING_S)}").close()
     try:
@@ -176,21 +175,21 @@ def configure_read_only(connection: Any, _record: Any) -> None:
 
 
 def begin_sqlite(connection: Connection) -> None:
-    """Begin a transaction; a writer takes the lock at the beginning, and waits for it."""
+    """Begin a transaction; a writer acquires the lock at once, and waits for it."""
     wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
     if wait_s is None:
         connection.exec_driver_sql("BEGIN")
         return
     if connection.get_execution_options().get("sceneprint_unchecked"):
         connection.exec_driver_sql("PRAGMA foreign_keys = OFF")  # no effect within a transaction
-    # a transaction that reads first would fail if another process wrote before its first write
+    # lock at once: after a read, a write fails if another process has written in between
     line: WriterLine | None = connection.get_execution_options().get("sceneprint_line")
     with nullcontext() if line is None else line.first(min(wait_s, LINE_S)):
         _begin_immediate(connection, wait_s)
 
 
 def _begin_immediate(connection: Connection, wait_s: float) -> None:
-    """Take the lock with frequent attempts; SQLite would wait up to 0.1 s between attempts."""
+    """Acquire the lock by frequent attempts, since SQLite waits up to 0.1 s between attempts."""
     until = time.monotonic() + wait_s
     connection.exec_driver_sql("PRAGMA busy_timeout = 0")
     try:
@@ -209,14 +208,14 @@ def _begin_immediate(connection: Connection, wait_s: float) -> None:
 
 
 class WriterLine:
-    """Line of processes that wait to write, of which only the first waits for SQLite's lock.
+    """Line of writing processes, of which only the first waits for the lock of SQLite.
 
     Without the line, a service that writes continuously would usually get the lock, and a worker
     would wait for seconds. Processes that do not use the line are safe, but not fair.
 
     Parameters
     ----------
-    folder : folder of the database, whose lock is the first place in the line
+    folder : folder of the database; its file lock is the first place in the line
     """
 
     def __init__(self, folder: Path) -> None:
@@ -225,7 +224,7 @@ class WriterLine:
 
     @contextmanager
     def first(self, longest_s: float) -> Iterator[None]:
-        """Wait to be first in line, at most `longest_s`, since the first process may be stopped."""
+        """Hold the first place in line; without it after `longest_s`, continue anyway."""
         descriptor = self._open()
         if descriptor is None or not _locked(descriptor, longest_s):
             yield
@@ -236,14 +235,14 @@ class WriterLine:
             fcntl.flock(descriptor, fcntl.LOCK_UN)
 
     def close(self) -> None:
-        """Close the folder."""
+        """Close the descriptor of the folder."""
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)
 
     def _open(self) -> int | None:
         if self._descriptor is None:
-            with suppress(OSError):  # the line is optional
+            with suppress(OSError):
                 flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
                 self._descriptor = os.open(self._folder, flags)
         return self._descriptor
@@ -258,7 +257,7 @@ def _locked(descriptor: int, longest_s: float) -> bool:
             if time.monotonic() >= until:
                 return False
             time.sleep(LOOK_S)
-        except OSError:  # the file system has no locks
+        except OSError:  # the file system does not support locks
             return False
         else:
             return True

@@ -1,4 +1,4 @@
-"""Counts over the whole store for frequent calls, and samples of the counts of processes."""
+"""Counts over the whole store, and samples of the counts of processes."""
 
 from __future__ import annotations
 
@@ -20,10 +20,7 @@ def count_maps(connection: Connection) -> int:
 
 
 def oldest_waiting(connection: Connection, map_number: int | None = None) -> dict[str, float]:
-    """Return the creation time of the oldest queued job of each kind, seconds since 1970.
-
-    The oldest job has the smallest number. The index of claims contains state, kind and number.
-    """
+    """Return the creation time of the oldest queued job by kind, seconds since 1970."""
     first = select(func.min(jobs.c.number)).where(jobs.c.state == JobState.QUEUED)
     if map_number is not None:
         first = first.where(jobs.c.map_number == map_number)
@@ -35,7 +32,7 @@ def oldest_waiting(connection: Connection, map_number: int | None = None) -> dic
 
 
 def running_jobs(connection: Connection, now: float) -> dict[str, str]:
-    """Return the ids of running jobs by name of the worker."""
+    """Return the ids of running jobs by name of their worker."""
     rows = connection.execute(
         select(jobs.c.worker, jobs.c.id).where(
             jobs.c.state == JobState.RUNNING, jobs.c.leased_until >= now
@@ -48,13 +45,13 @@ def count_events(
     connection: Connection, kinds: Sequence[str], at: float, width_s: float,
     map_name: str | None = None,
 ) -> Counter[tuple[int, str]]:  # fmt: skip
-    """Count the events of some kinds in each interval since a time.
+    """Count events of some kinds in intervals since a time.
 
     Parameters
     ----------
-    kinds : members of `KINDS` of the API
+    kinds : event kinds, from `KINDS` of the API
     at : start of the first interval, seconds since 1970
-    width_s : length of an interval, seconds
+    width_s : length of the intervals, seconds
     map_name : name of the map; default: all maps
 
     Returns
@@ -77,10 +74,7 @@ def count_events(
 
 
 def _first_since(connection: Connection, at: float) -> int:
-    """Return the number of the first event at or after a time by a binary search.
-
-    Events are sorted by time, so no index of times is needed.
-    """
+    """Return the number of the first event at or after a time, by a binary search."""
     low = int(connection.execute(select(func.min(events.c.number))).scalar() or 0)
     high = int(connection.execute(select(func.max(events.c.number))).scalar() or 0) + 1
     while low < high:
@@ -98,7 +92,7 @@ def _first_since(connection: Connection, at: float) -> int:
     return low
 
 
-# Samples, which contain the counts of a process over the last seconds, for a short history.
+# Samples: counts of a process over some seconds, stored as a short history.
 
 #: Seconds after which samples are removed.
 SAMPLES_S = 7200.0
@@ -106,7 +100,7 @@ SAMPLES_S = 7200.0
 
 @dataclass(frozen=True)
 class Sample:
-    """Counts of one process.
+    """Counts of a process in an interval.
 
     Parameters
     ----------
@@ -118,25 +112,25 @@ class Sample:
 
 
 def add_sample(connection: Connection, kind: str, process: str, data: dict[str, Any]) -> None:
-    """Store a sample, and remove up to 100 of its kind that are older than KEPT_S."""
+    """Store a sample, and remove up to 100 samples of its kind that are older than SAMPLES_S."""
     now = time.time()
     old = (
         select(samples.c.number)
         .where(samples.c.kind == kind, samples.c.at < now - SAMPLES_S)
         .order_by(samples.c.number)
         .limit(100)
-        .with_for_update(skip_locked=True)  # since writers of samples take no turns
+        .with_for_update(skip_locked=True)  # writers of samples take no turns
     )
     connection.execute(delete(samples).where(samples.c.number.in_(old)))
     connection.execute(insert(samples).values(at=now, process=process, kind=kind, data=data))
 
 
 def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
-    """Return the samples of all processes since a time, the oldest first."""
+    """Return the samples of all processes since a time, oldest first."""
     of_kind = select(samples.c.at, samples.c.data).where(samples.c.kind == kind, samples.c.at >= at)
     return [Sample(*row) for row in connection.execute(of_kind.order_by(samples.c.at))]
 
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:
-    """Return the number of samples of a kind since a time."""
+    """Count the samples of a kind since a time."""
     return count_rows(connection, samples.c.kind == kind, samples.c.at >= at)

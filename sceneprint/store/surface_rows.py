@@ -1,7 +1,7 @@
-"""Surfaces of maps, with their tiles, fused frames and pending work.
+"""Rows of surfaces: tiles, fused frames and pending work.
 
-Rows link each frame to the tiles that it touches. When a frame is deleted or edited, these tiles
-are rebuilt from the other frames that touch them.
+Rows link each frame to the tiles that it overlaps. When a frame is deleted or edited, these tiles
+are rebuilt from their other frames.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState
 
-#: Scale of a tile that must be published again.
+#: Number of the time scale of a tile that must be published again.
 NO_SCALE = -1
 #: Columns of a frame that affect its contribution to a surface.
 FUSED_COLUMNS = frozenset(("pose", "pose_parent", "session", "captured_at"))
@@ -53,7 +53,7 @@ FUSED_COLUMNS = frozenset(("pose", "pose_parent", "session", "captured_at"))
 
 @dataclass(frozen=True)
 class SurfaceRow:
-    """Surface; see the table for the fields."""
+    """A row of the table `surfaces`."""
 
     map_number: int
     model_id: str
@@ -73,7 +73,7 @@ class SurfaceRow:
     updated_at: float | None
 
     def is_current(self, row: MapRow) -> bool:
-        """Return whether the map has not changed since the end of the surface's last job."""
+        """Return whether the surface includes all changes of its map."""
         return (
             self.revision == row.revision
             and self.edits == self.pose_edits
@@ -82,14 +82,14 @@ class SurfaceRow:
 
 
 def find_surface(connection: Connection, map_number: int) -> SurfaceRow | None:
-    """Return the surface of a map; None if none has ever been started."""
+    """Return the surface of a map; None if no build was ever started."""
     statement = select(surfaces).where(surfaces.c.map_number == map_number)
     row = connection.execute(statement).mappings().first()
     return None if row is None else SurfaceRow(**row)
 
 
 def add_surface(connection: Connection, row: MapRow) -> SurfaceRow:
-    """Insert a surface without a model; its first job sets the model."""
+    """Insert a surface without a model, which its first job sets."""
     new = SurfaceRow(
         map_number=row.number, model_id="", cell_m=0.0, wanted=True, job_number=None,
         revision=-1, edits=0, pose_edits=0, scale=0, taken_from=None, taken_step_s=1.0,
@@ -107,7 +107,7 @@ def write_surface(connection: Connection, map_number: int, **values: object) -> 
 
 
 def note_edit(connection: Connection, frame_number: int, map_number: int) -> None:
-    """Mark a fused frame as edited and count the edit, in the transaction of the edit."""
+    """Mark a fused frame as edited, and count the edit, in the transaction of the edit."""
     mark_edited(connection, frame_number)
     _count_edit(connection, map_number)
 
@@ -125,13 +125,13 @@ def _count_edit(connection: Connection, map_number: int) -> None:
 
 
 def mark_edited(connection: Connection, frame_number: int) -> None:
-    """Mark a frame with a new revision of its map as edited; see `note_edit`."""
+    """Mark a fused frame as edited without counting the edit; its map has a new revision anyway."""
     own = surface_frames.c.frame_number == frame_number
     connection.execute(update(surface_frames).where(own).values(changed=True))
 
 
 def maps_to_update(connection: Connection) -> list[tuple[MapRow, SurfaceRow | None]]:
-    """Return the maps without a surface, and the maps whose surface may be outdated."""
+    """Return the maps without a surface, and those whose surface may be outdated."""
     statement = (
         select(maps, surfaces)
         .join(surfaces, surfaces.c.map_number == maps.c.number, isouter=True)
@@ -153,24 +153,24 @@ def maps_to_update(connection: Connection) -> list[tuple[MapRow, SurfaceRow | No
 
 
 def count_unfinished(connection: Connection, surface: SurfaceRow) -> int:
-    """Return the number of tiles to rebuild or to publish again."""
+    """Count the tiles to rebuild or to publish again."""
     c = surface_tiles.c
     lacking = c.rebuilt_to.is_not(None) | ((c.level == 0) & (c.scale != surface.scale))
     return count_rows(connection, c.map_number == surface.map_number, lacking)
 
 
-# Frames to add, fused frames, and frames to remove.
+# Frames to fuse, fused frames, and frames to remove.
 
 
 @dataclass(frozen=True)
 class FusedFrame:
-    """Posed frame with the values that affect its contribution to a surface.
+    """A frame with the values that affect its contribution to a surface.
 
     Parameters
     ----------
-    parent, pose : parent frame, and T_parent_sensor as 4 rows of 4
-    session, captured_at : run and time, if known
-    geometry : blob of the artifact
+    parent, pose : parent frame, and T_parent_sensor (4, 4)
+    session, captured_at : run and capture time; None if unknown
+    geometry : digest of the geometry artifact
     """
 
     number: int
@@ -182,7 +182,7 @@ class FusedFrame:
 
 
 def _posed(map_number: int, model_id: str) -> Select[Any]:
-    """Return the query of the numbers of the frames in a complete surface."""
+    """Return the query of the numbers of all frames that belong in a surface."""
     c = frames.c
     return (
         select(c.number)
@@ -215,7 +215,7 @@ def _outdated(surface: SurfaceRow) -> Select[Any]:
 
 
 def count_posed(connection: Connection, row: MapRow) -> int:
-    """Return the number of frames of a map in a complete surface."""
+    """Count the frames of a map that belong in a surface."""
     return _count(connection, _posed(row.number, row.model_id))
 
 
@@ -224,21 +224,21 @@ def _count(connection: Connection, statement: Select[Any]) -> int:
 
 
 def count_fused(connection: Connection, map_number: int) -> dict[str, int]:
-    """Return the number of fused frames by parent frame."""
+    """Count the fused frames of a map by parent frame."""
     c = surface_frames.c
     counts = select(c.parent, func.count()).where(c.map_number == map_number).group_by(c.parent)
     return {row[0]: row[1] for row in connection.execute(counts)}
 
 
 def count_left(connection: Connection, surface: SurfaceRow) -> int:
-    """Return the number of frames to add or to remove."""
+    """Count the frames to fuse or to remove."""
     return _count(connection, _unfused(surface)) + _count(connection, _outdated(surface))
 
 
 def frames_to_fuse(
     connection: Connection, surface: SurfaceRow, after: int, limit: int
 ) -> list[FusedFrame]:
-    """Return the next frames to add after a number."""
+    """Return up to `limit` frames to fuse after frame number `after`."""
     unfused = _unfused(surface).where(frames.c.number > after)
     numbers = connection.execute(unfused.order_by(frames.c.number).limit(limit)).scalars().all()
     return fused_frames(connection, surface, numbers)
@@ -253,7 +253,7 @@ def frames_to_remove(connection: Connection, surface: SurfaceRow, limit: int) ->
 def fused_frames(
     connection: Connection, surface: SurfaceRow, numbers: Iterable[int]
 ) -> list[FusedFrame]:
-    """Return the frames with these numbers, in order, except frames without pose or artifact."""
+    """Return some frames in the order of their numbers, except those without pose or artifact."""
     c = frames.c
     statement = (
         _posed(surface.map_number, surface.model_id)
@@ -266,7 +266,7 @@ def fused_frames(
 
 
 def add_fused(connection: Connection, surface: SurfaceRow, fused: Sequence[FusedFrame]) -> None:
-    """Record frames as fused, and mark frames that were edited after they were read."""
+    """Record frames as fused; mark those as edited that have changed since they were read."""
     now = {
         one.number: one for one in fused_frames(connection, surface, [one.number for one in fused])
     }
@@ -280,14 +280,14 @@ def add_fused(connection: Connection, surface: SurfaceRow, fused: Sequence[Fused
 
 
 def capture_range(connection: Connection, surface: SurfaceRow) -> tuple[float, float] | None:
-    """Return the first and last capture time of a surface's frames, fused or not."""
+    """Return the first and last capture time of all frames that belong in a surface."""
     at, posed = frames.c.captured_at, _posed(surface.map_number, surface.model_id)
     first, last = connection.execute(posed.with_only_columns(func.min(at), func.max(at))).one()
     return None if first is None else (first, last)
 
 
 def fused_range(connection: Connection, map_number: int) -> tuple[float | None, float | None]:
-    """Return the first and last capture time of a map's fused frames."""
+    """Return the first and last capture time of the fused frames of a map."""
     at = frames.c.captured_at
     statement = (
         select(func.min(at), func.max(at))
@@ -299,7 +299,7 @@ def fused_range(connection: Connection, map_number: int) -> tuple[float | None, 
 
 
 def spread_fused(connection: Connection, map_number: int, parent: str, most: int) -> list[int]:
-    """Return the numbers of evenly spaced fused frames of a parent frame."""
+    """Return the numbers of up to `most` evenly spaced fused frames in a parent frame."""
     c = surface_frames.c
     own = (c.map_number == map_number) & (c.parent == parent)
     statement = select(c.frame_number).where(own).order_by(c.frame_number)
@@ -309,7 +309,7 @@ def spread_fused(connection: Connection, map_number: int, parent: str, most: int
 
 @dataclass(frozen=True)
 class TileRow:
-    """Tile; see the table for the fields."""
+    """A row of the table `surface_tiles`."""
 
     number: int
     map_number: int
@@ -340,9 +340,9 @@ class TileRow:
 def tiles_at(
     connection: Connection, map_number: int, parent: str, level: int, places: Iterable[TilePlace]
 ) -> dict[TilePlace, TileRow]:
-    """Return existing tiles of a parent frame and level by place."""
+    """Return the tiles that exist at some places of a parent frame and level, by place."""
     c = surface_tiles.c
-    # one statement per row and floor is faster than a list of many tuples
+    # one statement per row and floor, which is faster than a list of many tuples
     columns: dict[tuple[int, int], list[int]] = {}
     for x, y, z in sorted(set(places)):
         columns.setdefault((y, z), []).append(x)
@@ -361,20 +361,20 @@ def _tiles(connection: Connection, statement: Select[Any]) -> list[TileRow]:
 
 
 def tile_of_digest(connection: Connection, map_number: int, digest: str) -> TileRow | None:
-    """Return the published tile with a digest, or None."""
+    """Return a published tile by digest; None if it does not exist."""
     c = surface_tiles.c
     own = c.map_number == map_number, c.digest == digest, c.blob.is_not(None)
     return next(iter(_tiles(connection, select(surface_tiles).where(*own).limit(1))), None)
 
 
 def tile_of_number(connection: Connection, number: int) -> TileRow | None:
-    """Return the tile with a number; None if it was removed."""
+    """Return a tile by number; None if it was removed."""
     own = surface_tiles.c.number == number
     return next(iter(_tiles(connection, select(surface_tiles).where(own))), None)
 
 
 def schedule_rebuild(connection: Connection, tile: TileRow) -> None:
-    """Schedule a tile whose bytes are lost for rebuilding from frames or finer tiles."""
+    """Schedule a lost tile to be rebuilt from frames or from finer tiles."""
     own = surface_tiles.c.number == tile.number
     doom(connection, [blob for blob in (tile.blob, tile.draft) if blob])
     if tile.level == 0:
@@ -390,7 +390,7 @@ def list_tiles(
     connection: Connection, map_number: int, parent: str, level: int,
     beyond: TilePlace | None = None, limit: int | None = None,
 ) -> list[TileRow]:  # fmt: skip
-    """Return published tiles after a place, sorted by column, row and floor."""
+    """Return up to `limit` published tiles after a place, sorted by column, row and floor."""
     c = surface_tiles.c
     place = (c.tile_x, c.tile_y, c.tile_z)
     statement = select(surface_tiles).where(
@@ -403,7 +403,7 @@ def list_tiles(
 
 @dataclass(frozen=True)
 class LevelTotals:
-    """Totals of the tiles of a parent frame and level; `low` and `high` bound the cells, (3,)."""
+    """Totals of the tiles of a parent frame and level; `low` and `high` (3,) bound the cells."""
 
     parent: str
     level: int
@@ -414,7 +414,7 @@ class LevelTotals:
 
 
 def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
-    """Return totals of the published tiles by parent frame and level."""
+    """Return the totals of the published tiles by parent frame and level."""
     c = surface_tiles.c
     lows = [func.min(one) for one in (c.low_x, c.low_y, c.low_z)]
     highs = [func.max(one) for one in (c.high_x, c.high_y, c.high_z)]
@@ -431,7 +431,7 @@ def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
 
 
 def tiles_to_rebuild(connection: Connection, map_number: int, most: int) -> list[TileRow]:
-    """Return tiles under reconstruction that have the same, most advanced progress."""
+    """Return up to `most` tiles to rebuild, those whose rebuild is most advanced."""
     c = surface_tiles.c
     own = c.map_number == map_number, c.rebuilt_to.is_not(None)
     statement = select(surface_tiles).where(*own).order_by(c.rebuilt_to.desc(), c.number)
@@ -440,7 +440,7 @@ def tiles_to_rebuild(connection: Connection, map_number: int, most: int) -> list
 
 
 def tiles_of_other_scale(connection: Connection, surface: SurfaceRow, most: int) -> list[TileRow]:
-    """Return some tiles of the finest level that were published with a different time scale."""
+    """Return up to `most` tiles of the finest level with an outdated time scale."""
     c = surface_tiles.c
     statement = select(surface_tiles).where(
         c.map_number == surface.map_number, c.level == 0, c.scale != surface.scale,
@@ -452,12 +452,13 @@ def tiles_of_other_scale(connection: Connection, surface: SurfaceRow, most: int)
 def forget_scale(
     connection: Connection, map_number: int, parent: str, place: TilePlace, factor: int
 ) -> None:
-    """Schedule the finest tiles within a lost coarser tile for publication.
+    """Schedule the finest tiles within a lost coarser tile to be published again.
 
     Parameters
     ----------
     connection, map_number, parent : see `tiles_at`
-    factor : ratio of the widths of the tiles
+    place : place of the coarser tile
+    factor : width of the coarser tile, as a multiple of that of the finest tiles
     """
     c = surface_tiles.c
     within = [
@@ -477,7 +478,7 @@ def write_tile(
     Returns
     -------
     number : number of the tile
-    blobs : blobs to which the tile no longer refers
+    blobs : blobs that the tile no longer refers to
     """
     c = surface_tiles.c
     before = tiles_at(connection, map_number, parent, level, [place]).get(place)
@@ -496,7 +497,7 @@ def write_tile(
 
 
 def remove_tiles(connection: Connection, tiles: Sequence[TileRow]) -> list[str]:
-    """Remove tiles and their links to frames, and return the blobs of the tiles."""
+    """Remove tiles and their links to frames; return the blobs of the tiles."""
     for block in blocks(tile.number for tile in tiles):
         touches = among(connection, surface_touches.c.tile_number, block)
         connection.execute(delete(surface_touches).where(touches))
@@ -506,7 +507,7 @@ def remove_tiles(connection: Connection, tiles: Sequence[TileRow]) -> list[str]:
 
 
 def add_touches(connection: Connection, touches: Iterable[tuple[int, int]]) -> None:
-    """Insert links of (number of the tile, number of the frame)."""
+    """Insert links between tiles and frames: pairs of tile number and frame number."""
     rows = [{"tile_number": tile, "frame_number": frame} for tile, frame in sorted(touches)]
     if rows:
         connection.execute(insert(surface_touches), rows)
@@ -515,7 +516,7 @@ def add_touches(connection: Connection, touches: Iterable[tuple[int, int]]) -> N
 def frames_touching(
     connection: Connection, tiles: Sequence[int], after: int, limit: int
 ) -> list[int]:
-    """Return, in order, the numbers above `after` of frames that touch any of the tiles."""
+    """Return the numbers of up to `limit` frames after `after` that overlap any of the tiles."""
     c = surface_touches.c
     statement = (
         select(c.frame_number)
@@ -528,7 +529,7 @@ def frames_touching(
 
 
 def remove_fused(connection: Connection, numbers: Sequence[int]) -> None:
-    """Remove fused frames, and schedule the tiles that they touch for rebuilding."""
+    """Remove fused frames, and schedule the tiles that they overlap to be rebuilt."""
     c = surface_touches.c
     own = among(connection, c.frame_number, numbers)
     tiles = list(connection.execute(select(c.tile_number).where(own).distinct()).scalars())
@@ -540,7 +541,7 @@ def remove_fused(connection: Connection, numbers: Sequence[int]) -> None:
     connection.execute(delete(surface_frames).where(fused))
 
 
-#: Number of tiles that one commit removes; it removes ten times as many frames.
+#: Number of tiles to remove in one commit; ten times as many frames are removed.
 _AT_ONCE = 50
 
 
@@ -549,8 +550,8 @@ def remove_block(connection: Connection, map_number: int) -> tuple[list[str], bo
 
     Returns
     -------
-    blobs : doomed blobs, to sweep after the commit
-    over : whether no tiles and frames remain
+    blobs : doomed blobs, to be collected after the commit
+    over : whether all tiles and frames are removed
     """
     c = surface_tiles.c
     own = c.map_number == map_number
@@ -567,12 +568,12 @@ def remove_block(connection: Connection, map_number: int) -> tuple[list[str], bo
     return blobs, len(numbers) < 10 * _AT_ONCE
 
 
-# Frames by position, or by the tiles that they touch.
+# Frames by position, or by the tiles that they overlap.
 
 
 @dataclass(frozen=True)
 class SightingFrame:
-    """Frame in a list of sightings; `square` is its squared distance from the spot, metres^2."""
+    """A frame near a spot; `square` is the squared distance of its viewpoint, square metres."""
 
     number: int
     id: str
@@ -590,7 +591,7 @@ def frames_seeing(
     connection: Connection, surface: SurfaceRow, parent: str, places: Iterable[TilePlace],
     spot: Sequence[float], beyond: tuple[float, int] | None, limit: int,
 ) -> list[SightingFrame]:  # fmt: skip
-    """Return frames that touch at least one of some tiles, the nearest to a spot first.
+    """Return frames that overlap any of some tiles, sorted by distance from a spot.
 
     Parameters
     ----------
@@ -613,7 +614,7 @@ def frames_captured_in(
     connection: Connection, surface: SurfaceRow, parent: str, low: Sequence[float],
     high: Sequence[float], beyond: tuple[float, int] | None, limit: int,
 ) -> list[SightingFrame]:  # fmt: skip
-    """Return frames captured in a box, the nearest to its centre first; see `frames_seeing`."""
+    """Return frames captured in a box, sorted by distance from its centre; see `frames_seeing`."""
     sides = [
         getattr(frames.c, f"pose_{axis}").between(a, b)
         for axis, a, b in zip("xyz", low, high, strict=True)
@@ -649,7 +650,7 @@ def _sightings(
 
 
 def living_surface(connection: Connection, name: str) -> tuple[MapRow, SurfaceRow | None]:
-    """Return a map and its surface; None for a surface that was never started or was deleted.
+    """Return a map and its surface; None for a surface that does not exist or was deleted.
 
     Raises
     ------

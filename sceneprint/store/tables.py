@@ -1,4 +1,4 @@
-"""Tables of the database, and the types of their rows. `create_schema` in `database` creates them.
+"""Tables of the database, and classes of their rows. `create_schema` in `database` creates them.
 
 Times are seconds since 1970. Values of `number` are in the order of insertion and never reused;
 `id` is public.
@@ -50,9 +50,9 @@ from sceneprint.process import current_actor, current_tenant, request_id
 from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.api.frames import Kind
 
-#: Type of 64-bit integers. In SQLite, all integers have 64 bits, and only INTEGER can number rows.
+#: Type of 64-bit integers. In SQLite, all integers have 64 bits; only INTEGER autoincrements.
 WHOLE = BigInteger().with_variant(Integer, "sqlite")
-#: Type of texts that are sorted by code points, as in SQLite, independent of the server's locale.
+#: Type of texts sorted by code points, as in SQLite, independent of the locale of the server.
 TEXT = Text().with_variant(Text(collation="C"), "postgresql")
 
 
@@ -86,7 +86,7 @@ maps = Table(
     Column("title", _string(200)),
     Column("model_id", _string(64), ForeignKey("models.id"), nullable=False),
     Column("next_model_id", _string(64)),  # next model during a re-encoding
-    # number of changes to the searched frames; an indexed or deleted frame gets the current value
+    # number of changes to the searched frames; indexed and deleted frames get the current value
     Column("revision", WHOLE, nullable=False),
     Column("created_at", Float, nullable=False),
     Column("quota_frames", BigInteger),  # null: unlimited
@@ -96,7 +96,7 @@ maps = Table(
     Column("used_frames", BigInteger, nullable=False, server_default="0"),
     Column("used_bytes", BigInteger, nullable=False, server_default="0"),
     Column("up", JSON(none_as_null=True)),  # unit vector in the parent frames; null: estimated
-    # greatest revision of a removed row: readers behind it must start again
+    # greatest revision of a removed row; readers at earlier revisions must restart
     Column("pruned_revision", WHOLE, nullable=False, server_default="0"),
     sqlite_autoincrement=True,
 )
@@ -105,14 +105,14 @@ frames = Table(
     "frames",
     metadata,
     Column("number", WHOLE, primary_key=True),
-    Column("id", _string(64), nullable=False),  # a new frame may take the id of a deleted one
+    Column("id", _string(64), nullable=False),  # ids of deleted frames can be reused
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("state", _string(16), nullable=False),
     Column("reason", TEXT),
-    Column("content_id", _string(64)),  # null when deleted: the content may be uploaded again
+    Column("content_id", _string(64)),  # null if deleted, so that the content can be uploaded again
     Column("blob", _string(64), nullable=False),
     Column("bytes", WHOLE, nullable=False),
-    Column("intrinsics", JSON, nullable=False),  # null of JSON for a cloud
+    Column("intrinsics", JSON, nullable=False),  # JSON null for a cloud
     Column("depth_scale", Float, nullable=False),
     Column("depth_along_ray", Boolean, nullable=False),
     Column("robot", _string(128)),
@@ -124,7 +124,7 @@ frames = Table(
     Column("pose_x", Float),  # translation of the pose, metres
     Column("pose_y", Float),
     Column("pose_z", Float),
-    # uploaded parent frame and pose, if a join transformed the pose
+    # parent frame and pose as uploaded, if a join transformed the pose
     Column("sent_parent", _string(128)),
     Column("sent_pose", JSON(none_as_null=True)),
     Column("base_frame", _string(128)),
@@ -134,20 +134,20 @@ frames = Table(
     Column("indexed_at", Float),
     Column("revision", WHOLE),
     Column("cloud", JSON(none_as_null=True)),  # description of the points; null: a depth image
-    Column("up", JSON(none_as_null=True)),  # unit vector in the sensor's axes
+    Column("up", JSON(none_as_null=True)),  # unit vector in the sensor frame
     Column("name", _string(255)),  # name of the original file or message; never used as a path
     Column("sequence", WHOLE),  # position within the session
     Column("samples", JSON(none_as_null=True)),  # ranges of the samples, and `trust_depth`
     Column("ended_at", Float),  # time at which the frame was deleted, rejected or redundant
-    # first revision of its deletion, for a deleted frame that can be restored (tombstone)
+    # first revision of the deletion, if the frame can be restored (tombstone)
     Column("deletion", WHOLE),
-    Column("deleted_from", _string(16)),  # former state; null: another frame has the id now
+    Column("deleted_from", _string(16)),  # former state; null if another frame uses the id now
     Column("deleted_content", _string(64)),  # former content_id
     UniqueConstraint("map_number", "id"),
     Index(None, "map_number", "content_id"),
     Index(None, "map_number", "revision"),
     Index(None, "map_number", "number"),
-    Index(  # this covers filters, which then read no rows
+    Index(  # covering index for filters
         "ix_frames_searched",
         "map_number",
         "state",
@@ -165,19 +165,19 @@ frames = Table(
     Index("ix_frames_placed", "map_number", "pose_parent", "pose_x", "pose_y", "pose_z"),
     sqlite_autoincrement=True,
 )
-#: Tombstones of a map, the oldest deletions first.
+#: Tombstones of a map, oldest deletions first.
 Index(
     "ix_frames_tombstones", frames.c.map_number, frames.c.deletion, frames.c.number,
     sqlite_where=frames.c.deletion.is_not(None), postgresql_where=frames.c.deletion.is_not(None),
 )  # fmt: skip
-#: Existing frames of a map, the oldest first.
+#: Existing frames of a map, oldest first.
 Index(
     "ix_frames_aging", frames.c.map_number, frames.c.received_at,
     sqlite_where=frames.c.state != "deleted", postgresql_where=frames.c.state != "deleted",
 )  # fmt: skip
 
-#: Condition for frames whose rows are removed after some days. The values are literals, because
-#: planners do not match bound values to a partial index.
+#: Condition for frames whose rows are removed after some days, with literal values: planners do not
+#: match bound values to a partial index.
 ENDED: ColumnElement[bool] = frames.c.state.in_(
     [literal_column("'deleted'"), literal_column("'redundant'")]
 )
@@ -186,18 +186,15 @@ Index(
     sqlite_where=ENDED, postgresql_where=ENDED,
 )  # fmt: skip
 
-#: Joins of parent frames. Poses that were uploaded in `parent` are stored in the root, where its
-#: joins end.
+#: Joins of parent frames; see `parent_joins`.
 parent_joins = Table(
     "parent_joins",
     metadata,
     Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
     Column("parent", _string(128), primary_key=True),
-    Column(
-        "towards", _string(128), primary_key=True
-    ),  # root at the time of the join, which may have been joined later
+    Column("towards", _string(128), primary_key=True),  # root at the time of the join
     Column("transform", JSON, nullable=False),  # T_towards_parent, 4 rows of 4
-    Column("job_id", _string(32), nullable=False),  # association that proposed the join
+    Column("job_id", _string(32), nullable=False),  # association that found the join
     Column("joined_at", Float, nullable=False),
     Column("undone_at", Float),  # null: the join is in effect; at most one per `parent`
 )
@@ -230,9 +227,9 @@ jobs = Table(
     Column("number", WHOLE, primary_key=True),
     Column("id", _string(32), nullable=False, unique=True),
     Column("kind", _string(16), nullable=False),
-    Column("frame_number", WHOLE, ForeignKey("frames.number")),  # null: not about a single frame
-    Column("map_number", WHOLE, ForeignKey("maps.number")),  # null: not about a map
-    Column("model_id", _string(64)),  # model to sign with; null: the map's own
+    Column("frame_number", WHOLE, ForeignKey("frames.number")),  # null for long jobs
+    Column("map_number", WHOLE, ForeignKey("maps.number")),  # null for jobs without a map
+    Column("model_id", _string(64)),  # model to sign with; null: that of the map
     Column("data", JSON(none_as_null=True)),  # parameters, by kind
     Column("progress", JSON(none_as_null=True)),  # done, total, and state for the next slice
     Column("result", JSON(none_as_null=True)),  # summary of the results
@@ -240,7 +237,7 @@ jobs = Table(
     Column("priority", WHOLE, nullable=False),
     Column("attempts", WHOLE, nullable=False),
     Column("failures", WHOLE, nullable=False),  # number of failed attempts
-    Column("token", WHOLE, nullable=False),  # fencing token: grows with every claim
+    Column("token", WHOLE, nullable=False),  # fencing token, incremented by each claim
     Column("run_after", Float, nullable=False),
     Column("leased_until", Float),
     Column("worker", _string(128)),
@@ -250,7 +247,7 @@ jobs = Table(
     Column("started_at", Float),
     Column("finished_at", Float),
     Column("tenant", _string(128), nullable=False, server_default=""),  # requester, or ""
-    Column("turn", WHOLE),  # number of the latest claim, which increases across all jobs
+    Column("turn", WHOLE),  # number of the latest claim, counted across all jobs
     Index(None, "state", "run_after"),
     Index(None, "frame_number"),
     Index(None, "map_number", "number"),
@@ -296,11 +293,11 @@ keys = Table(
     Column("id", _string(32), primary_key=True),
     Column("name", _string(128), nullable=False, unique=True),
     Column("digest", _string(64), nullable=False, unique=True),  # SHA-256 of the secret
-    Column("grants", JSON, nullable=False),  # scope by name of a map, "*" for all
+    Column("grants", JSON, nullable=False),  # scope by map name; "*" for all maps
     Column("created_at", Float, nullable=False),
     Column("expires_at", Float),
     Column("tenant", _string(128), nullable=False, server_default=""),
-    # SHA-256 of the secret before the last rotation, which is valid until `previous_until`
+    # SHA-256 of the previous secret, which is valid until `previous_until`
     Column("previous_digest", _string(64), index=True),
     Column("previous_until", Float),
     Column("last_used_at", Float),
@@ -334,8 +331,8 @@ def _event_table(name: str, *indexes: Index) -> Table:
 
 
 events = _event_table("events", Index(None, "map", "number"))
-#: Events of writers of single maps on PostgreSQL, which commit in any order. `number_events` moves
-#: them to `events`, with numbers in commit order.
+#: Events of writers of single maps on PostgreSQL. `number_events` moves them to `events`, with
+#: numbers in commit order.
 pending_events = _event_table("pending_events")
 #: Last events of former maps.
 Index(
@@ -343,11 +340,11 @@ Index(
     sqlite_where=events.c.kind == "map.deleted", postgresql_where=events.c.kind == "map.deleted",
 )  # fmt: skip
 
-#: Results of requests with an `Idempotency-Key`, which are stored for a day.
+#: Results of requests with an `Idempotency-Key`, stored for a day.
 idempotency = Table(
     "idempotency",
     metadata,
-    Column("actor", _string(128), primary_key=True),  # name of the caller's key, or ""
+    Column("actor", _string(128), primary_key=True),  # name of the key; "" without a key
     Column("key", _string(255), primary_key=True),
     Column("fingerprint", _string(64), nullable=False),  # hash of route and payload
     Column("data", JSON, nullable=False),  # ids of the result
@@ -361,7 +358,7 @@ audit = Table(
     metadata,
     Column("number", WHOLE, primary_key=True),
     Column("at", Float, nullable=False),
-    Column("actor", _string(128), nullable=False),  # name of the key; "" if none is required
+    Column("actor", _string(128), nullable=False),  # name of the key; "" without a key
     Column("address", _string(64)),
     Column("tenant", _string(128), nullable=False),
     Column("action", _string(32), nullable=False),
@@ -380,7 +377,7 @@ schema_range = Table(
     Column("least_revision", _string(32), primary_key=True),
 )
 
-#: Single row with the progress of the scrub, which checks stored bytes.
+#: Single row with the progress of the scrub, which verifies stored bytes.
 scrubs = Table(
     "scrubs",
     metadata,
@@ -388,13 +385,13 @@ scrubs = Table(
     Column("position", WHOLE, nullable=False),  # number of the last checked frame
     Column("next_at", Float, nullable=False),  # earliest time of the next slice, database clock
     Column("began_at", Float, nullable=False),  # start of this pass
-    Column("finished_at", Float),  # end of the last complete pass; null: there was none
-    Column("blobs", BigInteger, nullable=False),  # counts of this pass, or the last one
+    Column("finished_at", Float),  # end of the last complete pass; null before the first
+    Column("blobs", BigInteger, nullable=False),  # counts of the current or last pass
     Column("bytes", BigInteger, nullable=False),
     Column("damaged", BigInteger, nullable=False),
 )
 
-#: Counts of processes, which are written a few times per minute and stored for two hours.
+#: Counts of processes, written a few times per minute and stored for two hours.
 samples = Table(
     "samples",
     metadata,
@@ -407,7 +404,7 @@ samples = Table(
     sqlite_autoincrement=True,
 )
 
-#: Former maps with their last events, and their quotas for the next map with the name.
+#: Deleted maps with their last event, and their quotas for the next map of the same name.
 former_maps = Table(
     "former_maps",
     metadata,
@@ -418,8 +415,7 @@ former_maps = Table(
     Index(None, "number"),
 )
 
-#: Queries and their outcomes, which are stored for a limited time, and their answers while space
-#: permits.
+#: Queries and their outcomes, stored for a limited time, and their answers while space permits.
 queries = Table(
     "queries",
     metadata,
@@ -430,7 +426,7 @@ queries = Table(
     Column("maps", JSON(none_as_null=True)),  # names of all searched maps; null: only this one
     Column("robot", _string(128)),
     Column("session", _string(128)),
-    Column("key_id", _string(32)),  # key of the request
+    Column("key_id", _string(32)),
     Column("status", _string(16), nullable=False),
     Column("cause", _string(64)),
     Column("reason", TEXT, nullable=False),
@@ -441,21 +437,21 @@ queries = Table(
     Column("alternatives", WHOLE, nullable=False),
     Column("milliseconds", Float, nullable=False),
     Column("kind", _string(8)),
-    Column("frame_map", _string(63)),  # map of the query frame, if it is a stored frame
+    Column("frame_map", _string(63)),  # map of a stored query frame; null for an upload
     Column("frame_id", _string(64)),
-    Column("listed", Boolean, nullable=False),  # false: stored only to view its answer
-    Column("kept_at", Float),  # time at which the answer was marked as kept; null: it expires
-    Column("title", _string(200)),  # title of a kept answer
-    Column("shown", JSON(none_as_null=True)),  # numbers of the frames in the answer
-    Column("bytes", BigInteger, nullable=False),  # size of the answer; 0: it is not stored
-    Column("answer", LargeBinary),  # kept answer; others are files, see `answer_files`
+    Column("listed", Boolean, nullable=False),  # false: lists omit the query
+    Column("kept_at", Float),  # time from which the answer is permanent; null: it expires
+    Column("title", _string(200)),  # title of a permanent answer
+    Column("shown", JSON(none_as_null=True)),  # frame numbers in the answer
+    Column("bytes", BigInteger, nullable=False),  # size of the answer; 0 if it is not stored
+    Column("answer", LargeBinary),  # permanent answer; others are files, see `answer_files`
     Index(None, "at", "number"),
     Index(None, "map_number", "at", "number"),
     Index(None, "map_number", "status", "at", "number"),
     Index(None, "robot", "at", "number"),
     sqlite_autoincrement=True,
 )
-#: Stored answers by age, and kept answers, which are few among many rows.
+#: Stored answers by age, and permanent answers.
 Index(
     "ix_queries_stored", queries.c.at, queries.c.number, queries.c.bytes,
     sqlite_where=literal_column("bytes > 0"), postgresql_where=literal_column("bytes > 0"),
@@ -466,16 +462,16 @@ Index(
     postgresql_where=literal_column("kept_at IS NOT NULL"),
 )  # fmt: skip
 
-#: Fused surfaces of maps, and their progress.
+#: Surfaces of maps, and their progress.
 surfaces = Table(
     "surfaces",
     metadata,
     Column("map_number", WHOLE, ForeignKey("maps.number"), primary_key=True),
     Column("model_id", _string(64), nullable=False),  # model of the fused artifacts
-    Column("cell_m", Float, nullable=False),  # cell size of the finest level
+    Column("cell_m", Float, nullable=False),  # cell width of the finest level, metres
     Column("wanted", Boolean, nullable=False),  # false: the surface was deleted
-    Column("job_number", WHOLE),  # latest job, which may have been removed since
-    # revision and edits of the map that the surface includes
+    Column("job_number", WHOLE),  # latest job, possibly removed
+    # revision of the map and number of edits that the surface includes
     Column("revision", WHOLE, nullable=False),
     Column("edits", WHOLE, nullable=False),
     Column("pose_edits", WHOLE, nullable=False),  # number of edits of fused frames
@@ -507,7 +503,7 @@ surface_tiles = Table(
     Column("blob", _string(64)),  # sums of the finest level, cells of the others; null: none yet
     Column("digest", _string(64), nullable=False),  # digest of the published cells
     Column("scale", WHOLE, nullable=False),  # number of its time scale
-    # last frame in `draft` during a reconstruction, initially 0; null: the tile is up to date
+    # last frame in `draft` during a rebuild, initially 0; null if the tile is up to date
     Column("rebuilt_to", WHOLE),
     Column("draft", _string(64)),
     Column("low_x", Float, nullable=False),  # box of its cells, metres
@@ -533,11 +529,11 @@ surface_frames = Table(
     Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("parent", _string(128), nullable=False),
-    Column("changed", Boolean, nullable=False),  # edited afterwards: must be fused again
+    Column("changed", Boolean, nullable=False),  # edited since, so it must be fused again
     Index(None, "map_number", "parent", "changed"),
 )
 
-#: Tiles of the finest level that contain fused frames.
+#: Links between fused frames and tiles of the finest level.
 surface_touches = Table(
     "surface_touches",
     metadata,
@@ -546,7 +542,7 @@ surface_touches = Table(
     Index(None, "frame_number"),
 )
 
-#: Blobs of deleted rows, until they have been removed.
+#: Blobs of deleted rows, until the blobs are removed.
 doomed = Table(
     "doomed",
     metadata,
@@ -563,9 +559,9 @@ secrets = Table(
 )
 
 
-# Statements that count rows, or select rows by many numbers.
+# Counts of rows, and selection of rows by many numbers.
 
-#: Maximum length of a list of numbers; SQLite allows 32,766 parameters.
+#: Maximum length of a list of numbers in a statement; SQLite allows 32,766 parameters.
 MOST_ROWS = 10_000
 
 
@@ -575,7 +571,7 @@ def count_rows(connection: Connection, *conditions: ColumnElement[bool]) -> int:
 
 
 def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
-    """Yield the numbers in lists of at most `MOST_ROWS`."""
+    """Split numbers into lists of up to `MOST_ROWS`."""
     left = iter(numbers)
     while block := list(islice(left, MOST_ROWS)):
         yield block
@@ -584,10 +580,9 @@ def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
 def among(
     connection: Connection, column: Column[int], numbers: Sequence[int]
 ) -> ColumnElement[bool]:
-    """Return the condition that the value of a column is one of `numbers`.
+    """Return the condition that the value of a column is in `numbers`.
 
-    PostgreSQL gets the numbers as one array, because 10,000 parameters would take ten times as
-    long.
+    PostgreSQL receives an array, which takes a tenth of the time of 10,000 parameters.
     """
     if connection.dialect.name == "postgresql":
         return column == any_(literal(list(numbers), ARRAY(BigInteger)))
@@ -597,7 +592,7 @@ def among(
 def rows_among(
     connection: Connection, statement: Select[Any], column: Column[int], numbers: Iterable[int]
 ) -> Iterator[Any]:
-    """Yield the rows of a statement for which the value of a column is one of `numbers`."""
+    """Yield the rows of a statement for which the value of a column is in `numbers`."""
     for block in blocks(numbers):
         yield from connection.execute(statement.where(among(connection, column, block)))
 
@@ -627,13 +622,13 @@ def among_numbers(dialect: str, column: Column[int]) -> ColumnElement[bool]:
 
 
 def dialect_insert(connection: Connection, table: Table) -> Any:
-    """Return an INSERT of the database's dialect, which supports ON CONFLICT."""
+    """Return an INSERT that supports ON CONFLICT, in the dialect of the database."""
     return (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(table)
 
 
 @dataclass(frozen=True)
 class MapRow:
-    """Map; see the table for the fields."""
+    """A row of the table `maps`."""
 
     number: int
     name: str
@@ -653,7 +648,7 @@ class MapRow:
 
 @dataclass(frozen=True)
 class FrameRow:
-    """Frame; see the table for the fields."""
+    """A row of the table `frames`."""
 
     number: int
     id: str
@@ -701,7 +696,7 @@ class FrameRow:
 
 @dataclass(frozen=True)
 class JobRow:
-    """Job; see the table for the fields."""
+    """A row of the table `jobs`."""
 
     number: int
     id: str
@@ -730,9 +725,9 @@ class JobRow:
 
     @property
     def frame(self) -> int:
-        """Number of the frame of a job about a single frame."""
+        """Number of the frame of the job; raise ValueError if the job has none."""
         if self.frame_number is None:
-            raise ValueError(f"job {self.id} of kind {self.kind} is not about a single frame")
+            raise ValueError(f"job {self.id} of kind {self.kind} has no frame")
         return self.frame_number
 
 
@@ -747,7 +742,7 @@ def frame_row(row: RowMapping) -> FrameRow:
 
 
 def frame_rows(selected: Iterable[Row[Any]]) -> list[FrameRow]:
-    """Convert rows of `FRAME_COLUMNS` by position, in a third of the time of `frame_row`."""
+    """Convert rows of `FRAME_COLUMNS` by position, three times as fast as `frame_row`."""
     rows = []
     for row in selected:
         values = list(row)
@@ -762,7 +757,7 @@ def job_row(row: RowMapping) -> JobRow:
 
 
 def job_of_columns(row: Sequence[Any]) -> JobRow:
-    """Convert the first columns of a row, which are `JOB_COLUMNS`, to a job."""
+    """Convert the first columns of a row, `JOB_COLUMNS`, to a job."""
     values = list(row[: len(JOB_COLUMNS)])
     values[_JOB_STATE] = JobState(values[_JOB_STATE])
     return JobRow(*values)
@@ -776,16 +771,15 @@ _FRAME_STATE = [column.name for column in FRAME_COLUMNS].index("state")
 _JOB_STATE = [column.name for column in JOB_COLUMNS].index("state")
 
 
-# Leases and jobs use the clock of the database, because the clocks of hosts differ. A SQLite file
-# has only one host.
+# Leases and jobs use the clock of the database, since the clocks of hosts differ.
 
-#: Start of a PostgreSQL statement, seconds since 1970. The transaction may have waited for its turn
-#: after it began, and clock_timestamp() differs by row, which would prevent the use of an index.
+#: Start of a PostgreSQL statement, seconds since 1970. The start of the transaction would precede
+#: the wait for its turn, and clock_timestamp() differs by row, which prevents the use of an index.
 STATEMENT_TIME: ColumnElement[float] = cast(extract("epoch", func.statement_timestamp()), Float(53))
 
 
 def now(connection: Connection) -> ColumnElement[float]:
-    """Return the time of a statement, seconds since 1970."""
+    """Return an expression for the time of a statement, seconds since 1970."""
     if connection.dialect.name == "sqlite":
         return literal(time.time())
     return STATEMENT_TIME
@@ -795,7 +789,7 @@ def job_values(
     connection: Connection, kind: str, priority: int, model_id: str | None = None,
     data: dict[str, Any] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the columns of a job that is queued now, except its subject; see `enqueue`."""
+    """Return the columns of a newly queued job, except its frame and map; see `enqueue`."""
     at = now(connection)
     return {
         "id": uuid.uuid4().hex, "kind": kind, "model_id": model_id,
@@ -806,7 +800,7 @@ def job_values(
 
 
 def request_data() -> dict[str, Any] | None:
-    """Return the data of a job from the current request; None outside a request."""
+    """Return the request id as data of a job; None outside of a request."""
     if request_id() is None:
         return None
     return {"request_id": request_id()}  # log lines of the worker contain it
@@ -817,7 +811,7 @@ def audit_values(
 ) -> dict[str, Any] | None:
     """Return the columns of an audit line for a change by the current actor.
 
-    Return None for a worker, since the request that queued its job has a line.
+    Return None without an actor: the request that queued the job of a worker has a line.
     """
     actor = current_actor()
     if actor is None:
@@ -832,7 +826,7 @@ def audit_values(
 def event_values(
     kind: str, map_name: str | None, frame_id: str | None, job_id: str | None, data: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the columns of an event that happens now."""
+    """Return the columns of an event at the current time."""
     return {
         "at": time.time(), "kind": kind, "map": map_name, "frame_id": frame_id, "job_id": job_id,
         "data": data,

@@ -1,4 +1,4 @@
-"""Tenants, which own keys and the jobs that are queued with these keys."""
+"""Tenants, the owners of keys and of the jobs queued with these keys."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sceneprint.store.tables import jobs, keys, tenants
 
 @dataclass(frozen=True)
 class TenantRow:
-    """Tenant.
+    """A tenant.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def create_tenant(connection: Connection, name: str) -> None:
 
 
 def delete_tenant(connection: Connection, name: str) -> None:
-    """Delete a tenant without keys; its queued jobs keep their places.
+    """Delete a tenant without keys; its queued jobs remain.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> st
 
 
 def leave_tenant(connection: Connection, key_name: str, tenant: str) -> None:
-    """Delete the tenant that was created with a revoked key, if the tenant has no other key."""
+    """Delete the tenant of a revoked key if it was created with the key and has no other key."""
     if tenant == key_name and _first_key(connection, tenant) is None:
         delete_tenant(connection, tenant)
 
@@ -99,8 +99,7 @@ def unknown_tenant(name: str) -> UnknownTenant:
 def save_turns(connection: Connection, *names: str) -> None:
     """Store the latest turns of some tenants, or of all tenants, in the table of tenants.
 
-    Call this before removing jobs; otherwise a tenant that deletes its maps would always be served
-    first.
+    Call this before removing jobs: otherwise, a tenant that deletes its maps would always be next.
     """
     last = (
         select(func.max(jobs.c.turn))

@@ -1,4 +1,4 @@
-"""Tombstones, which are deleted frames that can be restored unchanged.
+"""Tombstones: deleted frames that can be restored unchanged.
 
 delete_frames  -->  tombstones  --list_deletions-->  Deletion, ...
 tombstones  --restore_frame-->  frames that queries find immediately
@@ -17,13 +17,13 @@ from sceneprint.store.queue import enqueue
 from sceneprint.store.tables import FrameRow, MapRow, frame_row, frames, now, signatures
 from sceneprint_client.api import FrameState
 
-#: States of frames that queries find, or will find.
+#: States of frames that are, or will be, searched.
 _SEARCHED = (FrameState.INDEXED, FrameState.RECEIVED, FrameState.SIGNING)
 
 
 @dataclass(frozen=True)
 class Deletion:
-    """Restorable frames of a map that a single call deleted.
+    """The restorable frames of a map that one call deleted.
 
     Parameters
     ----------
@@ -50,11 +50,11 @@ def _restorable(
 def list_deletions(
     connection: Connection, map_number: int, seconds: float, limit: int, before: int | None = None
 ) -> list[Deletion]:
-    """Return the deletions of a map that can be undone, the newest first.
+    """Return the deletions of a map that can be undone, newest first.
 
     Parameters
     ----------
-    seconds : period after a deletion in which frames can be restored
+    seconds : time for which deleted frames can be restored
     limit : maximum number of deletions
     before : number of the last deletion of the previous page
     """
@@ -71,7 +71,7 @@ def list_deletions(
 def find_deletion(
     connection: Connection, map_number: int, seconds: float, number: int
 ) -> Deletion | None:
-    """Return the deletion with a number if it can be undone; see `list_deletions`."""
+    """Return a deletion by number; None if it cannot be undone. See `list_deletions`."""
     deletions = list_deletions(connection, map_number, seconds, 1, number + 1)
     return next((one for one in deletions if one.number == number), None)
 
@@ -96,7 +96,7 @@ def tombstones_of(
 def find_tombstone(
     connection: Connection, map_number: int, seconds: float, frame_id: str
 ) -> FrameRow | None:
-    """Return the tombstone with an id if it can be restored; see `list_deletions`."""
+    """Return a tombstone by frame id; None if it cannot be restored. See `list_deletions`."""
     own = _restorable(connection, map_number, seconds)
     statement = select(frames).where(*own, frames.c.id == frame_id)
     row = connection.execute(statement).mappings().first()
@@ -104,7 +104,7 @@ def find_tombstone(
 
 
 def successor_of(connection: Connection, frame: FrameRow) -> str | None:
-    """Return the id of a frame with the same content that was received after the deletion."""
+    """Return the id of a frame with the same content as a tombstone; None without one."""
     c = frames.c
     statement = select(c.id).where(
         c.map_number == frame.map_number, c.content_id == frame.deleted_content,
@@ -114,7 +114,7 @@ def successor_of(connection: Connection, frame: FrameRow) -> str | None:
 
 
 def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
-    """Restore the frame of a tombstone; it is signed again only if the map's model has changed.
+    """Restore a tombstone; queue its signing only if the map has switched its model.
 
     Parameters
     ----------
@@ -142,6 +142,6 @@ def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
             job = enqueue(connection, "sign", frame.number)
             values |= {"state": FrameState.RECEIVED, "reason": None, "indexed_at": None}
             if frame.deleted_from == FrameState.INDEXED:
-                values["novelty"] = None  # the map has already accepted the frame
+                values["novelty"] = None  # the frame was accepted earlier
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**values))
     record_event(connection, "frame.restored", row.name, frame.id, None if job is None else job.id)

@@ -1,7 +1,7 @@
-"""Wake waiting workers after a job is committed, through FIFOs with SQLite or NOTIFY of PostgreSQL.
+"""Signals that wake workers after a job is committed: FIFOs with SQLite, NOTIFY of PostgreSQL.
 
 Each waiting worker creates a FIFO in a folder, and a ring writes a byte to each FIFO. Rings are
-only hints: workers also poll, because a file system may not support FIFOs, or a process may be on
+only hints: workers also poll, because a file system may not support FIFOs, or a worker may be on
 another machine. Functions of this module therefore raise no errors.
 """
 
@@ -30,26 +30,26 @@ if TYPE_CHECKING:
     import psycopg
 
 
-#: Seconds after which an abandoned FIFO is removed, and interval at which FIFOs in use are touched.
+#: Age in seconds at which an abandoned FIFO is removed, and interval of touching a FIFO in use.
 STALE_S, ALIVE_S = 300.0, 60.0
-#: Longest wait of a worker without a FIFO, seconds.
+#: Polling interval of a worker without a FIFO, seconds.
 DEAF_S = 0.25
-#: Longest timeout of poll(2), milliseconds.
+#: Maximum timeout of poll(2), milliseconds.
 MOST_MS = 2**31 - 1
-#: Number of last characters of the host in the name of a process. Servers truncate the names of
-#: connections, and hosts in clouds often differ only at the end.
+#: Number of characters from the end of the host name in the name of a process: servers truncate
+#: names of connections, and host names in clouds often differ only at the end.
 HOST = 44
 
 
 class Listening(Protocol):
-    """Process that waits for rings."""
+    """A process that waits for rings."""
 
     def wait(self, timeout_s: float, *others: int) -> bool:
         """Wait for a ring, for a readable descriptor of `others`, or for the timeout.
 
         Returns
         -------
-        rung : whether there was a ring, or may have been one during a disconnection
+        rung : whether there was a ring, or may have been during a disconnection
         """
 
     def close(self) -> None:
@@ -62,7 +62,7 @@ def process_name() -> str:
 
 
 def wait_for(timeout_s: float, *descriptors: int) -> set[int]:
-    """Return the descriptors that become readable within the timeout; ignore negative ones."""
+    """Return the descriptors that become readable within the timeout; ignore negative numbers."""
     waiting = select.poll()
     for descriptor in descriptors:
         if descriptor >= 0:
@@ -76,7 +76,7 @@ class Wakeup:
 
     Parameters
     ----------
-    folder : folder, which the first listener creates
+    folder : folder of the FIFOs, created by the first listener
     """
 
     def __init__(self, folder: Path) -> None:
@@ -87,7 +87,7 @@ class Wakeup:
         try:
             names = os.listdir(self._folder)  # noqa: PTH208  (a path for each would cost)
         except OSError:
-            return  # no process has listened so far
+            return
         for name in names:
             self._ring(self._folder / name)
 
@@ -101,14 +101,14 @@ class Wakeup:
         return [":".join(name.rsplit("-", 2)[:2]) for name in read]
 
     def listen(self) -> AbstractContextManager[Listening]:
-        """Listen for rings. A ring before the wait ends the wait immediately."""
+        """Listen for rings. A ring before a wait ends the wait immediately."""
         return closing(Listener(self._folder))
 
     def close(self) -> None:
         """Stop ringing."""
 
     def _is_read(self, path: Path) -> bool:
-        """Return whether a process reads a FIFO; otherwise, opening the FIFO fails."""
+        """Return whether a process reads a FIFO."""
         with suppress(OSError), _opened(path) as descriptor:
             return stat.S_ISFIFO(os.fstat(descriptor).st_mode)
         return False
@@ -117,9 +117,9 @@ class Wakeup:
         try:
             with _opened(path) as descriptor:
                 if stat.S_ISFIFO(os.fstat(descriptor).st_mode):
-                    with suppress(OSError):  # a full FIFO will wake its reader anyway
+                    with suppress(OSError):  # full: the reader will wake anyway
                         os.write(descriptor, b"!")
-        except OSError:  # the FIFO has no reader, since it is new or its process has died
+        except OSError:  # no reader: the FIFO is new, or its process has died
             with suppress(OSError):
                 if path.is_fifo() and time.time() - path.stat().st_mtime > STALE_S:
                     path.unlink()
@@ -135,7 +135,7 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 class Listener:
-    """Open FIFO; see `Wakeup.listen`."""
+    """An open FIFO; see `Wakeup.listen`."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / f"{process_name().replace(':', '-')}-{uuid.uuid4().hex[:8]}"
@@ -169,13 +169,13 @@ class Listener:
         try:
             make_folder(self._path.parent)
             os.mkfifo(self._path, 0o600)
-            # without a writer, the FIFO would be at its end and thus readable
+            # also open for writing: otherwise, the FIFO would be at its end, and thus readable
             self._fifo = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
         except OSError:
             self._fifo = -1
 
     def _refresh(self) -> None:
-        """Touch the FIFO to show that it is in use; create it again if it was removed."""
+        """Touch the FIFO, so that it is not abandoned; create it again if it was removed."""
         self._alive = time.monotonic()
         try:
             os.utime(self._path)
@@ -184,7 +184,7 @@ class Listener:
             self._open()
 
 
-# Rings through PostgreSQL for several hosts. They are hints too: if the server is unreachable, or a
+# Rings through PostgreSQL for several hosts, also only hints: if the server is unreachable, or a
 # pooler drops listeners, workers poll.
 
 log = logging.getLogger(__name__)
@@ -192,9 +192,9 @@ log = logging.getLogger(__name__)
 CHANNEL = "sceneprint"
 #: Prefix of the names of listening connections, before the name of the process.
 LISTENS = "sceneprint "
-#: Minimum seconds between rings, since one ring suffices for many uploads.
+#: Minimum seconds between rings.
 REST_S = 0.02
-#: Maximum seconds that `close` waits for a ring in progress, since the server may not answer.
+#: Maximum seconds that `close` waits for a ring in progress.
 CLOSING_S = 2.0
 #: Seconds between attempts to connect.
 AGAIN_S = 2.0
@@ -249,11 +249,11 @@ class Notices(Wakeup):
         connection: psycopg.Connection[Any] | None = None
         while self._rung.wait() and not self._closed:
             self._rung.clear()
-            for _ in range(2):  # the server may have closed the connection after the last ring
+            for _ in range(2):  # twice, since the server may have closed the connection
                 try:
                     if connection is None:
                         connection = self._database.driver_connection()
-                        # rings may be lost, so they need not wait for the disk and the standby
+                        # do not wait for disk and standby, since rings may be lost
                         connection.execute("SET synchronous_commit = off")
                     with self._database.explained():
                         connection.execute(f"NOTIFY {CHANNEL}")
@@ -267,7 +267,7 @@ class Notices(Wakeup):
 
 
 class NoticeListener:
-    """Listening connection; see `Notices.listen`."""
+    """A listening connection; see `Notices.listen`."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -312,7 +312,7 @@ class NoticeListener:
         self._connection, self._missed = connection, True
 
     def _has_rung(self) -> bool:
-        """Return whether the input is a ring rather than the end of the connection."""
+        """Return whether the input is a ring, not the end of the connection."""
         if self._connection is None:
             return False
         rung = False
@@ -324,7 +324,7 @@ class NoticeListener:
         except SceneprintError as error:
             log.debug("wakeup unavailable", extra={"error": str(error)})
             self.close()
-            self._again_at = time.monotonic()  # another server may be the primary now
+            self._again_at = time.monotonic()  # reconnect at once: the primary may have changed
         return rung
 
 

@@ -144,7 +144,7 @@ def test_a_table_that_is_changed_elsewhere_costs_one_try(
             assert [one.execute(asked).all(), other.execute(asked).all()] == [[], []]
     postgres.execute("ALTER TABLE changing ALTER a TYPE bigint", name)
     with (
-        pytest.raises(errors.StoreLocked, match="The tables were changed in the meantime"),
+        pytest.raises(errors.StoreLocked, match="The tables were changed meanwhile"),
         served.write(turn=False) as one,
     ):
         one.execute(asked)

@@ -171,7 +171,7 @@ class Tombstones:
             while numbers := self._spent(row, everything=everything):
                 with self._store.database.write(map_number=row.number) as connection:
                     # skip frames that were restored or purged meanwhile
-                    existing = {row[0] for row in oldest_tombstones(connection, row.number)}
+                    existing = {frame[0] for frame in oldest_tombstones(connection, row.number)}
                     numbers = [number for number in numbers if number in existing]
                     blobs = purge_frames(connection, row.number, numbers)
                 collect_deleted_blobs(self._store, blobs)

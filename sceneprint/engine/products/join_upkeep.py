@@ -93,7 +93,7 @@ def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
     if len(largest) < 2:
         return None
     kind = Associations.kind
-    jobs = [run.job for run in list_jobs(connection, None, _JOBS, None, kind, [row.name])]
+    jobs = [listed.job for listed in list_jobs(connection, None, _JOBS, None, kind, [row.name])]
     if any(not job.state.over for job in jobs):
         return None
     undone = undone_pairs(connection, row.number)

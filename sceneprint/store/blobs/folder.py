@@ -27,15 +27,15 @@ from sceneprint.atomic_files import (
 from sceneprint.errors import DamagedBlob, StoreLocked, UnusableStore
 from sceneprint.store.database_errors import unusable
 
-# All processes that share the blobs use one lock: shared while they need the blobs, exclusive for
-# removals. The kernel or the server releases the lock of a process that dies.
+# All processes that share the blobs use one lock: shared while blobs must not be removed, exclusive
+# during removals. The kernel or the server releases the lock of a process that dies.
 
-#: Time limits for finishing a removal, with and without a turn to write, seconds.
+#: Time limits of a removal, with and without a turn to write, seconds.
 TURN_S, REMOVAL_S = 5.0, 25.0
-#: Seconds after which each removal has ended, even that of a dead process: it sends no request
+#: Seconds after which any removal has ended, even if its process died: a removal sends no request
 #: after REMOVAL_S, and each request ends within `object_client.TRIED_S` and `SMALL_S`.
 LONGEST_S = 90.0
-#: Seconds between attempts to take the lock of a folder.
+#: Seconds between attempts to acquire the lock of a folder.
 _LOOK_S = 0.01
 
 
@@ -48,7 +48,7 @@ class Locks(ABC):
 
     @abstractmethod
     def removing(self) -> AbstractContextManager[bool]:
-        """Hold the lock exclusively if it is free, and yield whether it is."""
+        """Acquire the exclusive lock without waiting; yield whether this succeeded."""
 
     @property
     def outlast_turns(self) -> bool:
@@ -56,14 +56,14 @@ class Locks(ABC):
         return False
 
     def removals(self) -> int | None:
-        """Return a number that each removal changes; None if unknown, or during a removal."""
+        """Return a counter of removals; None if it is unknown, or during a removal."""
         return None
 
     def mark_uncertain(self) -> None:  # noqa: B027  (removals from a folder end at once)
-        """Mark this thread's removal as unfinished, since its requests may still be executed."""
+        """Mark the removal by this thread as unfinished: its requests may still be executed."""
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: B027  (most have none)
-        """Wait for the end of a removal whose turn is over, unless its process has died.
+        """Wait for a removal that continues after its turn, unless its process has died.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class FileLocks(Locks):
 
     @contextmanager
     def block_removals(self) -> Iterator[None]:
-        """See `Locks`. Raise UnusableStore if the lock cannot be taken."""
+        """See `Locks`. Raise UnusableStore if the lock cannot be acquired."""
         try:
             descriptor = self._lock(fcntl.LOCK_SH)
         except OSError as error:
@@ -113,7 +113,7 @@ class FileLocks(Locks):
         """See `Locks`."""
         try:
             descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:  # the lock is in use or not supported, and remaining blobs are harmless
+        except OSError:  # in use or not supported; blobs that remain are harmless
             yield False
             return
         try:
@@ -122,14 +122,14 @@ class FileLocks(Locks):
             os.close(descriptor)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
-        """See `Locks`. A removal outlasts its turn if a server ends the turn early."""
+        """See `Locks`. A removal continues after its turn if the server ended the turn early."""
         until = time.monotonic() + seconds
         while True:
             try:
                 os.close(self._lock(fcntl.LOCK_SH | fcntl.LOCK_NB))
             except BlockingIOError:
                 pass
-            except OSError:  # without locks in the file system, there are no removals
+            except OSError:  # without file locks, there are no removals
                 return
             else:
                 return
@@ -158,12 +158,13 @@ class FileLocks(Locks):
 
 
 class IncomingBlob:
-    """Blob that is written in parts; see `Blobs.incoming`.
+    """A blob that is written in chunks; see `Blobs.incoming`.
 
     Parameters
     ----------
-    what : beginning of error messages
-    keep : function that makes the file durable under its digest
+    file : file to write to
+    what : prefix of error messages
+    keep : function that stores the file durably under its digest
     """
 
     def __init__(self, file: BinaryIO | FileIO, what: str, keep: Callable[[str], None]) -> None:
@@ -176,7 +177,7 @@ class IncomingBlob:
         """Append bytes."""
         try:
             left = memoryview(data)
-            while left:  # an unbuffered file may write only a part of the data
+            while left:  # unbuffered files may write only part of the data
                 left = left[self._file.write(left) or 0 :]
         except OSError as error:
             raise unusable(self._what, error) from error
@@ -184,7 +185,7 @@ class IncomingBlob:
         self.size += len(data)
 
     def keep(self) -> str:
-        """Make the blob durable, and return its digest."""
+        """Store the blob durably, and return its digest."""
         digest = self._hashed.hexdigest()
         try:
             self._keep(digest)
@@ -200,26 +201,26 @@ MARK = "sceneprint.json"
 
 
 def is_digest(value: object) -> bool:
-    """Return whether a value is a digest."""
+    """Return whether a value is a digest: 64 hexadecimal digits."""
     return isinstance(value, str) and DIGEST.fullmatch(value) is not None
 
 
 def require_digest(text: str) -> None:
-    """Raise ValueError unless a text is a digest, since it becomes part of a path or a key."""
+    """Raise ValueError if a text is not a digest; only digests may become part of a path or key."""
     if not DIGEST.fullmatch(text):
         raise ValueError(f"{text!r} is not a digest")
 
 
 @dataclass(frozen=True)
 class BlobEntry:
-    """File or object in the blob storage.
+    """A file or object in a blob storage.
 
     Parameters
     ----------
-    place : path or URL for messages
+    place : path or URL, for messages
     digest : digest of the blob; None for other files
     changed_at : time of modification, seconds since 1970
-    unfinished : whether a writer is writing the file, or has abandoned it
+    unfinished : whether the file is incomplete: being written, or abandoned
     """
 
     place: str
@@ -229,7 +230,7 @@ class BlobEntry:
 
 
 class Blobs(ABC):
-    """Storage of blobs, which threads may share."""
+    """Storage of blobs; safe to share between threads."""
 
     def __init__(self, locks: Locks) -> None:
         self._locks = locks
@@ -244,20 +245,19 @@ class Blobs(ABC):
 
         Raises
         ------
-        StoreFull : If the disk is full; nothing is left behind.
+        StoreFull : If the disk is full; partial files are removed.
         UnusableStore : If the storage is missing or not writable.
         """
 
     @abstractmethod
     def incoming(self) -> AbstractContextManager[IncomingBlob]:
-        """Store a blob in parts, for example if it does not fit into memory.
+        """Store a blob in chunks, for example if it does not fit into memory.
 
         The blob is removed at the end unless `keep` has been called.
 
         Raises
         ------
-        StoreFull, UnusableStore : If the blob cannot be stored; see `put`. `write` and `keep` raise
-            them too.
+        StoreFull, UnusableStore : See `put`; also raised by `write` and `keep`.
         """
 
     @abstractmethod
@@ -277,15 +277,15 @@ class Blobs(ABC):
         Raises
         ------
         FileNotFoundError : If the blob is missing.
-        OSError, UnusableStore : If the blob cannot be read. Reading the file may raise them too.
+        OSError, UnusableStore : If the blob cannot be read; also raised when the file is read.
         """
 
     @abstractmethod
     def holds(self, digest: str) -> bool:
-        """Return whether a blob exists and will not be removed before the caller refers to it.
+        """Return whether a blob exists and will exist until the transaction is committed.
 
-        Call this in the transaction that writes the reference: no removal begins before the commit,
-        and the call waits for the end of a removal that outlasts its turn.
+        Call this in the transaction that writes a reference to the blob: no removal begins before
+        the commit, and the call waits for a removal that continues after its turn.
 
         Raises
         ------
@@ -300,32 +300,30 @@ class Blobs(ABC):
 
         Raises
         ------
-        StoreLocked, UnusableStore : If `holds` or `put` raises the error.
+        StoreLocked, UnusableStore : See `holds` and `put`.
         """
         if not self.holds(digest):
             self.put(data)
 
     @abstractmethod
     def size(self, digest: str) -> int | None:
-        """Return the size of an unverified blob, bytes; None if it is missing."""
+        """Return the size of a blob in bytes, unverified; None if it is missing."""
 
     def block_removals(self) -> AbstractContextManager[None]:
-        """Prevent removals of blobs, after waiting for a removal in progress.
-
-        The lock of a process that dies is released at once.
+        """Prevent removals of blobs during the context; first wait for a removal in progress.
 
         Raises
         ------
-        UnusableStore : If the lock cannot be taken.
+        UnusableStore : If the lock cannot be acquired.
         """
         return self._locks.block_removals()
 
     def removing(self) -> AbstractContextManager[bool]:
-        """Hold the right to remove blobs; yield False if another process needs or removes some.
+        """Acquire the right to remove blobs; yield False if another process needs or removes blobs.
 
-        Call it within a writing transaction: removals then run one at a time, and leave room for
-        processes that wait in `block_removals`. Hold it beyond that transaction only if
-        `outlast_turns`, and for blobs that the transaction doomed.
+        Begin this within a write transaction: removals then run one at a time, and do not starve
+        `block_removals`. Continue after the transaction only if `outlast_turns` is true, and only
+        with blobs that the transaction doomed.
         """
         return self._locks.removing()
 
@@ -345,11 +343,11 @@ class Blobs(ABC):
 
     @abstractmethod
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """Return the condition of a blob, read in parts to limit memory.
+        """Check the content of a blob, and return its condition.
 
         Parameters
         ----------
-        digest : digest; other texts count as missing
+        digest : digest of the blob; other texts count as missing blobs
         quick : whether to check only that the blob exists
 
         Raises
@@ -359,7 +357,7 @@ class Blobs(ABC):
 
     @abstractmethod
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Durably move a damaged blob, and return its new path; None if the blob is missing.
+        """Move a damaged blob to a folder durably; return its new path, or None if it is missing.
 
         Call this within `removing`.
 
@@ -382,15 +380,15 @@ class Blobs(ABC):
 
     @property
     def read_only(self) -> bool:
-        """Whether the storage is read-only, as far as can be checked without writing."""
+        """Whether the storage is read-only, as far as this can be checked without writing."""
         return False
 
     def check(self) -> None:  # noqa: B027
-        """Check that a network storage is reachable, or was so two seconds ago.
+        """Check that a network storage was reachable within the last two seconds.
 
         Raises
         ------
-        UnusableStore : If the storage does not answer.
+        UnusableStore : If the storage is unreachable.
         """
 
     def close(self) -> None:
@@ -398,7 +396,7 @@ class Blobs(ABC):
         self._locks.close()
 
 
-#: Pattern of the names of unfinished files, which remain if a writer is killed.
+#: Pattern of the names of unfinished files, which a killed writer leaves behind.
 PART = re.compile(r"\.[0-9a-f]{12}\.part")
 
 
@@ -416,7 +414,7 @@ class FolderBlobs(Blobs):
     """
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
-        # the folder itself is the lock, so no lock file is needed
+        # lock the folder itself, which avoids a lock file
         super().__init__(FileLocks(folder))
         self._folder = folder
         self._durable: set[str] = set()  # names of subfolders that are known to be durable
@@ -435,7 +433,7 @@ class FolderBlobs(Blobs):
         """See `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
         path = self.path(digest)
-        try:  # an existing file may be damaged, not yet durable, or about to be removed
+        try:  # replace an existing file too: it may be damaged, not durable, or about to be removed
             new = self._ensure_folder(path.parent)
             write_durable(path, data, folder_is_new=new)
         except OSError as error:
@@ -469,7 +467,7 @@ class FolderBlobs(Blobs):
         sync_folder(self._folder)
 
     def _ensure_folder(self, folder: Path) -> bool:
-        """Create a missing folder, and return whether it may not be durable yet."""
+        """Create a missing folder; return whether its entry must still be synced."""
         try:
             folder.mkdir(PRIVATE_FOLDER)
         except FileExistsError:
@@ -494,7 +492,7 @@ class FolderBlobs(Blobs):
 
     def holds(self, digest: str) -> bool:
         """See `Blobs.holds`."""
-        self._locks.wait(digest, TURN_S)  # a removal may continue after it lost its turn
+        self._locks.wait(digest, TURN_S)
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:
@@ -514,7 +512,7 @@ class FolderBlobs(Blobs):
             self.path(digest).unlink(missing_ok=True)
         for folder in {self.path(digest).parent for digest in digests}:
             if folder.is_dir():
-                sync_folder(folder)  # otherwise a loss of power may bring deleted frames back
+                sync_folder(folder)  # otherwise, a power failure could restore deleted frames
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
         """See `Blobs.condition`."""
@@ -565,7 +563,7 @@ class FolderBlobs(Blobs):
                         yield name
 
     def entries(self) -> Iterator[BlobEntry]:
-        """See `Blobs.entries`. Files that are removed in the meantime are skipped."""
+        """See `Blobs.entries`. Files that are removed meanwhile are skipped."""
         folders = [self._folder]
         while folders:
             with os.scandir(folders.pop()) as entries:

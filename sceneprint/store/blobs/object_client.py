@@ -2,10 +2,10 @@
 
     URL  --open_objects-->  Objects  --put | get | list | delete-->  object store
 
-There are time limits for each request and for all its attempts together. After a store was
-unreachable, calls fail immediately for a moment. Large objects are sent in parts to limit memory.
-Error messages contain the URL and the reason, but no credentials, which messages of the library may
-contain.
+Each request has a time limit, and so have all its attempts together. For AWAY_S seconds after a
+failure to reach the store, calls fail immediately. Large objects are sent in parts to limit memory.
+Error messages contain the URL and the reason, but not the text of the library, which may contain
+credentials.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ if TYPE_CHECKING:
     from _typeshed import WriteableBuffer
     from obstore.store import ClientConfig, ObjectStore, RetryConfig
 
-#: Minimum number of bytes that are fetched at once.
+#: Minimum size of a read request, bytes.
 AHEAD = 1 << 20
 
 
 class RangeFile(io.RawIOBase):
-    """Remote file that is read in ranges; see `buffered`.
+    """A remote file that is read in ranges; see `buffered`.
 
     Parameters
     ----------
     size : size of the file, bytes
-    fetch : function that takes a position and a number of bytes, and returns these bytes
+    fetch : function that returns the bytes at an offset, by offset and length
     """
 
     def __init__(self, size: int, fetch: Callable[[int, int], bytes]) -> None:
@@ -49,7 +49,7 @@ class RangeFile(io.RawIOBase):
 
     @classmethod
     def buffered(cls, size: int, fetch: Callable[[int, int], bytes]) -> BinaryIO:
-        """Return a buffered file, which combines small reads into one request."""
+        """Return a buffered file, which combines small reads into larger requests."""
         return cast("BinaryIO", io.BufferedReader(cls(size, fetch), AHEAD))
 
     def readable(self) -> bool:
@@ -61,7 +61,7 @@ class RangeFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Set the position, which may be beyond the end, and return it."""
+        """Set the position, possibly beyond the end, and return it."""
         base = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError("the position is negative")
@@ -83,8 +83,7 @@ class RangeFile(io.RawIOBase):
         return length
 
 
-#: Maximum size of a request, beyond which objects are sent in parts, bytes; and number of
-#: concurrent parts.
+#: Size of the parts of large objects, bytes, and number of concurrent parts.
 PART, AT_ONCE = 8 << 20, 3
 #: Maximum number of parts of an object.
 MOST_PARTS = 9_000
@@ -104,13 +103,13 @@ _REASON = re.compile(
 
 @dataclass(frozen=True)
 class ListedObject:
-    """Object in a list of a store.
+    """An object listed by a store.
 
     Parameters
     ----------
-    key : key below the store's prefix
+    key : key relative to the prefix
     size : size of the object, bytes
-    changed_at : time of modification by the store's clock, seconds since 1970
+    changed_at : time of modification by the clock of the store, seconds since 1970
     """
 
     key: str
@@ -119,7 +118,7 @@ class ListedObject:
 
 
 class Objects:
-    """Bytes under keys below the prefix of a URL, which threads may share.
+    """Client for the objects below the prefix of a URL; safe to share between threads.
 
     All methods raise UnusableStore if the store is unreachable or refuses the request, and
     StoreFull if the store is full.
@@ -140,16 +139,16 @@ class Objects:
         self._variables = variables
         #: URL for messages, without credentials.
         self.url = url
-        self._away = (0.0, "")  # end of the pause after a failure, and the reason for the failure
+        self._away = (0.0, "")  # end of the pause after a failure, and the reason of the failure
 
     def put(self, key: str, data: bytes, *, create: bool = False) -> bool:
-        """Store bytes under a key, and return after the store has acknowledged them.
+        """Store bytes under a key durably.
 
         Parameters
         ----------
         key : key below the prefix
-        data : bytes, which replace an existing object
-        create : whether to store the bytes only if no object exists
+        data : bytes to store; they replace an existing object
+        create : whether to store the bytes only if the object does not exist
 
         Returns
         -------
@@ -205,7 +204,7 @@ class Objects:
             size = answer.meta["size"]
             if size <= 1 << 20:
                 return bytes(answer.bytes())
-            del answer  # each part is requested separately, with its own time limit
+            del answer  # request each part separately, with its own time limit
         return b"".join(self.chunks(key, size))
 
     def read_range(self, key: str, start: int, length: int) -> bytes:
@@ -230,7 +229,7 @@ class Objects:
         return bytes(data)
 
     def chunks(self, key: str, size: int | None = None) -> Iterator[bytes]:
-        """Yield the parts of an object in order. Raise FileNotFoundError if it does not exist.
+        """Yield the content of an object in parts. Raise FileNotFoundError if it does not exist.
 
         Parameters
         ----------
@@ -275,7 +274,7 @@ class Objects:
         return None if listed is None else listed.size
 
     def list(self, prefix: str) -> Iterator[ListedObject]:
-        """Yield the objects whose keys start with a prefix, page by page, in the store's order."""
+        """Yield the objects whose keys start with a prefix, in the order of the store."""
         import obstore
 
         pages = iter(obstore.list(self._small, prefix, chunk_size=1000))
@@ -288,14 +287,14 @@ class Objects:
                 yield ListedObject(one["path"], one["size"], one["last_modified"].timestamp())
 
     def delete(self, *keys: str, seconds: float = math.inf, once: bool = False) -> None:
-        """Remove objects, and ignore missing objects.
+        """Remove objects; ignore missing objects.
 
         Parameters
         ----------
         keys : keys below the prefix
         seconds : time limit; StoreAway is raised if keys remain
-        once : whether to send each request only once, because a store may execute an unanswered
-            request after its repetition
+        once : whether to send each request only once. A store may execute an unanswered request
+            late, that is, after a repetition
         """
         import obstore
 
@@ -310,14 +309,14 @@ class Objects:
                 except FileNotFoundError as error:
                     if _NO_BUCKET.search(str(error)):
                         raise
-                    if len(block) > 1:  # the store stops at the first missing object
+                    if len(block) > 1:  # some stores stop at the first missing object
                         for key in block:
                             if time.monotonic() > until:
                                 raise self._error(key, "too slow", StoreAway) from None
                             self.delete(key, once=once)
 
     def _make_durable(self, key: str) -> None:
-        """Sync an object in a folder, which the library does not do."""
+        """Sync an object to disk if the store is a folder, since the library does not."""
         if self._folder is None:
             return
         path = self._folder / key
@@ -387,12 +386,12 @@ _ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 
 
 def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
-    """Check that a URL is that of an object store, and contains no credentials.
+    """Check that a URL is a valid object store URL without credentials.
 
     Parameters
     ----------
     url : URL such as s3://bucket/prefix
-    setting : name of the setting for messages, which omit the URL since it may contain a password
+    setting : name of the setting for messages; they omit the URL, which may contain a password
 
     Raises
     ------
@@ -427,7 +426,7 @@ def open_objects(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> Objects:
     Parameters
     ----------
     url : s3://bucket/prefix, gs://bucket/prefix, az://account/container/prefix, file:///folder, or
-        memory:/// for a store that ends with the process; credentials come from the environment
+        memory:/// (a store in the memory of this process). Credentials come from the environment
     setting : name of the setting, for messages
 
     Raises
@@ -499,7 +498,7 @@ def _retries(most: int) -> RetryConfig:
 
 
 def check_objects(objects: Objects) -> float:
-    """Write, read and remove a small object, and return the duration, seconds.
+    """Write, read and remove a small object; return the duration in seconds.
 
     Raises
     ------

@@ -3,8 +3,8 @@
     PREFIX/blobs/ab/abcdef...   blob under its digest
     PREFIX/sceneprint.json      name of the store that owns the blobs
 
-A blob appears completely or not at all, even if it is sent in parts. A blob is also sent if it
-exists, because the existing object may be damaged or about to be removed.
+A blob appears completely or not at all, even if it is sent in parts. An existing blob is sent
+again, because it may be damaged or about to be removed.
 """
 
 from __future__ import annotations
@@ -40,19 +40,19 @@ from sceneprint.store.blobs.folder import (
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.database_errors import unusable
 
-# Owner of a prefix, or of a fleet's folder. Two databases with the same prefix would remove each
-# other's blobs.
+# Owner of a prefix or of a shared folder. Two databases with the same prefix would remove the blobs
+# of each other.
 #
 #     PREFIX/sceneprint.json   {"store": its name, "restoring": true during a restore}
 #
-# The name is derived from the database's secret, so a restored store has the name of the original.
-# A restore therefore refuses a prefix in use even if it has the same name.
+# The name is derived from the secret of the database, so a restored store has the same name as the
+# original. A restore therefore refuses a prefix in use even if its name is the same.
 
 
 class BucketOwner:
     """Mark that states the owner of a prefix.
 
-    All methods raise UnusableStore if the prefix belongs to another database or cannot be used.
+    All methods raise UnusableStore if the prefix belongs to another database or is not accessible.
     """
 
     def __init__(self, objects: Objects) -> None:
@@ -60,17 +60,17 @@ class BucketOwner:
 
     @classmethod
     def of_folder(cls, folder: Path) -> BucketOwner:
-        """Return the mark for a folder of blobs."""
+        """Return the mark of a folder of blobs."""
         return cls(open_objects(f"file://{quote(str(folder.absolute()))}"))
 
     def claim(self, owner: str, *, anew: bool) -> bool:
-        """Check that the prefix belongs to a store, and return whether it is marked.
+        """Check that no other store owns the prefix; return whether the prefix is marked.
 
         Parameters
         ----------
         anew : whether to mark an unclaimed prefix
         """
-        for _ in range(2):  # another process may claim the prefix first
+        for _ in range(2):  # repeat if another process claims the prefix at the same time
             mark = self._read()
             if mark is None:
                 if not anew:
@@ -88,14 +88,15 @@ class BucketOwner:
 
         Parameters
         ----------
-        before : name of the empty database that receives the store; a service may have claimed the
-            prefix with it without using the prefix
+        owner : name of the store
+        before : name of the empty database that receives the store. If a service has claimed the
+            prefix for this database, the claim is replaced
         """
         mark = self._read()
         free = mark is not None and before != owner and mark.get("store") == before
         if mark is None or free:
             if not self._put(owner, create=mark is None, restoring=True):
-                raise self._conflict("another database")  # it claimed the prefix at the same time
+                raise self._conflict("another database")
         elif mark.get("store") != owner:
             raise self._conflict("another database")
         elif mark.get("restoring") is not True:
@@ -106,7 +107,7 @@ class BucketOwner:
         self._put(owner)
 
     def _read(self) -> dict[str, Any] | None:
-        """Return the mark; None if there is none."""
+        """Return the content of the mark; None without a mark."""
         try:
             mark = json.loads(self._objects.get(MARK))
         except FileNotFoundError:
@@ -130,7 +131,7 @@ class BucketOwner:
 
 #: Key prefix of the blobs.
 FOLDER = "blobs/"
-#: Number of stored blobs for which this process remembers the number of earlier removals.
+#: Maximum number of stored blobs for which the counter of removals is cached.
 _REMEMBERED = 4_096
 #: Seconds for which `check` repeats its last result.
 CHECK_S = 2.0
@@ -142,7 +143,7 @@ class ObjectBlobs(Blobs):
     Parameters
     ----------
     locks : lock of all processes that share the prefix
-    owner : function that returns the name of the blobs' store
+    owner : function that returns the name of the store that owns the blobs
     """
 
     def __init__(self, objects: Objects, locks: Locks, owner: Callable[[], str]) -> None:
@@ -150,7 +151,7 @@ class ObjectBlobs(Blobs):
         self.objects = objects
         self._owner = owner
         self._claimed = False
-        self._put: OrderedDict[str, int] = OrderedDict()  # number of earlier removals, by digest
+        self._put: OrderedDict[str, int] = OrderedDict()  # counter of removals, by digest
         self._lock = threading.Lock()
         self._checking = threading.Lock()
         self._wrong: UnusableStore | None = None
@@ -161,8 +162,7 @@ class ObjectBlobs(Blobs):
 
         Raises
         ------
-        UnusableStore : If the prefix belongs to another database, or the object store cannot be
-            used.
+        UnusableStore : If the prefix belongs to another database or is not accessible.
         """
         if not self._claimed:
             self._claimed = BucketOwner(self.objects).claim(self._owner(), anew=anew)
@@ -178,8 +178,8 @@ class ObjectBlobs(Blobs):
     def incoming(self) -> Iterator[IncomingBlob]:
         """See `Blobs.incoming`.
 
-        The blob is a temporary file without a name until its digest is known, because stores cannot
-        copy objects above 5 GB from one key to another.
+        The blob is a nameless temporary file until its digest is known, because stores cannot
+        rename objects larger than 5 GB.
         """
         place = tempfile.gettempdir()
         what = f"{place}: A blob cannot be written"
@@ -233,8 +233,8 @@ class ObjectBlobs(Blobs):
     def holds(self, digest: str) -> bool:
         """See `Blobs.holds`.
 
-        Writing transactions call this while others wait. If this process stored the blob and no
-        blob was removed afterwards, this queries only the database.
+        If this process stored the blob, and no blob was removed since, this does not contact the
+        object store, since other writers wait meanwhile.
         """
         return self._holds(digest, TURN_S)
 
@@ -250,7 +250,7 @@ class ObjectBlobs(Blobs):
         now = self._locks.removals()
         if before is not None and before == now:
             return True
-        if now is None:  # a removal in progress may remove the blob
+        if now is None:  # during a removal, which may remove the blob
             self._locks.wait(digest, seconds)
         return self.objects.size(_key(digest)) is not None
 
@@ -285,12 +285,12 @@ class ObjectBlobs(Blobs):
         try:
             for chunk in self.objects.chunks(_key(digest), size):
                 hashed.update(chunk)
-        except FileNotFoundError:  # the blob was removed in the meantime
+        except FileNotFoundError:
             return "missing"
         return "sound" if hashed.hexdigest() == digest else "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Durably move a damaged blob to a folder of this machine; see `Blobs.quarantine`."""
+        """Move a damaged blob to a folder of this machine durably; see `Blobs.quarantine`."""
         require_digest(digest)
         place = folder / f"blob-{digest}"
         make_folder(folder)
@@ -319,8 +319,8 @@ class ObjectBlobs(Blobs):
     def entries(self) -> Iterator[BlobEntry]:
         """Yield all objects of the blob storage, page by page.
 
-        Stores do not list unfinished objects of killed writers. Configure the lifecycle of the
-        bucket to abort incomplete uploads after a day.
+        Stores do not list incomplete uploads of killed writers. Configure the lifecycle rules of
+        the bucket to abort them after a day.
         """
         for one in self.objects.list(FOLDER):
             name = one.key.rpartition("/")[2]
@@ -330,7 +330,7 @@ class ObjectBlobs(Blobs):
 
     def check(self) -> None:
         """See `Blobs.check`."""
-        if self._checking.acquire(blocking=False):  # only one thread checks
+        if self._checking.acquire(blocking=False):
             try:
                 if time.monotonic() - self._answered > CHECK_S:
                     self._wrong = self._look()
@@ -344,8 +344,8 @@ class ObjectBlobs(Blobs):
         try:
             if self.objects.head(MARK) is None and self._claimed:
                 return UnusableStore(
-                    f"{self.objects.url}: {MARK} is missing: the bucket was emptied or replaced. "
-                    "Restore its objects."
+                    f"{self.objects.url}: {MARK} is missing, so the bucket was probably emptied or "
+                    "replaced. Restore its objects."
                 )
         except UnusableStore as error:
             return error

@@ -1,1 +1,1 @@
-"""Connections and locks of PostgreSQL servers."""
+"""PostgreSQL: connections and locks."""

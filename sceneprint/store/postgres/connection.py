@@ -1,8 +1,8 @@
-"""Configure connections to PostgreSQL, and let writers take turns.
+"""Connections to PostgreSQL, and turns of writers.
 
-Writers take turns as in SQLite: each transaction begins with an advisory lock of the database,
-which it holds until the commit. A transaction's reads are therefore valid until it writes, and its
-numbers are in commit order.
+Writers take turns as in SQLite: each transaction holds an advisory lock of the database from its
+beginning to the commit. Its reads are therefore valid until it writes, and numbers are in commit
+order.
 
 Writers of a single map share that lock and lock their map exclusively, so writers of other maps run
 concurrently. Their reads of the map remain valid, and its revisions are in commit order. Their
@@ -35,7 +35,7 @@ EVENTS = 8
 _EVENT = "at, kind, map, frame_id, job_id, data"
 #: Functions and a trigger of the schema. `number_pending_events` holds its lock until the commit,
 #: so that numbers are in commit order. It also runs before other events are inserted, which
-#: preserves the order of a map's events.
+#: preserves the order of the events of a map.
 NUMBERING = (
     f"""
     CREATE FUNCTION number_pending_events() RETURNS void LANGUAGE plpgsql AS $$
@@ -60,26 +60,26 @@ NUMBERING = (
     EXECUTE FUNCTION number_pending_events_first()
     """,
 )
-#: First number of the locks of single maps; the second is the map's.
+#: First number of the locks of single maps; the second is derived from the map number.
 MAP_LOCKS = 0x5CE7F
-#: Mask of the bits of a map's number in its lock. Maps with equal bits share a lock.
+#: Mask of the bits of a map number in its lock. Maps with equal bits share a lock.
 LOCK_BITS = 0x7FFFFFFF
-#: Time limits of a statement and of an idle transaction, seconds, so that a silent client loses its
+#: Time limits of statements and of idle transactions, seconds; a hanging client then loses its
 #: turn.
 STATEMENT_S, IDLE_S = 60.0, 30.0
-#: Seconds that a migration waits for its turn, since another process may be migrating.
+#: Maximum seconds that a migration waits for its turn.
 MIGRATION_S = 600.0
-#: Seconds that a writer waits after another writer has timed out. The whole fleet waits in one
-#: queue, and writers that leave it early and join again at its end might never succeed.
+#: Maximum seconds that a writer waits after another writer has timed out. With a shorter limit,
+#: writers would leave the queue early, join it again at the end, and might never succeed.
 HELD_S = 2.0
-#: Number of connections that a process keeps open, and maximum number of its connections.
+#: Maximum number of idle connections of a process, and of all its connections.
 IDLE_CONNECTIONS, MOST = 8, 32
-#: Idle seconds after which a connection is tested, which takes a round trip. Connections that the
-#: server has closed are detected without a test.
+#: Idle seconds after which a connection is tested by a round trip. Connections closed by the server
+#: are detected without a test.
 UNTRIED_S = 1.0
-#: Seconds after which a connection is replaced, so that new servers get their share.
+#: Age in seconds at which a connection is replaced, to spread connections over new servers.
 _OLD_S = 1800
-#: Defaults of libpq options, with which an unreachable server is detected within ten seconds.
+#: Default libpq options, which detect an unreachable server within ten seconds.
 _CONNECT = {
     "connect_timeout": "3",
     "application_name": "sceneprint",
@@ -92,14 +92,14 @@ _CONNECT = {
 #: Oldest supported version of PostgreSQL.
 _OLDEST = 14
 _WARNED, _USED = "sceneprint_warned", "sceneprint_used"
-#: Option of a connection whose single statement is a complete transaction.
+#: Connection option: the transaction is a single statement.
 SINGLE = "sceneprint_single"
-#: Option of a message with several statements, the last of which returns the rows.
+#: Connection option: the message has several statements, of which the last returns rows.
 _MESSAGE = "sceneprint_message"
 
 
 def open_postgres(url: URL) -> Engine:
-    """Return an engine whose connections are configured; none is open yet."""
+    """Create an engine with configured connections; do not connect yet."""
     engine = create_engine(
         url,
         connect_args=connect_options(url),
@@ -122,7 +122,7 @@ def open_postgres(url: URL) -> Engine:
 
 
 def connect_options(url: URL) -> dict[str, str]:
-    """Return the libpq options that a URL does not set."""
+    """Return the default libpq options that a URL does not override."""
     return {name: value for name, value in _CONNECT.items() if name not in url.query}
 
 
@@ -166,7 +166,7 @@ def configure(connection: Any, _record: object = None) -> None:
 
 
 def timeline_of(connection: Any) -> str | None:
-    """Return the timeline of the server of a psycopg connection; None for a standby."""
+    """Return the WAL timeline of the server of a psycopg connection; None for a standby."""
     before, connection.autocommit = connection.autocommit, True
     row = connection.execute(
         "SELECT CASE WHEN pg_is_in_recovery() THEN NULL"
@@ -178,10 +178,9 @@ def timeline_of(connection: Any) -> str | None:
 
 @cache
 def _texts() -> type[Any]:
-    """Return the dumper of texts, which replaces NUL, since PostgreSQL cannot store it.
+    """Return a psycopg dumper that replaces NUL characters, which PostgreSQL cannot store.
 
-    The API refuses NUL in stored texts, but unchecked texts, such as those of the audit log, may
-    contain it.
+    The API refuses NUL in most texts, but not in unvalidated texts such as those of the audit log.
     """
     from psycopg.types.string import StrDumperUnknown
 
@@ -189,14 +188,14 @@ def _texts() -> type[Any]:
         """Dumper that replaces NUL characters in strings."""
 
         def dump(self, obj: str) -> Any:
-            """As bytes."""
+            """Encode a text as bytes."""
             return super().dump(obj.replace("\0", "\ufffd") if "\0" in obj else obj)
 
     return Texts
 
 
 def allow(connection: Connection, seconds: float) -> None:
-    """Set the time limits of this transaction's statements and pauses, seconds; 0 for no limit."""
+    """Set the time limit of statements and idle times in this transaction, seconds; 0: no limit."""
     if connection.dialect.name == "postgresql":
         for name in ("statement_timeout", "idle_in_transaction_session_timeout"):
             connection.execute(
@@ -206,17 +205,16 @@ def allow(connection: Connection, seconds: float) -> None:
 
 
 def begin(connection: Connection, *statements: str) -> Any:
-    """Begin a transaction in one message with its first statements, which see earlier commits.
+    """Begin a transaction and execute its first statements in a single message.
 
     Parameters
     ----------
-    connection : connection that commits each statement immediately (`isolation_level`), because a
-        separate BEGIN would take a round trip
+    connection : connection in autocommit mode, so that BEGIN needs no separate round trip
     statements : statements without parameters
 
     Returns
     -------
-    row : first row of the last statement; None if there is none
+    row : first row of the last statement; None without rows
     """
     message = "; ".join(("BEGIN", *statements))
     answer = connection.exec_driver_sql(message, execution_options={_MESSAGE: True})
@@ -224,21 +222,21 @@ def begin(connection: Connection, *statements: str) -> Any:
 
 
 class MapsInUse(Exception):
-    """Error if another transaction uses a map for too long; nothing was written."""
+    """Error if another transaction locks a map for too long; nothing was written."""
 
 
 @dataclass(eq=False)
 class SingleStatement:
-    """Transaction of one statement that waits for its turn, executes and commits in one round trip.
+    """A transaction of one statement: wait for a turn, execution and commit in one round trip.
 
-    Other writers of its maps therefore do not wait for a distant client. The statement sees the
+    Other writers therefore do not wait for the latency of this client. The statement sees all
     commits before its turn.
 
     Parameters
     ----------
     wait_s : maximum seconds to wait for the turn
-    maps_wait_s : maximum seconds to wait for each map afterwards; default: `wait_s`
-    schema : last known schema, which is checked; None skips the check
+    maps_wait_s : maximum seconds to wait for each map; default: `wait_s`
+    schema : last known schema, to be checked; None skips the check
     executed : whether the statement has been sent
     """
 
@@ -249,7 +247,7 @@ class SingleStatement:
     executed: bool = False
 
     def execute(self, cursor: Any, statement: str, parameters: Any) -> None:
-        """Execute the statement on a psycopg cursor whose connection commits each statement.
+        """Execute the statement on a psycopg cursor in autocommit mode.
 
         Raises
         ------
@@ -260,18 +258,18 @@ class SingleStatement:
         import psycopg
 
         if self.executed:
-            raise ValueError("a transaction of a single statement has a second one")
+            raise ValueError("a single-statement transaction has a second statement")
         self.executed = True
         if self.schema is not None and self.schema.current is None:
             self.schema.read(cursor.connection)
         sent = None if self.schema is None else self.schema.current
         try:
             self._send(cursor, statement, parameters)
-        except psycopg.errors.DivisionByZero:  # nothing was written
+        except psycopg.errors.DivisionByZero:  # the schema has changed, see _MAPS_AND_SCHEMA
             if self.schema is None:
                 raise
             self.schema.read(cursor.connection)
-            if self.schema.current == sent:  # another thread may have read the new schema already
+            if self.schema.current == sent:  # not yet read by another thread
                 raise
             self._send(cursor, statement, parameters)
 
@@ -279,15 +277,15 @@ class SingleStatement:
         import psycopg
 
         connection = cursor.connection
-        # the order prevents deadlocks
+        # sort, to prevent deadlocks
         locks = sorted({number & LOCK_BITS for number in self.map_numbers})
         maps_wait_s = self.wait_s if self.maps_wait_s is None else self.maps_wait_s
         turn = connection.cursor()
         try:
             # a pipeline without BEGIN is a single transaction
             with connection.pipeline():
-                # the time limit of statements would interrupt a commit that waits for its standby,
-                # and acknowledge it although the standby may not have it
+                # no statement limit: it would interrupt the wait of a commit for its standby, and
+                # the commit would be acknowledged although the standby may not have it
                 turn.execute(
                     "SELECT set_config('statement_timeout', '0', true),"
                     " set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s),"
@@ -308,10 +306,10 @@ class SingleStatement:
 
 #: Query of the schema of a store, and of the oldest revision whose processes may write to it.
 SCHEMA = "SELECT version_num, least_revision FROM alembic_version, schema_range"
-#: Query that locks maps, one after the other.
+#: Query that locks maps in the order of their numbers.
 _MAPS, _NUMBERS = "SELECT pg_advisory_xact_lock(%s, number)", "FROM unnest(%s::integer[]) AS number"
-#: Query that also divides by zero, and so aborts the transaction, if the schema has changed. The
-#: schema cannot change while this process has its turn.
+#: Query that also divides by zero if the schema has changed, which aborts the transaction. During
+#: the turn of this process, the schema cannot change.
 _MAPS_AND_SCHEMA = (
     f"{_MAPS}, (SELECT 1 / count(*) FROM alembic_version, schema_range"
     f" WHERE version_num = %s AND least_revision = %s) {_NUMBERS}"
@@ -319,7 +317,7 @@ _MAPS_AND_SCHEMA = (
 
 
 class KnownSchema:
-    """Schema of a store that this process read last.
+    """The schema of a store, as last read by this process.
 
     Parameters
     ----------
@@ -338,7 +336,7 @@ class KnownSchema:
 
 
 def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool:
-    """Execute a statement with the option `_MESSAGE` or SINGLE, and return whether it has one."""
+    """Execute a statement that has the option `_MESSAGE` or SINGLE; return whether it has."""
     if _MESSAGE in context.execution_options:
         cursor.execute(statement)
         while cursor.nextset():
@@ -354,21 +352,19 @@ def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool
 def _refuse_single(_cursor: Any, _statement: str, *others: Any) -> None:
     """Raise ValueError, since SINGLE requires a statement with one set of parameters."""
     if others[-1].execution_options.get(SINGLE) is not None:
-        raise ValueError("a transaction of a single statement requires one set of parameters")
+        raise ValueError("a single-statement transaction requires one set of parameters")
 
 
 def take_turn(
     connection: Connection, wait_s: float, query: str | None = None, map_number: int | None = None
 ) -> Any:
-    """Begin a transaction and wait for a writer's turn in one message.
-
-    Other writers wait until the commit.
+    """Begin a transaction, and wait for a turn to write, in one message.
 
     Parameters
     ----------
     wait_s : maximum seconds to wait
-    query : query of one row, which is executed in the turn
-    map_number : number of the map, if the transaction writes to a single map
+    query : query of one row, executed in the turn
+    map_number : number of the only map that the transaction writes to; None for all maps
 
     Returns
     -------
@@ -384,7 +380,7 @@ def take_turn(
     if wait_s == BUSY_S:
         message.append(turn)
     else:
-        # a migration waits longer than BUSY_S, and its later locks have no time limit
+        # a migration waits longer than BUSY_S, and then has no time limit for locks
         after = "0" if wait_s > BUSY_S else _milliseconds(BUSY_S)
         message += [f"SET LOCAL lock_timeout = {_milliseconds(wait_s)}", turn]
         message.append(f"SET LOCAL lock_timeout = {after}")
@@ -395,16 +391,16 @@ def take_turn(
 
 
 def require_synchronous(connection: Connection) -> None:
-    """Check that the server waited for its standby at the commit.
+    """Check that the commit waited for a synchronous standby.
 
     Raises
     ------
-    StoreAway : If an operator ended the wait, which the server reports only as a warning.
+    StoreAway : If the wait was interrupted, which the server reports only as a warning.
     """
     if _WARNED in connection.info:
         raise StoreAway(
             f"{database_label(connection.engine.url)}: An operator ended the wait for a standby. "
-            "The commit is stored, but will be lost if the server fails before a standby has it. "
+            "The commit is stored, but is lost if the server fails before a standby receives it. "
             "Restart the standby, or remove it from synchronous_standby_names."
         )
 
@@ -414,12 +410,12 @@ def _note_use(_connection: Any, record: Any) -> None:
 
 
 def _require_alive(dialect: Dialect, connection: Any, record: Any, _proxy: object) -> None:
-    """Test a connection that was idle, or has input from the server, such as a shutdown message.
+    """Test a connection after idle time, or if it has input, such as a shutdown message.
 
-    If the connection is broken, all pooled connections are dropped.
+    If it is broken, drop all pooled connections.
     """
     used = record.info.get(_USED)
-    if used is None:  # a new connection
+    if used is None:
         return
     if time.monotonic() - used < UNTRIED_S and not _has_input(connection):
         return
@@ -432,14 +428,14 @@ def _require_alive(dialect: Dialect, connection: Any, record: Any, _proxy: objec
 
 
 def _has_input(connection: Any) -> bool:
-    """Return whether the server has sent input that was not requested."""
+    """Return whether the server has sent unrequested input."""
     poll = select.poll()
     poll.register(connection.fileno(), select.POLLIN)
     return bool(poll.poll(0))
 
 
 def _watch_commits(connection: Any, record: Any) -> None:
-    """Record warnings, which a COMMIT causes only if the wait for its standby ended early."""
+    """Record warnings: a COMMIT causes them only if the wait for its standby was interrupted."""
     if not hasattr(connection, "add_notice_handler"):
         return
 
@@ -451,14 +447,14 @@ def _watch_commits(connection: Any, record: Any) -> None:
 
 
 def forget_warnings(connection: Connection) -> None:
-    """Discard the warnings of the statements before a COMMIT."""
+    """Discard the warnings of statements before a COMMIT."""
     connection.info.pop(_WARNED, None)
 
 
 def _drop_connections(context: ExceptionContext) -> None:
-    """Drop all connections if the server is a standby, or prepared statements are outdated.
+    """Drop all connections after errors of a standby or of outdated prepared statements.
 
-    A new connection may lead to the primary.
+    New connections may reach the primary.
     """
     error = context.original_exception
     if getattr(error, "sqlstate", None) in ("25006", "26000") or is_of_old_plan(error):

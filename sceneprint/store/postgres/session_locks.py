@@ -1,6 +1,6 @@
-"""Session locks for the blobs of a fleet, and for processes that build an index.
+"""Session locks of PostgreSQL for the blobs of a fleet and for index builds.
 
-The server releases a session lock when the connection ends, even if the process is killed.
+The server releases a session lock when the connection ends, for example with its process.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 
 #: Second number of the lock of blobs, after `LOCKS` (see `blobs/`).
 BLOBS = 2
-#: First number of the locks of index builds; the second is the map's.
+#: First number of the locks of index builds; the second is derived from the map number.
 INDEX_LOCKS = 0x5CE80
 
 log = logging.getLogger(__name__)
 
-#: Sequence that counts the starts and ends of removals, so it is odd during a removal. Sequences
+#: Sequence that counts starts and ends of removals, so that it is odd during a removal. Sequences
 #: are not rolled back, so removals of dead processes count too.
 _COUNTER = "sceneprint_removals"
 _MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
 _READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
-#: Query that increments the sequence. `nextval` may skip up to 32 numbers after a crash, which
-#: would confuse odd and even numbers. Only the holder of the lock increments the sequence.
+#: Query that increments the sequence; only the holder of the lock uses it. After a crash, `nextval`
+#: could skip up to 32 numbers, and so confuse odd and even numbers.
 _NEXT = (
     f"SELECT setval('{_COUNTER}', CASE WHEN is_called THEN last_value ELSE 0 END + 1)"
     f" FROM {_COUNTER}"
@@ -44,28 +44,28 @@ _NEXT = (
 _SHARE = "SELECT pg_advisory_lock_shared(%s, %s)"
 _TAKE = "SELECT pg_try_advisory_lock(%s, %s)"
 _GIVE = "SELECT pg_advisory_unlock(%s, %s)"
-#: Query of the seconds since a blob was doomed; infinity if the blob is not doomed.
+#: Query of the seconds since a blob was doomed; infinity for other blobs.
 _DOOMED = (
     "SELECT coalesce(extract(epoch FROM clock_timestamp()) - max(at), 'infinity')::float"
     " FROM doomed WHERE blob = %s"
 )
-#: Query that waits for a lock, which is released as soon as it is granted.
+#: Query that waits until a lock is free.
 _WAIT = "SELECT set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shared(%s, %s)"
 
 
 class SessionLocks(Locks):
-    """Lock for all hosts that share a PostgreSQL database.
+    """Lock of the blobs for all hosts that share a PostgreSQL database.
 
-    The lock does not work with a pooler that assigns one connection to several clients. Connect
-    directly to the server, or configure the pooler to assign whole sessions.
+    It does not work with a pooler that shares connections among clients. Connect to the server
+    directly, or configure the pooler for session pooling.
     """
 
     def __init__(self, database: Database) -> None:
         self._database = database
-        self._alone = threading.Lock()  # held by the thread that removes blobs
+        self._alone = threading.Lock()  # lock of the thread that removes blobs
         self._remover, self._reader = _Connection(database), _Connection(database)
         self._uncertain = False
-        # last odd number of `_COUNTER`, and the time at which this process read it first
+        # last odd number of `_COUNTER`, and time of its first read by this process
         self._odd: tuple[int, float] | None = None
 
     def close(self) -> None:
@@ -75,8 +75,8 @@ class SessionLocks(Locks):
 
     @contextmanager
     def block_removals(self) -> Iterator[None]:
-        """See `Locks`. Raise UnusableStore if the lock cannot be taken, or was lost meanwhile."""
-        # a session does not block itself, so removals use a different connection
+        """See `Locks`. Raise UnusableStore if the lock cannot be acquired, or is lost."""
+        # use a separate connection, since a session does not block itself
         connection = self._database.driver_connection()
         try:
             with self._database.explained():
@@ -94,7 +94,7 @@ class SessionLocks(Locks):
         except psycopg.Error as error:
             raise UnusableStore(
                 f"{self._database.shown}: The connection that prevented removals of blobs was "
-                "lost, and needed blobs may be missing. Run the command again."
+                "lost, so blobs may be missing. Run the command again."
             ) from error
 
     @contextmanager
@@ -114,7 +114,7 @@ class SessionLocks(Locks):
             self._alone.release()
 
     def mark_uncertain(self) -> None:
-        """See `Locks`. For LONGEST_S, no removal begins, and this one is not finished."""
+        """See `Locks`. For LONGEST_S seconds, no other removal begins."""
         self._uncertain = True
 
     @property
@@ -128,11 +128,11 @@ class SessionLocks(Locks):
         return number if number is not None and number % 2 == 0 else None
 
     def wait(self, digest: str | None, seconds: float) -> None:
-        """See `Locks`. A dead process loses the lock, although the counter remains odd."""
-        # a blob that is removed after the turn is doomed until the end of the removal
+        """See `Locks`."""
+        # only doomed blobs are removed after a turn
         if digest is not None and self._reader.query(_DOOMED, digest) == math.inf:
             return
-        # other threads use the shared connection in `removals` in the meantime
+        # use a separate connection, since other threads use the shared one in `removals`
         connection = self._database.driver_connection()
         try:
             with self._database.explained():
@@ -140,7 +140,7 @@ class SessionLocks(Locks):
         finally:
             connection.close()
         if digest is not None and self.removals() is None:
-            # the removing process has lost its lock, so it is dead or disconnected, and its
+            # if the blob is still doomed, the removing process is dead or disconnected, but its
             # requests may still arrive
             age_s = self._reader.query(_DOOMED, digest)
             if age_s is None or age_s < LONGEST_S:
@@ -156,10 +156,10 @@ class SessionLocks(Locks):
         if not self._is_over(self._remover.query(_READ, same=True)):
             self._remover.close()
             return False
-        # a removal requires the counter, since writers of the same blobs would not notice it else
-        for _ in range(2):  # the number is already odd if a removing process has died
+        # count the removal, so that writers of the same blobs notice it
+        for _ in range(2):  # twice if the number is odd, since a removing process has died
             number = self._remover.query(_NEXT, same=True)
-            if number is None:  # the connection and the lock are lost
+            if number is None:  # connection and lock are lost
                 break
             if number % 2 == 1:
                 return True
@@ -167,10 +167,10 @@ class SessionLocks(Locks):
         return False
 
     def _is_over(self, number: int | None) -> bool:
-        """Return whether the former removal is finished.
+        """Return whether the previous removal is finished.
 
-        The number remains odd if the process died or was disconnected, or its requests failed,
-        because the requests may still be executed.
+        The number remains odd if its process died or was disconnected, or if its requests failed;
+        its requests may then still be executed.
         """
         if number is None:
             return False
@@ -184,7 +184,7 @@ class SessionLocks(Locks):
         if self._uncertain:  # leave the number odd
             self._remover.close()
             return
-        # on another connection, this would end the removal of the current holder of the lock
+        # only on the same connection: otherwise, this would end the removal of another process
         ended = self._remover.query(_NEXT, same=True) is not None
         if not ended or not self._remover.query(_GIVE, LOCKS, BLOBS, same=True):
             log.warning("blob lock lost")
@@ -193,13 +193,14 @@ class SessionLocks(Locks):
 
 @contextmanager
 def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], None] | None]:
-    """Hold the turn to build the index of a map for the fleet while a connection lasts.
+    """Acquire the right to build the index of a map for a fleet.
 
     On SQLite, the lock of the index folder suffices.
 
     Yields
     ------
-    check : function that raises UnusableStore if the turn was lost; None if another process has it
+    check : function that raises UnusableStore if the right was lost; None if another process has
+        the right
 
     Raises
     ------
@@ -218,7 +219,7 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
         except psycopg.Error as error:
             raise UnusableStore(
                 f"{database.shown}: The connection that prevented other processes from building "
-                "the same index was lost. The index will be built again."
+                "the same index was lost. A worker will build the index again."
             ) from error
 
     try:
@@ -231,13 +232,13 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
 
 
 class _Connection:
-    """Permanent connection, which is opened on demand and after a failure."""
+    """A permanent connection, opened on demand and again after a failure."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
         self._lock = threading.Lock()
         self._held: list[psycopg.Connection[Any]] = []  # at most one
-        # the driver issues a warning for open connections when they are collected
+        # close at collection, since the driver warns about open connections
         weakref.finalize(self, _close, self._held)
 
     def query(self, statement: str, *values: int | str, same: bool = False) -> Any:
@@ -260,7 +261,6 @@ class _Connection:
                 try:
                     return _one(connection, statement, values)
                 except psycopg.errors.UndefinedTable:
-                    # another process may create the sequence at the same time
                     with suppress(psycopg.errors.UniqueViolation, psycopg.errors.DuplicateTable):
                         connection.execute(_MAKE)
                     return _one(connection, statement, values)
