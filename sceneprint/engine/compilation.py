@@ -57,7 +57,6 @@ def compile_kernels(
     Parameters
     ----------
     cache_dir : folder of pair tables, in which a table is created
-    parts : parts to compile, from `ALL`
     say : function that receives lines of progress
     stop : event that cancels the compilation
     """

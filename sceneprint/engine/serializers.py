@@ -107,7 +107,6 @@ def query_sensor(frame: FrameName | None, kind: Kind, maps: Sequence[str]) -> st
     Parameters
     ----------
     frame : stored frame that is queried; None for an upload
-    kind : kind of the query frame
     maps : names of the searched maps
     """
     alone = frame is not None and list(maps) == [frame.map]

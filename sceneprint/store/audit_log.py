@@ -130,7 +130,6 @@ def surplus_lines(
     ----------
     before : time before which lines are expired, seconds since 1970. Removal stops at the first
         younger line, in case that a clock was set back
-    limit : maximum number of returned lines
     most_lines : maximum number of lines per tenant
     """
     oldest = connection.execute(

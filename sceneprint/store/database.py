@@ -261,7 +261,6 @@ class Database:
 
     Parameters
     ----------
-    engine : SQLAlchemy engine
     sealed : database file if it is read-only, else None
     """
 

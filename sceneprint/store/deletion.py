@@ -246,7 +246,6 @@ def remove_in_blocks(
 
     Parameters
     ----------
-    database : database of the rows
     find : function that returns up to a number of rows to remove. It is called outside of write
         transactions, because it usually returns no rows
     remove : function that removes the rows

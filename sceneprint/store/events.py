@@ -63,7 +63,6 @@ def record_event(
     kind : event kind, from `KINDS` of the API
     map_name, frame_id, job_id : changed objects
     details : data only for the audit line
-    data : data of the event, depending on its kind
     """
     record_events(connection, [event_values(kind, map_name, frame_id, job_id, data)], details)
 

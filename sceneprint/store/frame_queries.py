@@ -292,7 +292,6 @@ class RunSummary:
     posed : number of frames with a pose
     first, last : first and last capture time, seconds since 1970
     parents : number of frames with a pose, by parent frame
-    tags : number of frames by tag
     """
 
     robot: str | None
@@ -449,7 +448,6 @@ class PathFrame:
     Parameters
     ----------
     robot, session, captured_at, name, sequence : metadata; None if unknown
-    parent : parent frame of the pose
     pose : T_parent_sensor (4, 4); None if unknown
     is_cloud : whether the frame is a point cloud
     """

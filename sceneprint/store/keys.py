@@ -242,7 +242,6 @@ class IdempotentRequest:
     Parameters
     ----------
     actor : name of the API key of the caller; "" without a key
-    key : `Idempotency-Key` of the request
     fingerprint : hash (64 digits) of route and content
     """
 

@@ -120,7 +120,6 @@ def join_parent(connection: Connection, map_number: int, join: ParentJoin, job_i
     Parameters
     ----------
     connection : writing transaction of the map
-    map_number : number of the map
     join : join of two roots
     job_id : id of the association that found the join
 

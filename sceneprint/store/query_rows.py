@@ -79,7 +79,6 @@ class NewQuery(_Query):
         pose
     confidence : confidence of that pose, or of the best alternative
     alternatives : number of other poses that the evidence supports
-    milliseconds : duration of the query
     kind : kind of the query frame; None if it was not decoded
     frame_map, frame_id : map and id of a stored query frame; None for an upload
     key_id : id of the key of the request

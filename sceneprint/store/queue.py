@@ -686,7 +686,6 @@ class JobFile:
     ----------
     name : unique name within the job, such as mesh.ply
     blob : digest of the content, whose blob must exist
-    bytes : size of the file
     """
 
     name: str

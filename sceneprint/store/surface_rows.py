@@ -457,7 +457,6 @@ def forget_scale(
     Parameters
     ----------
     connection, map_number, parent : see `tiles_at`
-    place : place of the coarser tile
     factor : width of the coarser tile, as a multiple of that of the finest tiles
     """
     c = surface_tiles.c

@@ -63,7 +63,6 @@ class EventSlice(NamedTuple):
 
     Parameters
     ----------
-    events : events, oldest first
     place : number of the last event that was read, of any map
     seen : number of the last event up to `place` that the reader may read
     """
@@ -78,8 +77,6 @@ def begin(database: Database, wanted: EventFilter, minimum: int, after: int | No
 
     Parameters
     ----------
-    database : database of the events
-    wanted : events that the reader may read and has requested
     minimum : number of newest events per map that are never removed
     after : number of the last event that the reader has received; None starts with new events
     """
@@ -160,7 +157,6 @@ class Events:
 
         Parameters
         ----------
-        wanted : filter, see the method `wanted`
         after : id of the event before the first event of the page
         cursor : `next_cursor` of the previous page
         limit : maximum number of events

@@ -237,7 +237,6 @@ class Figures:
 
     Parameters
     ----------
-    stats : statistics
     began : number of worker starts in the last hour
     events : number of the newest event
     waiting : number of queued jobs by tenant
@@ -256,10 +255,8 @@ class StoreCounts:
     Parameters
     ----------
     frames, jobs : number of frames and of jobs, by state
-    indexes : result of `index_states`
     sizes : result of `sizes`
     at : time of the counts, seconds since 1970
-    seconds : duration of the computation
     """
 
     frames: Mapping[str, int]

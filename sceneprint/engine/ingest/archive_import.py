@@ -203,12 +203,7 @@ _MOST_PIXELS = 640
 
 
 class _FileBytes:
-    """Filter that checks the format of a received map file or recording.
-
-    Parameters
-    ----------
-    is_map : whether the file is a map, instead of a recording
-    """
+    """Filter that checks the format of a received map file or recording."""
 
     def __init__(self, name: str, *, is_map: bool) -> None:
         self._name, self._is_map, self._head, self._size = name, is_map, b"", 0

@@ -38,7 +38,6 @@ class Read:
 
     Parameters
     ----------
-    frame : frame for the geometry
     cloud : stored description of a cloud: file format, viewpoint, units per metre, number of
         points, and a note on corrections; None for a depth image
     base : name of the base frame of the robot, and T_base_sensor (4, 4); None if unknown
@@ -202,7 +201,6 @@ def base_of(
 
     Parameters
     ----------
-    transform : T_base_sensor in the request
     viewpoint : viewpoint of a cloud. Without `transform`, the coordinate frame of the cloud serves
         as the base frame, unless the viewpoint is its origin
 

@@ -77,7 +77,6 @@ class StoredSurface:
 
     Parameters
     ----------
-    surface : decoded surface
     poses, held_out : (V, 4, 4) and (H, 4, 4) T_map_sensor of the views to add, and of the views
         to test localisation with; empty before the phase `choose`
     floor : height of the floor along `up`, metres
@@ -122,7 +121,6 @@ class _Views:
     Parameters
     ----------
     stored : surface and viewpoints
-    parameters : sensor parameters
     """
 
     def __init__(
@@ -184,7 +182,6 @@ class MapImporter:
 
     Parameters
     ----------
-    uploads : store of the views
     queries : queries that test the localisation of held-out views
     """
 
@@ -457,7 +454,6 @@ def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
     Parameters
     ----------
     stored : surface with the poses of the test views
-    outcomes : outcome of each test view
 
     Returns
     -------

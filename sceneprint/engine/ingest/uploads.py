@@ -213,7 +213,6 @@ class Upload:
     Parameters
     ----------
     data : file of a depth image (PNG or NPY), or of a point cloud (see `sceneprint.formats.points`)
-    meta : metadata
     priority : priority of the job; ignored if the frame exists
     if_novel : minimum distance from the nearest frame of the map, as a share of the mean distance
         between unrelated frames; None accepts any distance. If the frame exists and is not signed
@@ -341,7 +340,6 @@ class Uploads:
 
         Parameters
         ----------
-        map_name, uploads, once : see `add`
         fence : function that is called first in the transaction; if it raises a
             `SceneprintError`, nothing is stored
 
@@ -431,7 +429,6 @@ class Uploads:
         ----------
         row : map
         ready : decoded uploads by index
-        results, once, fence : see `add_all`
 
         Returns
         -------

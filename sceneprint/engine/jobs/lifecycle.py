@@ -36,13 +36,7 @@ LEFT_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """A claimed job that signs a frame.
-
-    Parameters
-    ----------
-    job : row of the job at the claim
-    frame, map : rows of its frame and map
-    """
+    """A claimed job that signs a frame."""
 
     job: JobRow
     frame: FrameRow

@@ -88,7 +88,6 @@ def run(
 
     Parameters
     ----------
-    work : claimed job
     lease_s : duration of the lease after each renewal, seconds
     longest_s : seconds after which the lease is no longer renewed, in case that signing hangs
     broke : function to call after an unexpected error, which may have damaged this process

@@ -54,7 +54,6 @@ class LongJob:
 
     Parameters
     ----------
-    job : row of the job at the claim
     map : map of the job; None for a job without a map
     """
 
@@ -87,7 +86,6 @@ class SliceResult:
     ----------
     over : whether this slice is the last
     progress : `done` and `total` for users, and the state that the next slice needs
-    items : new items of the job
     files : new files of the job, whose blobs are stored
     result : result of the job; only from the last slice
     drop : names of files to remove from the job

@@ -393,7 +393,6 @@ class FrameFiles:
 
         Parameters
         ----------
-        map_name, frame_id : map and id of an indexed frame
         within : coordinate frame of the points: the sensor, the parent frame, or the robot base
 
         Raises

@@ -479,7 +479,6 @@ class Catalogue:
 
         Parameters
         ----------
-        name : name of a preset, or id or label of a model
         may_read : function that returns whether the caller may read a map. Models of other maps are
             hidden; None hides no model
 

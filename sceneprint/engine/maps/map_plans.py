@@ -233,7 +233,6 @@ def surface_picture(
 
     Parameters
     ----------
-    plan : frame of the image
     axes : (2, 3) axes of the plan
     points : points (N, 3) of each tile, metres
     cell_m : cell width of the surface, metres

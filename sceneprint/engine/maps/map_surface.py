@@ -137,7 +137,6 @@ class MapSurfaces:
         Parameters
         ----------
         parent : parent frame; None selects the parent frame with the most frames
-        level : level of the tiles; 0 is the finest
 
         Raises
         ------
@@ -252,7 +251,6 @@ class MapSurfaces:
 
         Parameters
         ----------
-        map_name, parent, cursor, limit : see `sightings`
         low, high : minimum and maximum x, y, z, metres
         """
         beyond = self._store.seals.moment("frame", cursor)

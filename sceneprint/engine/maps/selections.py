@@ -47,7 +47,6 @@ def delete_selection(
 
     Parameters
     ----------
-    selection : frames to delete
     tombstones : handler of the deletion
     seconds : time after which no further block is started
 
@@ -201,8 +200,6 @@ def edit_session(
 
     Parameters
     ----------
-    store, map_name, session, robot, seconds : see `delete_session`
-    edit : changes
     after : id of the last frame that an earlier call processed; this call continues after it
 
     Returns

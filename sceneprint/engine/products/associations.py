@@ -313,8 +313,6 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
         Parameters
         ----------
-        map_name, job_id, cursor, limit : see `page_of_items`
-        min_overlap : minimum overlap of the edges
         consistent : True selects supported edges, False outvoted edges, None all edges
         """
 

@@ -42,10 +42,8 @@ def finish_association(
 
     Parameters
     ----------
-    items : items of all edges
     source, target : frame numbers of both runs, in chronological order
     stops : existing frames by number
-    request : options of the association
     scale : scale of lengths of the model, relative to a model for rooms
 
     Returns

@@ -197,7 +197,6 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
 
         Parameters
         ----------
-        map_name, job_id, cursor, limit : see `page_of_items`
         outcome : outcome of the frames; None selects all frames
         """
 

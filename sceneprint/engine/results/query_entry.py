@@ -34,8 +34,6 @@ class StoredAnswer:
 
     Parameters
     ----------
-    answer, query : answer, and options of the query
-    model_id : id of the model that signed the query
     vector : (D,) signature of the query
     geometry : encoded geometry of the query; None without validation
     ranked : frame numbers of R, in its order

@@ -85,7 +85,6 @@ class StoredPair:
 
     Parameters
     ----------
-    stored, match : answer and match
     sensor : name of the sensor frame of the match
     blob : digest of the geometry of the match
     row, number : map and number of the matched frame

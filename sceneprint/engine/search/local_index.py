@@ -117,7 +117,6 @@ class AppendBuffer:
     ----------
     length : length of a signature in bytes
     folder : folder for a mapped file; the fallback is the temporary folder of the system
-    capacity : initial capacity in signatures
     """
 
     def __init__(self, length: int, folder: Path, capacity: int = 64) -> None:

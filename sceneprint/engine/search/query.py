@@ -67,7 +67,6 @@ def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]
 
     Parameters
     ----------
-    maps : names of the maps
     ask : function that answers the query with the model of the maps
 
     Raises
@@ -127,7 +126,6 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     Parameters
     ----------
-    a, b : frames
     how : options of the comparison; its frame names are ignored
 
     Raises
@@ -230,7 +228,6 @@ class Queries:
         Parameters
         ----------
         maps : distinct names of the maps
-        query : options of the query
         since : time of the request by `time.perf_counter`; None selects the current time
         sent : request for the query log; None does not log the query
 
@@ -260,7 +257,6 @@ class Queries:
         frames : uploads and metadata in chronological order, with odometry as poses in a common
             parent frame
         query : options for each frame
-        since, sent : see `upload`
 
         Raises
         ------

@@ -132,7 +132,6 @@ class PreparedQuery:
     home : map of the stored frame
     base : name of the base frame of the robot, and T_base_query (4, 4); None if unknown
     artifact : encoded `geometry`
-    kind : kind of the frame
     up : (3,) unit up vector in the sensor frame; None if unknown
     pose : (4, 4) T_parent_sensor of an upload, the odometry of a sequence
     """
@@ -332,7 +331,6 @@ class Searched:
 
     Parameters
     ----------
-    parts : searches of the maps
     hits : results of `parts`
     ranking : R, of frame numbers
     owners : (r,) index into `parts` for each frame of R

@@ -110,7 +110,6 @@ def validated(
     known : validations to reuse, by frame number
     k : number of accepted matches after which validation stops
     guided : whether earlier matches predict transforms of later candidates
-    retry : see `associate`
     """
     if geometry is None:
         return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
@@ -181,7 +180,6 @@ def placed(
     ----------
     geometries : loaded geometries of candidates, by frame number
     rows : rows of the candidates, by frame number
-    query_frames : frames of the query with their matches
     prior : prior pose of the robot; its parent is a key of `parent_key`
     query : options of the query; with validation options, a pose requires the vote of a match, and
         the mode `paper` ignores the other frames of the map

@@ -118,7 +118,6 @@ class Upkeep:
     ----------
     settings : maximum number of unindexed frames, interval of verification, and lifetime of rows of
         deleted frames
-    place : storage of the indexes
     """
 
     def __init__(

@@ -162,7 +162,6 @@ class IncomingBlob:
 
     Parameters
     ----------
-    file : file to write to
     what : prefix of error messages
     keep : function that stores the file durably under its digest
     """

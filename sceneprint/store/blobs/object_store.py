@@ -88,7 +88,6 @@ class BucketOwner:
 
         Parameters
         ----------
-        owner : name of the store
         before : name of the empty database that receives the store. If a service has claimed the
             prefix for this database, the claim is replaced
         """
