@@ -121,7 +121,7 @@ def test_pages_go_from_the_newest_to_the_oldest(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add_lines(store, *[{"at": float(i), "actor": ""} for i in range(5)])
-    log = Audit(store, kept_days=2.0)
+    log = Audit(store, days=2.0)
     first = log.page(AuditFilter(), limit=3)
     rest = log.page(AuditFilter(), first.next_cursor, limit=3)
     assert [one.number for one in (*first.items, *rest.items)] == [5, 4, 3, 2, 1]
@@ -134,11 +134,11 @@ def test_pages_go_from_the_newest_to_the_oldest(
 
 def test_old_lines_are_removed(store: Store) -> None:
     add_lines(store, *[{"at": DAY_S * day} for day in (1, 2, 9, 3)])
-    log = Audit(store, kept_days=2.0)
+    log = Audit(store, days=2.0)
     assert log.tidy(now=DAY_S * 4.5) == 2  # the last stays behind a younger one
     assert log.tidy(now=DAY_S * 99) == 0  # not before an hour is over
     assert [one.at for one in lines_of(store)] == [DAY_S * 9, DAY_S * 3]
-    assert Audit(store, kept_days=2.0).tidy(now=DAY_S * 99) == 2
+    assert Audit(store, days=2.0).tidy(now=DAY_S * 99) == 2
     add_lines(store, {})
     assert [one.number for one in lines_of(store)] == [5]  # a number is never given again
 
