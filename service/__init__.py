@@ -1,1 +1,1 @@
-"""HTTP service."""
+"""The HTTP service."""

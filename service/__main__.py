@@ -15,9 +15,9 @@ from service.server import run
 
 
 def main() -> int:
-    """Serve until a signal ends the process. Errors are printed in one line, with exit code 2."""
+    """Serve until a signal ends the process; print errors in one line, and return 2 for them."""
     log_as_json()
-    # uvicorn handles both signals while it runs, and raises them again when it stops.
+    # uvicorn handles both signals while it runs, and raises them again after it stops.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         read_secret_files(os.environ)
@@ -26,7 +26,7 @@ def main() -> int:
         print(f"service: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
         return 2
     except KeyboardInterrupt:
-        pass  # the normal end
+        pass
     return 0
 
 

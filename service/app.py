@@ -70,7 +70,7 @@ from service.routes import (
 )
 from service.running_service import Service
 
-# The OpenAPI document: that of FastAPI, with the records that routes parse themselves.
+# The OpenAPI document of FastAPI, supplemented by the records that routes parse themselves.
 
 PARSED: tuple[type[BaseModel], ...] = (
     FrameMeta, FrameEdit, SessionEdit, FrameSelection, FramesEdit, KeepOptions, MapEdit, Filter,
@@ -80,11 +80,11 @@ PARSED: tuple[type[BaseModel], ...] = (
 
 
 def openapi_of(app: FastAPI) -> dict[str, Any]:
-    """Return the OpenAPI document of an application, which is built once."""
+    """Return the OpenAPI document of an application; it is built in the first call."""
     if app.openapi_schema is None:
         for route in app.routes:
             if isinstance(route, APIRoute):
-                route.operation_id = route.name  # the function that a generated client has for it
+                route.operation_id = route.name  # name of the function in generated clients
         document = get_openapi(
             title=app.title, version=app.version, description=app.description, routes=app.routes
         )
@@ -136,7 +136,7 @@ async def warm_up(context: Context) -> AsyncIterator[None]:
         yield
     finally:
         stop.set()
-        await task  # the task uses the store, which closes next
+        await task  # before the store closes
 
 
 def _warm(context: Context, stop: threading.Event) -> None:
@@ -149,13 +149,13 @@ def _warm(context: Context, stop: threading.Event) -> None:
     context.store.decoders.start()
     try:
         context.signers.warm()
-    except SceneprintError as error:  # later requests load the models, or report the error
+    except SceneprintError as error:  # later requests retry
         log.info("store unreachable", extra={"error": str(error)})
 
 
 @asynccontextmanager
 async def housekeeping(service: Service) -> AsyncIterator[None]:
-    """Write metrics and uses of keys regularly, and drop cached data of deleted frames."""
+    """Write metrics and uses of keys at intervals, and drop cached data of deleted frames."""
     database, sampler = service.context.store.database, service.metrics.sampler
     purging = MemoryPurging(service.context)
 
@@ -182,18 +182,18 @@ async def housekeeping(service: Service) -> AsyncIterator[None]:
 
 
 def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
-    """Return the service as an ASGI application; `warm` loads models and kernels before the first
-    request.
+    """Return the service as an ASGI application; with `warm`, it loads models and kernels at its
+    start.
     """
     figures = Metrics()
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        # The database server was reachable when the process started, but may have stopped since.
+        # Wait for the database server, which may have stopped since the process started.
         opened = open_context(settings, PATIENCE_S)
         async with contextmanager_in_threadpool(opened) as context:
             service = Service(context, figures)
-            # Above the limit of one tenant, so that other tenants always find a free thread.
+            # More threads than one tenant may use, so that some are free for other tenants.
             to_thread.current_default_thread_limiter().total_tokens += service.places
             app.state.service, app.state.refusals = service, RefusalFilter()
             loading = warm_up(context) if warm else nullcontext()
@@ -201,13 +201,13 @@ def create_app(settings: Settings, *, warm: bool = True) -> FastAPI:
                 yield
             service.feed.close()
 
-    # A path with an extra slash is a 404: a redirection would send the client, with its key, to the
+    # A path with an extra slash returns 404: a redirect would send the client, with its key, to the
     # address in Host, and behind a proxy to an address without TLS.
     app = FastAPI(
         title="sceneprint", version=__version__, description=DESCRIPTION, lifespan=lifespan,
         redirect_slashes=False, docs_url=None, redoc_url=None, openapi_url=None,
     )  # fmt: skip
-    for router in (*ROUTERS, admin.router):  # `include_router` would build every route again
+    for router in (*ROUTERS, admin.router):  # `include_router` would build all routes again
         app.router.routes.extend(router.routes)
     app.include_router(static_files.routes(lambda: openapi_of(app)))
     app.include_router(dashboard.routes(dashboard.files_in(dashboard.PAGES)))

@@ -3,9 +3,9 @@
     request  --authenticate-->  Caller, with the Service  --may_read | may_write-->  a map
     refused request  --record_refusal-->  a line of the audit log
 
-Dependencies that do not block run in the event loop, because a thread may become free only after a
-wait under load. A map that the caller cannot read gets the same response, word for word, as a map
-that does not exist.
+Dependencies that do not block run in the event loop, since under load they would wait for a thread.
+For a map that the caller cannot read, the response is the same, word for word, as for a map that
+does not exist.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ log = logging.getLogger(__name__)
 
 
 def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> bool:
-    """Return whether grants (scope by map name, `*` for all maps) include a scope for a map, by
-    default for all maps.
+    """Return whether grants include a scope for a map, by default for all maps. Grants are scopes
+    by map name; `*` stands for all maps.
     """
     least = SCOPES.index(scope)
     held = [grants[name] for name in (EVERY, map_name) if name in grants]
@@ -84,13 +84,13 @@ _bearer = HTTPBearer(auto_error=False, description="A key that `sceneprint keys`
 
 @dataclass(frozen=True)
 class Caller:
-    """Sender of a request, with the data of its key.
+    """The sender of a request, with the data of its key.
 
     Parameters
     ----------
     name : name of the key; "" if no key is required
-    grants : scope by name of a map, `*` for all
-    expires_at : expiry of the key, seconds since 1970; None if it does not expire
+    grants : scope by map name; `*` stands for all maps
+    expires_at : expiry of the key, seconds since 1970; None for no expiry
     key_id : id of the key; None if no key is required
     tenant : tenant of the key; NOBODY if no key is required
     created_at : creation time of the key, seconds since 1970; None if no key is required
@@ -104,12 +104,12 @@ class Caller:
     created_at: float | None = None
 
     def may(self, scope: Scope, map_name: str = EVERY) -> bool:
-        """Return whether the caller has a scope for a map, by default for all maps."""
+        """Return whether the caller has a scope for a map; default: for all maps."""
         return allows(self.grants, scope, map_name)
 
     def require(self, map_name: str, scope: Scope) -> None:
-        """Check that the caller may use a map in this scope. Raise UnknownMap if it cannot read
-        the map, and Forbidden if it may only read it.
+        """Check that the caller has a scope for a map. Raise UnknownMap if it cannot read the map,
+        and Forbidden if it can only read it.
         """
         if not self.may("read", map_name):
             raise unknown_map(map_name)
@@ -117,7 +117,7 @@ class Caller:
             raise _forbidden(self, scope, f"map {map_name!r:.80}")
 
     def require_new(self, map_name: str) -> None:
-        """Raise Forbidden if the caller cannot create a map of this name, existing or not."""
+        """Raise Forbidden if the caller may not create a map of this name."""
         if not self.may("admin", map_name):
             raise _forbidden(self, "admin", f"a map named {map_name!r:.80}")
 
@@ -127,8 +127,8 @@ class Caller:
             raise _forbidden(self, scope, "all maps")
 
     def require_job(self, job: Job, scope: Scope = "read") -> Job:
-        """Return the job if the caller may use it in this scope. Raise UnknownJob if it cannot see
-        the job, and Forbidden if it may only see it.
+        """Return a job for which the caller has a scope. Raise UnknownJob if it cannot read the
+        job, and Forbidden if it can only read it.
         """
         of = EVERY if job.map is None else job.map
         if not self.may("read" if job.map is not None else "admin", of):
@@ -149,8 +149,8 @@ class Caller:
 
 
 def require_readable(query_id: str, here: Service, caller: Caller) -> QueryRow:
-    """Return the row of a query. Raise UnknownQuery, with the same text, if its answer is not
-    stored or the caller cannot read all maps that it names.
+    """Return the row of a query. Raise UnknownQuery if its answer is not stored, or the caller
+    cannot read all its maps.
     """
     row = here.context.query_log.find_row(query_id)
     maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]
@@ -163,9 +163,9 @@ async def authenticate(
     request: Request, here: Here,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller:  # fmt: skip
-    """Return the caller of the key in the request. A key is checked even if none is required, so
-    that a wrong key is noticed. Raise KeyRequired if the key is missing, unknown, revoked or
-    expired, and RateLimited or Busy if its tenant sends too many requests.
+    """Return the caller of a request. A key is checked even if no key is required. Raise
+    KeyRequired if the key is missing, unknown, revoked or expired, and RateLimited or Busy if its
+    tenant sends too many requests.
     """
     if credentials is None:
         if requires_key(request, here):
@@ -179,11 +179,11 @@ async def authenticate(
                 )
             )
             raise KeyRequired(
-                f"{reason} Send the header Authorization: Bearer KEY; create one with `sceneprint "
-                "keys --create NAME`."
+                f"{reason} Send the header Authorization: Bearer KEY; create a key with "
+                "`sceneprint keys --create NAME`."
             )
         set_actor(Actor("", address_of(request) or None))
-        return Caller("", {EVERY: "admin"})  # only processes of this machine reach the service
+        return Caller("", {EVERY: "admin"})
     key = await to_thread.run_sync(here.find_key, credentials.credentials, limiter=here.lookups)
     if key is None or (key.expires_at is not None and key.expires_at <= time.time()):
         enforce_rate_limit(request, here.wrong_keys, network_of(address_of(request)))
@@ -197,14 +197,16 @@ async def authenticate(
 
 
 async def _admit(request: Request, here: Service, tenant: str) -> None:
-    """Count a request for its tenant until the response ends; the body is read afterwards."""
+    """Count a request for its tenant until the response ends; raise RateLimited beyond the
+    limit.
+    """
     set_tenant(tenant)
     enforce_rate_limit(request, here.request_rate, tenant, request_cost(request))
     if not here.requests.take(tenant, 1, here.places):
         raise too_many_requests(share(here.places))
     request.state.place = partial(here.requests.give, tenant, 1)
     request.state.at_end.append(request.state.place)
-    if not is_import(request.scope):  # the body of an import is written to its final place
+    if not is_import(request.scope):  # bodies of imports are not spooled
         length = request.headers.get("content-length", "")
         known = length.isascii() and length.isdigit()
         here.spool.require_room(tenant, int(length) if known else 0)
@@ -215,7 +217,7 @@ async def _admit(request: Request, here: Service, tenant: str) -> None:
 
 
 def release_place(request: Request) -> None:
-    """Stop counting a request as one in progress, because a stream lasts as long as its client."""
+    """Stop counting a request as in progress, for streams, which last as long as their client."""
     place = getattr(request.state, "place", None)
     if place is not None:
         request.state.at_end.remove(place)
@@ -223,9 +225,8 @@ def release_place(request: Request) -> None:
 
 
 async def hold_read(request: Request, here: Service, tenant: str) -> None:
-    """Wait for a turn in the shared threads, held until the response begins. A page of many rows
-    takes several turns. Raise Busy if none becomes free in time. Requests without a key do not
-    wait.
+    """Hold a turn in the shared threads until the response begins. A page of many rows needs
+    several turns. Raise Busy if no turn becomes free in time. Requests without a key need no turn.
     """
     if tenant == NOBODY:
         return
@@ -237,8 +238,8 @@ async def hold_read(request: Request, here: Service, tenant: str) -> None:
 def v1_router(
     prefix: str = "", tag: str | None = None, *depends: Callable[..., object]
 ) -> APIRouter:
-    """Return a router for paths below /v1, which all check the caller and `depends`. `tag` names
-    the operations in the OpenAPI document.
+    """Return a router for paths below /v1 whose routes authenticate the caller and call `depends`.
+    `tag` is the tag of the operations in the OpenAPI document.
     """
     dependencies = [Depends(one) for one in (authenticate, *depends)]
     tags: list[str | Enum] | None = None if tag is None else [tag]
@@ -248,10 +249,10 @@ def v1_router(
 
 
 class ListRoute(APIRoute):
-    """A route that serialises a page of a list in the thread that read it, item by item.
+    """A route that serialises a page of a list item by item, in the thread that read it.
 
-    FastAPI would serialise it in the event loop with one call, which blocks all other requests for
-    10 ms per 1000 rows.
+    FastAPI would serialise the page by one call in the event loop, which blocks all requests for 10
+    ms per 1000 rows.
     """
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
@@ -271,7 +272,7 @@ def _serialize_pages_of(endpoint: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def page_response(page: Page[Any]) -> Response:
-    """Return a page as JSON, with the same text as pydantic writes in one call."""
+    """Return a page as a JSON response, the same bytes as pydantic writes in one call."""
     items = ",".join([one.model_dump_json(by_alias=True) for one in page.items])
     rest = page.model_dump_json(by_alias=True, exclude={"items"})
     return Response(f'{{"items":[{items}],{rest[1:]}', media_type="application/json")
@@ -284,8 +285,8 @@ async def guest(
     request: Request, here: Here,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller | None:  # fmt: skip
-    """Return the caller of a route that needs no key; None without a key. Raise KeyRequired if
-    the key is unknown, revoked or expired.
+    """Return the caller of a route without authentication; None without a key. Raise KeyRequired
+    if the key is unknown, revoked or expired.
     """
     if credentials is None and requires_key(request, here):
         return None
@@ -296,19 +297,19 @@ Guest = Annotated[Caller | None, Depends(guest)]
 
 
 def requires_key(request: Request, here: Here) -> bool:
-    """Return whether a request needs a key because it may come from another machine."""
+    """Return whether a request needs a key: whether it may come from another machine."""
     return here.keys or request.state.forwarded is not None
 
 
 def address_of(request: Request) -> str:
-    """Return the address of the client's connection, which headers cannot forge."""
+    """Return the network address of the client; headers cannot forge it."""
     return "" if request.client is None else request.client.host
 
 
-#: One text for all three causes, so that it does not reveal whether a guessed key once existed.
+#: The same text for all causes, so that it does not reveal whether a guessed key once existed.
 _REFUSED_KEY = (
     "The key that was sent is unknown, revoked or expired. Check that it is complete, or ask the "
-    "operator for another; `sceneprint keys --create NAME` creates one."
+    "operator for another key, which `sceneprint keys --create NAME` creates."
 )
 
 
@@ -348,16 +349,14 @@ def _forbidden(caller: Caller, scope: Scope, what: str) -> Forbidden:
 
 #: Status codes of requests that were refused because of their caller.
 REFUSED = (401, 403)
-#: Refusals of one caller and address that are logged at once, and the time until the next one.
+#: Number of refusals per caller and address to log at once, and seconds until the next one.
 AT_ONCE, AGAIN_S = 10, 600.0
-#: Refusals of all callers that are logged at once, and per second. Each one is a commit.
+#: Number of refusals of all callers to log at once, and per second. Each line is a commit.
 ALL_AT_ONCE, ALL_PER_S = 20, 1.0
 
 
 class RefusalFilter:
-    """Limiter of logged refusals, so that they fill neither the log nor the disk. It remembers the
-    `most` latest callers and addresses.
-    """
+    """Rate limiter of logged refusals. It remembers the `most` latest callers and addresses."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, most: int = 10_000) -> None:
         self._each = TokenBucket("refusals", 1 / AGAIN_S, AT_ONCE, most, clock)
@@ -366,7 +365,9 @@ class RefusalFilter:
         self._most = most
 
     def count(self, caller: str, address: str) -> int | None:
-        """Return the number of skipped similar refusals before this one; None to skip this one."""
+        """Return the number of refusals skipped since the last logged one; None to skip this
+        one.
+        """
         whose = f"{network_of(address)} {caller}"
         for bucket, of in ((self._each, whose), (self._all, "")):
             if bucket.take(of):
@@ -378,8 +379,8 @@ class RefusalFilter:
 
 
 async def record_refusal(scope: AsgiScope, status: int) -> None:
-    """Write a line of the audit log for a refused request before the response, unless there were
-    too many. If the log cannot be written, the response is sent anyway.
+    """Write an audit line for a refused request before the response, unless there were too many.
+    Errors are logged.
     """
     state: dict[str, Any] = scope["state"]
     client = scope.get("client")
@@ -399,7 +400,7 @@ async def record_refusal(scope: AsgiScope, status: int) -> None:
         path.get("map_name"), targets[-1] if targets else None, state["request_id"], **data,
     )  # fmt: skip
     try:
-        # It waits without a limit, so that a flood of requests cannot suppress audit lines.
+        # Wait without a limit, so that a flood of requests cannot suppress audit lines.
         await service.run(write, patient=True)
     except SceneprintError as error:
         log.error("audit entry not written", extra={"action": "refused", "error": str(error)})

@@ -41,7 +41,7 @@ from service.limits import IN_MEMORY
 
 _Record = TypeVar("_Record", bound=BaseModel)
 
-# A request whose body is the frame, with its metadata in the query string.
+# Requests whose body is a frame, with its metadata in the query string.
 #
 # curl --data-binary @frame.png -H 'Content-Type: image/png' '...?fx=585&fy=585&cx=320&cy=240'
 # curl --data-binary @scan.ply -H 'Content-Type: application/ply' '...?robot=spot'
@@ -49,7 +49,7 @@ _Record = TypeVar("_Record", bound=BaseModel)
 FORM, JSON = "multipart/form-data", "application/json"
 FILE: dict[str, Any] = {"type": "string", "format": "binary"}
 META: dict[str, Any] = {"$ref": "#/components/schemas/FrameMeta"}
-#: Media types of frames. The first bytes of the body decide the format.
+#: Media types of frames. The magic bytes of the body determine the format.
 TYPES = media_types_of("depth", "cloud")
 
 _CAMERA = ("fx", "fy", "cx", "cy", "width", "height", "distortion")
@@ -58,7 +58,7 @@ _PLAIN = (
     "session", "captured_at", "name", "sequence",
 )  # fmt: skip
 _OTHERS = ("viewpoint", "tags", "pose", "parent_frame", "base", "base_frame", "up")
-#: End of the descriptions of query parameters that replace fields of a form.
+#: Suffix of the descriptions of query parameters that replace form fields.
 BARE = "Allowed only if the request body is the frame itself."
 _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
@@ -69,7 +69,7 @@ def content(types: Sequence[str] = TYPES) -> dict[str, Any]:
 
 
 def parameters() -> list[dict[str, Any]]:
-    """Return the query parameters of a frame that is the body, for the OpenAPI document."""
+    """Return the query parameters of a frame sent as the body, for the OpenAPI document."""
     seven, size = ",".join(_SEVEN), "of the camera's image, pixels; default: that of the upload."
     own = CameraIntrinsics.model_json_schema()["properties"]
     own |= {"meta": {}, **FrameMeta.model_json_schema()["properties"]}
@@ -106,7 +106,7 @@ def option_parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of an option in a form: objects as JSON text, lists with commas."""
+    """Return the schema of an option in a form: objects as JSON text, lists separated by commas."""
     kinds = option.get("anyOf", [])
     reference = next((one for one in kinds if "$ref" in one), None)
     texts = {name: option[name] for name in ("description", "title") if name in option}
@@ -124,14 +124,14 @@ def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
 def form_body(
     properties: Mapping[str, Any], required: Sequence[str], *metas: str
 ) -> dict[str, Any]:
-    """Return `requestBody` of a form, for the OpenAPI document; `metas` are its parts with JSON."""
+    """Return `requestBody` of a form, for the OpenAPI document; `metas` names its JSON parts."""
     schema = {"type": "object", "required": [*required], "properties": {**properties}}
     encoding = {name: {"contentType": JSON} for name in metas}
     return {"required": True, "content": {FORM: {"schema": schema, "encoding": encoding}}}
 
 
 def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> dict[str, Any]:
-    """Return an optional parameter of the query string, for the OpenAPI document."""
+    """Return an optional query parameter, for the OpenAPI document."""
     return {
         "name": name, "in": "query", "required": False, "schema": schema,
         "description": description,
@@ -141,16 +141,16 @@ def query_parameter(name: str, schema: Mapping[str, Any], description: str) -> d
 async def read_frame_body(
     request: Request, fields: Sequence[str]
 ) -> tuple[UploadFile, FrameMeta, dict[str, str]]:
-    """Read a request whose body is the frame; errors are those of `read_upload`.
+    """Read a request whose body is the frame; see `read_upload` for errors.
 
     Parameters
     ----------
     request : request with a media type of `TYPES`
-    fields : names of query parameters that are allowed beside the metadata
+    fields : names of allowed query parameters, besides the metadata
 
     Returns
     -------
-    file : spooled body, which the caller closes
+    file : spooled body, to be closed by the caller
     meta : metadata of the frame
     others : parameters of `fields` that are present
     """
@@ -191,8 +191,8 @@ def spool_error(error: OSError) -> UnusableStore:
 
 
 def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
-    """Return the query string of a request that is not a form; raise InvalidRequest for unknown or
-    repeated parameters.
+    """Return the query parameters of a request; raise InvalidRequest for unknown or repeated
+    parameters.
     """
     values: dict[str, str] = {}
     for name, value in request.query_params.multi_items():
@@ -211,7 +211,7 @@ def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
 
 
 def take_alone(values: dict[str, str], name: str) -> str | None:
-    """Pop a parameter that replaces all others; raise InvalidRequest if others are present."""
+    """Remove and return a parameter that excludes others; raise InvalidRequest if there are any."""
     text = values.pop(name, None)
     if text is not None and values:
         raise InvalidRequest(
@@ -223,12 +223,12 @@ def take_alone(values: dict[str, str], name: str) -> str | None:
 
 
 def _fields(values: Mapping[str, str], head: bytes) -> dict[str, Any]:
-    """Return the fields of FrameMeta from single query parameters."""
+    """Convert query parameters to fields of FrameMeta; `head` is the beginning of the body."""
     camera: dict[str, Any] = {name: values[name] for name in _CAMERA if name in values}
     if "distortion" in camera:
         camera["distortion"] = camera["distortion"].split(",")
     size = size_of(head)
-    # An array of three or four columns is a cloud unless the request has camera parameters.
+    # An array with three or four columns is a cloud, unless the request has camera parameters.
     is_image = bool(camera) or ("format" not in values and format_of(head) is None)
     if size is not None and is_image:
         camera = {"width": size[0], "height": size[1], **camera}
@@ -245,7 +245,7 @@ def _fields(values: Mapping[str, str], head: bytes) -> dict[str, Any]:
 
 
 def add_up(fields: dict[str, Any], values: Mapping[str, str]) -> None:
-    """Add `up` of the query string, if present; the record validates it."""
+    """Add the query parameter `up`, if present, to the fields of a record."""
     if "up" in values:
         fields["up"] = values["up"].split(",")
 
@@ -253,18 +253,18 @@ def add_up(fields: dict[str, Any], values: Mapping[str, str]) -> None:
 def add_transform(
     fields: dict[str, Any], values: Mapping[str, str], name: str, field: str, frame: str
 ) -> None:
-    """Add a transform of the query string, if present, and its parent frame.
+    """Add a transform in the query string, if present, to the fields of a record.
 
     Parameters
     ----------
     fields : fields of a record, to which the transform is added
     values : parameters of the query string
-    name, frame : names of the parameters of the transform and of its parent frame
+    name, frame : names of the query parameters for the transform and for its parent frame
     field : name of the field of the transform
 
     Raises
     ------
-    InvalidRequest : If the transform does not have seven numbers, or the frame is sent without it.
+    InvalidRequest : If the transform does not have seven numbers, or is missing beside its frame.
     """
     if name in values:
         fields[field] = _transform(name, values[name])
@@ -293,7 +293,7 @@ def _transform(name: str, text: str) -> dict[str, Any]:
 
 
 def _numbers(name: str, text: str, count: int, what: str) -> list[str]:
-    """Return the parts of a parameter; raise InvalidRequest if their number is not `count`."""
+    """Split a parameter at commas; raise InvalidRequest unless it has `count` parts."""
     parts = text.split(",")
     if len(parts) != count:
         raise InvalidRequest(
@@ -305,7 +305,7 @@ def _numbers(name: str, text: str, count: int, what: str) -> list[str]:
 
 #: Maximum size of a form field other than a file, and of a JSON body, bytes.
 FIELD_BYTES = 1 << 18
-#: Charsets that a form may declare; their text is also valid UTF-8.
+#: Charsets that a form may declare; text in them is also valid UTF-8.
 _CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii")
 
 _FORMATS = ", ".join(f"{one.title} ({one.content})" for one in formats_of("depth"))
@@ -315,11 +315,11 @@ FRAME_PARTS: dict[str, Any] = {"frame": {**FILE, "description": _FRAME}, "meta":
 
 @dataclass(frozen=True, eq=False)
 class FormUpload:
-    """A frame of a form or a body.
+    """A frame that was sent in a form or as a body.
 
     Parameters
     ----------
-    file : content of the frame; large files stay on disk until they are read
+    file : content of the frame, on disk if it is large
     meta : metadata of the frame
     fields : other fields of the form or the query string
     """
@@ -336,7 +336,7 @@ _NO_BODY = (
 
 
 def _has_no_body(request: Request) -> bool:
-    """Return whether the headers of a request announce no body."""
+    """Return whether a request has no body, according to its headers."""
     headers = request.headers
     return headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers
 
@@ -348,8 +348,8 @@ def media_type(request: Request) -> str:
 
 @asynccontextmanager
 async def read_upload(request: Request, *fields: str) -> AsyncIterator[FormUpload]:
-    """Read a frame from a form with a file part `frame`, a field `meta` and the named fields, or
-    from a body that is the frame, with the same fields in the query string.
+    """Read a frame from a form with a file part `frame`, a field `meta` and other fields, or from a
+    body that is the frame, with the same fields in the query string.
 
     Parameters
     ----------
@@ -357,7 +357,7 @@ async def read_upload(request: Request, *fields: str) -> AsyncIterator[FormUploa
 
     Raises
     ------
-    UnsupportedType : If the body is neither.
+    UnsupportedType : If the body is neither a form nor a frame.
     MalformedBody : If the form or its JSON cannot be parsed.
     InvalidRequest : If a part is missing or unknown, or `meta` is invalid.
     StoreFull, UnusableStore : If the frame cannot be written to the temporary folder.
@@ -384,7 +384,7 @@ async def read_upload(request: Request, *fields: str) -> AsyncIterator[FormUploa
 
 @asynccontextmanager
 async def read_form(request: Request, most_files: int) -> AsyncIterator[FormData]:
-    """Read a form, and close its files afterwards. Errors are those of `read_upload`."""
+    """Read a form, and close its files at the end; see `read_upload` for errors."""
     if _has_no_body(request):
         raise MalformedBody(_NO_BODY)
     if media_type(request) != FORM:
@@ -393,7 +393,7 @@ async def read_form(request: Request, most_files: int) -> AsyncIterator[FormData
             "file part `frame` and a field `meta` with JSON. You can also send a single frame as "
             f"the whole body, with one of the types {', '.join(TYPES)}."
         )
-    # Some versions of Python decode other charsets in quadratic time.
+    # Accept only these charsets: some versions of Python decode others in quadratic time.
     _, parameters = parse_options_header(request.headers["content-type"])
     charset = parameters.get(b"charset", b"utf-8").decode("latin-1").lower()
     if charset not in _CHARSETS:
@@ -407,7 +407,7 @@ async def read_form(request: Request, most_files: int) -> AsyncIterator[FormData
             f"The form cannot be parsed ({getattr(error, 'detail', error)}). Send a file part "
             "`frame` and a field `meta`, with a boundary as in RFC 7578."
         ) from error
-    except OSError as error:  # large parts are spooled to a file
+    except OSError as error:
         raise spool_error(error) from error
     try:
         yield form
@@ -416,7 +416,7 @@ async def read_form(request: Request, most_files: int) -> AsyncIterator[FormData
 
 
 def check_parts(form: FormData, known: Collection[str]) -> None:
-    """Raise InvalidRequest if a form has a part that would have no effect."""
+    """Raise InvalidRequest if a form has an unknown part."""
     for name in form:
         if name not in known:
             raise InvalidRequest(
@@ -432,8 +432,8 @@ def texts_of(form: FormData) -> dict[str, str]:
 
 
 def priority_of(fields: Mapping[str, str]) -> int:
-    """Return the field `priority` of an upload, by default 0; raise InvalidRequest beyond
-    MOST_PRIORITY.
+    """Return the field `priority` of an upload, by default 0; raise InvalidRequest if it is not
+    valid.
     """
     text = fields.get("priority", "0")
     number = int(text) if re.fullmatch(r"[+-]?[0-9]{1,3}", text.strip(), re.ASCII) else None
@@ -447,15 +447,15 @@ def priority_of(fields: Mapping[str, str]) -> int:
 
 
 def json_body(record: str, *, required: bool = True) -> dict[str, Any]:
-    """Return `openapi_extra` of an operation that reads a record as JSON by hand."""
+    """Return `openapi_extra` of an operation that parses a JSON record itself."""
     schema = {"$ref": f"#/components/schemas/{record}"}
     content = {JSON: {"schema": schema}}
     return {"requestBody": {"required": required, "content": content}}
 
 
 async def read_json(request: Request) -> Any:
-    """Return the JSON body of a request. Raise MalformedBody if it is not JSON, and TooLarge,
-    without reading on, if it is longer than any valid one.
+    """Return the JSON body of a request. Raise MalformedBody if it is not JSON, and TooLarge as
+    soon as it exceeds FIELD_BYTES.
     """
     body = bytearray()
     async for chunk in request.stream():
@@ -468,7 +468,7 @@ async def read_json(request: Request) -> Any:
     if not body:
         raise MalformedBody("The body is empty. Send a JSON object.")
     try:
-        return from_json(bytes(body))  # unlike `json`, it refuses lone surrogates
+        return from_json(bytes(body))  # refuses lone surrogates, unlike `json`
     except ValueError as error:
         raise MalformedBody(f"The body is not JSON ({error}). Send a JSON object.") from error
 
@@ -476,8 +476,8 @@ async def read_json(request: Request) -> Any:
 async def read_json_object(
     request: Request, what: str, types: Sequence[str], otherwise: str = ""
 ) -> dict[str, Any]:
-    """Return a JSON object that is sent with one of some media types; errors are those of
-    `read_record`. FastAPI would parse the body before it checks the key.
+    """Return a JSON object sent with a media type in `types`; see `read_record` for errors. FastAPI
+    would parse the body before it checks the key.
     """
     if media_type(request) not in types:
         raise UnsupportedType(
@@ -495,13 +495,13 @@ async def read_json_object(
 async def read_record(
     request: Request, kind: type[_Record], what: str, *, optional: bool = False
 ) -> _Record:
-    """Return a record that is sent as JSON.
+    """Return a record sent as JSON.
 
     Parameters
     ----------
     kind : class of the record
-    what : start of error messages, such as "The association"
-    optional : whether a missing body stands for a record of defaults
+    what : prefix of error messages, such as "The association"
+    optional : whether a missing body selects the default record
 
     Raises
     ------
@@ -516,7 +516,7 @@ async def read_record(
 
 
 def read_meta(text: str, what: str) -> FrameMeta:
-    """Return the metadata of a frame from JSON; `what` starts the messages of errors."""
+    """Parse the metadata of a frame from JSON; `what` is the prefix of error messages."""
     try:
         return FrameMeta.model_validate_json(text)
     except ValidationError as error:
@@ -555,9 +555,9 @@ class FormFrames:
 
     Parameters
     ----------
-    files : contents of the frames, not yet read
-    metas : metadata of each frame, or the error in them
-    texts : the other fields of the form
+    files : contents of the frames
+    metas : metadata of each frame, or the error in its metadata
+    texts : other fields of the form
     """
 
     files: Sequence[BinaryIO]
@@ -566,16 +566,16 @@ class FormFrames:
 
     @property
     def priority(self) -> int:
-        """Priority of all frames in the queue."""
+        """Priority of all frames; raise InvalidRequest if it is not valid."""
         return priority_of(self.texts)
 
     @property
     def if_novel(self) -> float | None:
-        """Minimum novelty of all frames; None keeps all of them."""
+        """Minimum novelty of all frames; None accepts all frames."""
         return novelty_of(self.texts.get("if_novel"))
 
     def read(self) -> list[Upload]:
-        """Return the uploads whose metadata are valid."""
+        """Return the uploads with valid metadata."""
         return [
             Upload(file.read(), meta, self.priority, self.if_novel)
             for file, meta in zip(self.files, self.metas, strict=True)
@@ -583,7 +583,7 @@ class FormFrames:
         ]
 
     def faults(self) -> list[str]:
-        """Return the index and the error of each frame whose metadata are invalid."""
+        """Return a text with index and error for each frame with invalid metadata."""
         return [f"{i} {one}" for i, one in enumerate(self.metas) if not isinstance(one, FrameMeta)]
 
 
@@ -601,7 +601,7 @@ async def read_frames(
     Raises
     ------
     UnsupportedType, MalformedBody, StoreFull, UnusableStore : See `read_form`.
-    InvalidRequest : If there is no frame, or the numbers of metadata and frames differ.
+    InvalidRequest : If there is no frame, or the number of metadata objects is wrong.
     """
     async with read_form(request, most_files=most) as form:
         check_parts(form, ("frame", "metas", *fields))
@@ -617,7 +617,7 @@ async def read_frames(
         texts = dict(texts_of(form))
         metas = _metas(texts.pop("metas", None), len(files))
         batch = FormFrames(files, metas, texts)
-        _ = batch.priority, batch.if_novel  # raises early if they are invalid
+        _ = batch.priority, batch.if_novel  # validate them early
         yield batch
 
 
@@ -664,7 +664,7 @@ def _batch_meta(meta: Any) -> FrameMeta | InvalidRequest:
         return invalid_record(error, "The frame metadata")
 
 
-# The header Idempotency-Key: a repeated request takes effect once.
+# The header Idempotency-Key: a repeated request takes effect only once.
 #
 # idempotent_request(caller, key, route, payload...)  -->  IdempotentRequest, stored with the result
 
@@ -685,12 +685,12 @@ IdempotencyKey = Annotated[
 
 
 def idempotent_request(caller: Caller, key: str | None, *parts: object) -> IdempotentRequest | None:
-    """Return the record that makes a request take effect once; None without an idempotency key.
+    """Return the idempotent request of an idempotency key; None without a key.
 
     Parameters
     ----------
-    caller : caller of the request; the keys of different callers are independent
-    parts : everything that distinguishes the request, such as route, map, content and metadata, as
+    caller : caller of the request; idempotency keys of different callers are independent
+    parts : everything that identifies the request, such as route, map, content and metadata, as
         bytes, records or JSON values
     """
     if key is None:
@@ -700,7 +700,7 @@ def idempotent_request(caller: Caller, key: str | None, *parts: object) -> Idemp
 
 
 def mark_replayed(response: Response, *, replayed: bool) -> None:
-    """Mark a response as that of an earlier request."""
+    """Add the header that marks the response to a repeated request."""
     if replayed:
         response.headers["Idempotent-Replayed"] = "true"
 
@@ -709,7 +709,7 @@ def _plain(part: object) -> object:
     if isinstance(part, bytes):
         return hashlib.sha256(part).hexdigest()
     if isinstance(part, BaseModel):
-        # Defaults are left out, so a new field in a later version keeps the fingerprint.
+        # Exclude defaults, so that a new field in a later version does not change the fingerprint.
         return part.model_dump(mode="json", exclude_defaults=True)
     if isinstance(part, list | tuple):
         return [_plain(one) for one in part]

@@ -1,6 +1,4 @@
-"""Protection of browsers and of the service against foreign web pages: security headers, checks of
-Host and Origin, and CORS.
-"""
+"""Protection against foreign web pages: security headers, checks of Host and Origin, and CORS."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ _ALWAYS: Headers = [
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"no-referrer"),
     (b"cross-origin-resource-policy", b"same-origin"),
-    # If a browser displays a response as a page, the page cannot load or run anything.
+    # A browser that displays a response as a page must not load or run anything.
     (b"content-security-policy", b"default-src 'none'; frame-ancestors 'none'"),
     (b"cache-control", b"no-store"),  # maps change, and responses depend on the key
 ]
@@ -33,10 +31,10 @@ def security_headers(headers: Headers) -> Headers:
 # Checks of requests to a service that serves only its own machine.
 #
 # A service on a loopback address requires no key, because only processes of this machine reach it.
-# Browsers are such processes, and they run foreign pages. A page can make its own host name resolve
-# to 127.0.0.1 and read the responses ("DNS rebinding"); the header Host then has that name. It can
-# send requests without reading the responses; the header Origin then names the page. It can load an
-# address as an image, without Origin; the header Sec-Fetch-Site then says that a page sent it.
+# Among them are browsers, which run foreign pages. A foreign page can make its own host name
+# resolve to 127.0.0.1 and read the responses ("DNS rebinding"); Host then contains this name. It
+# can send requests without reading the responses; Origin then names the page. It can load an
+# address as an image, without Origin; Sec-Fetch-Site then states that a page sent the request.
 # Foreign links to a page of the service are allowed, because the foreign page learns nothing.
 
 #: Values of Sec-Fetch-Site for the service's own pages, and for typed addresses and bookmarks.
@@ -47,14 +45,14 @@ _PAGES = re.compile(r"/|/docs/?|/dashboard(/[^.]*)?")
 _HOST = re.compile(r"(?:\[(?P<v6>[^\[\]]*)\]|(?P<name>[^:\[\]]*))(?::\d*)?")
 
 
-#: Beginnings of the headers that most proxies add. Behind others, REQUIRE_KEYS must be set.
+#: Prefixes of the headers that most proxies add. Behind other proxies, set REQUIRE_KEYS.
 _FORWARDING = (b"forwarded", b"x-forwarded", b"x-real-ip", b"via")
 
 
 def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
-    """Return the first header that a proxy has added; None without a proxy.
+    """Return the name of the first header that a proxy has added; None without a proxy.
 
-    Its value is not used, because any client can send it.
+    The value of the header is not used, because any client can send it.
     """
     found = (name for name in headers if name.startswith(_FORWARDING))
     return next((name.decode("latin-1").title() for name in found), None)
@@ -63,14 +61,14 @@ def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
 def foreign_request_error(
     headers: Iterable[tuple[bytes, bytes]], allows: Callable[[bytes], bool], path: str = ""
 ) -> SceneprintError | None:
-    """Return the reason for refusing a request to a service of one machine; None to accept it.
+    """Return the error that refuses a request to a loopback service; None to accept the request.
 
     Requests without Host (HTTP/1.0) are accepted, because browsers always send Host.
 
     Parameters
     ----------
     allows : function that returns whether pages of an origin may send requests
-    path : path of the request; foreign links may open pages of the service
+    path : path of the request; foreign links to pages of the service are accepted
     """
     fetch: dict[bytes, bytes] = {}
     for name, value in headers:
@@ -84,12 +82,12 @@ def foreign_request_error(
                 "other machines, listen on another address with `sceneprint serve --host`."
             )
         if name == b"origin" and not (_is_here(text.partition("://")[2]) or allows(value)):
-            return ForeignOrigin(  # this includes the origin `null`
+            return ForeignOrigin(  # also for the origin `null`
                 f"A page of {text!r:.80} sent this request, but this service requires no key, so "
                 "it accepts requests only from pages on its own machine. Serve the page from "
                 "localhost, or add its origin to SCENEPRINT_CORS_ORIGINS."
             )
-    # Requests with Origin have passed the check above.
+    # A request with Origin has passed the check above.
     if b"origin" in fetch or fetch.get(b"sec-fetch-site", b"none") in _OWN_SITES:
         return None
     if _PAGES.fullmatch(path) and fetch.get(b"sec-fetch-dest") == b"document":
@@ -102,7 +100,7 @@ def foreign_request_error(
 
 
 def _is_here(authority: str) -> bool:
-    """Return whether a host, with or without a port, is this machine."""
+    """Return whether a host, optionally with a port, is a loopback address."""
     found = _HOST.fullmatch(authority)
     return found is not None and is_loopback(found["v6"] or found["name"] or "")
 
@@ -118,7 +116,7 @@ _SENT = (
     "Accept, Authorization, Content-Type, Idempotency-Key, If-Match, If-None-Match, If-Range, "
     "Last-Event-ID, Prefer, Range, X-Request-Id"
 )
-#: Headers of the response to a preflight, which a browser may cache for ten minutes.
+#: Headers of the response to a preflight request, which browsers cache for ten minutes.
 PREFLIGHT_HEADERS = {
     "Access-Control-Allow-Methods": "GET, POST, PUT, PATCH, DELETE",
     "Access-Control-Allow-Headers": _SENT,
@@ -129,8 +127,8 @@ PREFLIGHT_HEADERS = {
 class Origins:
     """Origins whose pages may send requests.
 
-    The service reads no cookies, so a page has only the key that its own code sends. Credentials of
-    the browser are therefore never allowed.
+    The service reads no cookies, and a page sends its key itself, so credentials of the browser are
+    never allowed.
 
     Parameters
     ----------
@@ -145,7 +143,7 @@ class Origins:
         return b"*" in self._allowed or origin.strip().lower() in self._allowed
 
     def headers(self, origin: bytes | None) -> Headers:
-        """Return the CORS headers of a response. All of them vary by Origin, because of caches."""
+        """Return the CORS headers of a response, including Vary for caches."""
         if not self._allowed:
             return []
         if origin is None or not self.allows(origin):
@@ -158,8 +156,8 @@ class Origins:
 
 
 def origins_of(settings: Settings) -> Origins:
-    """Return the origins that the operator allows. Raise InvalidRequest for `*` if no key is
-    required, because any page opened on this machine could then read and delete all maps.
+    """Return the allowed origins. Raise InvalidRequest for `*` if no key is required: any page
+    opened on this machine could then read and delete all maps.
     """
     if "*" in settings.cors_origins and not settings.asks_for_keys:
         raise InvalidRequest(

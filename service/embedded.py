@@ -26,19 +26,18 @@ from service.app import create_app
 
 #: Number of jobs after which housekeeping runs.
 _UPKEEP = 256
-#: Limits of an embedded service; only memory limits its own process.
+#: Limits of an embedded service, which are never reached in practice.
 _MOST_WAITING, _LONGEST_WAIT_S, _MOST_BYTES, _MOST_STREAMS = 10_000, 3600.0, 2 << 30, 10_000
-#: Time after which an idle connection is closed, and time for requests in progress at the end,
-#: seconds.
+#: Seconds after which an idle connection is closed, and seconds for requests in progress at the
+#: end.
 _KEEP_ALIVE_S, _GRACE_S = 86_400, 5
 
 
 def embedded_settings(path: Path) -> Settings:
-    """Return the settings of a service for one process.
+    """Return the settings of a service embedded in a process.
 
-    All data goes to the folder, whatever the environment says. No key is needed and nothing is
-    limited, because the process is the only caller. Frames come from the process itself, so they
-    are decoded in it, without another process.
+    All data is in the folder, regardless of the environment. The process is the only caller, so
+    keys and limits are disabled, and frames are decoded without confined processes.
     """
     settings = Settings(
         data_dir=path.absolute(), database_url=None, index_dir=None,
@@ -46,13 +45,13 @@ def embedded_settings(path: Path) -> Settings:
         queued_requests=_MOST_WAITING, queue_timeout_s=_LONGEST_WAIT_S,
         max_event_streams=_MOST_STREAMS, decoders=0,
     )  # fmt: skip
-    # This exceeds the setting's maximum; it is the limit of the decoders.
+    # The limit of the decoders exceeds the maximum of the setting.
     return settings.model_copy(update={"max_upload_bytes": _MOST_BYTES})
 
 
 class LocalService(httpx.BaseTransport):
-    """The application on a data folder, as a transport of httpx. It is thread-safe, and stops with
-    the program if nobody closes it.
+    """The application on a data folder, as an httpx transport. It is thread-safe, and stops at the
+    latest with the program.
 
     Parameters
     ----------
@@ -65,13 +64,13 @@ class LocalService(httpx.BaseTransport):
 
     def __init__(self, path: Path) -> None:
         self._name, self._jobs = f"embedded-{os.getpid()}", itertools.count(1)
-        # The path of a socket has at most 103 bytes on macOS, and 107 on Linux.
+        # Socket paths are limited to 103 bytes on macOS, and to 107 on Linux.
         parent = gettempdir() if len(os.fsencode(gettempdir())) <= 76 else "/tmp"
         self._folder = TemporaryDirectory("", "sceneprint-", parent)  # only this user may enter it
         address = str(Path(self._folder.name, "socket"))
         self._transport = httpx.HTTPTransport(uds=address, limits=httpx.Limits())
         self._server = _Server(embedded_settings(path), address)
-        # The calling thread also computes; one BLAS thread keeps the order of sums the same.
+        # The calling thread also computes; with one BLAS thread, the order of sums is reproducible.
         self._limits = threadpool_limits(1)
         self._thread = threading.Thread(target=self._server.run, name=self._name)
         self._thread.start()
@@ -84,8 +83,8 @@ class LocalService(httpx.BaseTransport):
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send a request to the application, and return a streaming response."""
-        request.headers["Host"] = "localhost"  # in place of the host name that the client uses
-        request.extensions = {}  # without timeouts, because this process computes the response
+        request.headers["Host"] = "localhost"  # replaces the host name in the URL of the client
+        request.extensions = {}  # no timeouts, because this process computes the response
         return self._transport.handle_request(request)
 
     def work(self, pause_s: float) -> None:
@@ -96,7 +95,7 @@ class LocalService(httpx.BaseTransport):
             return
         try:
             self._runner.run(claimed)
-        except BaseException:  # such as Ctrl-C: other workers need not wait until the lease expires
+        except BaseException:  # return the job, so that it need not wait for the end of the lease
             self._runner.put_back(claimed)
             raise
         if next(self._jobs) % _UPKEEP == 0:
@@ -112,7 +111,7 @@ class LocalService(httpx.BaseTransport):
 
 
 class _Server(uvicorn.Server):
-    """A server that ends with the program, and with `opened` has the context or the error."""
+    """A server that ends with the program; `opened` contains its context or its error."""
 
     def __init__(self, settings: Settings, address: str) -> None:
         self._app, self.opened = create_app(settings, warm=False), Future[Context]()

@@ -2,8 +2,8 @@
 
     database  --Feed-->  the newest events in memory  -->  streams, each at its own position
 
-A stream that lags behind the events in memory reads the database itself until it has caught up.
-Slow readers therefore cost no memory, and idle streams cost no queries.
+A stream that lags behind the events in memory reads the database itself until it catches up, so
+that slow readers need no memory, and idle streams no database queries.
 """
 
 from __future__ import annotations
@@ -29,12 +29,11 @@ from service.limits import Holdings, share
 
 log = logging.getLogger(__name__)
 
-#: Pause between polls of the database, seconds (half of it after new events), and the pause
-#: after an error.
+#: Seconds between polls of the database (half of that after new events), and after an error.
 POLL_S, TROUBLE_S = 0.1, 1.0
 #: Interval of keep-alive messages on a silent stream, seconds.
 ALIVE_S = 3.0
-#: Number of events in memory, and maximum number in one read or message.
+#: Number of events in memory, and maximum number of events per read.
 HELD, MOST = 4096, 500
 
 
@@ -43,7 +42,7 @@ class Feed:
 
     Parameters
     ----------
-    database : database that is polled while streams are open
+    database : database, polled while streams are open
     most : maximum number of open streams
     retained : number of newest events of each map that the database never deletes
     """
@@ -54,12 +53,12 @@ class Feed:
         self._closed = False
         self._poller: asyncio.Task[None] | None = None
         self._held: deque[EventRow] = deque()
-        # All events after `_since` are in memory; None if the database was not polled yet.
+        # All events after `_since` are in memory; None before the first poll.
         self._since: int | None = None
         self._newest = 0
         self._last: EventRow | None = None  # the event with the number `_newest`
-        # Identity of the database's history, and how often it was replaced by one that lacks known
-        # events: a standby that lagged behind assigns the same numbers to other events.
+        # History of the database, and how often it was replaced by a history without known events:
+        # a standby that lagged behind assigns the same numbers to other events.
         self._history, self._rewinds = database.history, 0
         self._news = asyncio.Event()
 
@@ -69,8 +68,8 @@ class Feed:
         return self._streams.total
 
     def join(self, tenant: str = NOBODY) -> None:
-        """Reserve a stream, until `leave`. Raise Busy if all are in use, and RateLimited if the
-        tenant has reached its share.
+        """Reserve a stream until `leave`. Raise Busy if all streams are in use, and RateLimited if
+        the tenant has reached its share.
         """
         if self._closed or self._streams.total >= self._most:
             raise Busy(
@@ -84,7 +83,7 @@ class Feed:
             )
 
     def leave(self, tenant: str = NOBODY) -> None:
-        """Release a stream. The poller stops with the last one."""
+        """Release a stream. The poller stops with the last stream."""
         self._streams.give(tenant, 1)
         if self._streams.total == 0 and self._poller is not None:
             self._poller.cancel()
@@ -100,22 +99,22 @@ class Feed:
     async def batches(
         self, wanted: EventFilter, after: int | None, has_access: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
-        """Yield events as they occur, with the number of the last event that the reader has passed.
+        """Yield lists of new events, each with the number of the last event that the reader may
+        read.
 
-        The first list, and one in every ALIVE_S seconds, is empty, even while events that the
-        filter excludes keep the poller busy. Excluded events do not change the number.
+        The first list may be empty, and empty lists follow at least every ALIVE_S seconds.
 
         Parameters
         ----------
         wanted : filter of the events
         after : number of the event to continue after; None starts with new events
-        has_access : function that is called every ALIVE_S seconds in a thread; False ends the
-            stream
+        has_access : function that is called every ALIVE_S seconds in a thread; if it returns False,
+            the stream ends
         """
         try:
             async for batch in self._batches(wanted, after, has_access):
                 yield batch
-        except SceneprintError as error:  # the client reconnects, and then gets the error
+        except SceneprintError as error:  # the client reconnects and receives the error
             log.error("event stream failed", extra={"error": str(error)})
 
     async def _batches(
@@ -127,13 +126,13 @@ class Feed:
         first, place, seen = await to_thread.run_sync(
             begin, self._database, wanted, self._retained, after
         )
-        yield first, seen  # even if it is empty, because the reader needs its position
+        yield first, seen  # also if empty, because the reader needs its position
         clock = asyncio.get_running_loop().time
         due = clock() + ALIVE_S
         while not self._closed:
             if clock() >= due:
                 if not await to_thread.run_sync(has_access) or self._poller.done():
-                    return  # without a poller the stream would stay silent
+                    return  # the poller has stopped
                 yield [], seen
                 due = clock() + ALIVE_S
             news = self._news
@@ -164,14 +163,16 @@ class Feed:
                 await asyncio.wait_for(news.wait(), max(due - clock(), 0.0))
 
     def _after(self, place: int) -> tuple[list[EventRow], int]:
-        """Return the next events in memory, and the number up to which they are complete."""
+        """Return the next events in memory after `place`, and the number of the last known
+        event.
+        """
         newer = sum(1 for event in reversed(self._held) if event.number > place)
         start = len(self._held) - newer
         found = list(islice(self._held, start, start + MOST))
         return found, found[-1].number if found else self._newest
 
     def _is_behind(self) -> bool:
-        """Return whether the last known event is missing from the database or differs there."""
+        """Return whether the last known event is missing or different in the database."""
         if self._last is None:
             return False
         with self._database.read() as connection:
@@ -187,7 +188,7 @@ class Feed:
         self._newest = self._since = 0 if self._last is None else self._last.number
 
     def _read(self, after: int | None) -> list[EventRow]:
-        """Return the events after a number; None returns the newest one."""
+        """Return the events after a number; None returns the newest event."""
         number_events(self._database)
         with self._database.read() as connection:
             after = newest_number(connection) - 1 if after is None else after
@@ -209,7 +210,7 @@ class Feed:
                         await self._begin()
                         self._rewinds += 1
                         self._wake()
-                    else:  # a synchronous standby, which has all known events
+                    else:  # a synchronous standby has all known events
                         self._history = history
                     pause = 0.0
                     continue
@@ -235,23 +236,25 @@ class Feed:
 #     Event  --message-->  text of the stream  --EventStream-->  client
 
 MEDIA_TYPE = "text/event-stream"
-#: Time until a client reconnects after a lost stream, milliseconds.
+#: Delay before a client reconnects after a lost stream, milliseconds.
 RETRY_MS = 1000
 BEGIN = f"retry: {RETRY_MS}\n\n".encode()
 
 
 def message(event: Event) -> bytes:
-    """Return an event as a message of the stream. JSON contains no line breaks."""
+    """Return an event as a server-sent message; its JSON contains no line breaks."""
     return f"id: {event.id}\ndata: {event.model_dump_json()}\n\n".encode()
 
 
 def alive(place: str) -> bytes:
-    """Return a keep-alive comment with the id that the client should continue from."""
+    """Return a keep-alive message with the id of the event to continue after."""
     return f": alive\nid: {place}\n\n".encode()
 
 
 class EventStream(StreamingResponse):
-    """A response that lasts until its source ends or the client leaves; then it calls `left`."""
+    """A response that ends with its source or when the client disconnects, and then calls
+    `left`.
+    """
 
     def __init__(self, source: AsyncGenerator[bytes, None], left: Callable[[], None]) -> None:
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}

@@ -1,11 +1,11 @@
 """Limits: shares of tenants, request rates, and the size and speed of request bodies.
 
-Tenants share turns, waiting places and bytes. If no key is required, there is only the tenant
-NOBODY, which has no limits.
+Tenants share turns, places in queues, and bytes. If no key is required, the only tenant is NOBODY,
+which has no limits.
 
-A rate limit is a token bucket for each caller: every request takes one or more tokens, and tokens
-return at a constant rate. Without enough tokens the response is 429. A full bucket equals no
-bucket, so callers that have not been seen for long are forgotten.
+A rate limit is a token bucket per caller: each request consumes one or more tokens, and tokens are
+added at a constant rate. Without enough tokens, the response is 429. A full bucket equals a missing
+bucket, so the buckets of inactive callers can be dropped.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ T = TypeVar("T")
 
 
 class Holdings:
-    """Amounts of a limited resource that tenants hold, at most three quarters each."""
+    """Amounts of a limited resource in use by tenants, at most three quarters per tenant."""
 
     def __init__(self) -> None:
         self._held: Counter[str] = Counter()
         self.total = 0
 
     def take(self, tenant: str, amount: int, room: int) -> bool:
-        """Add to the amount of a tenant, and return True, if its share of `room` allows it."""
+        """Allocate an amount to a tenant; return False if its share of `room` does not allow it."""
         if not self.allows(tenant, amount, room):
             return False
         self._held[tenant] += amount
@@ -52,15 +52,15 @@ class Holdings:
         return True
 
     def allows(self, tenant: str, amount: int, room: int) -> bool:
-        """Return whether a tenant may hold `amount` more."""
+        """Return whether the share of a tenant of `room` allows `amount` more."""
         return tenant == NOBODY or self._held[tenant] + amount <= share(room)
 
     def by_tenant(self) -> dict[str, int]:
-        """Return the amount that each tenant holds, without zeros."""
+        """Return the amount in use by each tenant, without zeros."""
         return {tenant: self._held[tenant] for tenant in list(self._held)}
 
     def give(self, tenant: str, amount: int) -> None:
-        """Subtract from the amount that a tenant holds."""
+        """Release an amount of a tenant."""
         self._held[tenant] -= amount
         self.total -= amount
         if not self._held[tenant]:
@@ -68,12 +68,12 @@ class Holdings:
 
 
 def share(room: int) -> int:
-    """Return the amount of `room` that one tenant may hold; the rest is for other tenants."""
+    """Return the amount of `room` that one tenant may use; the rest is for other tenants."""
     return max(3 * room // 4, 1)
 
 
 class Turns:
-    """Turns of requests, in the order of TurnOrder."""
+    """Turns of asynchronous requests, in the order of TurnOrder."""
 
     def __init__(
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
@@ -91,7 +91,7 @@ class Turns:
             await turn
         except asyncio.CancelledError:
             if self._order.leave(tenant, turn):
-                self._admit()  # the cancelled request may have blocked others
+                self._admit()  # other requests may have waited for the cancelled one
             else:
                 self.release(tenant, weight)
             raise
@@ -116,7 +116,7 @@ class Turns:
 
 
 class SharedChecks:
-    """Results of slow checks that concurrent requests share, up to an age of `most_s` seconds."""
+    """Results of slow checks, shared by concurrent requests and reused for `most_s` seconds."""
 
     def __init__(self, most_s: float) -> None:
         self._most_s = most_s
@@ -124,13 +124,13 @@ class SharedChecks:
         self._results: dict[str, tuple[float, Any]] = {}
 
     async def get(self, name: str, check: Callable[[], T]) -> T:
-        """Return the result of a check, or raise its error. `check` runs in a thread if there is no
-        recent result of this name. Requests that wait for it hold no thread.
+        """Return the result of the check `name`, or raise its error. Without a recent result, run
+        `check` in a thread; requests that wait for it occupy no thread.
         """
         arrived = time.monotonic()
         async with self._locks[name]:
             began, result = self._results.get(name, (-math.inf, None))
-            # A check that began after the request arrived is recent enough, however long it took.
+            # Also reuse a check that began after the request arrived, even if it took long.
             if began < arrived and time.monotonic() - began > self._most_s:
                 began = time.monotonic()
                 result = await to_thread.run_sync(_outcome, check)
@@ -141,7 +141,7 @@ class SharedChecks:
 
 
 def _outcome(do: Callable[[], object]) -> object:
-    """Return what a call returns, or the exception that it raises."""
+    """Return the result of a call, or the exception that it raises."""
     try:
         return do()
     except Exception as error:
@@ -149,14 +149,14 @@ def _outcome(do: Callable[[], object]) -> object:
 
 
 class Gate:
-    """A limit of concurrent heavy work: some of it runs, some waits, and the rest is refused.
+    """A limit of concurrent computations: some run, some wait, and the others are refused.
 
     Parameters
     ----------
-    running : maximum number of calls that run
+    running : maximum number of running calls
     waiting : maximum number of requests that wait for their bodies or for a turn
-    longest_s : maximum wait for a turn, seconds; robots cannot use later answers
-    beside : maximum number of calls of one tenant while others wait; default: half
+    longest_s : maximum wait for a turn, seconds
+    beside : maximum number of running calls of a tenant while others wait; default: half
     rests : whether tenants rest between turns; see TurnOrder
     """
 
@@ -172,8 +172,8 @@ class Gate:
 
     @asynccontextmanager
     async def place(self) -> AsyncIterator[None]:
-        """Hold a place. Take it before the body is read, so that refused requests spool nothing.
-        Raise Busy if all places are taken, and RateLimited if the tenant has reached its share.
+        """Hold a place. Use this before reading the body, so that refused requests spool nothing.
+        Raise Busy if all places are in use, and RateLimited if the tenant has reached its share.
         """
         tenant = current_tenant()
         if self._taken.total >= self._places:
@@ -186,16 +186,16 @@ class Gate:
             self._taken.give(tenant, 1)
 
     async def enter(self, do: Callable[[], T]) -> T:
-        """Take a place and run a function; see `place` and `run`."""
+        """Run a function while holding a place; see `place` and `run`."""
         async with self.place():
             return await self.run(do)
 
     async def run(self, do: Callable[[], T], *, patient: bool = False) -> T:
-        """Run a function in a thread after waiting for a turn. The caller holds a place.
+        """Wait for a turn, and run a function in a thread. The caller must hold a place.
 
         Parameters
         ----------
-        patient : whether to wait without a limit, because a large body would have to be sent again
+        patient : whether to wait without a limit, for requests that are expensive to repeat
 
         Raises
         ------
@@ -210,7 +210,7 @@ class Gate:
 
 
 async def take_turn(turns: Turns, tenant: str, longest_s: float | None, weight: int = 1) -> int:
-    """Wait for turns, see `Turns.acquire`. Raise Busy if none becomes free within `longest_s`."""
+    """Call `Turns.acquire`; raise Busy if no turn becomes free within `longest_s` seconds."""
     try:
         with anyio.fail_after(longest_s):
             return await turns.acquire(tenant, weight)
@@ -222,14 +222,14 @@ async def take_turn(turns: Turns, tenant: str, longest_s: float | None, weight: 
 
 
 def too_many_requests(most: int) -> RateLimited:
-    """Return the error for a tenant that has reached its number of requests in progress."""
+    """Return the error for a tenant that has reached its limit of requests in progress."""
     return RateLimited(
         f"{most} requests of this key's tenant are in progress, which is the limit. Wait for "
         "their responses."
     )
 
 
-#: Number of requests that one query counts as, and number of rows that count as one more request.
+#: Cost of a query in requests, and number of list rows that cost one more request.
 QUERY_COST, ROWS_PER_COST = 5.0, 50
 #: Number of rows of a list without a limit in the request.
 _USUAL_ROWS = 100
@@ -237,14 +237,14 @@ _QUERIES = re.compile(r"/(queries|queries/records|localize|localize/sequence|sim
 
 
 class TokenBucket:
-    """A token bucket for each caller; thread-safe.
+    """Token buckets of callers; thread-safe.
 
     Parameters
     ----------
     subject : noun phrase for the error, such as "requests"
-    per_s : number of tokens that return per second; 0 for no limit
+    per_s : number of tokens added per second; 0 for no limit
     burst : number of tokens in a full bucket
-    most : number of callers in memory; the one that was not seen for the longest time is dropped
+    most : maximum number of callers; the least recent callers are dropped
     clock : monotonic clock, seconds
     """
 
@@ -258,8 +258,8 @@ class TokenBucket:
         self._lock = threading.Lock()
 
     def take(self, caller: str, cost: float = 1.0) -> int:
-        """Take tokens and return 0 if there are enough or there is no limit; otherwise return the
-        number of seconds until there are.
+        """Consume `cost` tokens and return 0; without enough tokens, return the number of seconds
+        until there are enough.
         """
         if self._per_s <= 0:
             return 0
@@ -275,16 +275,14 @@ class TokenBucket:
         return math.ceil(lacking / self._per_s)
 
 
-#: Refusals without a delay: at once, and per second; and the delay of all others, seconds.
+#: Number of refusals without a delay, at once and per second, and delay of the others in seconds.
 REFUSALS, REFUSALS_PER_S, REFUSAL_S = 20, 10.0, 1.0
-#: Maximum number of delayed refusals of all callers. Each one holds a connection.
+#: Maximum number of concurrently delayed refusals, each of which occupies a connection.
 _MOST_HELD_BACK = 100
 
 
 class RefusalDelays:
-    """Delays of refusals for callers that repeat their requests without a pause. Hundreds of
-    refusals per second would take the time of other callers.
-    """
+    """Delays of refusals for callers that repeat refused requests without a pause."""
 
     def __init__(self) -> None:
         self._bucket = TokenBucket("refusals", REFUSALS_PER_S, REFUSALS)
@@ -302,7 +300,7 @@ class RefusalDelays:
 
 
 def page_rows(request: Request) -> int:
-    """Return the number of rows that a request asks for; 0 if the response is not a page."""
+    """Return the number of requested rows; 0 if the response is not a page."""
     model = getattr(request.scope.get("route"), "response_model", None)
     if not (isinstance(model, type) and issubclass(model, Page)):
         return 0
@@ -311,7 +309,7 @@ def page_rows(request: Request) -> int:
 
 
 def request_cost(request: Request) -> float:
-    """Return the cost of a request: 1, more for a query, and more for a list with many rows."""
+    """Return the cost of a request: 1, or more for a query or a list with many rows."""
     if request.method == "POST" and _QUERIES.search(request.url.path):
         return QUERY_COST
     return 1 + page_rows(request) / ROWS_PER_COST
@@ -320,7 +318,7 @@ def request_cost(request: Request) -> float:
 def enforce_rate_limit(
     request: Request, bucket: TokenBucket, whose: str, cost: float = 1.0
 ) -> None:
-    """Count a request before its body is read; raise RateLimited if there are too many."""
+    """Count a request, before its body is read; raise RateLimited if there are too many."""
     wait_s = bucket.take(whose, cost)
     if wait_s:
         request.state.wait_s = wait_s
@@ -328,11 +326,11 @@ def enforce_rate_limit(
 
 
 def network_of(address: str) -> str:
-    """Return the IPv4 address, or the /64 network of an IPv6 address, which has one owner."""
+    """Return an IPv4 address, or the /64 network of an IPv6 address, which has one owner."""
     try:
         found = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:
-        return "unknown"  # all connections without an IP address together
+        return "unknown"  # shared by all connections without an IP address
     if isinstance(found, ipaddress.IPv6Address):
         if found.ipv4_mapped is not None:
             return str(found.ipv4_mapped)
@@ -340,20 +338,20 @@ def network_of(address: str) -> str:
     return str(found)
 
 
-#: Maximum pause within a body, maximum wait for all of it, and more of that for each MiB, seconds.
+#: Maximum seconds without data in a body, for the whole body, and in addition per MiB of it.
 IDLE_S, BODY_S, S_PER_MIB = 10.0, 30.0, 4.0
 _IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
-#: Number of bytes of a body that stay in memory until they are read; the rest is spooled to disk.
-#: Tenants are charged for disk space in steps of this size.
+#: Number of bytes of a body in memory; the rest is spooled to disk. Tenants are charged for disk
+#: space in steps of this size.
 IN_MEMORY = 1 << 20
 
 
 class Broken(Exception):
-    """Signal that stops the reading of a body; `RequestMiddleware` catches it."""
+    """Exception that stops reading a body; `RequestMiddleware` catches it."""
 
 
 class BodySpool:
-    """Disk space of the temporary folder that the spooled bodies of each tenant take."""
+    """Disk space in the temporary folder used by spooled bodies, by tenant."""
 
     def __init__(self) -> None:
         self._held = Holdings()
@@ -374,11 +372,11 @@ class BodySpool:
         self._held.give(tenant, size)
 
     def by_tenant(self) -> dict[str, int]:
-        """Return the number of bytes on disk of each tenant, without zeros."""
+        """Return the number of spooled bytes of each tenant, without zeros."""
         return self._held.by_tenant()
 
     def _room(self) -> int:
-        """Return the number of bytes that all bodies together may take."""
+        """Return the maximum number of spooled bytes of all tenants."""
         found = os.statvfs(tempfile.gettempdir())
         return found.f_bavail * found.f_frsize + self._held.total
 
@@ -394,25 +392,25 @@ class BodySpool:
 class RequestBody:
     """The body of one request, read within limits of size and time.
 
-    The time limit grows with the received bytes, not with the announced length. Only the wait for
-    the client counts.
+    The time limit grows with the received bytes, not with the announced length. Only time spent
+    waiting for the client counts.
 
     Parameters
     ----------
-    receive : function that returns the next part
+    receive : function that returns the next message
     most : maximum size, bytes
     """
 
     def __init__(self, receive: Receive, most: int) -> None:
         self._receive, self._most, self._waited_s, self._whole = receive, most, 0.0, False
         self.received = 0  # bytes
-        #: Why the body is not read further.
+        #: Error for which reading was stopped.
         self.fault: SceneprintError | None = None
         self._spool: BodySpool | None = None
         self._tenant, self._charged = "", 0
 
     def charge(self, spool: BodySpool, tenant: str) -> None:
-        """Charge a tenant for the part of the body on disk, before it is written."""
+        """Charge a tenant for spooled bytes of the body from now on."""
         self._spool, self._tenant = spool, tenant
 
     def close(self) -> None:
@@ -422,8 +420,8 @@ class RequestBody:
             self._charged = 0
 
     async def next(self) -> Message:
-        """Return the next part, and after the last part any further message. Raise Broken with the
-        reason in `fault`.
+        """Return the next message. Raise Broken, with the reason in `fault`, if the body is too
+        large or too slow.
         """
         if self._whole:
             return await self._receive()

@@ -1,7 +1,7 @@
 """Metrics for Prometheus.
 
-Counters of a process (requests, answers, streams) add up over processes. Gauges of the store
-(frames, jobs, indexes, disk) are the same in all processes.
+Counters (requests, answers, streams) are per process: add them over all processes. Gauges of the
+store (frames, jobs, indexes, disk) are the same in all processes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sceneprint.store import Database
 from sceneprint.store.store_counts import add_sample
 from sceneprint_client.api import Answer, FrameState, JobState
 
-# Counts of this process in the last seconds, written to the database regularly.
+# Counts of this process over some seconds, written to the database at intervals.
 #
 #     requests, answers  -->  Sampler  --flush-->  table `samples`  -->  GET /v1/stats
 
@@ -85,10 +85,10 @@ class Sampler:
 
 EVENTS = "/v1/events"
 _SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
-#: Number of maps whose indexes have their own series: those with the longest tails.
+#: Maximum number of maps with separate series for their indexes, those with the longest tails.
 MOST_MAPS = 20
-#: Number of tenants with their own series, in the order in which the process meets them. All other
-#: tenants share one series, whose name no tenant can have.
+#: Number of tenants with separate series, the first to send requests. All other tenants share one
+#: series, whose name no tenant can have.
 MOST_TENANTS, OTHERS = 50, "(others)"
 
 
@@ -173,7 +173,7 @@ METRICS = {
 
 
 class TenantMetrics:
-    """Metrics of the tenants of keys: their requests in one process, and their waiting jobs."""
+    """Metrics by tenant: requests in this process, and waiting jobs."""
 
     def __init__(self, metrics: Metrics) -> None:
         self._metrics = metrics
@@ -189,7 +189,7 @@ class TenantMetrics:
         """Set `requests_in_progress`, `spool_bytes` and `waiting_jobs` by tenant, except NOBODY."""
         for name, by_tenant in values.items():
             gauge = self._metrics.gauges[f"tenant_{name}"]
-            gauge.clear()  # drop tenants that have none left
+            gauge.clear()  # drop tenants without a value
             for tenant, number in by_tenant.items():
                 if tenant != NOBODY:
                     gauge.labels(self._name(tenant)).inc(number)
@@ -201,7 +201,7 @@ class TenantMetrics:
 
 
 class Metrics:
-    """Metrics of one service process."""
+    """Metrics of a service process."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -227,13 +227,13 @@ class Metrics:
         self, method: str, route: str, status: int, seconds: float, received: int = 0,
         tenant: str = NOBODY,
     ) -> None:  # fmt: skip
-        """Count a request. `route` is a pattern, which limits the number of series."""
+        """Count a request; `route` is its path pattern, and `received` the size of its body."""
         self.counters["requests_total"].labels(method, route, str(status)).inc()
         if tenant != NOBODY:
             self.tenants.request(tenant, status, 0.0 if route == EVENTS else seconds)
         if received:
             self.counters["received_bytes_total"].labels(route).inc(received)
-        if route != EVENTS:  # a stream lasts as long as its client
+        if route != EVENTS:  # streams last as long as their client
             self.histograms["request_seconds"].labels(route).observe(seconds)
         if route.startswith("/v1/"):
             self.sampler.request(status)
@@ -249,8 +249,8 @@ class Metrics:
         self, figures: Figures, streams: int, lost: int, held: Mapping[str, int],
         spool: Mapping[str, int],
     ) -> bytes:  # fmt: skip
-        """Return all metrics in the text format of Prometheus. `lost` counts queries since the
-        start of the process; `held` and `spool` are requests and bytes on disk by tenant.
+        """Return all metrics in the text format of Prometheus. `lost` is the number of queries that
+        were not logged; `held` and `spool` are requests and spooled bytes by tenant.
         """
         self.tenants.update(
             requests_in_progress=held, spool_bytes=spool, waiting_jobs=figures.waiting
@@ -267,7 +267,7 @@ class Metrics:
         gauges["scrub_damaged"].set(0 if stats.scrub is None else stats.scrub.damaged)
         gauges["maps"].set(stats.maps)
         for name in ("oldest_waiting_seconds", "index_version", "index_tail_frames"):
-            gauges[name].clear()  # drop deleted maps and ended jobs
+            gauges[name].clear()  # drop deleted maps and finished jobs
         for waiting, age in stats.oldest_waiting_s.items():
             gauges["oldest_waiting_seconds"].labels(waiting).set(age)
         gauges["oldest_unsigned_seconds"].set(stats.oldest_waiting_s.get("sign", 0.0))

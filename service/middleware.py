@@ -38,15 +38,15 @@ from service.problems import error_problem
 log = logging.getLogger(__name__)
 
 _ID = re.compile(rb"[\w.-]{1,64}")
-#: Methods with their own metrics; a client may invent any number of others.
+#: Methods with separate metrics.
 _METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
 #: Status code in the log if the client disconnected before the response.
 _HUNG_UP = 499
-#: Status codes of responses that are delayed for clients that repeat their requests.
+#: Status codes of refusals, see `RefusalDelays`.
 _HELD_BACK = (401, 403, 429)
-#: Paths that are requested every few seconds or without a key. They are logged at level DEBUG.
+#: Paths that are requested every few seconds or without a key, logged at level DEBUG.
 _PROBES = ("/healthz", "/readyz", "/metrics", "/openapi.json")
-#: Maximum number of concurrent requests, including those that wait or stream.
+#: Maximum number of concurrent requests, including waiting requests and streams.
 _MOST_AT_ONCE = 900
 
 
@@ -80,7 +80,7 @@ class RequestMiddleware:
         sent_id = headers.get(b"x-request-id", b"")
         request_id = sent_id.decode() if _ID.fullmatch(sent_id) else uuid.uuid4().hex
         name_request(request_id)
-        set_tenant(NOBODY)  # until the key is checked; see `auth.authenticate`
+        set_tenant(NOBODY)  # until `auth.authenticate` checks the key
         set_actor(None)
         own: Headers = [(b"x-request-id", request_id.encode())]
         own += self._origins.headers(headers.get(b"origin"))
@@ -95,12 +95,12 @@ class RequestMiddleware:
         async def send_message(message: Message) -> None:
             nonlocal status
             if body.fault is not None and status == 0:
-                return  # the application's response to the broken body; ours follows
+                return  # drop the response of the application to the broken body; ours follows
             if message["type"] == "http.response.start":
                 status = message["status"]
                 complete = [*message["headers"], *own]
                 message["headers"] = complete + security_headers(complete)
-                _call(at_answer)  # the audit line below takes a turn of its own
+                _call(at_answer)  # release turns before the audit line below needs one
                 if status in _HELD_BACK and not self._alone:
                     whose = state.get("tenant") or network_of(address_of(Request(scope)))
                     await self._delays.wait(whose)
@@ -121,7 +121,7 @@ class RequestMiddleware:
             pass
         except ClientDisconnect:
             status = _HUNG_UP
-        except Exception:  # the outer handler responds with 500
+        except Exception:
             self._note(scope, request_id, 500, time.perf_counter() - start, body.received)
             raise
         finally:
@@ -135,7 +135,7 @@ class RequestMiddleware:
     def _early(
         self, scope: Scope, headers: dict[bytes, bytes]
     ) -> SceneprintError | Response | None:
-        """Return an early response or a refusal that needs no body; None to continue."""
+        """Return an early response, or an error that refuses the request; None to continue."""
         origin, length = headers.get(b"origin"), headers.get(b"content-length", b"")
         known = origin is not None and self._origins.allows(origin)
         if self._alone:
@@ -155,7 +155,7 @@ class RequestMiddleware:
                 "Send one."
             )
         encoding = headers.get(b"content-encoding", b"identity").strip().lower()
-        # Archives are compressed files, and some clients say so in this header.
+        # Some clients declare the compression of archives in this header.
         if encoding not in (b"identity", b"") and not is_import(scope):
             return UnsupportedType(
                 f"The body has Content-Encoding {encoding.decode('latin-1')!r:.40}, which is not "
@@ -175,7 +175,7 @@ class RequestMiddleware:
     ) -> None:
         route = getattr(scope.get("route"), "path", "other")
         if scope["path"].startswith("/v1/") and not route.startswith(("/v1", "other")):
-            route = f"/v1{route}"  # the router's pattern lacks the prefix of its mount point
+            route = f"/v1{route}"  # the pattern lacks the prefix of the mount point
         method = scope["method"] if scope["method"] in _METHODS else "other"
         tenant = scope["state"].get("tenant", NOBODY)
         self._metrics.request(method, route, status, seconds, received, tenant)
@@ -198,7 +198,7 @@ def _call(callbacks: list[Callable[[], None]]) -> None:
 
 
 def _refusal(request_id: str, error: SceneprintError) -> Response:
-    """Return an error response that closes the connection, because the body is not read."""
+    """Return an error response that closes the connection, since the body was not read."""
     response = error_problem(request_id, error)
     response.headers["Connection"] = "close"
     return response

@@ -1,4 +1,4 @@
-"""Table of the problem types: status, remedy and public detail of each error."""
+"""Table of problem types: status code, remedy and public text of each error."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from typing import NamedTuple
 
 
 class ProblemType(NamedTuple):
-    """A type of problem documents.
+    """A type of problem document.
 
     Parameters
     ----------
     status : HTTP status code
-    remedy : instruction for the reader of docs/reference.md
-    meaning : description; default: docstring of the error's class
-    retry_after_s : value of the header Retry-After. It is short if load is the cause, and longer if
-        a person must act first.
-    detail : message for clients instead of the error's own, which names folders that only the
-        operator should see
+    remedy : instruction in docs/reference.md
+    meaning : description; default: docstring of the error class
+    retry_after_s : value of the header Retry-After: short under load, longer if a person must act
+        first
+    detail : text for clients that replaces the message of the error, which contains paths that only
+        the operator should know
     """
 
     status: int
@@ -27,8 +27,8 @@ class ProblemType(NamedTuple):
 
 
 _LOG = "Its log has the details under the id of the request."
-#: Problem types by the name of the error's class; other classes have that of their nearest base
-#: class. Names without a class are problems that the framework finds.
+#: Problem types by error class; other classes inherit the type of their nearest base class. Names
+#: without a class are problems that the framework detects.
 PROBLEM_TYPES = {
     "MalformedBody": ProblemType(
         400, "Send valid JSON, or a form, with the right `Content-Type`."
@@ -134,7 +134,7 @@ PROBLEM_TYPES = {
 
 
 def problem_type(kind: type[BaseException]) -> ProblemType:
-    """Return the problem type of an error's class."""
+    """Return the problem type of an error class."""
     return next(
         PROBLEM_TYPES[one.__name__] for one in kind.__mro__ if one.__name__ in PROBLEM_TYPES
     )

@@ -24,7 +24,7 @@ MEDIA_TYPE = "application/problem+json"
 
 
 def type_of(name: str) -> str:
-    """Return the type of a problem: the name of the error in kebab case."""
+    """Return the type of a problem document: the name of the error in kebab case."""
     return f"/problems/{errors.kebab_case(name)}"
 
 
@@ -46,7 +46,7 @@ def problem(
 
 
 def error_problem(request_id: str, error: errors.SceneprintError) -> JSONResponse:
-    """Return the problem document of an error, by the type of its class or nearest base class."""
+    """Return the problem document of an error as a response."""
     kind = problem_type(type(error))
     fields = error.fields if isinstance(error, errors.InvalidRequest) else ()
     detail = kind.detail or str(error)
@@ -56,17 +56,17 @@ def error_problem(request_id: str, error: errors.SceneprintError) -> JSONRespons
     return response
 
 
-#: Names of RFC 9110 that the standard library has since Python 3.13.
+#: Names from RFC 9110, which the standard library has since Python 3.13.
 _PHRASES = {413: "Content Too Large", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
 
 
 def phrase(status: int) -> str:
-    """Return the name of a status code, the same in all versions of Python."""
+    """Return the name of a status code, independent of the version of Python."""
     return _PHRASES.get(status, HTTPStatus(status).phrase)
 
 
 def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return responses with these status codes for the OpenAPI document."""
+    """Return error responses with these status codes, for the OpenAPI document."""
     content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
     return {
         status: {"description": phrase(status), "content": content}
@@ -75,7 +75,7 @@ def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 
 def install(app: FastAPI) -> None:
-    """Install exception handlers that turn every error into a problem document."""
+    """Install exception handlers that convert all errors to problem documents."""
 
     @app.exception_handler(errors.SceneprintError)
     async def _ours(request: Request, error: errors.SceneprintError) -> JSONResponse:
@@ -98,7 +98,7 @@ def install(app: FastAPI) -> None:
         detail = f"{request.method} {request.url.path}: {error.detail}. See /docs."
         answer = problem(_id(request), name, error.status_code, detail)
         answer.headers.update(error.headers or {})
-        if error.status_code == 405:  # Starlette lists only the methods of the first route
+        if error.status_code == 405:  # add methods, since Starlette lists only those of one route
             answer.headers["Allow"] = ", ".join(_allowed(app, request.url.path))
         return answer
 
@@ -107,10 +107,10 @@ def install(app: FastAPI) -> None:
         log.error("unexpected error", exc_info=error, extra={"request_id": _id(request)})
         detail = (
             "The service failed to handle this request; nothing was partially written. Its log "
-            "has the traceback under the request's id. Please report it."
+            "contains the traceback under the id of the request. Please report it."
         )
         answer = problem(_id(request), "InternalError", 500, detail)
-        # `RequestMiddleware` does not see this response.
+        # This response does not pass through `RequestMiddleware`.
         for name, value in getattr(request.state, "headers", ()):
             answer.headers[name.decode()] = value.decode()
         for name, value in security_headers(answer.raw_headers):
@@ -120,11 +120,11 @@ def install(app: FastAPI) -> None:
 
 
 def _allowed(app: FastAPI, path: str) -> list[str]:
-    """Return the methods of a path. `/v1/keys/me` does not have those of `/v1/keys/{key_name}`."""
+    """Return the methods of a path, from the route with the fewest parameters."""
     paths = app.openapi()["paths"]
     found = [one for one in paths if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", one), path)]
     if not found:
-        return ["GET"]  # paths outside the document are read-only
+        return ["GET"]  # paths outside of the document are read-only
     return sorted(method.upper() for method in paths[min(found, key=lambda one: one.count("{"))])
 
 

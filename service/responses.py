@@ -1,4 +1,4 @@
-"""Responses with files and derived data, with ETags, content negotiation and byte ranges."""
+"""Responses with files and derived data: ETags, content negotiation and byte ranges."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ _QUALITY = re.compile(r";\s*q\s*=\s*(\d+(?:\.\d*)?)", re.ASCII)
 
 
 def expected_tags(request: Request) -> Collection[str] | None:
-    """Return the entity tags of If-Match, or None for any; raise InvalidRequest if the header has
-    no tag.
+    """Return the entity tags of If-Match; None if any tag matches. Raise InvalidRequest if the
+    header is not valid.
     """
     header = ", ".join(request.headers.getlist("if-match")).strip()
     if header in ("", "*"):
@@ -42,13 +42,13 @@ def expected_tags(request: Request) -> Collection[str] | None:
 
 
 def is_known(request: Request, tag: str) -> bool:
-    """Return whether If-None-Match names this entity tag, so that the client has the content."""
+    """Return whether If-None-Match contains an entity tag, so that the client has the content."""
     header = ", ".join(request.headers.getlist("if-none-match")).strip()
     return header == "*" or any(one == tag for _, one in _TAG.findall(header))
 
 
 def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
-    """Return the media type that Accept prefers; the first one if Accept prefers none of them."""
+    """Return the offered media type that Accept prefers; by default, the first."""
     ranges: dict[str, float] = {}
     for kind, parameters in _TYPE.findall(", ".join(request.headers.getlist("accept"))[:1000]):
         found = _QUALITY.search(parameters)
@@ -72,16 +72,16 @@ def file_responses(
     *kinds: str, description: str, model: Any = None, statuses: tuple[int, ...] = (404, 409),
     tagged: bool = True, ranges: bool = False,
 ) -> dict[int | str, dict[str, Any]]:  # fmt: skip
-    """Return the responses of a route that sends files, for the OpenAPI document.
+    """Return the responses of a route that returns files, for the OpenAPI document.
 
     Parameters
     ----------
-    kinds : media types of the file; text types have text as their schema
+    kinds : media types of the file
     description : description of a successful response
     model : class of the response if it is JSON
     statuses : status codes of errors
     tagged : whether the file has an entity tag
-    ranges : whether a request may ask for a range; see `send_file`
+    ranges : whether the route supports byte ranges; see `send_file`
     """
     content = {one: {"schema": _STRING if one.startswith("text/") else _BINARY} for one in kinds}
     done: dict[str, Any] = {"description": description, "content": content}
@@ -97,7 +97,7 @@ def file_responses(
 
 
 def tag_headers(output: Output[Any]) -> dict[str, str]:
-    """Return the headers of an output with its entity tag."""
+    """Return the response headers with the entity tag of an output."""
     return {"ETag": f'"{output.tag}"', "Cache-Control": "private, no-cache"}
 
 
@@ -105,7 +105,7 @@ async def send_output(
     request: Request, here: Service, output: Output[bytes], kind: str,
     name: str | None = None, **headers: str,
 ) -> Response:  # fmt: skip
-    """Send an output. It is built only if the client does not have it, after a wait at the gate."""
+    """Return a response with an output; compute it at the gate unless the client has it already."""
     headers |= tag_headers(output)
     if is_known(request, output.tag):
         return Response(None, 304, headers)
@@ -116,14 +116,14 @@ async def send_output(
 
 
 def safe(name: str) -> str:
-    """Replace characters of an id that a header must not contain."""
+    """Replace characters of an id that are not allowed in headers."""
     return "".join(one if one.isascii() and one.isprintable() and one not in '"\\/' else "_"
                    for one in name)  # fmt: skip
 
 
-# Files sent in chunks, whole or in part, so that memory does not grow with their size.
+# Files sent in chunks, which limits memory.
 
-#: Number of bytes in one read.
+#: Number of bytes per read.
 _CHUNK = 1 << 18
 _RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", re.IGNORECASE | re.ASCII)
 
@@ -131,9 +131,9 @@ _RANGE = re.compile(r"\s*bytes\s*=\s*(\d{0,18})\s*-\s*(\d{0,18})\s*", re.IGNOREC
 def send_file(
     request: Request, open_file: Callable[[], BinaryIO], media_type: str, tag: str, name: str
 ) -> Response:
-    """Return a file, or the one range of it that the request names (RFC 9110, section 14).
+    """Return a response with a file, or with the requested range of it (RFC 9110, section 14).
 
-    The file is opened before this returns, so that deleting it afterwards does not matter.
+    The file is opened before this returns, so that it can be deleted meanwhile.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def send_file(
 def send_product_file(
     request: Request, here: Service, find: Callable[[], JobFile], name: str
 ) -> Response:
-    """Return a file that a job has created, or the requested range of it; see `send_file`.
+    """Return a response with a result file of a job; see `send_file`.
 
     Parameters
     ----------
@@ -192,13 +192,13 @@ def send_product_file(
             return send_file(
                 request, lambda: blobs.open(file.blob), file.media_type, file.blob, name
             )
-    find()  # raises if the job has been deleted in the meantime
+    find()  # raises if the job was deleted
     raise DamagedBlob(f"{file.name} of the job is damaged. Delete the job, and start another.")
 
 
 def _requested_range(request: Request, tag: str, size: int) -> tuple[int, int]:
-    """Return the first and last byte of the range. It is the whole file if Range is invalid or
-    names several ranges, or if If-Range names another version of the file.
+    """Return the first and the last byte of the requested range, or those of the whole file if
+    Range is not valid or has several ranges, or If-Range has another entity tag.
     """
     whole = 0, size - 1
     condition = request.headers.get("if-range")
@@ -207,7 +207,7 @@ def _requested_range(request: Request, tag: str, size: int) -> tuple[int, int]:
     found = _RANGE.fullmatch(request.headers.get("range", ""))
     if found is None or not (found[1] or found[2]) or size == 0:
         return whole
-    if not found[1]:  # a suffix range: the last bytes
+    if not found[1]:  # a suffix range
         return (size - min(int(found[2]), size), size - 1) if int(found[2]) else (size, size - 1)
     first, last = int(found[1]), int(found[2] or size - 1)
     return whole if found[2] and last < first else (first, min(last, size - 1))

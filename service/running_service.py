@@ -1,4 +1,4 @@
-"""The state that all routes of a running service share: parts of the engine, gates and metrics."""
+"""The shared state of all routes of a running service: parts of the engine, gates and metrics."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from service.metrics import Metrics
 
 T = TypeVar("T")
 
-#: Maximum number of uploads in progress. With 12, one wait for the disk serves all of them.
+#: Maximum number of uploads in progress, which share commits.
 UPLOADS = 12
-#: Number of threads that look up keys, besides the shared threads.
+#: Number of separate threads that look up keys.
 LOOKUPS = 4
-#: Maximum number of concurrent requests in shared threads, such as lists, and the maximum of one
-#: tenant while others wait. They compete for one interpreter lock.
+#: Maximum number of concurrent requests in shared threads, such as lists, and maximum of one tenant
+#: while others wait.
 READS, READS_BESIDE = 8, 1
 #: Maximum age of the result of `/readyz`, seconds.
 READY_S = 1.0
 
 
 class Service:
-    """Parts of the engine by name, and the limits of the work of requests.
+    """Parts of the engine by name, and limits on the work of requests.
 
     Parameters
     ----------
@@ -55,16 +55,16 @@ class Service:
     Attributes
     ----------
     gate : limit of concurrent queries and other computations
-    upload_gate : limit of concurrent uploads and edits of many frames. They wait for the disk and
-        for other writers, so queries have a gate of their own
+    upload_gate : limit of concurrent uploads and edits of many frames, which mostly wait for the
+        disk and for other writers
     keys : whether requests need a key
     feed : stream of events
     request_rate, wrong_keys : rate limits of requests by tenant, and of wrong keys by address
-    places : maximum number of requests in progress; a tenant may have three quarters of them
+    places : maximum number of requests in progress, of which a tenant may have three quarters
     wait_s : maximum wait for a turn, seconds
-    requests : number of requests in progress of each tenant
+    requests : number of requests in progress by tenant
     reads : turns of requests in shared threads
-    spool : number of bytes on disk that wait to be read
+    spool : spooled bytes by tenant
     lookups : threads that look up keys
     checks : results of state checks that concurrent requests share
     """
@@ -88,7 +88,7 @@ class Service:
 
         self.wait_s = settings.queue_timeout_s
         self.gate = Gate(settings.concurrent_requests, settings.queued_requests, self.wait_s)
-        # Uploads mostly wait for the disk; the store limits the number of concurrent decodings.
+        # Uploads mostly wait for the disk; the store limits concurrent decoding.
         self.upload_gate = Gate(
             max(UPLOADS, settings.concurrent_requests), settings.queued_requests, self.wait_s,
             max(settings.concurrent_requests // 2, 1), rests=True,
@@ -104,7 +104,7 @@ class Service:
         self.lookups, self.checks = CapacityLimiter(LOOKUPS), SharedChecks(READY_S)
 
     def find_key(self, secret: str) -> KeyRow | None:
-        """Return the key with a secret, even an expired one; None if it does not exist."""
+        """Return the key of a secret, even if it has expired; None for an unknown secret."""
         with self.context.store.database.read() as connection:
             found = find_key(connection, secret)
         if found is not None and (found.expires_at is None or found.expires_at > time.time()):
@@ -112,8 +112,8 @@ class Service:
         return found
 
     async def run(self, do: Callable[..., T], *arguments: object, patient: bool = False) -> T:
-        """Run a function in a shared thread after waiting for a turn of the tenant. Do not call
-        this while holding a turn.
+        """Wait for a turn of the tenant, and run a function in a shared thread. Do not call this
+        while holding a turn.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""HTTP server: socket, TLS, and connections with time limits that uvicorn lacks."""
+"""The HTTP server: socket, TLS, and connections with time limits that uvicorn lacks."""
 
 from __future__ import annotations
 
@@ -37,23 +37,23 @@ if TYPE_CHECKING:
 
 # Connections, closed if the client neither sends nor reads.
 #
-# uvicorn has no time limit for the head of a request and for a client that reads its response. A
-# proxy enforces stricter limits; these bound the connections and the memory of a service without
-# one.
+# uvicorn has no time limits for the head of a request and for reading a response. Proxies enforce
+# stricter limits; these protect the connections and the memory of a service without a proxy.
 
-#: Interval of checks, seconds, and the minimum of bytes that a client reads in it.
+#: Seconds between checks, and minimum number of bytes that a client must read in this time.
 READING_S, READING_BYTES = 30.0, 30 << 10
-#: Time limit for a connection without a complete request, and for a TLS handshake, seconds.
+#: Time limits for a connection without a complete request, and for a TLS handshake, seconds.
 SILENT_S, HANDSHAKE_S = 60.0, 10.0
-#: Maximum number of connections. Beyond it, the one that has been silent for longest is closed.
+#: Maximum number of connections; beyond it, the connection that has been silent for longest is
+#: closed.
 MOST_CONNECTIONS = 1000
-#: Number of other open files, such as the database, uploads, blobs and indexes.
+#: Number of file descriptors for other purposes, such as database, uploads, blobs and indexes.
 OTHER_FILES = 256
 
 
 class Connection(H11Protocol):
-    """A connection that closes if the client is too slow. The time to compute a response does not
-    count.
+    """A connection that is closed if the client is too slow. The time to compute a response does
+    not count.
     """
 
     _checking: asyncio.TimerHandle | None = None
@@ -64,7 +64,7 @@ class Connection(H11Protocol):
 
     @property
     def silent(self) -> bool:
-        """Whether no request is being answered."""
+        """Whether no request is in progress."""
         return self.cycle is None or self.cycle.response_complete
 
     @property
@@ -73,7 +73,7 @@ class Connection(H11Protocol):
         return self.silent and not self.transport.is_closing()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start. If there is no room, the connection that has been silent for longest is closed."""
+        """Start the connection; see `close_oldest`."""
         super().connection_made(transport)
         self.silent_since = time.monotonic()
         close_oldest(self.connections, self)
@@ -85,7 +85,7 @@ class Connection(H11Protocol):
         super().on_response_complete()
 
     def resume_writing(self) -> None:
-        """Note that the client has read enough."""
+        """Record that the client has read enough of its response."""
         super().resume_writing()
         self._unread_before = math.inf
 
@@ -99,7 +99,7 @@ class Connection(H11Protocol):
     def shutdown(self) -> None:
         """Finish the response in progress, or close an idle connection."""
         if self.idle and self._unread() == 0:
-            self.transport.abort()  # TLS would wait for the client's close message
+            self.transport.abort()  # `close` would wait for the close message of TLS
         super().shutdown()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -123,18 +123,18 @@ class Connection(H11Protocol):
         self._checking = self.loop.call_later(READING_S, self._check)
 
     def _unread(self) -> int:
-        """Return the number of unread bytes in our buffers and in those of the kernel."""
+        """Return the number of unread bytes in the buffers of the process and of the kernel."""
         carried = 0 if self.wire is None else self.wire.get_write_buffer_size()
         handle = self.transport.get_extra_info("socket")
         try:
             (kernel,) = struct.unpack("i", fcntl.ioctl(handle, termios.TIOCOUTQ, bytes(4)))
-        except (OSError, TypeError):  # closed in the meantime
+        except (OSError, TypeError):  # closed
             kernel = 0
         return self.transport.get_write_buffer_size() + carried + int(kernel)
 
 
 def close_oldest(connections: Iterable[object], new: object) -> None:
-    """If there is no room for a new connection, close the one that has been silent for longest."""
+    """Beyond the limit, close the connection that has been silent for longest, except `new`."""
     all_ours = [one for one in connections if isinstance(one, Connection | Handshake)]
     if len(all_ours) <= connection_limit():
         return
@@ -143,28 +143,28 @@ def close_oldest(connections: Iterable[object], new: object) -> None:
         min(waiting, key=lambda one: one.silent_since).transport.abort()
 
 
-# TLS. asyncio creates a connection only after the handshake, which may take a minute, so
-# unfinished handshakes would not be counted.
+# TLS. asyncio creates a connection only after the handshake, which may take a minute, so handshakes
+# would not count as connections.
 
-#: Shutdown timeout of asyncio, which must not end a connection whose last response is still being
-#: read: `Connection` has its own time limit.
+#: TLS shutdown timeout of asyncio. It must not end a connection whose client still reads a
+#: response, for which `Connection` has a time limit.
 NEVER_S = 86_400.0
 
 
 def tls_context(settings: Settings) -> ssl.SSLContext | None:
-    """Return the TLS context of the service, or None for plain HTTP. Raise InvalidRequest if the
-    certificate or key cannot be read, or they do not match.
+    """Return the TLS context of the service; None for plain HTTP. Raise InvalidRequest if the
+    certificate or the key cannot be read, or they do not match.
     """
     if settings.tls_cert is None or settings.tls_key is None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.options |= ssl.OP_NO_RENEGOTIATION  # it costs the server more than the client
+    context.options |= ssl.OP_NO_RENEGOTIATION  # costs the server more than the client
     context.set_alpn_protocols(["http/1.1"])
     try:
-        # Without a password function, OpenSSL would ask on the terminal for an encrypted key.
+        # Without a password function, OpenSSL would prompt for the password of an encrypted key.
         context.load_cert_chain(settings.tls_cert, settings.tls_key, password=lambda: "")
-    except (OSError, ValueError) as error:  # SSLError is an OSError
+    except (OSError, ValueError) as error:
         reason = getattr(error, "reason", None) or getattr(error, "strerror", None) or error
         raise InvalidRequest(
             f"The certificate {settings.tls_cert} and the key {settings.tls_key} cannot be used "
@@ -175,13 +175,13 @@ def tls_context(settings: Settings) -> ssl.SSLContext | None:
 
 
 class Handshake(asyncio.Protocol):
-    """A connection during the TLS handshake, counted and timed like any other.
+    """A connection during the TLS handshake, to which the limits of connections apply.
 
     Parameters
     ----------
     context : see `tls_context`
-    server_state : state of uvicorn with the set of all connections
-    more : other arguments for connections from uvicorn
+    server_state : state of uvicorn, which contains the set of all connections
+    more : further arguments of uvicorn for the connection
     """
 
     transport: asyncio.Transport
@@ -190,7 +190,7 @@ class Handshake(asyncio.Protocol):
     def __init__(self, context: ssl.SSLContext, *, server_state: ServerState, **more: Any) -> None:
         self._context, self._state, self._more = context, server_state, more
         self._connections: set[Any] = server_state.connections
-        self._early = bytearray()  # data that arrived between the end of the handshake and our code
+        self._early = bytearray()  # data that arrived before the end of `start_tls`
         self._lost = False
 
     @property
@@ -220,7 +220,7 @@ class Handshake(asyncio.Protocol):
         self.transport.abort()
 
     async def _agree(self) -> None:
-        """Do the handshake, and pass the transport to a connection."""
+        """Perform the handshake, and pass the transport to a connection."""
         try:
             secured = await asyncio.get_running_loop().start_tls(
                 self.transport, self, self._context, server_side=True,
@@ -252,20 +252,20 @@ def connection_limit() -> int:
 
 log = logging.getLogger(__name__)
 
-#: Interval after which a computing thread releases the interpreter, seconds. The event loop waits
-#: for each of a dozen threads in turn and answers nothing in the meantime; a query releases the
-#: interpreter a hundred times and waits each time to get it back.
+#: Seconds after which a computing thread releases the interpreter lock. With the default, the event
+#: loop would wait too long for a dozen threads, and so would a query, which acquires the lock a
+#: hundred times.
 SWITCH_S = 0.0001
-#: Time for requests in progress after the signal to stop, seconds.
+#: Seconds for requests in progress after the signal to stop.
 GRACE_S = 20
 
 
 def listen(settings: Settings) -> socket.socket:
-    """Open a socket on the address of the settings. Raise UnusableStore if the address is in use or
-    does not belong to this machine.
+    """Open a listening socket on the configured address. Raise UnusableStore if the address is in
+    use or does not belong to this machine.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    # With the protocol argument, asyncio disables Nagle's algorithm, which delays responses 40 ms.
+    # Only with a protocol does asyncio disable Nagle's algorithm, which delays responses by 40 ms.
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -284,8 +284,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
 
     Parameters
     ----------
-    ready : function that is called at the start, with the address, and whether the store is
-        read-only
+    ready : function to call at the start, with the address and whether the store is read-only
 
     Raises
     ------
@@ -293,7 +292,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     UnusableStore, NewerSchema : If the store cannot be opened or the address is not available.
     """
     context = tls_context(settings)
-    listening = listen(settings)  # first, so that a failure does not create a data folder
+    listening = listen(settings)  # before a data folder is created
     try:
         read_only = _require_store(settings)
     except BaseException:
@@ -326,7 +325,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     server = _Server(config, app, lambda: ready(url, read_only))
     try:
         server.run(sockets=[listening])
-    except KeyboardInterrupt:  # uvicorn repeats the signal with which `Front` stopped it
+    except KeyboardInterrupt:  # uvicorn raises the signal of `Front` again
         if app.error is None:
             raise
     finally:
@@ -338,7 +337,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
 def _require_store(settings: Settings) -> bool:
     """Return whether the store is read-only; raise an error if it cannot be opened.
 
-    The application opens the store again, but there uvicorn would print a traceback.
+    When the application opens the store later, uvicorn would print a traceback for an error.
     """
     store = open_patiently(lambda: open_store(settings.database, settings.served_blobs))
     try:
@@ -348,7 +347,7 @@ def _require_store(settings: Settings) -> bool:
 
 
 def _load(settings: Settings) -> FastAPI:
-    """Return the application. Imported objects are excluded from garbage collection."""
+    """Import and return the application; exclude imported objects from garbage collection."""
     from service.app import create_app
 
     app = create_app(settings)
@@ -358,14 +357,14 @@ def _load(settings: Settings) -> FastAPI:
 
 
 class _Server(uvicorn.Server):
-    """A server that reports its start and the beginning of its shutdown."""
+    """A server that calls `started`, and closes event streams at its shutdown."""
 
     def __init__(self, config: uvicorn.Config, front: Front, started: Callable[[], None]) -> None:
         super().__init__(config)
         self._front, self._started = front, started
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, and report it."""
+        """Start, and call `started`."""
         await super().startup(sockets)
         if self.started:
             self._started()

@@ -1,4 +1,4 @@
-"""Startup of the service: it answers `/healthz` at once, while the application loads.
+"""Startup of the service: `/healthz` responds at once, while the application is being loaded.
 
     uvicorn  -->  Front  -->  the application, once it is loaded
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 
 class Front:
-    """An ASGI application that loads another one in a thread. If that fails, it calls `failed`, and
-    `error` has the cause.
+    """An ASGI application that loads the real application in a thread. If this fails, it calls
+    `failed`, and `error` contains the cause.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Front:
         self._load, self._failed = load, failed
         self._alone = not settings.asks_for_keys
         self._loaded, self._stop = asyncio.Event(), asyncio.Event()
-        #: The application once it is loaded, and the error if loading failed.
+        #: The application after it is loaded, and the error if it could not be loaded.
         self.app: FastAPI | None = None
         self.error: Exception | None = None
 
@@ -45,7 +45,7 @@ class Front:
             return
         if self.app is None:
             if self._is_harmless(scope):
-                content = {"status": "ok", "version": __version__}  # as the application answers
+                content = {"status": "ok", "version": __version__}  # as in the application
                 response = JSONResponse(content, headers={"X-Request-Id": uuid.uuid4().hex})
                 response.raw_headers += security_headers(response.raw_headers)
                 await response(scope, receive, send)
@@ -56,7 +56,7 @@ class Front:
         await self.app(scope, receive, send)
 
     def _is_harmless(self, scope: Scope) -> bool:
-        """Return whether a request is for `/healthz` and is not sent by another site."""
+        """Return whether a request is for `/healthz`, and not from a page of another site."""
         asks = scope["path"] == "/healthz" and scope["method"] in ("GET", "HEAD")
         headers = scope["headers"]
         if not asks or any(name == b"origin" for name, _ in headers):

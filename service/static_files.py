@@ -1,6 +1,6 @@
 """Static files, compressed once: the page `/docs` and the OpenAPI document.
 
-`/docs` is Swagger UI for the service's own OpenAPI document. All its files come from the package
+`/docs` is Swagger UI for the OpenAPI document of the service. All its files come from the package
 fastapi-offline, so the page needs no network.
 """
 
@@ -56,17 +56,17 @@ def read_file(path: Path) -> StaticFile:
 
 
 def pack_file(suffix: str, plain: bytes) -> StaticFile:
-    """Return bytes as a static file with a suffix of `KINDS`."""
+    """Compress bytes to a static file; `suffix` is in `KINDS`."""
     tag = hashlib.sha256(plain).hexdigest()[:20]
     return StaticFile(KINDS[suffix], plain, gzip.compress(plain, 9, mtime=0), tag)
 
 
 def answer_file(request: Request, file: StaticFile, policy: str | None = None) -> Response:
-    """Return a response with a file, or 304 if the client has it.
+    """Return a response with a file, or 304 if the client has the file.
 
     Parameters
     ----------
-    policy : content security policy of the file; default: the policy that allows nothing
+    policy : content security policy; the default allows nothing
     """
     packs = "gzip" in request.headers.get("accept-encoding", "")
     tag = f"{file.tag}-gzip" if packs else file.tag
@@ -85,7 +85,7 @@ def answer_file(request: Request, file: StaticFile, policy: str | None = None) -
     return Response(file.packed if packs else file.plain, headers=headers)
 
 
-#: Scripts and documents are those of the service. Swagger UI adds inline styles and data images.
+#: Allow only scripts and documents of the service; Swagger UI adds inline styles and data images.
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
@@ -119,8 +119,8 @@ _LIBRARY = ("swagger-ui.css", "swagger-ui-bundle.js")
 
 
 def routes(document: Callable[[], dict[str, Any]]) -> APIRouter:
-    """Return the routes of the page `/docs`, its files and the OpenAPI document, which is built on
-    the first request.
+    """Return the routes of the page `/docs`, its files and the OpenAPI document. The first request
+    calls `document`.
     """
     router = APIRouter(include_in_schema=False)
     rendered: list[StaticFile] = []
@@ -151,7 +151,7 @@ def routes(document: Callable[[], dict[str, Any]]) -> APIRouter:
 
 @cache
 def _file(name: str) -> StaticFile:
-    """Return a file by its name. It is packed on first use, because the library has 1.5 MB."""
+    """Return a file of Swagger UI by name; it is compressed on first use."""
     if name == "index.html":
         return pack_file(".html", _PAGE.encode())
     if name == "start.js":

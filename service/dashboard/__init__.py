@@ -1,7 +1,7 @@
 """The dashboard: static pages that use only the public HTTP API.
 
-The service reads the folder `pages` at startup and serves only those files. Paths of requests are
-looked up among their names and never reach the disk.
+The service reads the folder `pages` at startup and serves only these files. Request paths are keys
+of a dictionary, and never reach the disk.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ POLICY = "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-acti
 
 
 def files_in(folder: Path) -> dict[str, StaticFile]:
-    """Return the files of a folder and its subfolders that browsers load, by relative path."""
+    """Read the files in a folder and its subfolders that browsers load, by relative path."""
     return {
         path.relative_to(folder).as_posix(): read_file(path)
         for path in sorted(folder.rglob("*"))
@@ -44,7 +44,7 @@ def routes(files: Mapping[str, StaticFile]) -> APIRouter:
     def front(request: Request) -> Response:
         if "text/html" not in request.headers.get("accept", ""):
             raise HTTPException(404, "Not Found")
-        # A relative address keeps the prefix and the TLS of a proxy.
+        # A relative address preserves the prefix and the TLS of a proxy.
         return Response(status_code=307, headers={"Location": "dashboard", "Vary": "Accept"})
 
     @router.api_route("/dashboard", methods=["GET", "HEAD"])

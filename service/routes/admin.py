@@ -45,7 +45,7 @@ from service.running_service import Here
 
 router = APIRouter(tags=["operations"])
 
-#: Longest time that `/readyz` waits for the state of the compiled kernels, seconds.
+#: Maximum seconds that `/readyz` waits for compiled kernels.
 KERNEL_CHECK_S = 1.0
 
 
@@ -80,7 +80,7 @@ async def healthz() -> Health:
 @router.head("/readyz", include_in_schema=False)
 @router.get(
     "/readyz", responses=refusals(), response_model_exclude_defaults=True,
-    openapi_extra={"security": [{}]},  # besides a key: none
+    openapi_extra={"security": [{}]},  # the key is optional
 )  # fmt: skip
 async def readyz(here: Here, caller: Guest) -> Readiness:
     """Return 200 if the service is ready. Return 503 while the database or the object store does
@@ -88,7 +88,7 @@ async def readyz(here: Here, caller: Guest) -> Readiness:
     migrated the store. No key is required. The result is at most one second old.
     """
     found = await here.checks.get("readiness", partial(_check_readiness, here.context))
-    # Counting takes time that grows with the store, so requests without a key get no counts.
+    # Requests without a key get no counts, whose computation takes time.
     if caller is None or not caller.reads_every:
         return found
     frames, jobs = await here.checks.get("counts", here.statistics.state_counts)
@@ -247,7 +247,7 @@ def stats(
 def models(here: Here, caller: Sender) -> Page[ModelInfo]:
     """List the models for maps (the presets, and all models that maps have or had)."""
     found = here.catalogue.list_all(lambda name: caller.may("read", name))
-    if not caller.reads_every:  # a model of unreadable maps would reveal them
+    if not caller.reads_every:  # do not reveal models of unreadable maps
         found = [one for one in found if one.preset or one.maps]
     return Page[ModelInfo](items=found)
 

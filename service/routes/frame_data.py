@@ -149,7 +149,7 @@ async def get_upload(map_name: str, frame_id: str, request: Request, here: Here)
 
 
 def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str) -> Response:
-    """Send an upload from its file; several uploads of 70 MiB in memory would be too much."""
+    """Return a response with an upload, sent from its file to limit memory."""
     blobs, blob = here.context.store.blobs, found.blob or ""
     if blobs.condition(blob) == "sound":
         with suppress(FileNotFoundError):
@@ -157,7 +157,7 @@ def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str
                 kind, suffix = upload_type(file.read(HEAD))
             name = safe(f"{frame_id}{suffix}")
             return send_file(request, lambda: blobs.open(blob), kind, found.tag, name)
-    found.make()  # raises an error that says what is wrong with the blob
+    found.make()  # raises the error of the blob
     raise DamagedBlob(f"The upload of frame {frame_id} has just been restored. Try again.")
 
 

@@ -71,9 +71,9 @@ def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
 # Uploads: one frame, one frame under an id of the caller, or a batch.
 
 
-#: Longest time to wait for a worker, seconds.
+#: Maximum seconds to wait for a worker.
 LONGEST_WAIT_S = 200.0
-#: Pause between reads of the state, seconds. It starts short: most frames are signed at once.
+#: First and maximum pause between reads of the state, seconds, and its growth factor.
 FIRST_PAUSE_S, LONGEST_PAUSE_S, GROWTH = 0.03, 0.5, 1.5
 
 _PRIORITY = {
@@ -217,7 +217,7 @@ async def _add_frame(
 
 
 def _wait(prefer: str | None) -> float:
-    """Return the wait in seconds of the header `Prefer` (RFC 7240); 0 if it is not valid."""
+    """Return the wait in seconds from the header `Prefer` (RFC 7240); 0 if it is not valid."""
     found = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d{1,6})", prefer or "", re.IGNORECASE)
     return min(float(found[1]), LONGEST_WAIT_S) if found else 0.0
 
@@ -225,8 +225,8 @@ def _wait(prefer: str | None) -> float:
 async def _wait_for_frame(
     request: Request, here: Service, map_name: str, added: Added, wait_s: float
 ) -> Added:
-    """Return the frame in its final state, or in its present state after the wait or when the
-    client has disconnected.
+    """Wait until a frame has its final state, for at most `wait_s` seconds or until the client
+    disconnects; return the frame.
     """
     until, pause = time.monotonic() + wait_s, FIRST_PAUSE_S
     while added.state in (FrameState.RECEIVED, FrameState.SIGNING):
@@ -244,9 +244,9 @@ async def _wait_for_frame(
 
 imports_router = v1_router("/maps/{map_name}/imports", "imports")
 
-#: Media types of archives. The first bytes of the body decide the format.
+#: Media types of archives. The magic bytes of the body determine the format.
 TYPES = media_types_of("archive")
-#: Number of bytes in one write.
+#: Number of bytes per write.
 _CHUNK = 1 << 20
 _TEXTS = (
     "as", "name", "robot", "session", "parent_frame", "every", "with_poses", "trust_depth",
@@ -256,7 +256,7 @@ _PARAMETERS = (
     *_TEXTS, "tags", "base", "base_frame", "up", "heights", "offset", "camera", "priority",
     "if_novel",
 )  # fmt: skip
-#: How the query string writes options with several values.
+#: Descriptions of options with several values in the query string.
 _WRITTEN = {
     "tags": "Separated by commas.",
     "heights": "Separated by commas.",

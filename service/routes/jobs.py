@@ -36,7 +36,7 @@ from service.running_service import Here, Service
 
 router = v1_router("/jobs", "jobs")
 
-#: Maximum number of dead jobs in one request; each retry is a commit.
+#: Maximum number of dead jobs to retry per request; each retry is a commit.
 MOST_RETRIED = 200
 
 
@@ -186,7 +186,7 @@ async def events(
     last = after if last_event_id is None else last_event_id
 
     def read_filter() -> tuple[EventFilter, int | None]:
-        seals.row("event", cursor)  # raises for an invalid cursor, although a stream has no pages
+        seals.row("event", cursor)  # validates the cursor, although a stream has no pages
         wanted = _wanted(here, caller, map_name, kind)
         return wanted, None if last is None else seals.event(last, place)
 
@@ -223,12 +223,12 @@ def _wanted(here: Service, caller: Caller, map_name: str | None, kinds: list[str
 
 
 def _access_check(request: Request, here: Service, caller: Caller) -> Callable[[], bool]:
-    """Return a function that checks whether the key is still valid, with the same grants."""
+    """Return a function that checks that the key is still valid and has the same grants."""
     secret = request.headers.get("authorization", "").partition(" ")[2].strip()
 
     def has_access() -> bool:
         if not caller.name:
-            return True  # no key is required
+            return True
         key = here.find_key(secret)
         lasts = key is not None and (key.expires_at is None or key.expires_at > time.time())
         return key is not None and lasts and dict(key.grants) == dict(caller.grants)

@@ -79,7 +79,7 @@ DryRun = Annotated[
 
 
 def _document(record: str) -> dict[str, Any]:
-    """Return the request body and the header `If-Match`, which FastAPI cannot infer."""
+    """Return the request body and the header `If-Match`, for the OpenAPI document."""
     schema = {"schema": {"$ref": f"#/components/schemas/{record}"}}
     text = (
         "The ETag of a previous response. If the object has been edited since, the response is "

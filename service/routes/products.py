@@ -32,7 +32,7 @@ def product_router(
     products_of: Callable[[Service], Products[Any, Any]], record: type[Product], about: str, *,
     optional: bool = False,
 ) -> APIRouter:  # fmt: skip
-    """Return the routes that all products have: begin, list, get and delete.
+    """Return the routes that all products have: to begin, list, get and delete them.
 
     Parameters
     ----------

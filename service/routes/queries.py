@@ -47,13 +47,13 @@ _QUERY = "The query"
 
 @dataclass(frozen=True, eq=False)
 class QueryBody(Generic[Asked]):
-    """Contents of the request of a query.
+    """The content of a query request.
 
     Parameters
     ----------
     query : options of the query
-    upload : the sent frame; None if a stored frame is named
-    named : fields of bodies.JSON beside the query, by name
+    upload : uploaded frame; None if the request names a stored frame
+    named : JSON fields beside the query, by name
     robot : name of the robot that sends the query; None if unknown
     """
 
@@ -69,7 +69,7 @@ class QueryBody(Generic[Asked]):
 
 
 class _Sender(Given):
-    """The field of JSON that names the sender."""
+    """The JSON field that names the sender."""
 
     robot: Label | None = None
 
@@ -82,9 +82,9 @@ async def read_query(
 
     Parameters
     ----------
-    request : request with JSON, or with a frame that `read_upload` reads
+    request : request with JSON, or with a frame for `read_upload`
     kind : class of the query
-    named : name of the JSON field that names a stored frame; a form does not have it
+    named : name of the JSON field that names a stored frame; forms do not have it
 
     Raises
     ------
@@ -102,7 +102,7 @@ async def read_query(
 
 
 async def read_object(request: Request) -> dict[str, Any]:
-    """Return the body as a JSON object; raise MalformedBody if it is not one."""
+    """Return the body as a JSON object; raise MalformedBody if it is not a JSON object."""
     body = await bodies.read_json(request)
     if not isinstance(body, dict):
         raise MalformedBody("The body is not a JSON object. Send an object.")
@@ -128,7 +128,7 @@ def query_operation(kind: type[BaseModel], named: Mapping[str, Any], required: l
     """
     own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
     texts = {n: bodies.as_text(one) for n, one in own.items() if n not in bodies.FRAME_PARTS}
-    # Generated clients send the default, and as text if the field may be a text or a list.
+    # Generated clients send the default, as text if the field may be a text or a list.
     own["stages"]["default"] = texts["stages"]["default"]
     needed = sorted({*bodies.FRAME_PARTS, *(name for name in required if name in texts)})
     body = bodies.form_body(bodies.FRAME_PARTS | texts, needed, "meta")
@@ -155,14 +155,14 @@ def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
     return {"requestBody": bodies.form_body(properties, ["frame", "metas"], "metas")}
 
 
-# The comparison of two frames, each named or sent in a part of a form.
+# The comparison of two frames, which are named, or sent in parts of a form.
 
 _SIDES = ("a", "b")
 
 
 @dataclass(frozen=True, eq=False)
 class Sent:
-    """A frame of a form. Its bytes stay on disk until they are read."""
+    """A frame of a form, with its content in a spooled file."""
 
     file: BinaryIO
     meta: FrameMeta
@@ -201,7 +201,7 @@ async def read_pair(request: Request) -> AsyncIterator[PairBody]:
 
 
 def _parts(form: FormData) -> tuple[dict[str, BinaryIO], dict[str, str]]:
-    """Return the files and the texts of a form by their names."""
+    """Return the files and the texts of a form by name."""
     files: dict[str, BinaryIO] = {}
     texts: dict[str, str] = {}
     for name, value in form.multi_items():
@@ -222,7 +222,7 @@ def _parts(form: FormData) -> tuple[dict[str, BinaryIO], dict[str, str]]:
 def _pair_frame(
     name: str, how: Comparison, files: Mapping[str, BinaryIO], texts: Mapping[str, str]
 ) -> NamedFrame | Sent:
-    """Return frame `name` of a comparison."""
+    """Return frame `name` (a or b) of a comparison."""
     named: NamedFrame | None = getattr(how, f"frame_{name}")
     if (named is None) == (name not in files):
         raise _wrong(
@@ -249,11 +249,11 @@ def _wrong(name: str, how: str) -> InvalidRequest:
 async def run_query(
     here: Service, sent: SentQuery, since: float, do: Callable[[], Answer]
 ) -> Answer:
-    """Answer a query after its wait at the gate, count it, and log it if it fails.
+    """Answer a query at the gate, count it, and log it if it fails.
 
     Parameters
     ----------
-    here : the service; the query already has a place at its gate
+    here : service; the query must hold a place at its gate
     sent : the query and its sender
     since : time of the request, by `time.perf_counter`
     do : function that answers and logs the query, in a thread
@@ -264,7 +264,7 @@ async def run_query(
     """
     try:
         answer = await here.gate.run(do)
-    except NotFound:  # no query was started, so there is nothing to log
+    except NotFound:  # not logged, since no query was started
         raise
     except Exception as error:
         here.context.query_log.note(query_row(sent, error, time.perf_counter() - since))

@@ -39,7 +39,7 @@ def get_sessions(
     return list_sessions(here.context.store, map_name, cursor, limit)
 
 
-# Names of sessions may contain slashes, so they are not part of the path.
+# Session names are not part of the path, since they may contain slashes.
 _SessionName = Annotated[Label, Query(description="Name of the session.")]
 _Robot = Annotated[
     Label | None, Query(description="Only frames of this robot; default: all robots.")

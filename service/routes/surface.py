@@ -25,7 +25,7 @@ from service.running_service import Here
 router = v1_router("/maps/{map_name}/surface", "surface", may_read)
 
 _PNG, _BYTES = "image/png", "application/octet-stream"
-#: Content under a digest never changes.
+#: Cache header for content with a digest, which never changes.
 _FOREVER = "private, max-age=31536000, immutable"
 Parent = Annotated[
     Label | None, Query(description="Parent frame; default: the parent frame with the most frames.")
@@ -168,14 +168,14 @@ async def get_surface_plan(
 
 
 def _numbers(name: str, text: str, count: int) -> list[float]:
-    """Return the numbers that a parameter lists; raise InvalidRequest if there are too few, too
-    many or invalid ones.
+    """Return the comma-separated numbers of a parameter; raise InvalidRequest unless they are
+    `count` valid numbers.
     """
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
-    if len(found) != count or not all(abs(one) <= FARTHEST_M for one in found):  # NaN is not
+    if len(found) != count or not all(abs(one) <= FARTHEST_M for one in found):  # false for NaN
         raise InvalidRequest(
             f"`{name}` is {text!r:.80}. Specify {count} numbers in metres, separated by commas.",
             ((name, f"not {count} numbers"),),
