@@ -320,6 +320,21 @@ def page(open_page: Callable[..., Page]) -> Page:
     return open_page()
 
 
+@pytest.fixture
+def run(station: Station, page: Page, settle: Settle) -> Callable[..., Any]:
+    """A function that evaluates JavaScript with a module of the dashboard, in a page that shows
+    nothing of its own. The module is `m`, and further arguments are the array `given`.
+    """
+    page.goto(f"{station.home}#/nowhere")
+    settle(page)
+
+    def evaluate(module: str, expression: str, *given: object) -> Any:
+        script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
+        return page.evaluate(script, [f"{station.url}/dashboard/{module}.js", list(given)])
+
+    return evaluate
+
+
 def _asked(page: Page, request: Request) -> None:
     """Record a request of a page, except streams, which never end."""
     home = httpx.URL(page.url if page.url.startswith("http") else request.url)

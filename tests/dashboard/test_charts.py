@@ -2,22 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 
 @pytest.fixture
-def call(station, page, settle):
-    """Call a function of a module of the dashboard, in a page that shows nothing of its own."""
-    page.goto(f"{station.home}#/nowhere")
-    settle(page)
-
-    def run(module: str, expression: str):
-        place = json.dumps(f"/dashboard/{module}")
-        return page.evaluate(f"async () => {{ const m = await import({place}); {expression} }}")
-
-    return run
+def call(run):
+    """A function that runs statements with a module, `m`."""
+    return lambda module, body: run(module, f"(async () => {{ {body} }})()")
 
 
 def test_steps_of_an_axis(call):
@@ -32,7 +23,7 @@ def test_steps_of_an_axis(call):
         (0.07, 3, 0, [0, 0.05, 0.1]),
         (1_999, 3, 1, [0, 1000, 2000]),
     ]:
-        found = call("lib/scales.js", f"return m.steps({most}, {count}, {least})")
+        found = call("lib/scales", f"return m.steps({most}, {count}, {least})")
         assert found == wanted, (most, found)
 
 
@@ -41,42 +32,42 @@ def test_paths_leave_gaps_where_nothing_is_known(call):
         "const v = [null, 1, 3, null, 2, null, 0, 4], x = (i) => 10 * i, y = (n) => 40 - 10 * n;"
     )
     told = call(
-        "lib/scales.js", f"{given} return [m.linePath, m.dotPath, m.areaPath].map(f => f(v, x, y))"
+        "lib/scales", f"{given} return [m.linePath, m.dotPath, m.areaPath].map(f => f(v, x, y))"
     )
     assert told == [
         "M10 30L20 10M60 40L70 0",
         "M40 20h0",
         "M10 40L10 30L20 10L20 40ZM60 40L60 40L70 0L70 40Z",
     ]
-    assert call("lib/scales.js", "return m.stacked([[1, null, 2], [3, 4, 0]])") == [
+    assert call("lib/scales", "return m.stacked([[1, null, 2], [3, 4, 0]])") == [
         [[0, 1], [0, 0], [0, 2]], [[1, 4], [0, 4], [2, 2]],
     ]  # fmt: skip
 
 
 def test_labels_stand_at_whole_minutes_of_the_clock(call):
     given = "const t = Array.from({length: 60}, (_, i) => new Date(2026, 10, 22, 9, 47 + i));"
-    told = call("lib/scales.js", f"{given} return m.timeTicks(t, 5).map((i) => m.clock(t[i]))")
+    told = call("lib/scales", f"{given} return m.timeTicks(t, 5).map((i) => m.clock(t[i]))")
     assert told == ["10:00", "10:15", "10:30", "10:45"]
-    assert call("lib/scales.js", f"{given} return m.timeTicks(t, 1).map((i) => m.clock(t[i]))") == [
+    assert call("lib/scales", f"{given} return m.timeTicks(t, 1).map((i) => m.clock(t[i]))") == [
         "10:00"
     ]
-    assert call("lib/scales.js", "return m.timeTicks([], 5)") == []
+    assert call("lib/scales", "return m.timeTicks([], 5)") == []
 
 
 def test_a_sparkline_is_of_all_values_from_nothing_to_the_most(call):
-    told = call("lib/sparkline.js", "return m.sparkPoints([0, 2, 1, 4], 90, 20, 2)")
+    told = call("lib/sparkline", "return m.sparkPoints([0, 2, 1, 4], 90, 20, 2)")
     assert told == [[0, 18], [30, 10], [60, 14], [90, 2]]
-    assert call("lib/sparkline.js", "return m.sparkPoints([0, 0], 90, 20, 2)") == [
+    assert call("lib/sparkline", "return m.sparkPoints([0, 0], 90, 20, 2)") == [
         [0, 18],
         [90, 18],
     ]
     drawn = """const e = m.sparkline([5], {label: "<b>grown</b>"}), line = e.lastElementChild;
         return [e.getAttribute("role"), e.getAttribute("aria-label"), line.getAttribute("d")]"""
-    assert call("lib/sparkline.js", drawn) == ["img", "<b>grown</b>", "M0 1.5L96 1.5"]
+    assert call("lib/sparkline", drawn) == ["img", "<b>grown</b>", "M0 1.5L96 1.5"]
 
 
 def test_a_chart_reads_out_what_the_keys_point_at_and_keeps_it(call, page):
-    call("lib/charts.js", """
+    call("lib/charts", """
         const one = m.chart({title: "Apples", kind: "bars", format: (n) => `${n} pc`,
           series: [{name: "red", colour: "--bad"}, {name: "green", colour: "--good"},
             {name: "all", colour: "--ink", over: true}]});
@@ -100,7 +91,7 @@ def test_a_chart_reads_out_what_the_keys_point_at_and_keeps_it(call, page):
     assert told() == "09:00: red 1 pc, green 3 pc, all 4 pc"
     page.keyboard.press("ArrowRight")
     assert told() == "09:01: red 0 pc, green 4 pc, all 4 pc"
-    call("lib/charts.js", "window.later()")
+    call("lib/charts", "window.later()")
     assert told() == "09:01: red 0 pc, green 4 pc, all 4 pc"  # stays with its minute
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Apples"
     page.keyboard.press("End")
@@ -120,7 +111,7 @@ def test_a_hidden_page_asks_nothing_and_catches_up_when_it_is_seen(call, page):
     hide = (
         "Object.defineProperty(document, 'hidden', {get: () => window.away, configurable: true});"
     )
-    asked = call("operations/poll.js", f"""{hide}
+    asked = call("operations/poll", f"""{hide}
         const done = new AbortController(), wait = (ms) => new Promise((r) => setTimeout(r, ms));
         const turn = () => document.dispatchEvent(new Event("visibilitychange"));
         window.away = false;
@@ -147,7 +138,7 @@ def test_a_hidden_page_asks_nothing_and_catches_up_when_it_is_seen(call, page):
 
 
 def test_rows_that_stay_are_left_alone_and_focus_moves_to_what_replaced_its_row(call):
-    told = call("operations/poll.js", """
+    told = call("operations/poll", """
         const list = document.createElement("ul");
         document.querySelector("main").append(list);
         const show = m.rows(list, (one) => one.id, (one) => {

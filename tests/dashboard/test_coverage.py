@@ -31,9 +31,7 @@ def click_at(page: Page, place: Any) -> None:
 
 
 @pytest.fixture
-def measured(
-    station: Any, four_sides: dict[str, Any], page: Page, settle: Settle
-) -> dict[str, Any]:
+def measured(station, four_sides, page, settle):
     """The result of a job that was begun on the page, which shows it."""
     del four_sides  # its map is measured
     path = "/v1/maps/four-sides/coverage"
@@ -58,10 +56,7 @@ def measured(
 
 
 @pytest.mark.thorough
-def test_a_result_is_begun_shown_and_explained(
-    station: Any, page: Page, settle: Settle, measured: dict[str, Any],
-    axe: Callable[[Page], list[str]],
-) -> None:  # fmt: skip
+def test_a_result_is_begun_shown_and_explained(station, page, settle, measured, axe):
     result, (plan,) = measured["result"], measured["plans"]
     assert result["ambiguous"] > 0  # its four sides look the same
     for name in OUTCOMES:
@@ -125,9 +120,7 @@ def test_a_result_is_begun_shown_and_explained(
 
 
 @pytest.mark.thorough
-def test_two_results_are_compared(
-    station: Any, four_sides: dict[str, Any], page: Page, settle: Settle, until: Callable[..., Any]
-) -> None:
+def test_two_results_are_compared(station, four_sides, page, settle, until):
     del four_sides  # its map is measured twice, by three of its frames
     path = "/v1/maps/four-sides/coverage"
     before, after = (
@@ -167,10 +160,8 @@ def test_two_results_are_compared(
     expect(page.locator("#cover-result")).not_to_have_value(after)
 
 
-def test_cells_are_ranked_by_what_robots_lose(station: Any, page: Page, settle: Settle) -> None:
+def test_cells_are_ranked_by_what_robots_lose(run):
     """Worked out by hand: shares found less shares wrong are -1, 0, 0, 0.5 and 1."""
-    page.goto(f"{station.home}#/")
-    settle(page)
 
     def cell(column: int, **counts: int) -> dict[str, int]:
         known = {"column": column, "row": 0, "frames": 9, "unchecked": 0}
@@ -180,10 +171,8 @@ def test_cells_are_ranked_by_what_robots_lose(station: Any, page: Page, settle: 
         cell(0, found=1, not_found=1), cell(1, found=3), cell(2, not_found=1), cell(3, ambiguous=2),
         cell(4, wrong=1), cell(5), cell(6, unchecked=2), cell(7, found=1, unchecked=1),
     ]  # fmt: skip
-    script = """async ([url, cells]) => { const m = await import(url);
-        return [m.worstCells(cells).map((one) => one.column), cells.map(m.outcomeIn)]; }"""
-    url = f"{station.url}/dashboard/coverage/outcomes.js"
-    worst, outcomes = page.evaluate(script, [url, cells])
+    worst = run("coverage/outcomes", "m.worstCells(given[0]).map((one) => one.column)", cells)
+    outcomes = run("coverage/outcomes", "given[0].map(m.outcomeIn)", cells)
     assert worst == [4, 3, 2, 0]
     assert outcomes[:5] == ["not_found", "found", "not_found", "ambiguous", "wrong"]
     assert outcomes[5:] == [None, "unchecked", "found"]

@@ -33,16 +33,17 @@ def filled(station: Any, until: Callable[..., Any], name: str, *, apart: bool) -
 
 
 @pytest.fixture(scope="module")
-def weeks(station: Any, until: Callable[..., Any]) -> str:
+def weeks(station, until):
     """See `filled`."""
     return filled(station, until, "weeks", apart=False)
 
 
+@pytest.mark.thorough
 def test_sessions_that_share_no_frame_are_joined_on_the_page_where_that_is_sure(
-    station: Any, until: Callable[..., Any], page: Page, settle: Settle
-) -> None:
+    station, until, page, settle
+):
     path = filled(station, until, "astray", apart=True)
-    page.allowed.append("422")  # type: ignore[attr-defined]
+    page.allowed.append("422")
     page.goto(f"{station.home}#/maps/astray/difference")
     settle(page)
     page.get_by_role("button", name="Compare").click()
@@ -59,9 +60,7 @@ def test_sessions_that_share_no_frame_are_joined_on_the_page_where_that_is_sure(
     expect(card.get_by_role("link", name="2 frames of reference")).to_be_visible()
 
 
-def test_two_sessions_are_compared_and_seen_side_by_side(
-    station: Any, weeks: str, page: Page, settle: Settle, axe: Callable[[Page], list[str]]
-) -> None:
+def test_two_sessions_are_compared_and_seen_side_by_side(station, weeks, page, settle, axe):
     page.goto(f"{station.home}#/maps/weeks/sessions")
     settle(page)
     page.get_by_role("link", name="Compare session tuesday").click()

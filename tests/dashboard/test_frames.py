@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -67,9 +66,7 @@ def add(station: Any, name: str, seeds: range, columns: int = 32) -> list[str]:
     return [one["frame"]["frame_id"] for one in answer.json()["items"]]
 
 
-def test_gallery_shows_and_filters_what_the_api_lists(
-    page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]]
-) -> None:
+def test_gallery_shows_and_filters_what_the_api_lists(page, station, settle, axe):
     page.goto(f"{station.home}#/maps/building")
     settle(page)
     assert ids(page) == listed(station, "building", order="desc")
@@ -119,10 +116,9 @@ def test_gallery_shows_and_filters_what_the_api_lists(
     assert len(ids(page)) == 16
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("moved", [False, True])
-def test_a_click_counts_although_what_was_pressed_is_drawn_anew(
-    page: Page, station: Any, settle: Callable[[Page], None], moved: bool
-) -> None:
+def test_a_click_counts_although_what_was_pressed_is_drawn_anew(page, station, settle, moved):
     name = f"pressed-{moved}".lower()
     station.make_map(name)
     (first,) = add(station, name, range(1))
@@ -144,9 +140,7 @@ def test_a_click_counts_although_what_was_pressed_is_drawn_anew(
 
 
 @pytest.mark.thorough
-def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(
-    page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any]
-) -> None:
+def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(page, station, settle, until):
     path = station.make_map("walls")
     came = add(station, "walls", range(50))
     until(lambda: station.client.get(path).json()["frames"] == {"rejected": 50})
@@ -187,7 +181,7 @@ def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(
     settle(page)
     assert ids(page) == newest[:24]
     # an address that was cut off is refused each time: there is a way on
-    page.allowed.append("422")  # type: ignore[attr-defined]
+    page.allowed.append("422")
     page.goto(f"{station.home}#/maps/walls?cursor=abc&page=2")
     expect(page.get_by_role("main")).to_contain_text("The cursor 'abc' is not valid")
     page.get_by_role("button", name="First page").click()
@@ -198,9 +192,7 @@ def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(
     expect(page.locator(".tile").first).to_have_attribute("data-frame", new[0])
 
 
-def test_states_change_as_they_happen(
-    page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any]
-) -> None:
+def test_states_change_as_they_happen(page, station, settle, until):
     path = station.make_map("coming")
     with page.expect_request(lambda one: "/v1/events" in one.url):
         page.goto(f"{station.home}#/maps/coming")
@@ -213,13 +205,13 @@ def test_states_change_as_they_happen(
     assert np.array_equal(drawn(page.locator(".tile canvas")), want)
     station.client.delete(f"{path}/frames/{one}")
     expect(page.locator(f"[data-frame='{one}'] .badge")).to_have_text("deleted")
-    page.allowed.append("404")  # type: ignore[attr-defined]
+    page.allowed.append("404")
     station.client.delete(path)
     expect(page.get_by_role("main")).to_contain_text("There is no map 'coming'")
 
 
 @pytest.fixture
-def shown(page: Page, station: Any, settle: Callable[[Page], None]) -> Sent:
+def shown(page, station, settle):
     """The page of a frame of `building`; what the API says of that frame."""
     path = f"/v1/maps/building/frames/{station.frames[4].frame_id}"
     page.goto(f"{station.home}#{path.removeprefix('/v1')}")
@@ -228,10 +220,7 @@ def shown(page: Page, station: Any, settle: Callable[[Page], None]) -> Sent:
     return found
 
 
-def test_frame_page_tells_what_the_api_tells(
-    page: Page, station: Any, shown: Sent, settle: Callable[[Page], None],
-    axe: Callable[[Page], list[str]], pixels: Callable[..., Image.Image],
-) -> None:  # fmt: skip
+def test_frame_page_tells_what_the_api_tells(page, station, shown, settle, axe, pixels):
     path = f"/v1/maps/building/frames/{shown['frame_id']}"
     facts = dict(
         zip(
@@ -299,10 +288,8 @@ def test_frame_page_tells_what_the_api_tells(
 
 
 @pytest.mark.thorough
-def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
-    page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any]
-) -> None:
-    page.allowed += ["412"]  # type: ignore[attr-defined]
+def test_an_edit_of_somebody_else_is_not_overwritten_unseen(page, station, settle, until):
+    page.allowed += ["412"]
     path = station.make_map("edited")
     [one] = add(station, "edited", range(1), columns=64)
     mine = f"{path}/frames/{one}"
@@ -334,7 +321,6 @@ def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
     expect(page.get_by_role("heading", name="No frames yet")).to_be_visible()
     assert station.client.get(mine).json()["state"] == "deleted"
     toast = page.locator(".toast", has_text="Deleted 1 frame").bounding_box()
-    assert toast is not None
     assert toast["x"] + toast["width"] <= 200  # in the rail, where it covers no control
     page.get_by_role("button", name="Undo", exact=True).click()
     expect(page.locator(".toast", has_text="Restored 1 frame.")).to_be_visible()
@@ -344,10 +330,7 @@ def test_an_edit_of_somebody_else_is_not_overwritten_unseen(
 
 
 @pytest.mark.thorough
-def test_frames_are_found_selected_changed_and_restored(
-    page: Page, station: Any, settle: Callable[[Page], None], until: Callable[..., Any],
-    axe: Callable[[Page], list[str]],
-) -> None:  # fmt: skip
+def test_frames_are_found_selected_changed_and_restored(page, station, settle, until, axe):
     path = station.make_map("picked")
     came = add(station, "picked", range(6))
     until(lambda: station.client.get(path).json()["frames"] == {"rejected": 6})

@@ -105,6 +105,7 @@ def test_new_queries_are_announced_and_looking_leaves_none(station, asked, page,
     assert len(rows) == len(before) + 2
 
 
+@pytest.mark.thorough
 def test_a_query_between_the_list_and_the_events_is_announced(station, asked, page, settle, until):
     held = []
 

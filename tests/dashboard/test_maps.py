@@ -20,7 +20,7 @@ def card(page: Page, name: str) -> Any:
     return page.locator(f"[data-map='{name}']")
 
 
-def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle) -> None:
+def test_a_card_tells_what_the_api_does(station, page, settle):
     station.make_map("marked-up", title=MARKUP)
     page.goto(station.home)
     settle(page)
@@ -56,9 +56,7 @@ def test_a_card_tells_what_the_api_does(station: Any, page: Page, settle: Settle
     )
 
 
-def test_a_map_is_made(
-    station: Any, page: Page, settle: Settle, axe: Callable[[Page], list[str]]
-) -> None:
+def test_a_map_is_made(station, page, settle, axe):
     page.allowed += ["422", "409"]
     page.goto(station.home)
     settle(page)
@@ -85,9 +83,7 @@ def test_a_map_is_made(
 
 
 @pytest.mark.thorough
-def test_a_map_is_retitled_and_an_edit_of_another_not_overwritten_unseen(
-    station: Any, page: Page, settle: Settle
-) -> None:
+def test_a_map_is_retitled_and_an_edit_of_another_not_overwritten_unseen(station, page, settle):
     page.allowed.append("412")
     path = station.make_map("retitled", title="Before")
     page.goto(station.home)
@@ -109,7 +105,7 @@ def test_a_map_is_retitled_and_an_edit_of_another_not_overwritten_unseen(
     assert station.client.get(path).json()["title"] == "Mine"
 
 
-def test_a_map_is_removed_when_its_name_was_typed(station: Any, page: Page, settle: Settle) -> None:
+def test_a_map_is_removed_when_its_name_was_typed(station, page, settle):
     path = station.make_map("condemned", title="To go")
     page.goto(station.home)
     settle(page)
@@ -129,7 +125,8 @@ def test_a_map_is_removed_when_its_name_was_typed(station: Any, page: Page, sett
     assert station.client.get(path).status_code == 404
 
 
-def test_counts_move_while_workers_sign(station: Any, page: Page, settle: Settle) -> None:
+@pytest.mark.thorough
+def test_counts_move_while_workers_sign(station, page, settle):
     page.goto(station.home)
     settle(page)
     path = station.make_map("growing")  # by another: the card comes by itself
@@ -142,9 +139,8 @@ def test_counts_move_while_workers_sign(station: Any, page: Page, settle: Settle
     expect(page.locator("#summary")).to_contain_text("frames indexed")
 
 
-def test_a_map_keeps_the_focus_while_its_counts_move(
-    station: Any, page: Page, settle: Settle
-) -> None:
+@pytest.mark.thorough
+def test_a_map_keeps_the_focus_while_its_counts_move(station, page, settle):
     path = station.make_map("focused")
     page.goto(station.home)
     settle(page)
@@ -159,7 +155,7 @@ def test_a_map_keeps_the_focus_while_its_counts_move(
 
 
 @pytest.mark.thorough
-def test_many_maps_are_few_requests(station: Any, page: Page, settle: Settle) -> None:
+def test_many_maps_are_few_requests(station, page, settle):
     for number in range(40):
         station.make_map(f"many-{number:02d}")
     names, at_once, most = [], set(), 0
@@ -188,13 +184,13 @@ def test_many_maps_are_few_requests(station: Any, page: Page, settle: Settle) ->
 
 
 @pytest.fixture(scope="module")
-def walk() -> list[Shot]:
+def walk():
     """A recorded walk through a room, with up to 40 cm between two views."""
     return shots((0,), 5, 8)
 
 
 @pytest.fixture(scope="module")
-def walked(station: Any, walk: list[Shot], until: Callable[..., Any]) -> dict[str, Any]:
+def walked(station, walk, until):
     """The surface of a map `walked`, which has the frames of the walk."""
     path = station.make_map("walked")
     send(station.client, "walked", walk)
@@ -215,10 +211,7 @@ def ask(station: Any, robot: str, shot: Shot) -> dict[str, Any]:
 
 
 @pytest.mark.thorough
-def test_robots_are_seen_moving_on_the_plan(
-    station: Any, page: Page, settle: Settle, axe: Callable[[Page], list[str]],
-    walk: list[Shot], walked: dict[str, Any],
-) -> None:  # fmt: skip
+def test_robots_are_seen_moving_on_the_plan(station, page, settle, axe, walk, walked):
     first = ask(station, "walker", walk[0])
     ask(station, "idler", walk[0])
     page.goto(f"{station.home}#/")
@@ -287,16 +280,10 @@ def test_robots_are_seen_moving_on_the_plan(
     assert after == {"found": before["found"] + 1}
 
 
-def test_the_health_is_one_sentence(station: Any, page: Page, settle: Settle) -> None:
-    page.goto(station.home)
-    settle(page)
-
+def test_the_health_is_one_sentence(run):
     def told(maps: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[Any]:
-        url = f"{station.url}/dashboard/maps/condition.js"
-        script = """async ([url, maps, jobs]) => {
-          const { kind, text, href } = (await import(url)).conditionOf(maps, jobs);
-          return [kind, text, href]; }"""
-        return list(page.evaluate(script, [url, maps, jobs]))
+        one = run("maps/condition", "m.conditionOf(...given)", maps, jobs)
+        return [one["kind"], one["text"], one.get("href")]
 
     def of(name: str, **frames: int) -> dict[str, Any]:
         return {"name": name, "frames": frames, "reencoding": None}
@@ -304,11 +291,8 @@ def test_the_health_is_one_sentence(station: Any, page: Page, settle: Settle) ->
     # the fleet page does not tell of a recording whose topic a person has to choose
     import_job = {"frame_id": None, "followed_by": None, "finished_at": "2101-01-01T00:00:00Z"}
     recordings = [None, {"recording": None}, {"recording": {"problem": "2 topics have frames."}}]
-    news = page.evaluate(
-        "async ([url, jobs]) => jobs.map((await import(url)).isNews)",
-        [f"{station.url}/dashboard/maps/condition.js",
-         [{**import_job, "progress": one} for one in recordings]],
-    )  # fmt: skip
+    jobs = [{**import_job, "progress": one} for one in recordings]
+    news = run("maps/condition", "given[0].map(m.isNews)", jobs)
     assert news == [True, True, False]
     fine = "Everything is signed; no job failed."
     assert told([], []) == told([of("hall", indexed=3, rejected=1)], []) == ["good", fine, None]
@@ -332,9 +316,7 @@ def test_the_health_is_one_sentence(station: Any, page: Page, settle: Settle) ->
 
 
 @pytest.mark.thorough
-def test_the_first_page_of_a_hundred_maps_is_small_and_fast(
-    station: Any, page: Page, settle: Settle, walked: dict[str, Any]
-) -> None:
+def test_the_first_page_of_a_hundred_maps_is_small_and_fast(station, page, settle, walked):
     del walked
     for number in range(100):
         station.make_map(f"hundred-{number:03d}")
@@ -346,28 +328,21 @@ def test_the_first_page_of_a_hundred_maps_is_small_and_fast(
     assert sum(sizes) <= 400_000
 
 
-def test_labels_and_colours_by_value(station: Any, page: Page, settle: Settle) -> None:
-    page.goto(station.home)
-    settle(page)
-
-    def run(module: str, expression: str, *values: object) -> Any:
-        script = f"async ([url, values]) => {{ const m = await import(url); return {expression}; }}"
-        return page.evaluate(script, [f"{station.url}/dashboard/lib/{module}.js", list(values)])
-
+def test_labels_and_colours_by_value(run):
     label = {"x": 50, "y": 50, "width": 30, "height": 20}
     spots = [[8, -26], [8, 6], [-38, -26], [-38, 6], [8, -48]]
-    assert run("labels", "m.spread(values[0])", [label] * 5) == spots
+    assert run("lib/labels", "m.spread(given[0])", [label] * 5) == spots
     far = {**label, "x": 90}  # its first spot is free again, unless the picture ends before
-    assert run("labels", "m.spread(values[0])", [label, far]) == [[8, -26], [8, -26]]
+    assert run("lib/labels", "m.spread(given[0])", [label, far]) == [[8, -26], [8, -26]]
     room = {"width": 100, "height": 60}
-    within = run("labels", "m.spread(...values)", [label, far, far], room)
+    within = run("lib/labels", "m.spread(...given)", [label, far, far], room)
     assert within == [[8, -26], [-38, -48], None]
     # a hash modulo six, and the next that is free; the seventh name begins anew
     names = ["a", "g", "b"]
-    assert run("palette", "[...m.paletteOf(values[0], 6)]", names) == [
+    assert run("lib/palette", "[...m.paletteOf(given[0], 6)]", names) == [
         ["a", 1],
         ["g", 2],
         ["b", 3],
     ]
-    shown = run("palette", "[...m.robotTokens(values[0])]", ["b", "a", "b"])
+    shown = run("lib/palette", "[...m.robotTokens(given[0])]", ["b", "a", "b"])
     assert shown == [["a", "--robot-1"], ["b", "--robot-2"]]

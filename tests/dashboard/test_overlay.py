@@ -62,14 +62,12 @@ def matrix(page: Page) -> Any:
 
 
 @pytest.fixture(scope="module")
-def answer(station: Any) -> dict[str, Any]:
+def answer(station):
     """Of a frame in the middle of the first room; the first match is accepted, others are not."""
     return ask(station, 3, k=3)
 
 
-def test_what_is_shown_is_what_the_api_says(
-    page: Page, station: Any, answer: Any, settle: Any, axe: Any
-) -> None:
+def test_what_is_shown_is_what_the_api_says(page, station, answer, settle, axe):
     best = answer["matches"][0]
     page.goto(address(station, answer, best))
     settle(page)
@@ -106,9 +104,7 @@ def test_what_is_shown_is_what_the_api_says(
 
 
 @pytest.mark.thorough
-def test_before_after_and_what_is_drawn(
-    page: Page, station: Any, answer: Any, settle: Any, pixels: Any, until: Any
-) -> None:
+def test_before_after_and_what_is_drawn(page, station, answer, settle, pixels, until):
     def told(match: dict[str, Any]) -> dict[str, Any]:
         path = f"/v1/queries/{answer['query_id']}/matches/{match['frame_id']}"
         reply: dict[str, Any] = station.client.get(path, params={"map": "building"}).json()
@@ -168,7 +164,8 @@ def test_before_after_and_what_is_drawn(
     assert shown() == aligned
 
 
-def test_the_file_is_what_is_shown(page: Page, station: Any, answer: Any, settle: Any) -> None:
+@pytest.mark.thorough
+def test_the_file_is_what_is_shown(page, station, answer, settle):
     best = answer["matches"][0]
     page.goto(address(station, answer, best, pose="before", colour="normal"))
     settle(page)
@@ -193,9 +190,7 @@ def box(ahead: float) -> dict[str, Any]:
 
 
 @pytest.mark.thorough
-def test_an_ambiguous_match_has_its_rival(
-    page: Page, station: Any, settle: Any, axe: Any, until: Any, pixels: Any
-) -> None:
+def test_an_ambiguous_match_has_its_rival(page, station, settle, axe, until, pixels):
     path = station.make_map("boxes")
     added = station.client.post(f"{path}/frames", **box(0), headers={"Prefer": "wait=200"})
     assert added.json()["state"] == "indexed", added.text
@@ -256,9 +251,7 @@ def test_an_ambiguous_match_has_its_rival(
 
 
 @pytest.mark.thorough
-def test_without_webgl_the_numbers_are_still_there(
-    open_page: Any, station: Any, answer: Any, settle: Any
-) -> None:
+def test_without_webgl_the_numbers_are_still_there(open_page, station, answer, settle):
     page = open_page(viewport={"width": 768, "height": 1024})
     page.add_init_script(
         "const get = HTMLCanvasElement.prototype.getContext;"

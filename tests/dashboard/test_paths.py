@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -23,7 +21,7 @@ CANVAS = ".paths-canvas"
 
 
 @pytest.fixture(scope="module")
-def apart(station: Any, until: Callable[..., Any]) -> dict[str, Any]:
+def apart(station, until):
     """A map of one room by two runs with a frame of reference each, and one run without poses."""
     path = station.make_map("apart")
     metas, files = [], []
@@ -57,9 +55,7 @@ def click_at(page: Page, point: Any) -> None:
     page.locator(CANVAS).click(position={"x": x, "y": y})
 
 
-def test_runs_are_joined_from_here(
-    page: Page, apart: dict[str, Any], station: Any, settle: Any
-) -> None:
+def test_runs_are_joined_from_here(page, apart, station, settle):
     """Before and after: what nothing joins is told, and then drawn where the join says."""
     asked = []
     page.on("request", lambda one: asked.append(urlsplit(one.url)))
@@ -120,9 +116,7 @@ def test_runs_are_joined_from_here(
 
 
 @pytest.mark.thorough
-def test_a_join_is_undone_from_here(
-    page: Page, station: Any, settle: Any, until: Any, room_views: Any, tmp_path: Path
-) -> None:
+def test_a_join_is_undone_from_here(page, station, settle, until, room_views, tmp_path):
     path, metas, files = station.make_map("alike"), [], []
     for i, frame in enumerate(room_views(21, 0, 160, along_path=True, step=8).frames):
         write_depth_png(tmp_path / "frame.png", frame.depth, 1000.0)
@@ -156,9 +150,7 @@ def test_a_join_is_undone_from_here(
 
 
 @pytest.mark.thorough
-def test_a_query_is_among_them(
-    page: Page, station: Any, settle: Any, axe: Any, until: Callable[..., Any]
-) -> None:
+def test_a_query_is_among_them(page, station, settle, axe, until):
     sent = station.frames[3]
     answer = station.client.post("/v1/maps/building/queries", **sent.form(k=3)).json()
     location = answer["location"]
@@ -211,8 +203,8 @@ def test_a_query_is_among_them(
 
 @pytest.mark.thorough
 def test_alternatives_are_drawn_alike_and_none_as_the_answer(
-    page: Page, station: Any, four_sides: dict[str, Any], settle: Any, axe: Any, until: Any
-) -> None:
+    page, station, four_sides, settle, axe, until
+):
     several = four_sides["alternatives"]
     page.goto(f"{station.home}#/maps/four-sides/place?query={four_sides['query_id']}")
     settle(page)
@@ -245,14 +237,12 @@ def test_alternatives_are_drawn_alike_and_none_as_the_answer(
 
 
 @pytest.mark.thorough
-def test_what_is_not_there_is_told(
-    page: Page, open_page: Callable[..., Page], station: Any, settle: Any
-) -> None:
+def test_what_is_not_there_is_told(page, open_page, station, settle):
     station.make_map("pathless")
     page.goto(f"{station.home}#/maps/pathless/place")
     settle(page)
     expect(page.get_by_role("heading", name="This map is empty")).to_be_visible()
-    page.allowed.append("404")  # type: ignore[attr-defined]
+    page.allowed.append("404")
     page.goto(f"{station.home}#/maps/building/place?query={'0' * 32}")
     expect(page.get_by_text("Its answer has expired")).to_be_visible()
     expect(page.locator(".paths-run")).to_have_count(2)
@@ -268,41 +258,34 @@ def test_what_is_not_there_is_told(
     expect(far.get_by_role("button", name="New association…")).to_have_count(0)
 
 
-def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> None:
+def test_numbers_behind_the_picture(run):
     """What is computed for the picture, against values by hand and NumPy."""
-    page.goto(f"{station.home}#/")
-    settle(page)
-
-    def run(module: str, expression: str, *given: object) -> Any:
-        url = f"{station.url}/dashboard/paths/{module}.js"
-        script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
-        return page.evaluate(script, [url, list(given)])
-
-    assert run("shapes", "[0.07, 0.1, 1, 1.2, 3, 6, 51].map(m.nice)") == pytest.approx(
+    assert run("paths/shapes", "[0.07, 0.1, 1, 1.2, 3, 6, 51].map(m.nice)") == pytest.approx(
         [0.1, 0.1, 1, 2, 5, 10, 100]
     )
-    assert run("shapes", "[m.evenly(5, 9), m.evenly(11, 3), m.evenly(4, 1), m.evenly(0, 5)]") == [
+    evenly = "[m.evenly(5, 9), m.evenly(11, 3), m.evenly(4, 1), m.evenly(0, 5)]"
+    assert run("paths/shapes", evenly) == [
         [0, 1, 2, 3, 4], [0, 5, 10], [0], []
     ]  # fmt: skip
     way = [[x, 0, 0] for x in (0, 1, 2, 2.1, 5, 5.5)]
-    assert run("shapes", "[m.spaced(given[0], 2, 9), m.spaced(given[0], 2, 2)]", way) == [
+    assert run("paths/shapes", "[m.spaced(given[0], 2, 9), m.spaced(given[0], 2, 2)]", way) == [
         [0, 2, 4, 5], [0, 5]
     ]  # fmt: skip
     rng = np.random.default_rng(3)
     for scale in (1.0, 1e-4):
         root = rng.normal(size=(3, 3)) * scale
         covariance = root @ root.T
-        found = run("shapes", "m.axesOf(given[0])", covariance.tolist())
+        found = run("paths/shapes", "m.axesOf(given[0])", covariance.tolist())
         values, vectors = np.linalg.eigh(covariance)
         for one, value, vector in zip(found, values[::-1], vectors.T[::-1], strict=True):
             assert one["deviation"] == pytest.approx(np.sqrt(value), rel=1e-6)
             assert abs(np.dot(one["axis"], vector)) == pytest.approx(1, abs=1e-6)
     # two dashes of 1 with gaps of 0.5 along 3 m; a long one has no more than `most`
-    dashed = run("shapes", "Array.from(m.dashes([[[0,0,0],[3,0,0]]], 1, 0.5))")
+    dashed = run("paths/shapes", "Array.from(m.dashes([[[0,0,0],[3,0,0]]], 1, 0.5))")
     assert dashed == [0, 0, 0, 1, 0, 0, 1.5, 0, 0, 2.5, 0, 0]
-    assert run("shapes", "m.dashes([[[0,0,0],[900,0,0]]], 1, 0.5, 10).length") == 60
+    assert run("paths/shapes", "m.dashes([[[0,0,0],[900,0,0]]], 1, 0.5, 10).length") == 60
     # each line broken, however short: dashes of 1, or of half a short line
-    broken = run("shapes", "Array.from(m.hollow(new Float32Array(given[0]), 1))",
+    broken = run("paths/shapes", "Array.from(m.hollow(new Float32Array(given[0]), 1))",
                  [0, 0, 0, 3, 0, 0, 0, 0, 0, 0, 1, 0])  # fmt: skip
     assert broken == [0, 0, 0, 1, 0, 0, 2, 0, 0, 3, 0, 0, 0, 0, 0, 0, 0.5, 0]
     # cameras look level along x: their down is the map's -z; a camera's own axes: down is y
@@ -310,9 +293,9 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
     itself = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     for matrix, is_cloud, up in ((level, False, "z"), (itself, False, "-y"), (itself, True, "z")):
         pose = {"matrix": matrix, "isCloud": is_cloud}
-        assert run("shapes", "m.upright([given[0]])", pose) == up
+        assert run("paths/shapes", "m.upright([given[0]])", pose) == up
     level = {"right": [1, 0, 0], "ahead": [0, 1, 0], "above": [0, 0, 1]}
-    grid = run("shapes", "m.grid(given[0], given[1], 0, [10, 20, 1])",
+    grid = run("paths/shapes", "m.grid(given[0], given[1], 0, [10, 20, 1])",
                {"low": [0, 0, 0], "high": [10, 4, 1]}, level)  # fmt: skip
     lines = np.array(grid["positions"]).reshape(-1, 3) + np.array([10, 20, 1])
     assert grid["step"] == 1
@@ -322,20 +305,22 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
     assert (lines.max(0)[:2] >= [20, 24]).all()
     # the same ground where z is ahead and up is -y: turned, at 2 m below the origin
     turned = {"right": [1, 0, 0], "ahead": [0, 0, 1], "above": [0, -1, 0]}
-    grid = run("shapes", "m.grid(given[0], given[1], -2, [10, 1, 20])",
+    grid = run("paths/shapes", "m.grid(given[0], given[1], -2, [10, 1, 20])",
                {"low": [0, 0, 0], "high": [10, 1, 4]}, turned)  # fmt: skip
     lines = np.array(grid["positions"]).reshape(-1, 3) + np.array([10, 1, 20])
     assert set(lines[:, 1]) == {2}
     assert (lines.max(0)[[0, 2]] >= [20, 24]).all()
     reach = run(
-        "shapes", "m.reachAlong(given[0], [0.6, 0, -0.8])", {"low": [0, 0, 1], "high": [10, 9, 2]}
+        "paths/shapes",
+        "m.reachAlong(given[0], [0.6, 0, -0.8])",
+        {"low": [0, 0, 1], "high": [10, 9, 2]},
     )
     assert reach == pytest.approx([-1.6, 6 - 0.8])
     # the nearest on the screen; of two about as near, the one in front; nothing far away
     flat = "p => [p[0], p[1], p[2]]"
     points = [[0, 0, 9], [10, 0, 9], [10, 1, 3], [300, 0, 1]]
     for x, place in ((1, 0), (10, 2), (290, 3), (100, -1)):
-        assert run("pick", f"m.nearest(given[0], {flat}, given[1], 0)", points, x) == place
+        assert run("paths/pick", f"m.nearest(given[0], {flat}, given[1], 0)", points, x) == place
     # a -> b -> c, of which the second is told the other way round; d is joined by nothing
     turn, shift = np.eye(4), np.eye(4)
     turn[:2, :2], shift[:3, 3] = [[0, -1], [1, 0]], (1, 2, 3)
@@ -349,20 +334,14 @@ def test_numbers_behind_the_picture(page: Page, station: Any, settle: Any) -> No
          "strength": "strong", "support": 9, "undone": True},
     ]  # fmt: skip
     told = [{"job_id": "x", "result": {"joins": joins}}]
-    reached = run("joined", """[...m.reach("a", m.bridges(given[0]))]
+    reached = run("paths/joined", """[...m.reach("a", m.bridges(given[0]))]
         .map(([name, one]) => [name, one.matrix, one.over.length])""", told)  # fmt: skip
     assert [(name, over) for name, _, over in reached] == [("a", 0), ("b", 1), ("c", 2)]
     a_from_c = np.linalg.inv(turn) @ shift
     np.testing.assert_allclose(np.array(reached[2][1]).reshape(4, 4).T, a_from_c, atol=1e-12)
 
 
-def test_colours_of_runs_stay_when_sessions_come(page: Page, station: Any, settle: Any) -> None:
-    page.goto(f"{station.home}#/")
-    settle(page)
-    script = """async ([url, sessions]) => { const { runsOf } = await import(url);
-        const { runs } = runsOf(sessions);
-        return Object.fromEntries(runs.map((one) => [one.session, one.colour])); }"""
-
+def test_colours_of_runs_stay_when_sessions_come(run):
     def colours(*days: int) -> dict[str, int]:
         sessions = [
             {"session": f"run {day}", "robot": None, "with_pose": 3, "frames": {"indexed": 3},
@@ -370,9 +349,8 @@ def test_colours_of_runs_stay_when_sessions_come(page: Page, station: Any, settl
              "last_captured_at": f"2026-11-{day:02d}T10:00:00Z"}
             for day in sorted(days, key=str)  # as the API lists them, by name
         ]  # fmt: skip
-        url = f"{station.url}/dashboard/paths/data.js"
-        told: dict[str, int] = page.evaluate(script, [url, sessions])
-        return told
+        expression = "m.runsOf(given[0]).runs.map((one) => [one.session, one.colour])"
+        return dict(run("paths/data", expression, sessions))
 
     before = colours(2, 3, 20)
     after = colours(2, 3, 20, 21, 22, 23, 24, 25)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -21,7 +20,7 @@ PROJECT = """([css, p]) => { const { viewer, scene } = document.querySelector(cs
 
 
 @pytest.fixture(scope="module")
-def built(station: Any, until: Callable[..., Any]) -> dict[str, Any]:
+def built(station, until):
     """The surface of `building`, and all of its finest cells in room-0: (N, 3) metres."""
     path = "/v1/maps/building/surface"
     begun = station.client.post(path)
@@ -82,9 +81,7 @@ def highest(built: dict[str, Any]) -> Any:
 
 
 @pytest.mark.thorough
-def test_a_spot_names_the_frames_that_saw_it(
-    page: Page, station: Any, built: dict[str, Any], settle: Any, axe: Any, until: Any
-) -> None:
+def test_a_spot_names_the_frames_that_saw_it(page, station, built, settle, axe, until):
     asked: list[Any] = []
     page.on("request", lambda one: asked.append(urlsplit(one.url)))
     opened(page, station, settle, "#/maps/building/place?parent=room-0&heights=all", until)
@@ -122,9 +119,8 @@ def test_a_spot_names_the_frames_that_saw_it(
     assert page.evaluate("css => document.querySelector(css).viewer.frames", CANVAS) == before
 
 
-def test_what_is_drawn_is_in_the_address_and_reached_by_keys(
-    page: Page, station: Any, built: dict[str, Any], settle: Any, until: Any
-) -> None:
+@pytest.mark.thorough
+def test_what_is_drawn_is_in_the_address_and_reached_by_keys(page, station, built, settle, until):
     opened(page, station, settle, "#/maps/building/place?parent=room-0", until)
     for _ in range(2):  # the link past the rail, and what it leads to
         page.keyboard.press("Tab")
@@ -164,9 +160,7 @@ def test_what_is_drawn_is_in_the_address_and_reached_by_keys(
 
 
 @pytest.mark.thorough
-def test_it_is_measured_and_frames_are_boxed(
-    page: Page, station: Any, built: dict[str, Any], settle: Any, until: Any
-) -> None:
+def test_it_is_measured_and_frames_are_boxed(page, station, built, settle, until):
     opened(page, station, settle, "#/maps/building/place?parent=room-0&heights=all", until)
     one = highest(built)
     page.get_by_role("button", name="Measure").click()
@@ -199,7 +193,6 @@ def test_it_is_measured_and_frames_are_boxed(
     high = np.array([at[order[gap : gap + 2], 0].mean(), at[:, 1].max() + 8])
     page.get_by_role("button", name="Select frames").click()
     corner = page.locator(CANVAS).bounding_box()
-    assert corner is not None
     left, top = corner["x"], corner["y"]
     page.mouse.move(left + low[0], top + low[1])
     page.mouse.down()
@@ -223,7 +216,7 @@ def test_it_is_measured_and_frames_are_boxed(
 
 
 @pytest.fixture(scope="module")
-def patrolled(station: Any) -> dict[str, Any]:
+def patrolled(station):
     """A map that two robots asked: spot was found twice, cart once, and then not any more."""
     path = station.make_map("patrolled")
     for sent in station.frames[:3]:
@@ -247,9 +240,7 @@ def ask(station: Any, robot: str, sent: int) -> dict[str, Any]:
 
 
 @pytest.mark.thorough
-def test_robots_stand_where_their_queries_found_them(
-    page: Page, station: Any, patrolled: dict[str, Any], settle: Any, axe: Any, until: Any
-) -> None:
+def test_robots_stand_where_their_queries_found_them(page, station, patrolled, settle, axe, until):
     listed = {"map": "patrolled", "limit": 100}
     until(lambda: len(station.client.get("/v1/queries", params=listed).json()["items"]) == 4)
     before = station.client.get("/v1/queries", params=listed).json()["items"]
@@ -310,8 +301,8 @@ def test_robots_stand_where_their_queries_found_them(
 
 @pytest.mark.thorough
 def test_a_query_between_the_list_and_the_events_moves_its_robot_too(
-    page: Page, station: Any, patrolled: dict[str, Any], settle: Any, until: Any
-) -> None:
+    page, station, patrolled, settle, until
+):
     held: list[Any] = []
 
     def hold(route: Any) -> None:
@@ -342,10 +333,7 @@ def test_a_query_between_the_list_and_the_events_moves_its_robot_too(
 
 
 @pytest.mark.thorough
-def test_what_is_missing_is_told(
-    page: Page, open_page: Callable[..., Page], station: Any, built: dict[str, Any], settle: Any,
-    until: Any,
-) -> None:  # fmt: skip
+def test_what_is_missing_is_told(page, open_page, station, built, settle, until):
     path = station.make_map("poseless")
     station.client.post(f"{path}/frames", **station.frames[0].form())
     until(lambda: station.client.get(path).json()["frames"].get("indexed") == 1)
@@ -381,16 +369,8 @@ def test_what_is_missing_is_told(
     expect(blind.locator(".paths-run")).to_have_count(2)
 
 
-def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
+def test_detail_by_value(run):
     """Which tiles are drawn, of a pyramid by hand; and where robots are, of records by hand."""
-    page.goto(f"{station.home}#/")
-    settle(page)
-
-    def run(module: str, expression: str, *given: object) -> Any:
-        url = f"{station.url}/dashboard/place/{module}.js"
-        script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
-        return page.evaluate(script, [url, list(given)])
-
     levels = [
         {"level": 0, "cell_m": 1, "tile_m": 64, "cells": 30_001},  # too many to do without others
         {"level": 1, "cell_m": 4, "tile_m": 256, "cells": 55},
@@ -424,15 +404,15 @@ def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
     })()"""
     # all but the largest fits: the one at 1 0 would take 500. What is not in view is not counted,
     # and drawn if it is there
-    assert run("detail", script, levels, fine, coarse, 400, ["2 2"]) == [
+    assert run("place/detail", script, levels, fine, coarse, 400, ["2 2"]) == [
         ["1:0 0", "1:-1 0"], 280, [], ["0:0 0", "0:3 3", "0:-1 0", "1:1 0"], []
     ]  # fmt: skip
     # one of its parts is on its way: the coarse tile stays until then
-    assert run("detail", script, levels, fine, coarse, 400, ["2 2", "3 3"])[3:] == [
+    assert run("place/detail", script, levels, fine, coarse, 400, ["2 2", "3 3"])[3:] == [
         ["1:0 0", "0:-1 0", "1:1 0"], ["0:3 3"]
     ]  # fmt: skip
     # the finer level is not listed yet
-    assert run("detail", script, levels, None, coarse, 400, [])[:3] == [[], 55, [1]]
+    assert run("place/detail", script, levels, None, coarse, 400, [])[:3] == [[], 55, [1]]
     pose = {"parent_frame": "a", "translation": {"x": 1, "y": 2, "z": 3}}
     records = [
         {"robot": robot, "key": None, "status": status, "pose": pose if status == "found" else None,
@@ -442,7 +422,7 @@ def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
             (None, "unvalidated"), ("cart", "found"), ("spot", "failed"),
         ])
     ]  # fmt: skip
-    told = run("robots", """m.robotsOf(given[0]).map((one) => [one.name, one.last.query_id,
+    told = run("place/robots", """m.robotsOf(given[0]).map((one) => [one.name, one.last.query_id,
         one.found?.query_id ?? null, one.trail.map((each) => each.query_id),
         one.lost.map((each) => [each.record.query_id, each.near?.query_id ?? null])])""",
         records)  # fmt: skip
@@ -453,6 +433,6 @@ def test_detail_by_value(page: Page, station: Any, settle: Any) -> None:
     ]  # fmt: skip
     # a ceiling over three of four columns; and walls, which reach up in one of four
     hall = [[0, 3], [0.2, 3], [0, 3], [0, 0]]
-    assert run("surface", "m.ceiling(given[0], [0, 3])", hall) == [-1e9, pytest.approx(2.1)]
+    assert run("place/surface", "m.ceiling(given[0], [0, 3])", hall) == [-1e9, pytest.approx(2.1)]
     walls = [[0, 3], [0, 0], [1, 1], [3, 3]]
-    assert run("surface", "m.ceiling(given[0], [0, 3])", walls) is None
+    assert run("place/surface", "m.ceiling(given[0], [0, 3])", walls) is None

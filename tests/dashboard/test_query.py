@@ -132,8 +132,12 @@ def test_the_rows_are_the_answer(station, page, ask, axe):
     ("search", "status", "title"),
     [
         ("", "found", "Found, 99."),
-        ("&ambiguous=0&confidence=0.999", "ambiguous", "Ambiguous, "),
-        ("&stages=retrieve", "unvalidated", "Not validated."),
+        pytest.param(
+            "&ambiguous=0&confidence=0.999", "ambiguous", "Ambiguous, ", marks=pytest.mark.thorough
+        ),
+        pytest.param(
+            "&stages=retrieve", "unvalidated", "Not validated.", marks=pytest.mark.thorough
+        ),
         ("&session=nobody", "not_found", "Not found."),
     ],
 )
@@ -297,15 +301,7 @@ def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, se
     assert "why=open" in page.url
 
 
-def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
-    page.goto(f"{station.home}#/")
-    settle(page)
-
-    def run(expression: str, *given: object) -> Any:
-        url = f"{station.url}/dashboard/query/words.js"
-        script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
-        return page.evaluate(script, [url, list(given)])
-
+def test_what_a_found_pose_rests_on_is_told_in_words(run):
     def told(**change: object) -> tuple[list[str], str, str]:
         pose = {"parent_frame": "hall", "translation": {"x": 1, "y": 2, "z": 0.5}}
         location = {
@@ -318,7 +314,7 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
             "status": "found", "reason": "3 of 3", "cause": None, "matches": [], "counts": {},
             "alternatives": [], "maps": ["house"], "location": location,
         }  # fmt: skip
-        one = run("m.verdict(given[0])", answer)
+        one = run("query/words", "m.verdict(given[0])", answer)
         assert one["text"] == "In map house, at x 1, y 2, z 0.5 m in hall."
         return one["details"], one["kind"], one["title"]
 
@@ -356,10 +352,10 @@ def test_what_a_found_pose_rests_on_is_told_in_words(station, page, settle):
     )  # fmt: skip
 
     gravity = "tilted by 3.5 deg against `up`. Check `up`"
-    assert run("m.parts(given[0])", gravity) == {
+    assert run("query/words", "m.parts(given[0])", gravity) == {
         "why": "Tilted by 3.5 deg against `up`.", "next": "Check `up`."
     }  # fmt: skip
-    assert run("m.parts(given[0])", "no match") == {"why": "No match.", "next": None}
+    assert run("query/words", "m.parts(given[0])", "no match") == {"why": "No match.", "next": None}
 
 
 @pytest.mark.thorough

@@ -16,7 +16,7 @@ TAKEN = [("monday", "ann")] * 2 + [("monday", None)] + [("tuesday/2", "ann")] * 
 
 
 @pytest.fixture(scope="module")
-def runs(station: Any) -> str:
+def runs(station):
     """Path of a map of six frames, a second apart, whether they are signed or not."""
     path = str(station.make_map("runs", title="Runs"))
     metas, files = [], []
@@ -39,10 +39,8 @@ def listed(station: Any, path: str) -> dict[tuple[str | None, str | None], tuple
     }
 
 
-def test_sessions_are_listed_renamed_tagged_joined_and_deleted(
-    station: Any, runs: str, page: Page, settle: Settle, axe: Callable[[Page], list[str]]
-) -> None:
-    page.allowed.append("422")  # type: ignore[attr-defined]
+def test_sessions_are_listed_renamed_tagged_joined_and_deleted(station, runs, page, settle, axe):
+    page.allowed.append("422")
     page.goto(f"{station.home}#/maps/runs")
     settle(page)
     page.get_by_role("link", name="Sessions", exact=True).click()
@@ -122,9 +120,7 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(
     expect(rows).to_have_count(1)
 
 
-def test_who_may_only_read_changes_nothing(
-    station: Any, open_page: Callable[..., Page], settle: Settle
-) -> None:
+def test_who_may_only_read_changes_nothing(station, open_page, settle):
     reader = station.key("sessions-reader", {"building": "read"})
     page = open_page(extra_http_headers=PROXIED)
     page.add_init_script(f"sessionStorage.setItem('sceneprint.key', '{reader}')")

@@ -5,20 +5,16 @@ from __future__ import annotations
 import os
 import re
 import signal
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
 BUDGET = 40_000
 
 
-def test_the_first_page_is_small_and_asks_for_nothing_long(
-    station: Any, page: Page, settle: Callable[[Page], None], axe: Callable[[Page], list[str]]
-) -> None:
+def test_the_first_page_is_small_and_asks_for_nothing_long(station, page, settle, axe):
     code: dict[str, int] = {}
     asked: list[str] = []
 
@@ -48,7 +44,7 @@ def test_the_first_page_is_small_and_asks_for_nothing_long(
     assert axe(page) == []
 
 
-def test_a_theme_is_kept(station: Any, page: Page, settle: Callable[[Page], None]) -> None:
+def test_a_theme_is_kept(station, page, settle):
     page.emulate_media(color_scheme="light")
     page.goto(station.home)
     settle(page)
@@ -69,12 +65,7 @@ def test_a_theme_is_kept(station: Any, page: Page, settle: Callable[[Page], None
 
 
 @pytest.mark.thorough
-def test_keys(
-    station: Any,
-    open_page: Callable[..., Page],
-    settle: Callable[[Page], None],
-    axe: Callable[[Page], list[str]],
-) -> None:
+def test_keys(station, open_page, settle, axe):
     station.make_map("secret-place")
     reader = station.key("dashboard-reader", {"building": "read"})
     late = station.key("dashboard-late", {"*": "read"}, expires_at="2026-01-01T00:00:00Z")
@@ -116,9 +107,7 @@ def test_keys(
     assert page.evaluate("() => Object.keys(sessionStorage)") == []
 
 
-def test_addresses_focus_and_keyboard(
-    station: Any, page: Page, settle: Callable[[Page], None]
-) -> None:
+def test_addresses_focus_and_keyboard(station, page, settle):
     page.goto(f"{station.home}#/maps/a/b/c/d")
     settle(page)
     expect(page.get_by_role("heading", name="Page not found")).to_be_visible()
@@ -158,9 +147,7 @@ def test_addresses_focus_and_keyboard(
 
 
 @pytest.mark.thorough
-def test_a_page_looks_the_same_wherever_one_comes_from(
-    station: Any, page: Page, settle: Callable[[Page], None]
-) -> None:
+def test_a_page_looks_the_same_wherever_one_comes_from(station, page, settle):
     look = """() => { const one = getComputedStyle(document.querySelector(".gallery .tile"));
       return [one.padding, one.gap, one.borderRadius]; }"""
     page.goto(f"{station.home}#/maps/building")
@@ -177,14 +164,7 @@ def test_a_page_looks_the_same_wherever_one_comes_from(
 
 
 @pytest.mark.thorough
-def test_a_service_without_maps_goes_and_comes_back(
-    serve: Callable[..., Any],
-    free_port: int,
-    page: Page,
-    settle: Callable[[Page], None],
-    axe: Callable[[Page], list[str]],
-    tmp_path: Path,
-) -> None:
+def test_a_service_without_maps_goes_and_comes_back(serve, free_port, page, settle, axe, tmp_path):
     page.allowed += [
         "ERR_CONNECTION_REFUSED",
         "ERR_INCOMPLETE_CHUNKED_ENCODING",
@@ -229,9 +209,7 @@ def test_a_service_without_maps_goes_and_comes_back(
         expect(page.locator("#banner")).to_be_hidden(timeout=30_000)
 
 
-def test_nothing_is_wider_than_a_small_screen(
-    station: Any, open_page: Callable[..., Page], settle: Callable[[Page], None]
-) -> None:
+def test_nothing_is_wider_than_a_small_screen(station, open_page, settle):
     page = open_page(viewport={"width": 768, "height": 900})
     page.goto(station.home)
     settle(page)
@@ -245,7 +223,7 @@ def test_nothing_is_wider_than_a_small_screen(
 
 
 @pytest.mark.thorough
-def test_the_api_s_page_draws_every_operation_with_its_own_files(page: Page, station: Any) -> None:
+def test_the_api_s_page_draws_every_operation_with_its_own_files(page, station):
     told = station.client.get("/openapi.json").json()
     operations = sum(len(one) for one in told["paths"].values())
     page.goto(station.home.replace("/dashboard", "/docs"))

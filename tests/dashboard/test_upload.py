@@ -7,8 +7,6 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -63,21 +61,13 @@ def open_upload(page: Page, station: Any, name: str, settle: Callable[[Page], No
     return page.locator("input[name=files]")
 
 
-def test_the_page_recognises_the_formats_of_the_table(
-    page: Page, station: Any, settle: Callable[[Page], None]
-) -> None:
-    page.goto(f"{station.home}#/")
-    settle(page)
-    script = """async ([url, name, data]) => {
-        const { kindOf } = await import(url);
-        const bytes = Uint8Array.from(atob(data), (one) => one.charCodeAt(0));
-        return kindOf(new File([bytes], name));
-    }"""
-
+def test_the_page_recognises_the_formats_of_the_table(run):
     def kind_of(name: str, data: bytes) -> dict[str, Any]:
-        url = f"{station.url}/dashboard/frames/kinds.js"
-        text = base64.b64encode(data).decode()
-        found: dict[str, Any] = page.evaluate(script, [url, name, text])
+        expression = "m.kindOf(new File([Uint8Array.from(atob(given[1]), (one) => "
+        expression += "one.charCodeAt(0))], given[0]))"
+        found: dict[str, Any] = run(
+            "frames/kinds", expression, name, base64.b64encode(data).decode()
+        )
         return found
 
     size = {"width": 64, "height": 48}
@@ -95,11 +85,8 @@ def test_the_page_recognises_the_formats_of_the_table(
     assert kind_of("a.exe", b"MZ") == {"kind": "other"}
 
 
-def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
-    page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]],
-    until: Callable[..., Any],
-) -> None:  # fmt: skip
-    page.allowed.append("422")  # type: ignore[attr-defined]
+def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(page, station, settle, axe, until):
+    page.allowed.append("422")
     chooser = open_upload(page, station, "dropped", settle)
     pose = np.eye(4)
     pose[:3, 3] = (1.0, 2.0, 0.5)
@@ -174,9 +161,7 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(
 
 
 @pytest.mark.thorough
-def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
-    page: Page, station: Any, settle: Callable[[Page], None]
-) -> None:
+def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(page, station, settle):
     open_upload(page, station, "archive", settle)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
@@ -221,12 +206,11 @@ def test_a_drop_waits_for_its_camera_and_an_archive_goes_to_imports(
 
 @pytest.mark.thorough
 def test_five_hundred_files_and_a_service_that_asks_to_wait(
-    open_page: Callable[..., Page], serve: Callable[..., Any], settle: Callable[[Page], None],
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any],
-) -> None:  # fmt: skip
+    open_page, serve, settle, tmp_path, monkeypatch, until
+):
     monkeypatch.setenv("SCENEPRINT_TENANT_REQUESTS_PER_S", "2")  # of a key, and ten at once
     page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
-    page.allowed.append("429")  # type: ignore[attr-defined]
+    page.allowed.append("429")
     refused: list[str] = []
 
     def heard(answer: Response) -> None:
@@ -261,9 +245,7 @@ def test_five_hundred_files_and_a_service_that_asks_to_wait(
 
 
 @pytest.mark.thorough
-def test_who_may_only_look_is_told_so(
-    open_page: Callable[..., Page], station: Any, settle: Callable[[Page], None]
-) -> None:
+def test_who_may_only_look_is_told_so(open_page, station, settle):
     key = station.key("looker", {"building": "read"})
     page = open_page(extra_http_headers={"X-Forwarded-For": "192.0.2.7"})
     page.add_init_script(f"sessionStorage.setItem('sceneprint.key', '{key}')")
@@ -278,10 +260,7 @@ def test_who_may_only_look_is_told_so(
 
 
 @pytest.mark.thorough
-def test_a_cloud_or_mesh_may_be_a_whole_map(
-    page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]],
-    room_mesh: bytes,
-) -> None:  # fmt: skip
+def test_a_cloud_or_mesh_may_be_a_whole_map(page, station, settle, axe, room_mesh):
     chooser = open_upload(page, station, "whole", settle)
     chooser.set_input_files([named("room.ply", room_mesh), named("room.glb", b"glTF")])
     expect(row(page, "room.ply").locator(".row-about")).to_contain_text("Point cloud")
@@ -308,10 +287,7 @@ def test_a_cloud_or_mesh_may_be_a_whole_map(
 
 
 @pytest.mark.thorough
-def test_a_recording_becomes_a_map_with_its_coverage(
-    page: Page, station: Any, settle: Callable[[Page], None], axe: Callable[[Page], list[str]],
-    ros: SimpleNamespace, tmp_path: Path,
-) -> None:  # fmt: skip
+def test_a_recording_becomes_a_map_with_its_coverage(page, station, settle, axe, ros, tmp_path):
     def fill(writer: Any) -> None:
         for i, shot in enumerate(circled(range(0, 360, 60))):
             writer.transforms(20 * i, {("odom", "camera"): np.array(shot.meta["pose"]["matrix"])})
@@ -358,10 +334,8 @@ def test_a_recording_becomes_a_map_with_its_coverage(
 
 
 @pytest.mark.thorough
-def test_coverage_waits_for_no_later_frames_nor_for_a_removed_row(
-    page: Page, serve: Callable[..., Any], settle: Callable[[Page], None], tmp_path: Path
-) -> None:
-    page.allowed.append("429")  # type: ignore[attr-defined]
+def test_coverage_waits_for_no_later_frames_nor_for_a_removed_row(page, serve, settle, tmp_path):
+    page.allowed.append("429")
     with serve(tmp_path, workers=0) as station:
         path = station.make_map("fed")
         form = {"files": {"frame": ("wall.png", wall(0))}}
@@ -397,10 +371,7 @@ def test_coverage_waits_for_no_later_frames_nor_for_a_removed_row(
 
 
 @pytest.mark.thorough
-def test_a_dead_import_shows_its_reason_beside_the_outline(
-    page: Page, station: Any, settle: Callable[[Page], None], ros: SimpleNamespace,
-    tmp_path: Path,
-) -> None:  # fmt: skip
+def test_a_dead_import_shows_its_reason_beside_the_outline(page, station, settle, ros, tmp_path):
     def fill(writer: Any) -> None:
         writer.image(0, np.full((48, 64), 2000))
 

@@ -21,7 +21,7 @@ ORANGE = (217, 119, 43)
 
 
 @pytest.fixture
-def stage(page: Page, station: Any) -> Page:
+def stage(page, station):
     """An empty page of the dashboard with a canvas and our modules."""
     page.goto(station.home)
     page.evaluate(
@@ -73,7 +73,7 @@ def seen_at(point: tuple[float, float, float]) -> tuple[int, int]:
     return round(HEIGHT / 2 + FOCAL * y / (z + 2)), round(WIDTH / 2 + FOCAL * x / (z + 2))
 
 
-def test_sums_by_value(stage: Page) -> None:
+def test_sums_by_value(stage):
     js: Callable[..., Any] = stage.evaluate
     rows = [[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
     told = js("(rows) => matrix.ofRows(rows)", rows)
@@ -100,7 +100,7 @@ def test_sums_by_value(stage: Page) -> None:
         assert fixed == pytest.approx([x + 1, y + 2, z + 3, 1])
 
 
-def test_the_orbit_by_value(stage: Page) -> None:
+def test_the_orbit_by_value(stage):
     js: Callable[..., Any] = stage.evaluate
     axes = js("() => new camera.Orbit('-y').axes()")  # looking down a little
     js("() => { window.o = new camera.Orbit('z'); o.look({azimuth: 0, elevation: 0}); }")
@@ -125,7 +125,7 @@ def test_the_orbit_by_value(stage: Page) -> None:
     assert abs(ends).max() <= 1  # nor cut off in depth
 
 
-def test_a_plan_by_value(stage: Page) -> None:
+def test_a_plan_by_value(stage):
     """Straight down, one scale at every height: metres to pixels by hand."""
     js: Callable[..., Any] = stage.evaluate
     js("""() => {
@@ -153,7 +153,7 @@ def test_a_plan_by_value(stage: Page) -> None:
     assert js("() => view.orbit.elevation") == pytest.approx(0.3)  # as it was
 
 
-def test_cells_lie_where_they_are_projected(stage: Page) -> None:
+def test_cells_lie_where_they_are_projected(stage):
     """Bytes of a tile as the API sends them: places, four colours, and heights that are cut."""
     cells = np.zeros(3, np.dtype([("at", "u1", 3), ("seen", "u1"), ("last", "<u2", 2)]))
     cells["at"] = [(64, 128, 128), (191, 64, 128), (128, 200, 128)]
@@ -198,7 +198,7 @@ def test_cells_lie_where_they_are_projected(stage: Page) -> None:
     assert [picture[seen_at(point)].tolist() == blank for point in at] == [False, True, True]
 
 
-def test_points_are_read_as_they_were_written(stage: Page) -> None:
+def test_points_are_read_as_they_were_written(stage):
     rng = np.random.default_rng(2)
     at = rng.uniform(-3, 5, (50, 3))
     normals = rng.normal(size=(50, 3))
@@ -233,7 +233,7 @@ def test_points_are_read_as_they_were_written(stage: Page) -> None:
 
 
 @pytest.mark.thorough
-def test_points_lie_where_they_are_projected(stage: Page) -> None:
+def test_points_lie_where_they_are_projected(stage):
     at = [(0.0, 0.0, 0.0), (0.5, 0.25, 0.0), (-0.6, -0.3, 0.5), (0.9, 0.0, 1.5)]
     normals = np.array([(0, 0, -1), (1, 0, 0), (0, -1, 0), (0.6, 0, -0.8)], float)
     residuals = np.array([30, 100, 254, 253], np.uint8)
@@ -279,7 +279,7 @@ def test_points_lie_where_they_are_projected(stage: Page) -> None:
         assert there[2] == pytest.approx(point[2] + 2)
 
 
-def test_pixels_before_the_first_frame_have_the_canvas_size(stage: Page) -> None:
+def test_pixels_before_the_first_frame_have_the_canvas_size(stage):
     told = stage.evaluate(
         """() => {
           const canvas = document.createElement("canvas");
@@ -294,7 +294,7 @@ def test_pixels_before_the_first_frame_have_the_canvas_size(stage: Page) -> None
     assert told == [40 * 30 * 4, 2 * 2 * 4]
 
 
-def test_the_nearer_hides_the_farther_and_none_is_too_small(stage: Page) -> None:
+def test_the_nearer_hides_the_farther_and_none_is_too_small(stage):
     far, near = (0.0, 0.0, 3.0), (0.0, 0.0, 0.0)
     ground = drawn(stage)[0, 0].tolist()
     cloud(stage, encode_points(np.array([near])), tint=[0, 0, 255])
@@ -315,7 +315,7 @@ def test_the_nearer_hides_the_farther_and_none_is_too_small(stage: Page) -> None
     assert 13 <= wide.sum() <= 15
 
 
-def test_lines_and_triangles(stage: Page) -> None:
+def test_lines_and_triangles(stage):
     ground = drawn(stage)[0, 0].astype(int)
     stage.evaluate(
         """() => { view.lines("l", { positions: new Float32Array([-0.5, 0, 0, 0.5, 0, 0,
@@ -350,7 +350,7 @@ def test_lines_and_triangles(stage: Page) -> None:
 
 
 @pytest.mark.thorough
-def test_nothing_is_drawn_unless_something_changed(stage: Page) -> None:
+def test_nothing_is_drawn_unless_something_changed(stage):
     cloud(stage, encode_points(np.array([(0.0, 0, 0)])))
     stage.evaluate(
         "() => new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))"
@@ -373,7 +373,7 @@ def test_nothing_is_drawn_unless_something_changed(stage: Page) -> None:
 
 
 @pytest.mark.thorough
-def test_hands_on_it(stage: Page) -> None:
+def test_hands_on_it(stage):
     before = stage.evaluate("view.camera")
     stage.locator("canvas").last.focus()
     stage.keyboard.press("ArrowRight")
@@ -408,7 +408,7 @@ def test_hands_on_it(stage: Page) -> None:
 
 
 @pytest.mark.thorough
-def test_a_lost_context_comes_back_as_it_was(stage: Page) -> None:
+def test_a_lost_context_comes_back_as_it_was(stage):
     rng = np.random.default_rng(4)
     cloud(stage, encode_points(rng.uniform(-0.5, 0.5, (200, 3)), patches=np.arange(200)),
           colour="patch")  # fmt: skip
@@ -434,7 +434,7 @@ def test_a_lost_context_comes_back_as_it_was(stage: Page) -> None:
     assert len(np.unique(before.reshape(-1, 3), axis=0)) > 100
 
 
-def test_pixels_are_no_denser_than_two(open_page: Any, station: Any) -> None:
+def test_pixels_are_no_denser_than_two(open_page, station):
     page = open_page(device_scale_factor=3)
     page.goto(station.home)
     told = page.evaluate(
