@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.index import IndexVersion, Tail, publish, search
+from sceneprint.index.index_version import IndexVersion, Tail, publish, search
 from sceneprint.models import PRESETS, read_model
 from sceneprint.types import Bytes
 from sceneprint_lab.evaluation.pair_run import Clock
@@ -35,7 +35,7 @@ _PROBE = """
 import sys, time
 from pathlib import Path
 import numpy as np
-from sceneprint.index import Tail, newest, search
+from sceneprint.index.index_version import Tail, newest, search
 folder, queries = Path(sys.argv[1]), np.load(sys.argv[2])
 def held():
     lines = dict(line.split()[:2] for line in open("/proc/self/smaps_rollup") if "kB" in line)

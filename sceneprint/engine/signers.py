@@ -17,7 +17,7 @@ from sceneprint.geometry.retrieval.ranking import distances, pairwise_distances
 from sceneprint.geometry.validation.inspection import patches_at, residuals
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.geometry.views import Renderer, choose_views, view_parameters
-from sceneprint.index import Tail, search
+from sceneprint.index.index_version import Tail, search
 from sceneprint.models import Model, parse_model, read_model
 from sceneprint.pipeline import Signer, open_signer, prepare, validate
 from sceneprint.store import Database

@@ -8,29 +8,3 @@ FAISS files that all processes of a machine map into memory, and that the next v
 reuses. A search compares all signatures; in a map with more than `segment.FLAT_BYTES`, sketches
 select the signatures to compare. An index that is deleted can be rebuilt from the database.
 """
-
-from sceneprint.index.index_manifest import manifests, newest_number, scrub
-from sceneprint.index.index_version import (
-    IndexVersion,
-    SearchHits,
-    Tail,
-    clear,
-    newest,
-    publish,
-    search,
-    signatures_of,
-)
-
-__all__ = [
-    "IndexVersion",
-    "SearchHits",
-    "Tail",
-    "clear",
-    "manifests",
-    "newest",
-    "newest_number",
-    "publish",
-    "scrub",
-    "search",
-    "signatures_of",
-]

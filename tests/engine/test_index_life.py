@@ -13,7 +13,8 @@ import pytest
 from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import AppendBuffer
 from sceneprint.errors import UnusableStore
-from sceneprint.index import newest, scrub
+from sceneprint.index.index_manifest import scrub
+from sceneprint.index.index_version import newest
 from sceneprint.models import read_model
 from sceneprint.store.signatures import SignatureChange
 from sceneprint_client.api import Query

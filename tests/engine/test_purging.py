@@ -21,7 +21,8 @@ from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep import index_upkeep, purge
 from sceneprint.engine.upkeep.purge import Purging
 from sceneprint.errors import BusyIndex, UnknownJob, UnknownQuery
-from sceneprint.index import newest, newest_number
+from sceneprint.index.index_manifest import newest_number
+from sceneprint.index.index_version import newest
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.store.frames import delete_frame, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs

@@ -24,7 +24,7 @@ from sceneprint.geometry.retrieval.ranking import (
     pairwise_distances,
 )
 from sceneprint.geometry.validation.validation import ValidationParameters
-from sceneprint.index import SearchHits
+from sceneprint.index.index_version import SearchHits
 from sceneprint.pipeline import Signature, Signer, retrieve, validate
 from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import frames

@@ -14,8 +14,8 @@ from sqlalchemy import update
 from sceneprint.engine import signers
 from sceneprint.engine.search import retrieval
 from sceneprint.errors import InvalidRequest, UnreadableModel
-from sceneprint.index import index_manifest, index_version, manifests
-from sceneprint.index.index_manifest import read_manifest
+from sceneprint.index import index_manifest, index_version
+from sceneprint.index.index_manifest import manifests, read_manifest
 from sceneprint.index.part_files import verify
 from sceneprint.store.tables import models
 from sceneprint_client.api import JobState, NewMap, Query

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sceneprint.index import IndexVersion, publish
+from sceneprint.index.index_version import IndexVersion, publish
 from sceneprint.index.part_files import Keys
 from sceneprint.types import Bytes
 

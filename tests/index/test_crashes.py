@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.index import (
+from sceneprint.index.index_manifest import newest_number
+from sceneprint.index.index_version import (
     IndexVersion,
     Tail,
     newest,
-    newest_number,
     publish,
     search,
     signatures_of,
@@ -33,7 +33,7 @@ import os, signal, sys
 from pathlib import Path
 import faiss
 import numpy as np
-from sceneprint.index import newest, publish
+from sceneprint.index.index_version import newest, publish
 
 folder = Path(sys.argv[1])
 LENGTH, STEP = 512, 25

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import IndexVersion, newest, part_files, scrub
+from sceneprint.index import part_files
 from sceneprint.index.faiss_index import map_index
-from sceneprint.index.index_manifest import IndexManifest, manifests, read_manifest
+from sceneprint.index.index_manifest import IndexManifest, manifests, read_manifest, scrub
+from sceneprint.index.index_version import IndexVersion, newest
 from sceneprint.index.sketches import map_sketches
 from sceneprint.sealed_record import _checksum as checksum
 from sceneprint.sealed_record import unseal

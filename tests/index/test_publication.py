@@ -16,13 +16,8 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.atomic_files import folder_turn
-from sceneprint.index import (
-    IndexVersion,
-    clear,
-    newest,
-    newest_number,
-    publish,
-)
+from sceneprint.index.index_manifest import newest_number
+from sceneprint.index.index_version import IndexVersion, clear, newest, publish
 from sceneprint.index.part_files import Block
 from sceneprint.types import Bytes
 
@@ -210,7 +205,7 @@ def test_what_was_mapped_survives_its_file(walk: Walk, tmp_path: Path) -> None:
 import sys
 from pathlib import Path
 import numpy as np
-from sceneprint.index import Tail, newest, publish, search
+from sceneprint.index.index_version import Tail, newest, publish, search
 
 folder, n = Path(sys.argv[1]), 4000
 rows = np.random.default_rng(0).integers(0, 256, (n, 256), np.uint8)

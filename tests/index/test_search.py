@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sceneprint.index import (
+from sceneprint.index.index_version import (
     IndexVersion,
     SearchHits,
     Tail,

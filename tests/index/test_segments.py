@@ -13,8 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import IndexVersion, Tail, newest, publish, search, signatures_of
 from sceneprint.index.index_manifest import SegmentFiles
+from sceneprint.index.index_version import (
+    IndexVersion,
+    Tail,
+    newest,
+    publish,
+    search,
+    signatures_of,
+)
 from sceneprint.index.segment import (
     GONE_SHARE,
     MOST_SEGMENTS,

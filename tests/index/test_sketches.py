@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sceneprint.index import IndexVersion, Tail, newest, search, sketches
+from sceneprint.index import sketches
+from sceneprint.index.index_version import IndexVersion, Tail, newest, search
 from sceneprint.index.segment import Segment
 from sceneprint.index.sketches import LEAST_SELECTED, Sketches, draw, make_sketches, neighbours
 from sceneprint.types import Bytes

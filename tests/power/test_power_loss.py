@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, event
 
 from sceneprint import atomic_files
-from sceneprint.index import IndexVersion, index_version, newest, publish
+from sceneprint.index import index_version
 from sceneprint.index.index_manifest import IndexManifest
+from sceneprint.index.index_version import IndexVersion, newest, publish
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
 from sceneprint.types import Bytes

@@ -37,7 +37,7 @@ from sceneprint.engine.serializers import (
 )
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_deleted_blobs
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
-from sceneprint.index import IndexVersion
+from sceneprint.index.index_version import IndexVersion
 from sceneprint.models import PRESETS, Model, parse_model, read_model, write_model
 from sceneprint.store import Database, Store, signatures
 from sceneprint.store import reencoding_rows as stored

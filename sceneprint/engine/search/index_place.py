@@ -30,15 +30,15 @@ import numpy as np
 from sceneprint.atomic_files import PRIVATE_FILE, folder_turn
 from sceneprint.engine.search.local_index import index_folder, is_index_folder, trusted
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
-from sceneprint.index import IndexVersion, clear, manifests
 from sceneprint.index.index_manifest import (
     IndexManifest,
     decode_manifest,
     manifest_number,
+    manifests,
     read_manifest,
     write_manifest,
 )
-from sceneprint.index.index_version import keep_only, remove_unneeded
+from sceneprint.index.index_version import IndexVersion, clear, keep_only, remove_unneeded
 from sceneprint.index.part_files import put
 from sceneprint.sealed_record import seal
 from sceneprint.settings import Settings

@@ -27,16 +27,15 @@ from sqlalchemy import Connection
 from sceneprint.atomic_files import make_folder
 from sceneprint.errors import UnusableStore
 from sceneprint.geometry.retrieval.ranking import Metric
-from sceneprint.index import (
+from sceneprint.index.index_manifest import SCHEMA_VERSION, IndexManifest, newest_number
+from sceneprint.index.index_version import (
     IndexVersion,
     SearchHits,
     Tail,
     newest,
-    newest_number,
     search,
     signatures_of,
 )
-from sceneprint.index.index_manifest import SCHEMA_VERSION, IndexManifest
 from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.store.events import holds_anchor

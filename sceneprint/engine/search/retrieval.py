@@ -26,7 +26,7 @@ from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.retrieval.ranking import Ranking, ranking_size, similarity
-from sceneprint.index import SearchHits
+from sceneprint.index.index_version import SearchHits
 from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import Signer, prepare, sign

@@ -30,8 +30,8 @@ from sceneprint.errors import (
     UnusableStore,
 )
 from sceneprint.geometry.retrieval.ranking import Metric
-from sceneprint.index import IndexVersion, newest, newest_number, publish, scrub
-from sceneprint.index.index_manifest import IndexManifest
+from sceneprint.index.index_manifest import IndexManifest, newest_number, scrub
+from sceneprint.index.index_version import IndexVersion, newest, publish
 from sceneprint.models import Model
 from sceneprint.settings import Settings
 from sceneprint.store import Store

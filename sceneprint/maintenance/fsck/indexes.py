@@ -11,7 +11,8 @@ from sqlalchemy import select
 
 from sceneprint.engine.search.local_index import index_folder, trusted
 from sceneprint.errors import StoreError
-from sceneprint.index import IndexVersion, clear, newest, newest_number
+from sceneprint.index.index_manifest import newest_number
+from sceneprint.index.index_version import IndexVersion, clear, newest
 from sceneprint.maintenance.fsck.findings import BLOCK, Finding, Folder
 from sceneprint.store.maps import list_maps
 from sceneprint.store.signatures import stored_signatures
