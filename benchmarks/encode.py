@@ -77,11 +77,7 @@ def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
 def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list[str]:
     """Sign every frame and compute its FPFH, in turn; return the table.
 
-    Parameters
-    ----------
-    frames : frames of a depth camera
-    preset : preset of the model
-    warm_up : number of frames that are signed first without timing
+    `warm_up`: number of frames that are signed first without timing.
     """
     signer, o3d, note = open_signer(preset), *open3d_or_note()
     p = signer.model.parameters.depth

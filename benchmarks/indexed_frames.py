@@ -30,9 +30,6 @@ def fill(
 
     Parameters
     ----------
-    database : database of the store
-    name : name of the map
-    model : model of its signatures
     vectors : (n, D) signatures
     blob : digest of the upload and the artifact of each frame
     columns : other values of the columns of each frame

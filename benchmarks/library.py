@@ -30,12 +30,7 @@ Matches = list[tuple[int, list[list[float]]]]
 
 
 class Library:
-    """A database in memory with timed stages of a query.
-
-    Parameters
-    ----------
-    frames : frames of the database
-    """
+    """A database in memory with timed stages of a query."""
 
     def __init__(self, frames: Sequence[FrameReference]) -> None:
         self._signer = open_signer("depth")

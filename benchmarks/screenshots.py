@@ -51,7 +51,6 @@ class View:
     ----------
     name, address : name of the screenshot, and address within the dashboard
     tall : whether the screenshot shows the whole height of the page
-    size : size of the window
     headers, key : headers of every request, and key in the tab's storage
     files, press : files to select, and labels of buttons to press afterwards
     gone : whether the service is unreachable when the page opens
@@ -229,11 +228,9 @@ def take_picture(browser: Any, url: str, view: View, theme: str, path: Path) -> 
 
     Parameters
     ----------
-    browser : see `benchmarks.chromium.chromium`
     url : address of the service
     view : page
     theme : "light" or "dark"
-    path : path of the screenshot
     """
     width, low = view.size
     context = browser.new_context(

@@ -38,14 +38,12 @@ def measure(
 
     Parameters
     ----------
-    frames : frames of a data set
-    map_frames : number of frames of the map; random frames are added if `frames` are fewer, and
-        the answers are then not compared with the library's, since R grows with the map
+    map_frames : number of frames of the map; random frames are added if `frames` are fewer, and the
+        answers are then not compared with the library's, since R grows with the map
     n_queries : number of queries
 
-    Raises
-    ------
-    AssertionError : If the answers of service and library differ, so the times are not comparable.
+    Raise AssertionError if the answers of service and library differ, so the times are not
+    comparable.
     """
     places = {int(i) for i in np.linspace(1, len(frames) - 2, n_queries)}
     database = [frame for i, frame in enumerate(frames) if i not in places]

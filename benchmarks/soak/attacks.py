@@ -73,7 +73,6 @@ class AttackFigures:
 
     Parameters
     ----------
-    name : name of the attack
     calm_s, under_s : 99th percentiles, seconds, of requests and of the time until frames are signed
     victim_refused : number of requests of other tenants that had to be repeated
     sent, refused : number of requests of the attacker, and of those that were rejected
@@ -110,7 +109,6 @@ def run_attacks(
 
     Parameters
     ----------
-    url, secrets, shots : see Attack
     seconds : duration of each attack
     log : requests of the other tenants
     drain : function that removes the jobs of an attack from the queue

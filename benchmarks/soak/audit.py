@@ -98,8 +98,6 @@ def check(
     ----------
     ledger : all acknowledgements
     stable : ids of the frames that readers searched
-    clients : a client for each service
-    listeners : a listener for each map
     aging : retention of some maps, seconds
     """
     expected = {one.frame_id: one for one in ledger.frames if one.frame_id not in ledger.deleted}
@@ -202,7 +200,6 @@ def wrong_matches(
 
     Parameters
     ----------
-    search : search for the neighbours of a stored frame
     deleted : times at which the deletion of a frame was sent and acknowledged
     stable : ids of frames that are always in the map
     vectors : signatures by frame; matches may include other frames

@@ -203,7 +203,6 @@ def send_broken(
     parts : services and workers
     shots : frames to damage
     n : number of uploads
-    seed : seed of the damage
     threads : number of sending threads
     """
     before = {pid for part in parts for pid in [part.pid, *part.children()]}

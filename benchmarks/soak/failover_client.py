@@ -78,9 +78,7 @@ class FailoverClient(ExitStack):
         kind : kind of the request, for the log
         method, path, request : arguments of httpx
 
-        Raises
-        ------
-        NoAnswer : If no address has answered for too long.
+        Raise NoAnswer if no address has answered for too long.
         """
         begun, tries = time.monotonic(), 0
         while time.monotonic() < begun + PATIENCE_S:

@@ -43,9 +43,7 @@ class LockShares:
 class LockSampler(threading.Thread):
     """A thread that samples the locks of the current primary.
 
-    Parameters
-    ----------
-    url : function that returns the address of the primary
+    `url`: function that returns the address of the primary.
     """
 
     def __init__(self, url: Callable[[], str]) -> None:

@@ -38,7 +38,6 @@ class OperationFigures:
     caller : description of the key and of the requested objects
     operations : number of operations
     requests, passed : number of requests, and of those with an answer as declared
-    report : report of schemathesis
     """
 
     caller: str
@@ -61,7 +60,6 @@ def call_operations(
     Parameters
     ----------
     caller, url : see OperationFigures, and address of the service
-    folder : folder for the configuration
     options : further options of schemathesis
     path_values : values of path parameters, such as path.map_name, of existing objects, so that not
         every answer is 404; deletions are then excluded
@@ -106,9 +104,7 @@ def call_as_everybody(
     Parameters
     ----------
     folder : empty folder for data and configuration
-    frames : frames of each map
     examples : number of requests per operation, in addition to the edge cases of its schema
-    phases : phases of schemathesis
     """
     found = []
     plan = Plan("sqlite", services=1, workers=1)

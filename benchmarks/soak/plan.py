@@ -27,7 +27,6 @@ class Plan:
 
     Parameters
     ----------
-    store : store of the rows
     faults : number of each fault; for the offline hour, the number of frames that a robot spools
     seconds : duration of the walks; attacks may end earlier
     robots, rate : number of robots, and frames per second of each
@@ -40,7 +39,6 @@ class Plan:
     most_turn_ms : longest time for which a frame may block all writers, without the time of hosts
         that are cut off
     most_query_ms, most_bytes : bounds of the 99th percentile of queries, and of a process's memory
-    seed : seed of victims and times
     data : folder of recordings; default: synthetic rooms
     """
 

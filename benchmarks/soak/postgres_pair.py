@@ -22,10 +22,7 @@ DATABASE = "fleet"
 class Pair:
     """A primary and its standby, which exchange their roles.
 
-    Parameters
-    ----------
-    folder : folder of their data
-    synchronous : whether a commit waits for the standby
+    `synchronous`: whether a commit waits for the standby.
     """
 
     def __init__(self, folder: Path, *, synchronous: bool) -> None:

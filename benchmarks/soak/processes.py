@@ -55,7 +55,6 @@ class Part:
     ----------
     arguments : arguments of `sceneprint`
     log : file to which its standard error is appended
-    environment : environment of the process
     """
 
     def __init__(self, arguments: list[str], log: Path, environment: Mapping[str, str]) -> None:
@@ -115,11 +114,6 @@ class Fleet:
 
     On PostgreSQL, each service has its own host, and the workers are distributed over the hosts. On
     SQLite, all share a data folder.
-
-    Parameters
-    ----------
-    folder : folder of data and logs
-    plan : plan of the run
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:

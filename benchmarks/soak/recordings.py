@@ -54,9 +54,7 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
     data : folder of recordings
     n, frames : number of walks, and of the frames of each
 
-    Raises
-    ------
-    DatasetError : If the sequence has fewer frames.
+    Raise DatasetError if the sequence has fewer frames.
     """
     recorded = [
         [one for one in sequence.frames if one.kind == "depth"] for sequence in find_sequences(data)

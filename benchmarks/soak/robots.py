@@ -47,7 +47,6 @@ class Search:
 
     Parameters
     ----------
-    frame_id : id of the stored frame
     matches : ids and distances in the order of the answer
     begun, answered : times by `time.monotonic`
     """
@@ -66,7 +65,6 @@ class Ledger:
     ----------
     frames : acknowledged uploads
     deleted : times at which the deletion of a frame was sent and acknowledged
-    searches : searches of the readers
     queries : number of answered queries
     """
 
@@ -128,7 +126,6 @@ class Driver(SoakThread):
     ----------
     robots : robots in the order in which they start
     rate : frames per second of each robot
-    client : client of the service
     ledger, log : records that clients share
     stop : event that ends the walks; a sent request is repeated until it is answered
     deletes, signed : whether robots delete frames, and wait until frames are signed
@@ -187,7 +184,6 @@ class OfflineRobot(SoakThread):
 
     Parameters
     ----------
-    robot : robot whose whole walk is spooled at the start
     file : path of the spool
     offline_s : duration without a network, seconds
     urls : addresses of the services
@@ -249,9 +245,7 @@ class Reader(SoakThread):
     ----------
     key, map_name : key of the reader, and name of the map
     stable : ids of the permanent frames
-    client : client of the service
     ledger, log, stop : records that clients share, and event that ends the searches
-    seed : seed of the selection of frames
     """
 
     def __init__(
@@ -281,12 +275,7 @@ class Reader(SoakThread):
 class Listener(SoakThread):
     """A listener to all events of a map; after a broken stream it continues at another address.
 
-    Parameters
-    ----------
-    map_name : name of the map
-    key : key of the listener
-    client : client of the service
-    log : log that clients share
+    `log`: log that clients share.
     """
 
     def __init__(self, map_name: str, key: str, client: FailoverClient, log: RequestLog) -> None:

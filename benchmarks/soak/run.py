@@ -65,9 +65,7 @@ class SoakFigures:
     Parameters
     ----------
     plan, found : plan of the run, and final state of the store
-    kills : kills by victim
     outages : see `outages`
-    promotions : promotions of the standby
     waits_ms : median and 99th percentile of each kind of request
     memory : peak memory of a service process and of a worker process, bytes
     deleted, queries, repeated : number of frames that robots deleted, of answered queries, and of
@@ -78,7 +76,6 @@ class SoakFigures:
     lost : acknowledged frames that are missing, except those that a standby had not received
     window : acknowledged frames that the standbys had not received
     spooled, spooled_twice : frames of the offline robot, and those that were sent again
-    locks, attacks, broken, operations : see their classes
     seconds : total duration
     """
 

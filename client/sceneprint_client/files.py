@@ -31,14 +31,11 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
 
     Parameters
     ----------
-    path : path of the file
     limit : maximum accepted size, bytes; a larger file is rejected unread
     error : class of the error to raise
 
-    Raises
-    ------
-    error : If the file is missing, is not a regular file (reading a pipe could block forever),
-        is too large, or is not readable.
+    Raise error if the file is missing, is not a regular file (reading a pipe could block forever),
+    is too large, or is not readable.
     """
     try:
         status = path.stat()
@@ -84,14 +81,8 @@ def read_object(
 ) -> dict[str, object]:
     """Return the object of a JSON file.
 
-    Parameters
-    ----------
-    path, limit, error : see `read_text`
-    example : example of such a file for error messages
-
-    Raises
-    ------
-    error : If the file cannot be read or does not hold a JSON object. The message names the file.
+    Raise `error` if the file cannot be read or does not hold a JSON object. The message names the
+    file. See `read_text` for the parameters.
     """
     text = read_text(path, limit, error)
     with naming(str(path)):
@@ -147,9 +138,7 @@ def npy_header(
     shapes : sentences for the error if the array has another shape
     whole : whether to accept uint16 too
 
-    Raises
-    ------
-    error : If the header cannot be read, or the array has another type or shape.
+    Raise error if the header cannot be read, or the array has another type or shape.
     """
     fields, start = _fields(data, error)
     dtype = _dtype(fields["descr"], error, advice, _FLOATING + _WHOLE if whole else _FLOATING)
@@ -267,9 +256,7 @@ class SerializedCloud:
 def read_point_cloud(data: bytes) -> SerializedCloud:
     """Return the message of a serialised PointCloud2 without copying its data.
 
-    Raises
-    ------
-    UnreadableCloud : If the bytes are not such a message, are truncated, or have trailing data.
+    Raise UnreadableCloud if the bytes are not such a message, are truncated, or have trailing data.
     """
     if not _is_encapsulated(data):
         raise UnreadableCloud(
@@ -314,9 +301,7 @@ def read_livox_scan(data: bytes, *, ros1: bool = False) -> SerializedCloud:
     data : message in the serialisation of ROS 2, or of ROS 1
     ros1 : whether ROS 1 serialised the message
 
-    Raises
-    ------
-    UnreadableCloud : If the bytes are not such a message, are truncated, or have trailing data.
+    Raise UnreadableCloud if the bytes are not such a message, are truncated, or have trailing data.
     """
     if not ros1 and not _is_encapsulated(data):
         raise UnreadableCloud(

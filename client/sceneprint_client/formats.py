@@ -34,13 +34,11 @@ class Format:
     Parameters
     ----------
     name : unique within its kind
-    kind : kind of content
     title : name of the format for people
     suffixes : lower-case suffixes of file names
     content : description of the data that the reader uses, in Markdown
-    signature : regular expression for the first bytes, as Latin-1, for Python and JavaScript;
-        empty if they do not determine the format. Its groups are width and height
-    media_type : media type over HTTP
+    signature : regular expression for the first bytes, as Latin-1, for Python and JavaScript; empty
+        if they do not determine the format. Its groups are width and height
     reader : MODULE:FUNCTION that takes the bytes, or, for a capture, the path and a name; empty if
         one reader handles all formats of the kind
     size : MODULE:FUNCTION that returns width and height from the first bytes of a depth image

@@ -140,9 +140,7 @@ class FrameFile:
     def pose(self) -> NDArray[np.float64] | None:
         """Return T_parent_sensor (4, 4), or None if unknown; each call reads the file again.
 
-        Raises
-        ------
-        InvalidPose : If the file does not hold a rigid transform; names the file.
+        Raise InvalidPose if the file does not hold a rigid transform; names the file.
         """
         if isinstance(self.pose_source, Path):
             return read_pose(self.pose_source)
@@ -152,15 +150,9 @@ class FrameFile:
 def find_frame_file(file: Path) -> FrameFile:
     """Return the frame of a depth image or file of points, with its pose if a pose file exists.
 
-    Parameters
-    ----------
-    file : absolute path
-
-    Raises
-    ------
-    DatasetError : If no intrinsics.json lies beside a depth image or in a folder above it, or
-        clouds.json is invalid.
-    InvalidIntrinsics : If intrinsics.json does not describe a camera.
+    `file`: absolute path. Raise DatasetError if no intrinsics.json lies beside a depth image or in
+    a folder above it, or clouds.json is invalid. Raise InvalidIntrinsics if intrinsics.json does
+    not describe a camera.
     """
     folder, number = file.parent, seven_scenes_number(file.name)
     stem = file.name.removesuffix(".depth.png") if SEVEN_SCENES.fullmatch(file.name) else file.stem
@@ -184,10 +176,7 @@ def find_pose_file(folder: Path, stem: str) -> Path | None:
     lies in the frame's folder, or beside it if the frame's folder is named depth (ScanNet). The
     pose of `depth_NAME` may also be named `pose_NAME.txt`.
 
-    Parameters
-    ----------
-    folder : folder of the frame
-    stem : name of the frame's file without its suffix: NAME, NAME.depth or depth_NAME
+    `stem`: name of the frame's file without its suffix: NAME, NAME.depth or depth_NAME.
     """
     name = stem.removesuffix(".depth")
     renamed = [f"{name.replace('depth', 'pose')}.txt"] if "depth" in name else []
@@ -241,7 +230,6 @@ def meta_of(
     Parameters
     ----------
     reference : the frame
-    robot, tags : see FrameMeta
     session : name of the session; default: the name of the frame's sequence
     with_pose : whether to send the pose if it is known
     parent_frame : parent frame of the pose; default: the session's name. Sequences of one scene
@@ -252,10 +240,8 @@ def meta_of(
         ignore
     trust_depth : whether to accept an image that does not look like depth
 
-    Raises
-    ------
-    InvalidPose : If the pose file does not hold a rigid transform.
-    InvalidRequest : If a name is empty, too long or not printable.
+    Raise InvalidPose if the pose file does not hold a rigid transform. Raise InvalidRequest if a
+    name is empty, too long or not printable.
     """
     if up is None:
         source = reference.camera or reference.cloud
@@ -520,9 +506,7 @@ def camera_of(
         (fx, fy, cx, cy), pixels
     size : width and height, pixels, for a `camera` that lacks them
 
-    Raises
-    ------
-    InvalidIntrinsics : If `camera` has another type or is not a valid camera.
+    Raise InvalidIntrinsics if `camera` has another type or is not a valid camera.
     """
     if isinstance(camera, CameraIntrinsics):
         return camera
@@ -550,9 +534,7 @@ def camera_of(
 def rows_as_npy(data: bytes, row: tuple[str, ...]) -> bytes:
     """Return x, y and z of rows of float32 values as an NPY file.
 
-    Raises
-    ------
-    UnreadableCloud : If the length is not a multiple of a row's size.
+    Raise UnreadableCloud if the length is not a multiple of a row's size.
     """
     width = 4 * len(row)
     if len(data) % width or not data:

@@ -94,7 +94,6 @@ def interpolate(
 
     Parameters
     ----------
-    trajectory : trajectory of N poses
     stamps : M stamps in any order, seconds
     longest_gap : longest interval between two poses in which to interpolate, seconds
     tolerance : maximum distance to a pose, seconds, that replaces a missing interpolation
@@ -166,9 +165,7 @@ class Accelerations:
     def add(self, stamp_ns: int, acceleration: Sequence[float], turn: Sequence[float]) -> None:
         """Add a measurement, m/s^2 and rad/s in the IMU's axes.
 
-        Raises
-        ------
-        DatasetError : If there are more than 10 million measurements.
+        Raise DatasetError if there are more than 10 million measurements.
         """
         row = [*acceleration, *turn]
         if not np.isfinite(row).all():
@@ -221,17 +218,12 @@ TOLERANCE = 1e-2  #: maximum error of a rotation matrix, and of the length of a 
 def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a pose whose rotation is orthonormal to machine precision.
 
-    Parameters
-    ----------
-    matrix : (4, 4) T_parent_sensor, with a rotation that is orthonormal to 1e-2
-
     Returns
     -------
     T_parent_sensor : (4, 4) float64, with the nearest rotation
 
-    Raises
-    ------
-    InvalidPose : If the matrix is not 4 x 4, not finite, or not rigid.
+    `matrix`: (4, 4) T_parent_sensor, with a rotation that is orthonormal to 1e-2. Raise InvalidPose
+    if the matrix is not 4 x 4, not finite, or not rigid.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)

@@ -66,13 +66,8 @@ def image_encoding(message: Any, *, compressed: bool) -> str | None:
 def depth_samples(message: Any) -> NDArray[Any]:
     """Return the samples (H, W) of a depth image: uint16 millimetres, or float32 metres.
 
-    Parameters
-    ----------
-    message : sensor_msgs Image
-
-    Raises
-    ------
-    UnreadableFrame : If the encoding is not supported, or the sizes contradict each other.
+    `message`: sensor_msgs Image. Raise UnreadableFrame if the encoding is not supported, or the
+    sizes contradict each other.
     """
     kind = ENCODINGS.get(message.encoding)
     if kind is None:
@@ -134,14 +129,8 @@ class CompressedDepth:
 def compressed_depth(message: Any) -> CompressedDepth:
     """Return the samples of a compressed depth image and their relation to metres.
 
-    Parameters
-    ----------
-    message : sensor_msgs CompressedImage of compressed_depth_image_transport (PNG or RVL), or of a
-        16-bit PNG
-
-    Raises
-    ------
-    UnreadableFrame : If the compression is not supported, or its header is missing.
+    `message`: sensor_msgs CompressedImage of compressed_depth_image_transport (PNG or RVL), or of a
+    16-bit PNG. Raise UnreadableFrame if the compression is not supported, or its header is missing.
     """
     encoding = image_encoding(message, compressed=True)
     data = bytes(memoryview(message.data))
@@ -187,9 +176,8 @@ def rvl_samples(data: bytes) -> NDArray[np.uint16]:
     predecessor. Numbers are groups of three bits, lowest first, each with a continuation bit, in
     big-endian words of 32 bits (Wilson, Fast Lossless Depth Image Compression, 2017).
 
-    Raises
-    ------
-    UnreadableFrame : If the data is truncated, the size is invalid, or a sample exceeds 16 bits.
+    Raise UnreadableFrame if the data is truncated, the size is invalid, or a sample exceeds 16
+    bits.
     """
     broken = UnreadableFrame("The RVL-compressed image is damaged. Record it again.")
     width, height = struct.unpack_from("<II", data) if len(data) >= 8 else (0, 0)
@@ -243,9 +231,7 @@ def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
     info : sensor_msgs CameraInfo
     rectified : whether the images are rectified, so that their camera is P without distortion
 
-    Raises
-    ------
-    InvalidIntrinsics : If it does not describe a camera, or the lens model is not supported.
+    Raise InvalidIntrinsics if it does not describe a camera, or the lens model is not supported.
     """
     k, p = _numbers(info, "k", 9), _numbers(info, "p", 12)
     if k is None:
@@ -335,13 +321,8 @@ def cloud_points(message: Any) -> NDArray[np.float32]:
     Points that are not finite are dropped, and points at the sensor's origin, which some drivers
     write for missing returns.
 
-    Parameters
-    ----------
-    message : sensor_msgs PointCloud2 with fields x, y and z, organised or not
-
-    Raises
-    ------
-    UnreadableCloud : If x, y or z is missing, or the sizes contradict each other.
+    `message`: sensor_msgs PointCloud2 with fields x, y and z, organised or not. Raise
+    UnreadableCloud if x, y or z is missing, or the sizes contradict each other.
     """
     table, found = cloud_table(message), []
     with np.errstate(all="ignore"):  # coordinates that overflow count as missing

@@ -52,9 +52,7 @@ class Camera:
     along_ray : whether depth is the range along the pixel's ray instead of z
     up : unit vector in the camera's axes if the camera is carried level; None if unknown
 
-    Raises
-    ------
-    InvalidIntrinsics : If the depth scale is not positive, or `up` is not a unit vector.
+    Raise InvalidIntrinsics if the depth scale is not positive, or `up` is not a unit vector.
     """
 
     intrinsics: Intrinsics
@@ -80,10 +78,8 @@ def is_unit(vector: Position) -> bool:
 def find_camera(folder: Path) -> Camera:
     """Return the camera of the nearest `intrinsics.json`, in this folder or up to 4 above.
 
-    Raises
-    ------
-    DatasetError : If there is no such file; the message shows an example.
-    InvalidIntrinsics : If the file is invalid; see `read_camera`.
+    Raise DatasetError if there is no such file; the message shows an example. Raise
+    InvalidIntrinsics if the file is invalid; see `read_camera`.
     """
     absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
     for place in (absolute, *absolute.parents[:_PARENTS]):
@@ -103,10 +99,8 @@ def read_camera(path: Path) -> Camera:
     Fields: width, height, fx, fy, cx, cy in pixels. Optional fields and their defaults:
     depth_scale (1000), distortion (none), depth_along_ray (false), up (unknown).
 
-    Raises
-    ------
-    InvalidIntrinsics : If the file cannot be read, is not a JSON object, lacks a field, has an
-        unknown field, or has an invalid value; names the file.
+    Raise InvalidIntrinsics if the file cannot be read, is not a JSON object, lacks a field, has an
+    unknown field, or has an invalid value; names the file.
     """
     fields = read_object(path, _MAXIMUM_BYTES, InvalidIntrinsics, _INTRINSICS_EXAMPLE)
     with naming(str(path)):
@@ -208,10 +202,9 @@ class CloudSource:
     file_format : format; None if the first bytes determine it
     viewpoint : position of the sensor in the file's axes, metres; None for points from many
         viewpoints; UNSAID: that of the file, or else the origin
-    units_per_metre : units of the coordinates per metre
     up : unit vector in the file's axes if the sensor is carried level; None if unknown
-    row : names of the float32 values in each row of a .bin file, such as x, y, z, i, ring; None:
-        x, y, z and intensity
+    row : names of the float32 values in each row of a .bin file, such as x, y, z, i, ring; None: x,
+        y, z and intensity
     """
 
     file_format: CloudFormat | None = None
@@ -224,9 +217,7 @@ class CloudSource:
 def row_of(text: str) -> tuple[str, ...]:
     """Return the names of the values in a row, from a text such as x,y,z,i,ring.
 
-    Raises
-    ------
-    DatasetError : If x, y or z is missing or repeated, or there are more than 32 names.
+    Raise DatasetError if x, y or z is missing or repeated, or there are more than 32 names.
     """
     names = tuple(name.strip().lower() for name in text.split(","))
     if any(names.count(axis) != 1 for axis in "xyz") or len(names) > _LONGEST_ROW:
@@ -242,9 +233,7 @@ def find_cloud_source(folder: Path) -> CloudSource:
 
     Without such a file, all fields have their defaults.
 
-    Raises
-    ------
-    DatasetError : If the file cannot be read, is not a JSON object, or has an invalid field.
+    Raise DatasetError if the file cannot be read, is not a JSON object, or has an invalid field.
     """
     absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
     for place in (absolute, *absolute.parents[:_PARENTS]):
@@ -330,9 +319,7 @@ _MAXIMUM_POSE_BYTES = 65_536
 def read_pose(path: Path) -> NDArray[np.float64]:
     """Return T_parent_sensor (4, 4) of a text file with 16 numbers, row by row.
 
-    Raises
-    ------
-    InvalidPose : If the file cannot be read or its matrix is not rigid; names the file.
+    Raise InvalidPose if the file cannot be read or its matrix is not rigid; names the file.
     """
     words = read_text(path, _MAXIMUM_POSE_BYTES, InvalidPose).split()
     with naming(str(path)):

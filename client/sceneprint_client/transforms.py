@@ -108,9 +108,7 @@ class TransformTree:
         -------
         added : False if the sample was ignored
 
-        Raises
-        ------
-        DatasetError : If there are more than 5 million samples; `forget` removes old samples.
+        Raise DatasetError if there are more than 5 million samples; `forget` removes old samples.
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)

@@ -29,7 +29,6 @@ class JudgedQuery:
     Parameters
     ----------
     site, kind, query : site of the query, its kind, and the number of the query
-    evidence : evidence for each pose
     right : whether each pose is right
     """
 

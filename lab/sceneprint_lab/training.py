@@ -78,9 +78,7 @@ def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
     `depth`, the default, suits depth cameras indoors. `lidar` has longer lengths, for scanners with
     a range of tens of metres. `paper` has the sizes of Sec. III-F.
 
-    Raises
-    ------
-    TrainingError : If the preset does not exist.
+    Raise TrainingError if the preset does not exist.
     """
     if preset not in PRESET_SIZES:
         raise TrainingError(
@@ -233,16 +231,13 @@ def train(
 
     Parameters
     ----------
-    name : name of the model
     model_p, mixture_p : parameters of the model, such as the results of `preset_parameters`
     references : the user's frames, each with the name of its place, in addition to the rooms
     jobs : number of processes that create and segment frames; 1 uses this process
     report : callback for progress
 
-    Raises
-    ------
-    TrainingError : If there is too little data, the frames show fewer than two places, or a level
-        does not exist.
+    Raise TrainingError if there is too little data, the frames show fewer than two places, or a
+    level does not exist.
     """
     from threadpoolctl import threadpool_limits
 
@@ -308,10 +303,7 @@ def _silent(stage: str, done: int, total: int) -> None:
 def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -> Model:
     """Return the model with quantiser step and d0 computed from one frame per place.
 
-    Parameters
-    ----------
-    model : model with projection and mixture
-    lessons : training data of at least two places
+    `lessons`: training data of at least two places.
     """
     signer = open_signer(model, cached=False)
     first = {lesson.place: lesson for lesson in reversed(lessons)}
@@ -336,9 +328,7 @@ def whitened(
     model : result of `calibrated`
     p, references, jobs, report : arguments of `train`
 
-    Raises
-    ------
-    TrainingError : If there are too few frames for the dimension of the whitening.
+    Raise TrainingError if there are too few frames for the dimension of the whitening.
     """
     from threadpoolctl import threadpool_limits
 

@@ -51,9 +51,7 @@ class Decoders(Protocol):
 class LocalDecoders:
     """Decoders that run in this process.
 
-    Parameters
-    ----------
-    count : maximum number of concurrent uploads
+    `count`: maximum number of concurrent uploads.
     """
 
     def __init__(self, count: int) -> None:

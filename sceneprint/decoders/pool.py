@@ -165,10 +165,8 @@ class DecoderProcess:
     def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
         """Run a task and return its unchecked reply; `array_of` returns its arrays.
 
-        Raises
-        ------
-        DecoderEnded : If the process ends during the task.
-        DecoderFailure : If the task takes too long.
+        Raise DecoderEnded if the process ends during the task. Raise DecoderFailure if the task
+        takes too long.
         """
         self._sent, self._used = len(data), SHARED_BYTES  # upper bound until the reply arrives
         self._shared[: len(data)] = data

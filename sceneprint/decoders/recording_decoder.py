@@ -28,7 +28,6 @@ class RecordingIndex:
     outline : content of the recording
     topic : name and type of the frames' topic
     frames : name, metadata and place in the recording of each frame
-    notes : notes on omitted data
     sequences : number of sequences
     """
 
@@ -77,10 +76,8 @@ class RecordingDecoder:
     def outline(self, options: ImportOptions) -> tuple[bytes, RecordingIndex]:
         """Return the index of the recording, and the document from which it can be parsed again.
 
-        Raises
-        ------
-        UnreadableArchive : If the recording cannot be read with the memory and time of a process.
-        Busy : If no process can be started.
+        Raise UnreadableArchive if the recording cannot be read with the memory and time of a
+        process. Raise Busy if no process can be started.
         """
         fields = options.model_dump(mode="json", by_alias=True)
         text = self._run({"task": "outline", "options": fields})

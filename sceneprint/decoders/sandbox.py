@@ -60,9 +60,7 @@ def die_with_parent(parent: int) -> bool:
 def close_process(more_bytes: int) -> Protections:
     """Irrevocably give up all rights except computation and open files.
 
-    Parameters
-    ----------
-    more_bytes : maximum memory that this process may still allocate, bytes; 0 for no limit
+    `more_bytes`: maximum memory that this process may still allocate, bytes; 0 for no limit.
     """
     limit_memory(more_bytes)
     no_new = _LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
@@ -136,9 +134,7 @@ _SET_FILTER, _ALL_THREADS = 1, 1
 def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
     """Return the filter as BPF instructions: code, jump if true, jump if false, operand.
 
-    Parameters
-    ----------
-    machine : result of `platform.machine()`, x86_64 or aarch64
+    `machine`: result of `platform.machine()`, x86_64 or aarch64.
     """
     allowed, mapping = sorted(_ALLOWED[machine].values()), _MAPPING[machine]
     program = [

@@ -95,10 +95,8 @@ def parts_of(name: str) -> tuple[str, ...]:
     -------
     parts : printable names; none is empty, `.` or `..`
 
-    Raises
-    ------
-    UnusableName : If the name is absolute, has a part `..`, is too long or too deep, or has a
-        character that is not printable.
+    Raise UnusableName if the name is absolute, has a part `..`, is too long or too deep, or has a
+    character that is not printable.
     """
     text = name.replace("\\", "/")  # some Windows programs write backslashes
     if len(name.encode(errors="replace")) > LONGEST_NAME:
@@ -173,13 +171,8 @@ def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
 
     If the tar is damaged or truncated, the `trouble` of the last member says so.
 
-    Parameters
-    ----------
-    file : seekable tar without compression
-
-    Raises
-    ------
-    UnreadableArchive : If the tar has too many members, or the first member is unreadable.
+    `file`: seekable tar without compression. Raise UnreadableArchive if the tar has too many
+    members, or the first member is unreadable.
     """
     end = file.seek(0, os.SEEK_END)
     file.seek(0)
@@ -230,13 +223,8 @@ def _tar_trouble(info: tarfile.TarInfo) -> str | None:
 def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
     """Yield the members of a zip except folders; unreadable members have `trouble`.
 
-    Parameters
-    ----------
-    file : seekable zip, which must stay open
-
-    Raises
-    ------
-    UnreadableArchive : If the directory is missing or damaged, or has too many entries.
+    `file`: seekable zip, which must stay open. Raise UnreadableArchive if the directory is missing
+    or damaged, or has too many entries.
     """
     end = file.seek(0, os.SEEK_END)
     headers = _HeaderFile(file, _MAXIMUM_DIRECTORY)
@@ -285,9 +273,7 @@ def _zip_trouble(info: zipfile.ZipInfo, mode: int, beyond: bool) -> str | None:
 def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
     """Return the content of a member without `trouble`.
 
-    Raises
-    ------
-    UnreadableArchive : If the content is damaged, or its size differs from the declared size.
+    Raise UnreadableArchive if the content is damaged, or its size differs from the declared size.
     """
     if entry.open is None:
         file.seek(entry.start)
@@ -347,9 +333,7 @@ def is_archive(head: bytes) -> bool:
 class Inflater:
     """Decompressor of tars that receives chunks of any size; zips pass unchanged.
 
-    Parameters
-    ----------
-    most_bytes : maximum size of the decompressed archive
+    `most_bytes`: maximum size of the decompressed archive.
     """
 
     def __init__(self, most_bytes: int) -> None:
@@ -365,9 +349,7 @@ class Inflater:
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
         """Yield the decompressed pieces of the archive for the next chunk.
 
-        Raises
-        ------
-        UnreadableArchive : If the file is not an archive, is damaged, or exceeds `most_bytes`.
+        Raise UnreadableArchive if the file is not an archive, is damaged, or exceeds `most_bytes`.
         """
         self.bytes_in += len(chunk)
         if self._head is not None:
@@ -476,10 +458,7 @@ Role = Literal["image", "text"]
 class Archive:
     """Open archive; see `open_archive`.
 
-    Parameters
-    ----------
-    file : file of the archive
-    root : private folder that represents the content of the archive
+    `root`: private folder that represents the content of the archive.
     """
 
     def __init__(self, file: BinaryIO, root: Path) -> None:
@@ -507,9 +486,7 @@ class Archive:
     def data_of(self, reference: FrameReference) -> bytes:
         """Return the bytes of a frame.
 
-        Raises
-        ------
-        UnreadableArchive : If the member is damaged, encrypted or too large.
+        Raise UnreadableArchive if the member is damaged, encrypted or too large.
         """
         limit = MAXIMUM_IMAGE_BYTES if reference.cloud is None else MAXIMUM_CLOUD_BYTES
         data = self._read(self._members[reference.path], limit)
@@ -539,9 +516,7 @@ class Archive:
     def lay_out(self, name: str) -> None:
         """Fill the private folder, and find the sequences in it.
 
-        Parameters
-        ----------
-        name : name of the scene if the archive has no folder for it
+        `name`: name of the scene if the archive has no folder for it.
         """
         members = self._sequence_members()
         tops = {parts[0] for parts, _, _ in members}
@@ -654,11 +629,8 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
     folder : parent of the private folder, which is removed at the end
     name : name of the scene if the archive has no folder for it; a single part of a path
 
-    Raises
-    ------
-    UnreadableArchive : If the file is not an archive, is damaged, exceeds a limit, has no depth, or
-        has two scenes with the same name.
-    OSError : If the folder cannot be written.
+    Raise UnreadableArchive if the file is not an archive, is damaged, exceeds a limit, has no
+    depth, or has two scenes with the same name. Raise OSError if the folder cannot be written.
     """
     with tempfile.TemporaryDirectory(prefix="archive-", dir=folder) as private:
         archive = Archive(file, Path(private).joinpath(*_PARENTS).absolute())

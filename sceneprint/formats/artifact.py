@@ -311,10 +311,8 @@ _PATCH = np.dtype(
 def write_geometry(geometry: Geometry) -> bytes:
     """Return the bytes of a geometry artifact; equal artifacts have equal bytes.
 
-    Parameters
-    ----------
-    geometry : artifact whose model id has 64 hexadecimal digits; more than MAXIMUM_POINTS unordered
-        points are thinned
+    `geometry`: artifact whose model id has 64 hexadecimal digits; more than MAXIMUM_POINTS
+    unordered points are thinned.
     """
     patches, camera, spread = geometry.patches, geometry.surface.camera, geometry.surface.spread
     schema = SCHEMA_VERSION if isinstance(camera, Intrinsics) else CLOUD_SCHEMA
@@ -363,10 +361,8 @@ def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
 def read_geometry(data: bytes) -> Geometry:
     """Return the geometry artifact from the bytes of `write_geometry`.
 
-    Raises
-    ------
-    UnreadableGeometry : If the bytes are not an artifact, are truncated or damaged, have another
-        schema, or describe an impossible camera, depth or patch.
+    Raise UnreadableGeometry if the bytes are not an artifact, are truncated or damaged, have
+    another schema, or describe an impossible camera, depth or patch.
     """
     nothing = f"The {len(data)} bytes are not a geometry artifact."
     if len(data) < _HEAD.size or data[: len(MAGIC)] != MAGIC:

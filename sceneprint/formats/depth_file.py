@@ -56,10 +56,8 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
     -------
     samples : (H, W) uint16
 
-    Raises
-    ------
-    UnreadableFrame : If the file is empty, damaged, truncated, animated or too large, or has
-        another pixel format.
+    Raise UnreadableFrame if the file is empty, damaged, truncated, animated or too large, or has
+    another pixel format.
     """
     check_length(data)
     if not data.startswith(PNG_SIGNATURE):
@@ -282,10 +280,8 @@ def decode_npy(data: bytes) -> Samples:
     samples : (H, W) float32 metres for a floating-point array, with its NaN and infinities; uint16
         stored units for a uint16 array
 
-    Raises
-    ------
-    UnreadableFrame : If the file is empty, too large or not NPY, has another type or shape,
-        contains Python objects, or its size contradicts its header.
+    Raise UnreadableFrame if the file is empty, too large or not NPY, has another type or shape,
+    contains Python objects, or its size contradicts its header.
     """
     check_length(data)
     if not data.startswith(NPY_SIGNATURE):
@@ -346,19 +342,16 @@ def make_frame(
     intrinsics : camera of the image, with its distortion
     depth_scale : stored units per metre; ignored for floating-point samples
     along_ray : whether the samples are ranges along the pixel's ray instead of z
-    name : name of the frame in messages
     pose : (4, 4) T_parent_sensor, or None if unknown
 
     Returns
     -------
     frame : depth (H, W) float32, metres, where 0 is missing
 
-    Raises
-    ------
-    UnreadableFrame : If the samples have another type or are not two-dimensional.
-    InvalidIntrinsics : If the intrinsics do not fit the image, or the depth scale is not positive.
-    InvalidPose : If the pose is not a rigid transform.
-    UselessFrame : If no valid sample remains.
+    Raise UnreadableFrame if the samples have another type or are not two-dimensional. Raise
+    InvalidIntrinsics if the intrinsics do not fit the image, or the depth scale is not positive.
+    Raise InvalidPose if the pose is not a rigid transform. Raise UselessFrame if no valid sample
+    remains.
     """
     with naming(name):
         if not (math.isfinite(depth_scale) and depth_scale > 0):
@@ -403,10 +396,8 @@ def read_frame(
 ) -> DepthFrame:
     """Return the frame of a depth image file; see `make_frame` for the other parameters.
 
-    Raises
-    ------
-    UnreadableFrame : If the file is missing or too large, or `decode_frame` raises the error. The
-        message names the file.
+    Raise UnreadableFrame if the file is missing or too large, or `decode_frame` raises the error.
+    The message names the file.
     """
     data = read_bytes(path, MAXIMUM_IMAGE_BYTES, UnreadableFrame)
     with naming(str(path)):
@@ -434,9 +425,7 @@ def decode_frame(
     samples_of : decoder of the file; default: `decode_samples`
     trust_depth : whether to accept samples that do not look like depth
 
-    Raises
-    ------
-    UnreadableFrame : If `decode_samples`, `check_depth` or `make_frame` raises the error.
+    Raise UnreadableFrame if `decode_samples`, `check_depth` or `make_frame` raises the error.
     """
     with naming(name):
         samples = (samples_of or decode_samples)(data)
@@ -451,9 +440,7 @@ def decode_frame(
 def decode_samples(data: bytes) -> Samples:
     """Return the samples (H, W) of a depth image: uint16 in stored units, or float32 metres.
 
-    Raises
-    ------
-    UnreadableFrame : If the first bytes match no depth format, or the reader raises the error.
+    Raise UnreadableFrame if the first bytes match no depth format, or the reader raises the error.
     """
     check_length(data)
     file_format = format_at(data, "depth")

@@ -50,9 +50,7 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
     samples : (H, W) uint16 in stored units, or floating-point metres
     depth_scale : stored units per metre
 
-    Raises
-    ------
-    UnreadableFrame : If the samples are not depth; the message contains the remedy.
+    Raise UnreadableFrame if the samples are not depth; the message contains the remedy.
     """
     rows = samples[:: max(1, len(samples) // _ROWS)]
     is_whole = rows.dtype == np.uint16

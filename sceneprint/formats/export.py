@@ -81,9 +81,7 @@ def write_ply(
     edges : (E, 2) lines, as indices of points
     comments : lines of the header, such as the coordinate frame; escaped to printable ASCII
 
-    Raises
-    ------
-    ValueError : If an array has another shape, or an index is out of range.
+    Raise ValueError if an array has another shape, or an index is out of range.
     """
     n = len(points)
     kinds = [(name, "<f4") for name in "xyz"]
@@ -229,10 +227,7 @@ def g2o(poses: Sequence[Floats], edges: Sequence[PoseEdge]) -> str:
 
     The text has no other lines, because some readers fail at comments and fixed vertices.
 
-    Parameters
-    ----------
-    poses : (4, 4) T_parent_vertex of each vertex
-    edges : edges between the vertices
+    `poses`: (4, 4) T_parent_vertex of each vertex.
     """
     lines = [f"VERTEX_SE3:QUAT {i} {_pose(pose)}" for i, pose in enumerate(poses)]
     upper = np.triu_indices(6)

@@ -23,9 +23,7 @@ _HEADER = re.compile(
 def decode_pfm(data: bytes) -> Floats32:
     """Return the samples (H, W) of a PFM file, metres; the file stores the bottom row first.
 
-    Raises
-    ------
-    UnreadableFrame : If the header is damaged or contradicts the size of the data.
+    Raise UnreadableFrame if the header is damaged or contradicts the size of the data.
     """
     (width, height), scale, start = _header(data)
     if len(data) - start != 4 * width * height:

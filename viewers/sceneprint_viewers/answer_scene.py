@@ -99,7 +99,6 @@ class AnswerScene:
     Parameters
     ----------
     stream : output of the scene
-    client : client of the service with the answers
     limits : maximum numbers of points
     map_frames : number of frames of each map whose points are drawn; 0 draws no map
     """
@@ -122,14 +121,10 @@ class AnswerScene:
         Parameters
         ----------
         answer : stored answer with the stage `validate`
-        name : name of the query
         text : description of the answer
         camera : camera of the query; None for a cloud
-        index, stamp_ns : see Moment
 
-        Raises
-        ------
-        UnknownQuery : If the service does not store the answer.
+        Raise UnknownQuery if the service does not store the answer.
         """
         named = dict.fromkeys(one.map for one in placed(answer.matches))
         for map_name in answer.maps if len(answer.maps) == 1 else named:
@@ -317,7 +312,6 @@ def association_scene(client: Client, association: Association, text: str, most:
 
     Parameters
     ----------
-    client : client of the service with the association
     text : description of the association
     most : maximum number of frames whose points are drawn
     """

@@ -58,7 +58,6 @@ class PosedRun:
     Parameters
     ----------
     name : display name
-    map_name, parent_frame : map and parent frame of the frames
     frame_ids : ids in chronological order
     poses : (4, 4) T_parent_sensor of each frame
     cameras : whether the frames are depth images
@@ -75,9 +74,7 @@ class PosedRun:
 def map_runs(client: Client, map_name: str) -> list[PosedRun]:
     """Return the runs of a map with at most TRACK_POSES poses each.
 
-    Raises
-    ------
-    UnknownMap : If the map does not exist.
+    Raise UnknownMap if the map does not exist.
     """
     runs, unnamed = [], False
     for session in itertools.islice(client.sessions(map_name), MOST_LISTED):
@@ -147,8 +144,6 @@ def map_entities(
 
     Parameters
     ----------
-    client : client of the service with the points
-    runs : runs of one parent frame
     space : name of the space
     up : (3,) unit vector in the space; None estimates it from the sensors
     most : maximum number of frames whose points are fetched, evenly spaced along the runs
@@ -213,7 +208,6 @@ def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
 
     Parameters
     ----------
-    client : client of the service with the points
     frames : frames of one map, at least one; frames without a pose are omitted
     most : maximum number of frames that are drawn, evenly spaced
     """
@@ -238,9 +232,7 @@ def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
 def frame_scene(client: Client, frame: Frame) -> Moment:
     """Return permanent entities of one frame, in its parent frame or else in its sensor's frame.
 
-    Raises
-    ------
-    NotIndexed : If the frame is not indexed (yet).
+    Raise NotIndexed if the frame is not indexed (yet).
     """
     optical = frame.kind == "depth"
     points = client.frame_points(frame.map, frame.frame_id).points

@@ -84,9 +84,7 @@ class _OutputFile:
 def mcap_file(path: Path) -> Iterator[McapWriter]:
     """Yield a writer of an MCAP file, which is created at the end if it is not empty.
 
-    Raises
-    ------
-    OSError : If the file cannot be written. No partial file remains.
+    Raise OSError if the file cannot be written. No partial file remains.
     """
     import foxglove
 

@@ -62,7 +62,6 @@ class LineSet:
     Parameters
     ----------
     strips : (M, 3) points of each strip, metres
-    colours : colour of each strip
     width_px : width on the screen, pixels
     """
 

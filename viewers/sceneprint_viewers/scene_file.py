@@ -22,7 +22,6 @@ class SceneFile:
     Parameters
     ----------
     stream : output of the scene
-    client : client of the service with the results
     map_frames : number of frames of each map whose points are drawn; 0 draws no map
     """
 
@@ -64,9 +63,7 @@ class SceneFile:
 def open_scene_file(path: Path, client: Client, map_frames: int) -> Iterator[SceneFile]:
     """Open an MCAP file for drawing, which is created at the end if it is not empty.
 
-    Raises
-    ------
-    OSError : If the file cannot be written. No partial file remains.
+    Raise OSError if the file cannot be written. No partial file remains.
     """
     with mcap_file(path) as writer:
         yield SceneFile(SceneStream(writer), client, map_frames)

@@ -113,13 +113,7 @@ class Choice:
 def choose_frames(path: Path) -> Choice:
     """Return database and query frames, by the split files of the scene if it has them.
 
-    Parameters
-    ----------
-    path : path of one or several sequences
-
-    Raises
-    ------
-    DatasetError : If there is no sequence, or too few frames for both.
+    Raise DatasetError if there is no sequence, or too few frames for both.
     """
     database: list[DemoFrame] = []
     queries: list[DemoFrame] = []
@@ -228,10 +222,8 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
     -------
     indexed : indexed frames by id
 
-    Raises
-    ------
-    DatasetError : If no frame could be signed.
-    ServiceError : If some frames were not signed in time.
+    Raise DatasetError if no frame could be signed. Raise ServiceError if some frames were not
+    signed in time.
     """
     client.create_map(DEMO_MAP, model=model)
     indexed: dict[str, DemoFrame] = {}
@@ -407,9 +399,7 @@ def serving(data: Path, workers: int) -> Iterator[str]:
     ------
     url : URL of the ready service
 
-    Raises
-    ------
-    Unreachable : If the service did not start; the message includes the end of its log.
+    Raise Unreachable if the service did not start; the message includes the end of its log.
     """
     log = data / "service.log"
     arguments = ["--port", "0", "--data", str(data), "--workers", str(workers)]
@@ -442,9 +432,7 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 def _first_line(pipe: IO[bytes]) -> str:
     """Return the first line, or its beginning if the other end is closed.
 
-    Raises
-    ------
-    Unreachable : If no line arrived in time.
+    Raise Unreachable if no line arrived in time.
     """
     data, until = b"", time.monotonic() + START_S
     with DefaultSelector() as selector:

@@ -101,10 +101,8 @@ def thumbnail(depth: Floats32, rows: int = ROWS, columns: int = COLUMNS) -> Floa
 class Thumbnails(Baseline):
     """Small inverse depth images, by mean absolute difference or by correlation.
 
-    Parameters
-    ----------
-    comparison : "l1", the mean absolute difference over cells that are filled in both, or "zncc",
-        1 - zero-mean normalised cross-correlation, with the mean in empty cells
+    `comparison`: "l1", the mean absolute difference over cells that are filled in both, or "zncc",
+    1 - zero-mean normalised cross-correlation, with the mean in empty cells.
     """
 
     def __init__(self, comparison: Comparison) -> None:
@@ -210,9 +208,7 @@ def vlad(local: Floats32, words: Floats) -> Floats32:
 class FpfhVlad(Baseline):
     """The baseline FPFH-VLAD, for depth images and clouds.
 
-    Parameters
-    ----------
-    maximum : range of the sensor, metres; farther points are omitted
+    `maximum`: range of the sensor, metres; farther points are omitted.
     """
 
     name = "fpfh_vlad"
@@ -228,10 +224,8 @@ class FpfhVlad(Baseline):
     def read(self, frame: AnyFrame) -> Floats32:
         """Return the local features of a frame.
 
-        Raises
-        ------
-        MissingDependency : If Open3D cannot be imported.
-        UselessFrame : If no point is in range.
+        Raise MissingDependency if Open3D cannot be imported. Raise UselessFrame if no point is in
+        range.
         """
         points = (
             np.asarray(frame.points, np.float64)
@@ -281,13 +275,11 @@ RINGS, SECTORS, RADIUS, LIFT = 20, 60, 80.0, 2.0
 def ring_descriptor(points: Floats32 | Floats) -> Floats32:
     """Return the maximum height in each ring and sector around the sensor.
 
-    Parameters
-    ----------
-    points : (N, 3) metres, with the sensor at the origin and z up; azimuth is from x towards y
-
     Returns
     -------
     (RINGS, SECTORS) float32, height plus `LIFT`; 0 for cells without a point
+
+    `points`: (N, 3) metres, with the sensor at the origin and z up; azimuth is from x towards y.
     """
     x, y, z = np.asarray(points, np.float64).T
     flat = np.hypot(x, y)
@@ -345,14 +337,12 @@ def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
 def ring_distance(a: Floats32, b: Floats32) -> tuple[float, int]:
     """Return the distance between two scans, which does not depend on their yaw.
 
-    Parameters
-    ----------
-    a, b : (rings, sectors) descriptors
-
     Returns
     -------
     distance : mean of 1 - cosine over columns that are filled in both, at the best shift; 0 to 2
     shift : number of sectors by which the columns of `a` are shifted in `b`
+
+    `a`, `b`: (rings, sectors) descriptors.
     """
     distance, shift = _best_shift(*_columns(a), *_columns(b))
     return float(distance), int(shift)
@@ -400,9 +390,7 @@ def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
     names : keys of BASELINES
     maximum : range of the sensor, metres
 
-    Raises
-    ------
-    MissingDependency : If a library is absent.
+    Raise MissingDependency if a library is absent.
     """
     opened = [BASELINES[name](maximum) for name in names]
     for one in opened:
@@ -420,7 +408,6 @@ class Compared:
 
     Parameters
     ----------
-    name : name of the baseline
     reason : reason why the baseline cannot be used; empty if it can
     rankings : indices of the database for each query, nearest first
     first : validated pair of each query with its nearest frame; None without a ranking
@@ -448,8 +435,6 @@ def compare(
     baseline : baseline that is measured
     prepared, store : frames of the evaluation
     allowed : (Q, N) mask of the frames that a query may find
-    signer : signer for the time of the signature
-    seed : seed of the baseline's fit
     watch : callback for progress
     """
     from threadpoolctl import threadpool_limits

@@ -61,8 +61,6 @@ class Candidate:
     Parameters
     ----------
     match : index of the frame in the database
-    number : number of the frame in the store
-    scene, pose : see SignedFrame
     overlap_mean, overlap_least : overlaps with the query; see Overlaps
     """
 
@@ -85,8 +83,6 @@ class QueryTask:
 
     Parameters
     ----------
-    number : number of the query in the store
-    scene, pose : scene and pose of the query
     ranking : database indices of the first members of R, in order
     selection : database indices of C, in order
     candidates : candidates of `ranking` and `selection`, without duplicates
@@ -162,9 +158,7 @@ def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
     Poses are comparable within one scene only. The selected scene has the most strong matches; ties
     are resolved by the number of matches, then by the rank of the first match.
 
-    Parameters
-    ----------
-    pairs : pairs of a query, in the order of R
+    `pairs`: pairs of a query, in the order of R.
     """
     accepted = in_preferred_order(pairs)
     scenes = [pair.scene for pair in accepted]

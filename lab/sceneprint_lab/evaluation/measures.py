@@ -247,9 +247,7 @@ def accuracy(errors: Sequence[Error]) -> Figures:
 def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
     """Return figures of the overlap of the first match, and of the first five, with the query.
 
-    Parameters
-    ----------
-    five : overlaps, by the definition of retrieval, of the first five matches of each query
+    `five`: overlaps, by the definition of retrieval, of the first five matches of each query.
     """
     first = [overlaps[0] for overlaps in five]
     return {
@@ -399,13 +397,8 @@ class Calibration:
 def calibration(confidences: Sequence[float], right: Sequence[bool]) -> Calibration:
     """Return the calibration of confidences.
 
-    Parameters
-    ----------
-    confidences, right : confidence and correctness of each pose; at least one pose
-
-    Raises
-    ------
-    ValueError : If the lengths differ or are 0.
+    `confidences`, `right`: confidence and correctness of each pose; at least one pose. Raise
+    ValueError if the lengths differ or are 0.
     """
     if len(confidences) != len(right) or not len(right):
         raise ValueError(
@@ -512,7 +505,6 @@ def diversity(
 
     Parameters
     ----------
-    outcomes : outcomes of the queries
     poses : (4, 4) pose of each database frame
     database : function that returns the frame of a database index, with its pose
     """

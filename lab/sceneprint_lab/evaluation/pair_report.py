@@ -217,10 +217,7 @@ SCHEMA_VERSION = 1
 def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[str, Any]:
     """Return all figures of an evaluation of pairs.
 
-    Parameters
-    ----------
-    evaluation : see PairEvaluation
-    settings : all settings with which the evaluation can be repeated
+    `settings`: all settings with which the evaluation can be repeated.
     """
     members, tried = evaluation.members, evaluation.tried
     scenes = list(dict.fromkeys(member.scene for member in members))

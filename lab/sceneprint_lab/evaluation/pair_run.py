@@ -79,7 +79,6 @@ class Drawing:
     pairs : number of pairs per bin and scene, and of negatives per scene
     negatives : total number of pairs of two scenes
     apart : minimum number of frames between two frames of one sequence
-    seed : seed of the sample
     """
 
     pairs: int = 120
@@ -281,7 +280,6 @@ def register(
     query, match : (N, 3) metres
     o3d : result of `open3d`
     methods : members of METHODS
-    seed : seed of the random choices
     scale : factor of all lengths; 1 for rooms
     """
     o3r, shared = o3d.pipelines.registration, Clock()
@@ -378,8 +376,6 @@ class Bench:
 
     Parameters
     ----------
-    judging : see Judge
-    store : store of the frames
     model : model, whose parameters the baselines use
     limits : maximum error of a right transform, metres and degrees
     o3d : Open3D; None without baselines
@@ -528,13 +524,10 @@ def evaluate_pairs(
     paths : paths of sequences with poses; frames of different scenes are negatives
     signer : result of `open_signer`
     store : empty store
-    settings : settings of the evaluation
     watch : callback for progress
 
-    Raises
-    ------
-    DatasetError : If no two frames can be used, or none make a pair.
-    MissingDependency : If baselines need Open3D, which cannot be imported.
+    Raise DatasetError if no two frames can be used, or none make a pair. Raise MissingDependency if
+    baselines need Open3D, which cannot be imported.
     """
     if settings.baselines:
         # detect a missing library before frames are read

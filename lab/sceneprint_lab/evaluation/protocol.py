@@ -71,7 +71,6 @@ class SignedFrame:
 
     Parameters
     ----------
-    number : number of the frame in the store
     name : name, unique in the evaluation
     scene : parent frame
     pose : (4, 4) T_parent_sensor
@@ -104,7 +103,6 @@ class ValidatedPair:
     Parameters
     ----------
     match : index of the database frame
-    scene : scene of the database frame
     validation : result of the validation
     same_scene : whether the match is in the query's scene
     error : error of T_match_query; infinite for another scene
@@ -142,8 +140,6 @@ class JudgedPlace:
 
     Parameters
     ----------
-    evidence : evidence for the pose
-    confidence : confidence of the pose
     error : error of the pose; infinite in another parent frame
     right : whether the pose is at the right place
     """
@@ -233,10 +229,8 @@ class QueryOutcome:
     def views(self, of: str) -> list[ValidatedPair]:
         """Return the pairs of a row of the table in its order.
 
-        Parameters
-        ----------
-        of : "R" and "DR" for all pairs in the order of R; "VR" and "VDR" for accepted pairs, strong
-            before weak
+        `of`: "R" and "DR" for all pairs in the order of R; "VR" and "VDR" for accepted pairs,
+        strong before weak.
         """
         first = self.ranking[: self.candidates] if of in ("R", "VR") else self.selection
         pairs = [self.pairs[match] for match in first]
@@ -280,7 +274,6 @@ class OverlapView:
     ----------
     samples : (N, 3) valid samples of a grid in the parent frame, metres
     depth : (H, W) float32, metres; 0 if missing
-    intrinsics : intrinsics of the depth image
     pose : (4, 4) T_parent_sensor
     """
 
@@ -423,14 +416,11 @@ def travelled(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -
     The path consists of straight lines between the frames of the evaluation, so it is slightly too
     short if they are sparse.
 
-    Parameters
-    ----------
-    queries, database : frames; names of one run are equal up to the last slash, and their order is
-        the order of time
-
     Returns
     -------
     (Q, N) metres; negative if the database frame is later, infinite for another run
+
+    Names of frames of one run are equal up to the last slash, and their order is that of time.
     """
     along = {name: place for run in _runs((*queries, *database)) for name, place in run.items()}
     of_queries, of_database = ([_run(m) for m in members] for members in (queries, database))
@@ -561,10 +551,7 @@ Ranges = tuple[Range, ...]
 class PathRanges:
     """A path and its ranges.
 
-    Parameters
-    ----------
-    path : path of sequences
-    database, queries : ranges over the frames of all sequences, in order; None if unspecified
+    `database`, `queries`: ranges over the frames of all sequences, in order; None if unspecified.
     """
 
     path: Path
@@ -611,9 +598,7 @@ class EvaluationProtocol:
 def parse_ranges(text: str) -> Ranges:
     """Parse ranges such as 0:600, 0:600:2, 650: or 0:25+50:75.
 
-    Raises
-    ------
-    DatasetError : If the text does not consist of ranges, a range is empty, or its step is 0.
+    Raise DatasetError if the text does not consist of ranges, a range is empty, or its step is 0.
     """
     ranges = []
     for one in text.split("+"):
@@ -635,9 +620,7 @@ def parse_ranges(text: str) -> Ranges:
 def parse_part(text: str) -> PathRanges:
     """Parse PATH, or PATH@db=RANGES,queries=RANGES, in which one of the two is optional.
 
-    Raises
-    ------
-    DatasetError : If the part after the @ does not have this form.
+    Raise DatasetError if the part after the @ does not have this form.
     """
     match = _OWN_RANGES.fullmatch(text)
     if match is None:
@@ -673,10 +656,8 @@ def choose(
     shared : whether frames may have both uses, which frames of paths without ranges then have
     find : function that returns the sequences of a path; it is called once per path
 
-    Raises
-    ------
-    DatasetError : If the use of a path's frames is unspecified, a range lies outside its path, a
-        frame is selected twice, two scenes have the same name, or there is no query.
+    Raise DatasetError if the use of a path's frames is unspecified, a range lies outside its path,
+    a frame is selected twice, two scenes have the same name, or there is no query.
     """
     gathered = _Gathered(shared=shared, find=find)
     every = (Range(None, None, None),)
@@ -711,9 +692,7 @@ def choose(
 def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
     """Return all frames of all paths in order, as queries, without reading frames.
 
-    Raises
-    ------
-    DatasetError : If a frame occurs twice, or two scenes have the same name.
+    Raise DatasetError if a frame occurs twice, or two scenes have the same name.
     """
     places = [path.resolve() for path in paths]
     for i, place in enumerate(places):
@@ -796,9 +775,7 @@ class _Gathered:
 class FrameStore:
     """A folder with depth and geometry of frames by number, which would exceed the memory.
 
-    Parameters
-    ----------
-    folder : folder of the files, which the caller removes
+    `folder`: folder of the files, which the caller removes.
     """
 
     folder: Path

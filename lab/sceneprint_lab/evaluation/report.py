@@ -184,7 +184,6 @@ def figures(
 
     Parameters
     ----------
-    evaluation : see Evaluation
     database : function that returns the frame of a database index, with its pose
     settings : all settings with which the evaluation can be repeated
     """

@@ -109,7 +109,6 @@ class EvaluationSettings:
     within_m : maximum distance of a frame that shows the query's place, metres; None requires an
         overlap by half instead
     baselines : names of baselines; see BASELINES
-    seed : seed of all validations
     jobs : number of processes, on which no figure depends
     cache_dir : folder of derived files of the model; None selects the user's cache folder
     """
@@ -136,11 +135,9 @@ class Evaluation:
     Parameters
     ----------
     prepared : frames of the evaluation
-    outcomes : outcomes of all queries with the whole database
     alone : outcomes of each scene with a separate database, for a 7-Scenes table of several scenes;
         else empty
     allowed, relevant : (Q, N) masks of the frames that a query may find, and that show its place
-    within_m : see EvaluationSettings
     compared : answers of each baseline
     """
 
@@ -164,13 +161,10 @@ def evaluate(
     protocol : result of `choose`
     signer : result of `open_signer`
     store : empty store
-    settings : settings of the evaluation
     watch : callback for progress
 
-    Raises
-    ------
-    DatasetError : If no query or no database frame is usable.
-    MissingDependency : If the library of a baseline is missing.
+    Raise DatasetError if no query or no database frame is usable. Raise MissingDependency if the
+    library of a baseline is missing.
     """
     baselines = open_baselines(
         settings.baselines, signer.model.parameters.depth.maximum_depth

@@ -45,7 +45,6 @@ class SiteAnswer:
     ----------
     site, kind, query : site of the query, its kind, and the number of the query
     answerable : whether a frame of the map overlaps the query enough, or a scan is near enough
-    answer : answer with its error
     """
 
     site: str
@@ -78,7 +77,6 @@ def with_flaws(
 
     Parameters
     ----------
-    frames : frames of the map with poses
     flaws : maximum share of missing frames and standard deviation of the steps of the error; those
         of a site are random shares of them
     rng : random generator for missing frames and drift
@@ -154,7 +152,6 @@ def ask_site(
     ----------
     signer : result of `open_signer`, whose model determines the sensor of the site
     work : kind (see `kinds_of`), index and number of queries
-    seed : seed of the collection of sites
     candidates : size of C
     prior : minimum and maximum error of the robot's prior, metres; None for queries without a prior
     flaws : flaws of the map; None for a map with all frames and exact poses
@@ -213,7 +210,6 @@ def answers_of(
 
     Parameters
     ----------
-    signer : signer with the model
     database, queries : results of `signed`, with consecutive numbers from 0
     geometries : geometries of the database and the queries, by number
     candidates : size of C

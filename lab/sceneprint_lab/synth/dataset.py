@@ -65,9 +65,7 @@ def synthesise_room(
     step : interval of frames along the path
     noise : sensor noise; None for ideal depth
 
-    Raises
-    ------
-    MissingDependency : If Embree cannot be imported.
+    Raise MissingDependency if Embree cannot be imported.
     """
     room, rng = room_and_rng(seed, index)
     sensor = own_sensor(noise, intrinsics, rng) if noise else None
@@ -182,9 +180,7 @@ def synthesise_survey(
     sensor : scanner; default: a random scanner for each site
     perfect : whether the scanner has no errors and loses no returns
 
-    Raises
-    ------
-    MissingDependency : If Embree cannot be imported.
+    Raise MissingDependency if Embree cannot be imported.
     """
     premises, rng = premises_and_rng(seed, index, kind)
     drawn = own_scanner(rng)

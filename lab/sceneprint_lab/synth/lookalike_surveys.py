@@ -131,10 +131,8 @@ def synthesise_lookalike_survey(
     queries : number of queries
     perfect : whether the scanner has no errors and loses no returns, and the map's poses are exact
 
-    Raises
-    ------
-    MissingDependency : If Embree cannot be imported.
-    ValueError : If the kind does not exist.
+    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
+    exist.
     """
     if kind not in SURVEYED_KINDS:
         known = ", ".join(SURVEYED_KINDS)

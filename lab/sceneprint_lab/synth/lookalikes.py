@@ -128,10 +128,8 @@ def synthesise_lookalike(
     queries : number of queries
     noise : sensor noise; None for ideal depth
 
-    Raises
-    ------
-    MissingDependency : If Embree cannot be imported.
-    ValueError : If the kind does not exist.
+    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
+    exist.
     """
     kinds = KINDS + ORDINARY
     if kind not in kinds:

@@ -59,9 +59,7 @@ class Caster:
     def cast(self, origins: Floats32, directions: Floats32) -> RayHits:
         """Return the first hit of each ray.
 
-        Parameters
-        ----------
-        origins, directions : (R, 3) float32, metres; directions may have any length
+        `origins`, `directions`: (R, 3) float32, metres; directions may have any length.
         """
         found = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
@@ -89,9 +87,7 @@ def cast_depth(
     depth : (H, W) float32, metres along the optical axis; 0 without a hit
     cosine : (H, W) float32, |cos| between ray and normal, [0, 1]; 0 without a hit
 
-    Raises
-    ------
-    MissingDependency : If Embree cannot be imported.
+    Raise MissingDependency if Embree cannot be imported.
     """
     depth, cosine, _ = cast_faces(caster, T_world_camera, intrinsics)
     return depth, cosine
@@ -361,7 +357,6 @@ class Rosette:
     turns : turns of the first and of the second prism in a scan
     lasers : number of lasers, one above the other
     laser_step : angle between two lasers, rad
-    minimum, maximum, sigma, loss, grazing : see Spinning
     """
 
     half_angle: float = math.radians(35.0)

@@ -33,10 +33,8 @@ def read_trajectory(path: Path) -> SensorTrajectory:
 
     The poses are sorted by time. If several lines have the same time stamp, the first one counts.
 
-    Raises
-    ------
-    InvalidPose : If the file cannot be read or has no pose, or a line does not consist of 8 finite
-        numbers with a quaternion of unit length. The message names file and line.
+    Raise InvalidPose if the file cannot be read or has no pose, or a line does not consist of 8
+    finite numbers with a quaternion of unit length. The message names file and line.
     """
     numbers, rows = [], []
     for number, line in data_lines(read_text(path, _MAXIMUM_TRAJECTORY_BYTES, InvalidPose)):
@@ -78,10 +76,8 @@ def read_cloud(
 ) -> Scan:
     """Return the cloud of a file with the parameters used to read it.
 
-    Raises
-    ------
-    UnreadableCloud : If the file is missing or too large, or `decode_scan` raises the error. The
-        message names the file.
+    Raise UnreadableCloud if the file is missing or too large, or `decode_scan` raises the error.
+    The message names the file.
     """
     data = read_bytes(path, MAXIMUM_CLOUD_BYTES, UnreadableCloud)
     file_format = source.file_format or ("kitti" if is_kitti(path) else None)
@@ -159,9 +155,7 @@ class FrameReference(FrameFile):
     def read_depth(self) -> DepthFrame:
         """Read a depth image; raise the errors of `read_frame` and `pose`.
 
-        Raises
-        ------
-        DatasetError : If the frame is a cloud.
+        Raise DatasetError if the frame is a cloud.
         """
         if self.camera is None:
             raise DatasetError(
@@ -188,8 +182,6 @@ class FrameSequence:
     Parameters
     ----------
     name : name that is unique among the sequences of `find_sequences`
-    folder : folder or file of the sequence
-    layout : layout of the files
     parent_frame : name of the parent frame of the poses; only poses with the same parent frame can
         be compared
     split : use of the sequence according to the authors of the scene, or None
@@ -230,9 +222,7 @@ EMPTY_FRAMES = frozenset(
 def count_lost(left_out: Counter[str]) -> int:
     """Return the number of omitted frames with depth or points.
 
-    Parameters
-    ----------
-    left_out : numbers of omitted frames by reason
+    `left_out`: numbers of omitted frames by reason.
     """
     return left_out.total() - sum(left_out[reason] for reason in EMPTY_FRAMES)
 

@@ -72,9 +72,7 @@ def list_folder(folder: Path) -> tuple[list[str], list[str]]:
 
     Both lists are in natural order: frame 9 precedes frame 10.
 
-    Raises
-    ------
-    DatasetError : If the folder cannot be read.
+    Raise DatasetError if the folder cannot be read.
     """
     files: list[str] = []
     folders: list[str] = []
@@ -126,16 +124,12 @@ def references(
     ----------
     folder : folder; for depth images, it or a parent has an `intrinsics.json`
     files : names of the files in the order of `list_folder`
-    layout : layout of the folder
     name : name of the sequence, which prefixes the names of the frames
     camera : camera of a 7-Scenes sequence without an intrinsics.json
 
-    Raises
-    ------
-    DatasetError : If intrinsics.json is missing, depth.txt or clouds.json is invalid, or two frames
-        would have the same name.
-    InvalidIntrinsics : If intrinsics.json does not describe a camera.
-    InvalidPose : If a line of groundtruth.txt is not a pose.
+    Raise DatasetError if intrinsics.json is missing, depth.txt or clouds.json is invalid, or two
+    frames would have the same name. Raise InvalidIntrinsics if intrinsics.json does not describe a
+    camera. Raise InvalidPose if a line of groundtruth.txt is not a pose.
     """
     unposed = NO_POSE_FILE
     if layout is Layout.SEVEN_SCENES:
@@ -317,13 +311,11 @@ def find_sequences(
     -------
     sequences : at least one sequence, in natural order of the names
 
-    Raises
-    ------
-    DatasetError : If there are no frames, an intrinsics.json or a listed file is missing, two
-        scenes or recordings have the same name, or recordings are mixed with other frames.
-    InvalidIntrinsics : If an intrinsics.json does not describe a camera.
-    InvalidPose : If a line of a groundtruth.txt is not a pose.
-    MissingDependency : If the path is a recording and rosbags is not installed.
+    Raise DatasetError if there are no frames, an intrinsics.json or a listed file is missing, two
+    scenes or recordings have the same name, or recordings are mixed with other frames. Raise
+    InvalidIntrinsics if an intrinsics.json does not describe a camera. Raise InvalidPose if a line
+    of a groundtruth.txt is not a pose. Raise MissingDependency if the path is a recording and
+    rosbags is not installed.
     """
     # the name of `..` is that of its target; a symlink keeps its own name
     path = Path(path)
@@ -392,10 +384,8 @@ def _recordings(
 ) -> tuple[FrameSequence, ...]:
     """Return the sequences of several recordings, named by their positions below `root`.
 
-    Raises
-    ------
-    DatasetError : If there are other frames too, two recordings have the same name, or
-        `recording_sequences` raises the error.
+    Raise DatasetError if there are other frames too, two recordings have the same name, or
+    `recording_sequences` raises the error.
     """
     from sceneprint.formats.recording import recording_name, recording_sequences
 
@@ -430,18 +420,13 @@ def find_each(
 
     ROS recordings are skipped; see `find_sequences` for the other layouts.
 
-    Parameters
-    ----------
-    root : absolute path of a folder
-
     Returns
     -------
     sequences : readable sequences, if any
     refused : name and error of each unreadable sequence
 
-    Raises
-    ------
-    DatasetError : If there are too many folders, or two scenes have the same name.
+    `root`: absolute path of a folder. Raise DatasetError if there are too many folders, or two
+    scenes have the same name.
     """
     sequences: list[FrameSequence] = []
     refused = []
@@ -698,10 +683,8 @@ def write_depth_png(path: Path, depth: Floats32, depth_scale: float) -> None:
         are written as 0 (missing)
     depth_scale : stored units per metre
 
-    Raises
-    ------
-    ValueError : If the depth is empty or not two-dimensional, or the scale is not a positive
-        number.
+    Raise ValueError if the depth is empty or not two-dimensional, or the scale is not a positive
+    number.
     """
     from PIL import Image
 
@@ -720,9 +703,7 @@ def write_depth_png(path: Path, depth: Floats32, depth_scale: float) -> None:
 def write_pose(path: Path, T_parent_sensor: Floats) -> None:
     """Write a pose (4, 4) as text, row by row, without loss of precision.
 
-    Raises
-    ------
-    InvalidPose : If the pose is not a rigid transform.
+    Raise InvalidPose if the pose is not a rigid transform.
     """
     rows = rigid_transform(T_parent_sensor)
     text = "".join(" ".join(f"{value:.17g}" for value in row) + "\n" for row in rows)

@@ -38,9 +38,7 @@ def file_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, 
     path : absolute path of a file for which `is_export` returns True
     name : name of the sequences; default: name of the file
 
-    Raises
-    ------
-    DatasetError : If the file is damaged, has an unsupported version, or has no frames.
+    Raise DatasetError if the file is damaged, has an unsupported version, or has no frames.
     """
     name = name or path.stem
     file_format = format_named(path.name, "capture")
@@ -71,8 +69,6 @@ def folder_layout(folder: Path, files: list[str], folders: list[str]) -> Layout 
 def folder_sequence(folder: Path, layout: Layout, name: str) -> FrameSequence:
     """Return the sequence of a folder with a layout of `folder_layout`.
 
-    Raises
-    ------
-    DatasetError : If the folder is damaged, or no frame has depth.
+    Raise DatasetError if the folder is damaged, or no frame has depth.
     """
     return _OF_FOLDER[layout](folder, name)

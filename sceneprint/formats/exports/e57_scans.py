@@ -36,10 +36,7 @@ _FARTHEST_M = 5_000.0
 class E57Source:
     """Source of the bytes of one scan of an E57 file.
 
-    Parameters
-    ----------
-    path : path of the file
-    place : index of the scan in the file
+    `place`: index of the scan in the file.
     """
 
     path: Path
@@ -50,9 +47,7 @@ class E57Source:
 
         A scan with more than 5 million points is thinned to one point per voxel, as by the service.
 
-        Raises
-        ------
-        UnreadableCloud : If the file is damaged or cannot be read.
+        Raise UnreadableCloud if the file is damaged or cannot be read.
         """
         with naming(f"{self.path}, scan {self.place + 1}"), _scans(self.path) as scans:
             if self.place >= len(scans):
@@ -87,18 +82,11 @@ def _scans(path: Path) -> Iterator[tuple[E57Scan, ...]]:
 def e57_sequence(path: Path, name: str) -> FrameSequence:
     """Return the scans of a file that have a single viewpoint.
 
-    Parameters
-    ----------
-    path : path of the file
-    name : name of the sequence
-
     Returns
     -------
     sequence : sequence whose `note` lists the omitted scans
 
-    Raises
-    ------
-    DatasetError : If the file is damaged, or has only merged clouds.
+    Raise DatasetError if the file is damaged, or has only merged clouds.
     """
     try:
         with _scans(path) as scans:

@@ -51,10 +51,7 @@ _REMEDY = (
 class ScaledNpy:
     """Source of an NPY depth image whose floating-point samples are not in metres.
 
-    Parameters
-    ----------
-    path : path of the file
-    metres : metres per stored unit
+    `metres`: metres per stored unit.
     """
 
     path: Path
@@ -79,18 +76,11 @@ class ScaledNpy:
 def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:
     """Return the frames of a folder with a `transforms.json`.
 
-    Parameters
-    ----------
-    folder : folder with the file
-    name : name of the sequence
-
     Returns
     -------
     sequence : sequence whose `note` lists the omitted frames
 
-    Raises
-    ------
-    DatasetError : If the JSON file is invalid, or no frame has depth.
+    Raise DatasetError if the JSON file is invalid, or no frame has depth.
     """
     file = folder / TRANSFORMS
     fields = read_object(file, _MAXIMUM_BYTES, DatasetError, _EXAMPLE)

@@ -73,10 +73,8 @@ def depth_camera(
     depth_scale : stored units per metre
     up : unit vector in optical axes, or None
 
-    Raises
-    ------
-    DatasetError : If the images have different aspect ratios.
-    InvalidIntrinsics : If the camera is invalid.
+    Raise DatasetError if the images have different aspect ratios. Raise InvalidIntrinsics if the
+    camera is invalid.
     """
     across, down = size[0] / lens.width, size[1] / lens.height
     if not math.isclose(across, down, rel_tol=0.02):
@@ -94,9 +92,7 @@ def depth_camera(
 def depth_size(path: Path) -> tuple[int, int]:
     """Return the width and height of a depth image from its first bytes.
 
-    Raises
-    ------
-    UnreadableFrame : If the file cannot be read, or is not a depth image.
+    Raise UnreadableFrame if the file cannot be read, or is not a depth image.
     """
     try:
         with path.open("rb") as file:
@@ -161,15 +157,11 @@ def sequence_of(
 
     Parameters
     ----------
-    folder : folder or file of the frames
-    layout, name : layout and name of the sequence
     frames : frames in order
     left_out : numbers of omitted frames by reason
     remedy : advice for users if there are no frames
 
-    Raises
-    ------
-    DatasetError : If there are no frames.
+    Raise DatasetError if there are no frames.
     """
     reasons = [f"{count} {printable(reason)}" for reason, count in left_out.most_common(5)]
     if not frames:

@@ -47,18 +47,12 @@ def is_polycam(folder: Path, folders: list[str]) -> bool:
 def polycam_sequence(folder: Path, name: str) -> FrameSequence:
     """Return the frames of a folder with `keyframes`.
 
-    Parameters
-    ----------
-    folder : folder `keyframes` or its parent
-    name : name of the sequence
-
     Returns
     -------
     sequence : sequence whose `note` lists the omitted frames
 
-    Raises
-    ------
-    DatasetError : If no frame has depth and a camera, or the folder cannot be read.
+    `folder`: folder `keyframes` or its parent. Raise DatasetError if no frame has depth and a
+    camera, or the folder cannot be read.
     """
     from sceneprint.formats.dataset.sequences import list_folder
 

@@ -69,7 +69,6 @@ class LzfseDepth:
     Parameters
     ----------
     capture : .r3d file, or folder
-    name : name of the depth file in the capture
     width, height : size of the depth image, pixels
     """
 
@@ -81,10 +80,8 @@ class LzfseDepth:
     def read_bytes(self) -> bytes:
         """Return an NPY file of float32 metres.
 
-        Raises
-        ------
-        UnreadableFrame : If the file is damaged, or its content has another size.
-        MissingDependency : If lzfse is not installed.
+        Raise UnreadableFrame if the file is damaged, or its content has another size. Raise
+        MissingDependency if lzfse is not installed.
         """
         size = 4 * self.width * self.height
         with naming(str(self.capture / self.name)):
@@ -171,18 +168,12 @@ def _parts_of_zip(capture: Path, _changed_ns: int, _size: int) -> dict[str, tupl
 def record3d_sequence(capture: Path, name: str) -> FrameSequence:
     """Return the frames of a capture.
 
-    Parameters
-    ----------
-    capture : .r3d file, or folder with `metadata` and `rgbd`
-    name : name of the sequence
-
     Returns
     -------
     sequence : sequence whose `note` lists the omitted frames
 
-    Raises
-    ------
-    DatasetError : If the capture is damaged or exported in another format, or no frame has depth.
+    `capture`: .r3d file, or folder with `metadata` and `rgbd`. Raise DatasetError if the capture is
+    damaged or exported in another format, or no frame has depth.
     """
     if capture.is_dir() and not (capture / METADATA).is_file():
         raise DatasetError(

@@ -96,7 +96,6 @@ class RtabmapDepth:
 
     Parameters
     ----------
-    path : path of the database
     node : id of the node
     camera, cameras : index of the camera from the left, and number of cameras that share the image
     """
@@ -109,10 +108,8 @@ class RtabmapDepth:
     def read_bytes(self) -> bytes:
         """Return a 16-bit PNG of millimetres, or an NPY file of float metres.
 
-        Raises
-        ------
-        DatasetError : If the database cannot be read.
-        UnreadableFrame : If the image is damaged or missing.
+        Raise DatasetError if the database cannot be read. Raise UnreadableFrame if the image is
+        damaged or missing.
         """
         blob = _value(self.path, "depth", self.node)
         kind = depth_size(blob[:DEPTH_HEAD])
@@ -132,7 +129,6 @@ class RtabmapScan:
 
     Parameters
     ----------
-    path : path of the database
     node : id of the node
     form : format number of rtabmap for the points; 0 if not stored
     """
@@ -144,10 +140,8 @@ class RtabmapScan:
     def read_bytes(self) -> bytes:
         """Return an NPY file of points (N, 3), metres.
 
-        Raises
-        ------
-        DatasetError : If the database cannot be read.
-        UnreadableCloud : If the scan is damaged or two-dimensional.
+        Raise DatasetError if the database cannot be read. Raise UnreadableCloud if the scan is
+        damaged or two-dimensional.
         """
         return encode_npy(scan_points(_value(self.path, "scan", self.node), self.form))
 
@@ -158,19 +152,13 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
     The poses are the optimised ones that rtabmap stores when it closes a database. If they are
     missing, odometry provides the poses, and each session has its own parent frame.
 
-    Parameters
-    ----------
-    path : path of the database
-    name : name of the sequences; default: name of the file
-
     Returns
     -------
     sequences : at least one sequence; the `note` lists the omitted nodes
 
-    Raises
-    ------
-    DatasetError : If the file is not a database of RTAB-Map, has an unsupported version, is in use
-        or damaged, or no node has depth or a three-dimensional laser scan.
+    `name`: name of the sequences; default: name of the file. Raise DatasetError if the file is not
+    a database of RTAB-Map, has an unsupported version, is in use or damaged, or no node has depth
+    or a three-dimensional laser scan.
     """
     name = name or path.stem
     with _opened(path) as database:
@@ -235,9 +223,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
 def _version(path: Path, database: sqlite3.Connection) -> Version:
     """Return the RTAB-Map version of a database.
 
-    Raises
-    ------
-    DatasetError : If tables or columns are missing, or the version is not supported.
+    Raise DatasetError if tables or columns are missing, or the version is not supported.
     """
     tables = database.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchmany(500)
     names = {str(row[0]) for row in tables}
@@ -355,9 +341,7 @@ def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _No
 def _scaled(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
     """Scale the camera of a colour image to a depth image of this size, pixels.
 
-    Raises
-    ------
-    BrokenBlob : If the images have different aspect ratios, or the camera is invalid.
+    Raise BrokenBlob if the images have different aspect ratios, or the camera is invalid.
     """
     across = width / lens.width if lens.width else 1.0
     down = height / lens.height if lens.height else 1.0

@@ -75,9 +75,7 @@ class BrokenBlob(ValueError):
 def transform(blob: bytes) -> Floats | None:
     """Return the transform (4, 4) from 3 x 4 float32, row by row; None for the null transform.
 
-    Raises
-    ------
-    BrokenBlob : If the length is wrong, or the transform is not rigid.
+    Raise BrokenBlob if the length is wrong, or the transform is not rigid.
     """
     if len(blob) != 48:
         raise BrokenBlob(f"a transform has {len(blob)} bytes, not 48")
@@ -96,9 +94,7 @@ def matrix(blob: bytes) -> NDArray[Any]:
 
     Three 32-bit integers after the compressed bytes are rows, columns and the OpenCV type.
 
-    Raises
-    ------
-    BrokenBlob : If the matrix is damaged, or larger than 256 MiB.
+    Raise BrokenBlob if the matrix is damaged, or larger than 256 MiB.
     """
     if len(blob) < 12:
         raise BrokenBlob("a matrix is truncated")
@@ -126,15 +122,9 @@ def matrix(blob: bytes) -> NDArray[Any]:
 def cameras(blob: bytes, version: Version) -> tuple[RtabmapCamera, ...]:
     """Return the cameras of a node, from left to right in its images; empty for a stereo camera.
 
-    Parameters
-    ----------
-    blob : calibration. Since 0.18, it has one record per camera. Before, it had the float32 numbers
-        fx, fy, cx, cy, (since 0.11.2) width, height, and the local transform of each camera
-    version : version of the database
-
-    Raises
-    ------
-    BrokenBlob : If the calibration is damaged.
+    `blob`: calibration. Since 0.18, it has one record per camera. Before, it had the float32
+    numbers fx, fy, cx, cy, (since 0.11.2) width, height, and the local transform of each camera.
+    Raise BrokenBlob if the calibration is damaged.
     """
     if version >= (0, 18, 0):
         return _serialized_cameras(blob)
@@ -196,9 +186,7 @@ DepthKind = Literal["millimetres", "metres", "rvl"]
 def depth_size(head: bytes) -> tuple[DepthKind, int, int] | None:
     """Return the kind, width and height of a depth image; None for other images.
 
-    Parameters
-    ----------
-    head : first `DEPTH_HEAD` bytes of the image
+    `head`: first `DEPTH_HEAD` bytes of the image.
     """
     if head.startswith(_RVL) and len(head) >= _RVL_HEADER:
         width, height = struct.unpack_from("<II", head, len(_RVL))
@@ -215,9 +203,7 @@ def depth_size(head: bytes) -> tuple[DepthKind, int, int] | None:
 def depth_samples(blob: bytes) -> Samples:
     """Return the samples (H, W) of a depth image: uint16 millimetres, or float32 metres.
 
-    Raises
-    ------
-    UnreadableFrame : If the image is damaged, too large, or not a depth image.
+    Raise UnreadableFrame if the image is damaged, too large, or not a depth image.
     """
     header = depth_size(blob[:DEPTH_HEAD])
     if header is None:
@@ -255,14 +241,7 @@ _SOLID_FORMATS, _SOLID_CHANNELS = range(5, 12), (3, 4, 6, 7)
 def scan_placement(blob: bytes | None, version: Version) -> tuple[int, Floats]:
     """Return the format of a laser scan (0 if not stored) and T_base_scan (4, 4).
 
-    Parameters
-    ----------
-    blob : column scan_info, or None
-    version : version of the database
-
-    Raises
-    ------
-    BrokenBlob : If the column is damaged.
+    `blob`: column scan_info, or None. Raise BrokenBlob if the column is damaged.
     """
     if not blob:
         return 0, np.eye(4)
@@ -293,9 +272,7 @@ def is_solid(tail: bytes, form: int) -> bool:
 def scan_points(blob: bytes, form: int) -> Floats32:
     """Return the points (N, 3) of a laser scan, metres in the axes of the scan.
 
-    Raises
-    ------
-    UnreadableCloud : If the scan is damaged or two-dimensional.
+    Raise UnreadableCloud if the scan is damaged or two-dimensional.
     """
     try:
         rows = matrix(blob)

@@ -48,9 +48,7 @@ _KITTI_ROW = 16  #: bytes: x, y, z, intensity
 def read_kitti(data: bytes) -> FilePoints:
     """Return the points of a KITTI scan: rows of x, y, z, intensity as little-endian float32.
 
-    Raises
-    ------
-    UnreadableCloud : If the size is not a multiple of a row, or the rows have another length.
+    Raise UnreadableCloud if the size is not a multiple of a row, or the rows have another length.
     """
     count, rest = divmod(len(data), _KITTI_ROW)
     if (floats := _row_length(data)) is not None:
@@ -110,10 +108,8 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 
     The fourth column is omitted. The blocks are read when they are iterated, once.
 
-    Raises
-    ------
-    UnreadableCloud : If the file is not NPY, has another type or shape or more than `most` points,
-        or its size contradicts its header.
+    Raise UnreadableCloud if the file is not NPY, has another type or shape or more than `most`
+    points, or its size contradicts its header.
     """
     if data[: len(NPY_SIGNATURE)] != NPY_SIGNATURE:
         raise UnreadableCloud("This is not an NPY file. Write the points with numpy.save.")
@@ -144,10 +140,8 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 def read_pointcloud2(data: bytes) -> FilePoints:
     """Return the points of a serialised PointCloud2; points at the origin count as missing.
 
-    Raises
-    ------
-    UnreadableCloud : If the bytes are not such a message, are damaged, lack x, y or z, or their
-        sizes contradict each other.
+    Raise UnreadableCloud if the bytes are not such a message, are damaged, lack x, y or z, or their
+    sizes contradict each other.
     """
     table = cloud_table(read_point_cloud(data))
     return FilePoints(table.size, cloud_blocks(table))
@@ -258,7 +252,6 @@ class Scan:
     Parameters
     ----------
     cloud : points relative to the viewpoint
-    file_format : format of the file
     viewpoint : position of the sensor, metres in the file's axes; None without a viewpoint
     file_points : number of points in the file, including missing points
     """
@@ -311,7 +304,6 @@ def decode_scan(
     viewpoint : position of the sensor, metres in the file's axes; None for points of many views;
         default: the VIEWPOINT of a PCD file, else the origin
     units_per_metre : units of the file's coordinates per metre, such as 1000 for millimetres
-    name : name of the frame in messages
     pose : (4, 4) T_parent_sensor, or None if unknown
     points_of : reader of the file; default: `read_points`
 
@@ -320,13 +312,10 @@ def decode_scan(
     scan : points in the file's axes, with the viewpoint at the origin, without missing (NaN or
         infinite) points
 
-    Raises
-    ------
-    UnreadableCloud : If the bytes have another format or are damaged, there are more than 20
-        million points, or a point is more than 10 km from the viewpoint.
-    UselessFrame : If there are fewer than 10 points.
-    InvalidPose : If the pose is not a rigid transform.
-    MissingDependency : If the file is LAZ and lazrs is not installed.
+    Raise UnreadableCloud if the bytes have another format or are damaged, there are more than 20
+    million points, or a point is more than 10 km from the viewpoint. Raise UselessFrame if there
+    are fewer than 10 points. Raise InvalidPose if the pose is not a rigid transform. Raise
+    MissingDependency if the file is LAZ and lazrs is not installed.
     """
     with naming(name):
         _check_units(units_per_metre)

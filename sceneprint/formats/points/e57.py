@@ -139,18 +139,13 @@ def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats
 def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
     """Return the scans of an E57 file in their order, without decoding their points.
 
-    Parameters
-    ----------
-    data : the whole file, which must not change while points are decoded
-
     Returns
     -------
     scans : at least one scan
 
-    Raises
-    ------
-    UnreadableCloud : If the file is not E57, is damaged, has a later version or no scan, a scan has
-        no coordinates or more than 200 million points, or a pose is not rigid.
+    `data`: the whole file, which must not change while points are decoded. Raise UnreadableCloud if
+    the file is not E57, is damaged, has a later version or no scan, a scan has no coordinates or
+    more than 200 million points, or a pose is not rigid.
     """
     if len(data) < _HEADER.size or bytes(data[:8]) != E57_SIGNATURE:
         raise UnreadableCloud(f"This is not an E57 file. {_AGAIN}")
@@ -242,9 +237,7 @@ class _Pages:
     def read(self, start: int, length: int) -> bytes:
         """Return bytes of the payload.
 
-        Raises
-        ------
-        UnreadableCloud : If the bytes are beyond the end, or the checksum of a page is wrong.
+        Raise UnreadableCloud if the bytes are beyond the end, or the checksum of a page is wrong.
         """
         total = len(self._data) // self._page * self._payload
         if length > total - start:
@@ -402,7 +395,6 @@ def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
 
     Parameters
     ----------
-    pages : pages of the file
     start : offset of the section in the payload
     fields : number of fields
     """

@@ -59,10 +59,8 @@ def inflated_records(
     count : number of points
     row : dtype of a record
 
-    Raises
-    ------
-    MissingDependency : If lazrs is not installed.
-    UnreadableCloud : If the compressed points are damaged or contradict the header.
+    Raise MissingDependency if lazrs is not installed. Raise UnreadableCloud if the compressed
+    points are damaged or contradict the header.
     """
     lazrs = _lazrs()
     vlr = _laszip_vlr(data)
@@ -213,11 +211,9 @@ Records = NDArray[np.void]
 def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     """Return the points of a LAS or LAZ file.
 
-    Raises
-    ------
-    UnreadableCloud : If the file is not LAS, has an unknown point format or more than `most`
-        points, or its size contradicts its header.
-    MissingDependency : If the file is LAZ and lazrs is not installed.
+    Raise UnreadableCloud if the file is not LAS, has an unknown point format or more than `most`
+    points, or its size contradicts its header. Raise MissingDependency if the file is LAZ and lazrs
+    is not installed.
     """
     if len(data) < _SMALLEST_HEADER or data[:4] != LAS_SIGNATURE:
         raise UnreadableCloud(

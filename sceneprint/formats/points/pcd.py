@@ -50,9 +50,7 @@ def inflate(packed: Bytes, size: int) -> Bytes:
     packed : (n,) compressed bytes
     size : exact size of the result, which the caller has limited, bytes
 
-    Raises
-    ------
-    UnreadableCloud : If the result has another size, or the compressed bytes are damaged.
+    Raise UnreadableCloud if the result has another size, or the compressed bytes are damaged.
     """
     if size > MOST_RATIO * len(packed):  # this check must precede the allocation
         raise UnreadableCloud(
@@ -134,10 +132,8 @@ class Field:
 def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     """Return the points of a PCD file, and its VIEWPOINT unless it is the origin.
 
-    Raises
-    ------
-    UnreadableCloud : If the file is not PCD, its points lack x, y or z, there are more than `most`
-        points, or the header contradicts the rest of the file.
+    Raise UnreadableCloud if the file is not PCD, its points lack x, y or z, there are more than
+    `most` points, or the header contradicts the rest of the file.
     """
     entries, start = _header(data)
     fields, count = _fields(entries), _points(entries)

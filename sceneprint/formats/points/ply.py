@@ -44,9 +44,7 @@ Kinds = Sequence[tuple[str, str | None]]
 def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> int:
     """Return the offset after `count` rows.
 
-    Raises
-    ------
-    UnreadableCloud : If the file ends before the last row.
+    Raise UnreadableCloud if the file ends before the last row.
     """
     end = start
     for _, behind in value_offsets(view, start, count, kinds, (0, 0, 0), order):
@@ -161,10 +159,8 @@ class Element:
 def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     """Return the vertices of a PLY file.
 
-    Raises
-    ------
-    UnreadableCloud : If the file is not PLY, its vertices lack x, y or z, there are more than
-        `most`, or the header contradicts the rest of the file.
+    Raise UnreadableCloud if the file is not PLY, its vertices lack x, y or z, there are more than
+    `most`, or the header contradicts the rest of the file.
     """
     order, elements, start = ply_header(data)
     names = [element.name for element in elements]

@@ -113,9 +113,7 @@ def parse_blocks(
 ) -> Iterator[Floats]:
     """Yield the coordinates of `count` rows in blocks (n, 3); see `parse_rows`.
 
-    Raises
-    ------
-    UnreadableCloud : If a row is missing or malformed. The message states its number.
+    Raise UnreadableCloud if a row is missing or malformed. The message states its number.
     """
     for first, n in steps(count):
         block = np.full((n, 3), np.nan)
@@ -131,9 +129,7 @@ def parse_blocks(
 def skip_lines(text: Bytes, start: int, count: int) -> int:
     """Return the offset after `count` lines that are not empty.
 
-    Raises
-    ------
-    UnreadableCloud : If there are fewer lines.
+    Raise UnreadableCloud if there are fewer lines.
     """
     place, lines = _skip(text, start, count)
     if lines < count:

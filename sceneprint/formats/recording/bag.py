@@ -97,14 +97,9 @@ class RawMessage:
 class Bag:
     """Open ROS recording, which threads may share.
 
-    Parameters
-    ----------
-    path : .mcap, .db3 or .bag file, or rosbag2 folder
-
-    Raises
-    ------
-    DatasetError : If the file does not exist, is damaged, or has an unsupported format.
-    MissingDependency : If rosbags is not installed.
+    `path`: .mcap, .db3 or .bag file, or rosbag2 folder. Raise DatasetError if the file does not
+    exist, is damaged, or has an unsupported format. Raise MissingDependency if rosbags is not
+    installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -144,9 +139,7 @@ class Bag:
         topics : names of the topics
         start_ns, stop_ns : first time of recording, and time after the last, nanoseconds
 
-        Raises
-        ------
-        DatasetError : If the file is damaged.
+        Raise DatasetError if the file is damaged.
         """
         connections = [one for one in self._connections if one.topic in topics]
         if not connections:
@@ -172,13 +165,8 @@ class Bag:
     def at(self, topic: str, log_ns: int, occurrence: int) -> RawMessage:
         """Return the message of a topic with this time of recording.
 
-        Parameters
-        ----------
-        occurrence : index among the messages with the same time
-
-        Raises
-        ------
-        DatasetError : If the message no longer exists, or the file is damaged.
+        `occurrence`: index among the messages with the same time. Raise DatasetError if the message
+        no longer exists, or the file is damaged.
         """
         with self._lock:
             messages = list(self.messages([topic], log_ns, log_ns + 1))
@@ -192,14 +180,8 @@ class Bag:
     def decode(self, message: RawMessage, kind: str) -> Any:
         """Return the fields of a message, as attributes.
 
-        Parameters
-        ----------
-        message : message of this bag
-        kind : type of the message, one of TYPES
-
-        Raises
-        ------
-        DatasetError : If the bytes are not a message of this type.
+        `kind`: type of the message, one of TYPES. Raise DatasetError if the bytes are not a message
+        of this type.
         """
         if kind in LIVOX:
             try:
@@ -309,9 +291,7 @@ def require_rosbags() -> None:
 def _types(*, ros1: bool) -> Typestore:
     """Return the standard message definitions. Those in the bag are not trusted.
 
-    Raises
-    ------
-    MissingDependency : If rosbags is not installed.
+    Raise MissingDependency if rosbags is not installed.
     """
     require_rosbags()
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -34,12 +34,10 @@ class BagOutline:
     ----------
     kind : format of the files
     start_ns, end_ns : times of recording of the first and the last message, nanoseconds
-    topics : all topics
     frames : topics with frames
     chosen : selected topic, or None
     camera : topic of its camera, or None
     sequences : sequences of the selected frames; may be empty
-    range : range of a sample of these frames
     problem : reason why no frames are selected; empty if there are some
     """
 
@@ -91,10 +89,8 @@ class BagOutline:
 def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
     """Return the content of a bag, and the frames that an upload with these options would select.
 
-    Raises
-    ------
-    DatasetError : If the bag cannot be read.
-    MissingDependency : If rosbags is not installed.
+    Raise DatasetError if the bag cannot be read. Raise MissingDependency if rosbags is not
+    installed.
     """
     bag = Bag(path)
     try:

@@ -69,7 +69,6 @@ class BagPart:
     first : number of the first frame
     tree : transforms, and odometry that no transform duplicates
     imus : measurements by frame of the IMU
-    odometry : odometry by topic
     info_stamps_ns, infos : time of each calibrated CameraInfo, and its index in the scan
     """
 
@@ -147,9 +146,7 @@ class _SeveralClocks(Exception):
 class _Clocks:
     """Latest stamps of the sources within a part: topics, and transforms of tf.
 
-    Parameters
-    ----------
-    ignored : sources whose stamps do not determine the clock
+    `ignored`: sources whose stamps do not determine the clock.
     """
 
     ignored: set[str]
@@ -161,9 +158,7 @@ class _Clocks:
     def goes_back(self, source: str, stamp_ns: int) -> bool:
         """Record a stamp, and return whether it shows that the clock was set back.
 
-        Raises
-        ------
-        _SeveralClocks : If the stamps of the source go back and forth.
+        Raise _SeveralClocks if the stamps of the source go back and forth.
         """
         if stamp_ns <= 0 or source in self.ignored:
             return False
@@ -195,9 +190,7 @@ def scan_bag(
     camera : topic of the CameraInfo of the frames, or None
     progress : function that is called from time to time, or None
 
-    Raises
-    ------
-    DatasetError : If the bag is damaged or too long.
+    Raise DatasetError if the bag is damaged or too long.
     """
     ignored = set[str]()
     while True:

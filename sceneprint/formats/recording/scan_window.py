@@ -55,10 +55,8 @@ class ScanWindow:
     def cloud(self, bag: Bag, topic: BagTopic) -> Floats32:
         """Return the joined points (N, 3) in the axes of the newest scan.
 
-        Raises
-        ------
-        UnreadableCloud : If the newest scan is damaged, or the odometry does not cover it.
-        DatasetError : If the bag is damaged.
+        Raise UnreadableCloud if the newest scan is damaged, or the odometry does not cover it.
+        Raise DatasetError if the bag is damaged.
         """
         tree = self._near_tree()
         joiner = Joiner(partial(tree.poses, self.world, self.sensor), self.metres)

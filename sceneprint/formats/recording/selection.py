@@ -89,7 +89,6 @@ class RecordingOptions:
 
     Parameters
     ----------
-    topic : topic of depth images or points
     camera_info : topic of the CameraInfo of the depth images
     pose_frame : parent frame of the poses, such as "map" or "odom"
     keyframe_m, keyframe_deg : minimum distance or angle from the previous keyframe; 0 selects every
@@ -133,11 +132,9 @@ def recording_sequences(
     sequences : one sequence, or several if stamps go back; the `note` of the first one lists the
         selected and the omitted frames, with reasons
 
-    Raises
-    ------
-    DatasetError : If the recording cannot be read, has no suitable topic, or has several.
-    InvalidIntrinsics : If the camera is invalid, or its lens is not supported.
-    MissingDependency : If rosbags is not installed.
+    Raise DatasetError if the recording cannot be read, has no suitable topic, or has several. Raise
+    InvalidIntrinsics if the camera is invalid, or its lens is not supported. Raise
+    MissingDependency if rosbags is not installed.
     """
     bag = Bag(path)
     frames = choose_topic(bag, options.topic)
@@ -217,9 +214,8 @@ def _sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptio
     It is the frame of the messages, unless the user specifies another frame or the points are in a
     world frame, such as the registered points of FAST-LIO.
 
-    Raises
-    ------
-    DatasetError : If points are in a world frame and the transforms do not determine their sensor.
+    Raise DatasetError if points are in a world frame and the transforms do not determine their
+    sensor.
     """
     frame, trees = frames.frame, [part.tree for part in scan.parts]
     stated = options.sensor_frame

@@ -58,9 +58,7 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
     -------
     data : 16-bit PNG of millimetres, or NPY file of float32 metres
 
-    Raises
-    ------
-    UnreadableFrame : If the message has another encoding, or its sizes contradict each other.
+    Raise UnreadableFrame if the message has another encoding, or its sizes contradict each other.
     """
     if compressed:
         image = compressed_depth(message)
@@ -96,7 +94,6 @@ class FrameTopic:
     ----------
     topic : name, type and number of messages
     encoding : encoding of a depth image, such as "16UC1"; None for points
-    frame : frame of the sensor in the first message
     """
 
     topic: BagTopic
@@ -130,8 +127,6 @@ class BagSource:
 
     Parameters
     ----------
-    bag : bag with the message
-    topic : topic of the message
     log_ns, occurrence : time of recording, and index among the messages with the same time
     T_cloud_sensor : (4, 4) transform with which points are converted to the sensor's axes, or None
     window : scans that are joined to the frame, or None
@@ -218,14 +213,8 @@ def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
 def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
     """Return the topic of the frames.
 
-    Parameters
-    ----------
-    name : name that the user specifies, or None
-
-    Raises
-    ------
-    DatasetError : If no topic fits, or several topics fit and `name` is None. Infrared and the like
-        must be named.
+    `name`: name that the user specifies, or None. Raise DatasetError if no topic fits, or several
+    topics fit and `name` is None. Infrared and the like must be named.
     """
     candidates = frame_topics(bag)
     if name is not None:
@@ -289,9 +278,7 @@ def camera_topic(bag: Bag, frames: FrameTopic, name: str | None) -> BagTopic | N
     frames : topic of depth images
     name : name that the user specifies, or None
 
-    Raises
-    ------
-    DatasetError : If `name` is not a topic of CameraInfo, or several topics have the frame.
+    Raise DatasetError if `name` is not a topic of CameraInfo, or several topics have the frame.
     """
     topics = bag.of_type(CAMERA)
     if name is not None:

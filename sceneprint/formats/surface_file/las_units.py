@@ -22,9 +22,7 @@ _WKT_UNIT = re.compile(r'UNIT\s*\[\s*"([^"]{1,60})"\s*,\s*([0-9.eE+-]{1,30})')
 def las_units_per_metre(data: FileBytes) -> float | None:
     """Return the units per metre of the file's coordinates; None if the file does not state them.
 
-    Raises
-    ------
-    UnreadableCloud : If the coordinates are degrees.
+    Raise UnreadableCloud if the coordinates are degrees.
     """
     for user, number, content in las_records(data):
         if user == b"LASF_Projection" and number in (_GEO_KEYS, _WKT):

@@ -60,11 +60,8 @@ class FileMesh:
 def read_mesh(data: FileBytes, file_format: MeshFormat) -> FileMesh:
     """Return the vertices and triangles of all parts of a file.
 
-    Raises
-    ------
-    UnreadableCloud : If the file is damaged, has no geometry or too much, or needs other files or
-        unsupported extensions.
-    MissingDependency : If trimesh is not installed.
+    Raise UnreadableCloud if the file is damaged, has no geometry or too much, or needs other files
+    or unsupported extensions. Raise MissingDependency if trimesh is not installed.
     """
     trimesh = _trimesh()
     name = {"glb": "glTF", "gltf": "glTF"}.get(file_format, file_format.upper())

@@ -43,10 +43,8 @@ def read_faces(data: FileBytes) -> Ints32 | None:
 
     Indices are not compared with the number of vertices. Indices beyond int32 are -1.
 
-    Raises
-    ------
-    UnreadableCloud : If the faces have no list of vertices, or fewer or more bytes than declared,
-        a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.
+    Raise UnreadableCloud if the faces have no list of vertices, or fewer or more bytes than
+    declared, a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.
     """
     order, elements, start = ply_header(data)
     names = [element.name for element in elements]

@@ -83,10 +83,8 @@ def gather(
     origin : (3,) float64 with integer values; zero unless the points are far from the file's origin
     voxel : edge of the voxels of the thinned cloud, units; None if it is not thinned
 
-    Raises
-    ------
-    UnreadableCloud : If there are more points than declared, or a point is too far from the
-        others.
+    Raise UnreadableCloud if there are more points than declared, or a point is too far from the
+    others.
     """
     cloud = _Cloud(count, units_of, most)
     for block in blocks:

@@ -65,9 +65,7 @@ class SurfaceOptions:
     units_per_metre : units of the file's coordinates per metre, such as 1000 for millimetres
     up : axis of the file that points up
 
-    Raises
-    ------
-    UnreadableCloud : If the units or the axis are invalid.
+    Raise UnreadableCloud if the units or the axis are invalid.
     """
 
     units_per_metre: float | None = None
@@ -96,7 +94,6 @@ class ReadSurface:
     units : source of the units
     up_from : source of the up direction
     notes : sentences for the user on estimated values, omitted parts and thinning
-    units_per_metre : units of the file's coordinates per metre
     file_points : number of points of the file, including missing points
     voxel : edge of the voxels of a thinned cloud, metres; None if it is not thinned
     """
@@ -119,9 +116,7 @@ def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
     name : name of the file; its suffix identifies OBJ and ascii STL
     size : size of the file, bytes
 
-    Raises
-    ------
-    UnreadableCloud : If the file is empty or has an unknown format.
+    Raise UnreadableCloud if the file is empty or has an unknown format.
     """
     if not size:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
@@ -161,12 +156,10 @@ def read_surface(
     read : surface without missing points, and without triangles that have no area or lack a vertex;
         a cloud of more than 10 million points is thinned to the first point of each voxel
 
-    Raises
-    ------
-    UnreadableCloud : If the bytes have an unknown format, are damaged, have coordinates in degrees
-        or exceed a limit, a triangle refers to a missing vertex, or the surface exceeds 20 km.
-    UselessFrame : If there are fewer than 10 points.
-    MissingDependency : If lazrs or trimesh is needed and not installed.
+    Raise UnreadableCloud if the bytes have an unknown format, are damaged, have coordinates in
+    degrees or exceed a limit, a triangle refers to a missing vertex, or the surface exceeds 20 km.
+    Raise UselessFrame if there are fewer than 10 points. Raise MissingDependency if lazrs or
+    trimesh is needed and not installed.
     """
     stated = options or SurfaceOptions()
     with naming(name):
@@ -354,9 +347,7 @@ def _to_metres(points: Floats32, origin: Floats, units: float) -> Floats:
     origin : (3,) in units of the file
     units : number of units per metre
 
-    Raises
-    ------
-    UnreadableCloud : If the points are more than `2 * FARTHEST_M` apart along an axis.
+    Raise UnreadableCloud if the points are more than `2 * FARTHEST_M` apart along an axis.
     """
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     widest = float((high - low).max()) / units
