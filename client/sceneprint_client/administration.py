@@ -21,7 +21,6 @@ from sceneprint_client.api.admin import (
 )
 from sceneprint_client.api.base import checked
 from sceneprint_client.calls import Call, Series
-from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import PAGE, without_none
 from sceneprint_client.jobs import JobMethods
 
@@ -168,11 +167,6 @@ class AdminMethods(JobMethods):
         UnknownMap : If the map does not exist.
         InvalidRequest : If `minutes` is out of range.
         """
-        if not 1 <= minutes <= 60:
-            raise InvalidRequest(
-                f"A history of {minutes} minutes was requested. Pass 1 to 60 minutes.",
-                (("minutes", "out of range"),),
-            )
         parameters = without_none(minutes=minutes, map=map_name)
         return await self._call(Stats, "GET", "/v1/stats", params=parameters)
 

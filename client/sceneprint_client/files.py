@@ -34,8 +34,8 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
     limit : maximum accepted size, bytes; a larger file is rejected unread
     error : class of the error to raise
 
-    Raise error if the file is missing, is not a regular file (reading a pipe could block forever),
-    is too large, or is not readable.
+    Raise `error` if the file is missing, is not a regular file (reading a pipe could block
+    forever), is too large, or is not readable.
     """
     try:
         status = path.stat()
@@ -138,7 +138,7 @@ def npy_header(
     shapes : sentences for the error if the array has another shape
     whole : whether to accept uint16 too
 
-    Raise error if the header cannot be read, or the array has another type or shape.
+    Raise `error` if the header cannot be read, or the array has another type or shape.
     """
     fields, start = _fields(data, error)
     dtype = _dtype(fields["descr"], error, advice, _FLOATING + _WHOLE if whole else _FLOATING)

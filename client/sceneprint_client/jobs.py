@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import httpx
 
@@ -32,7 +33,7 @@ from sceneprint_client.api.sessions import (
 )
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from sceneprint_client.calls import Call, Series
-from sceneprint_client.errors import InvalidRequest, UnreadableArchive, UnreadableCloud
+from sceneprint_client.errors import FrameError, InvalidRequest, UnreadableArchive, UnreadableCloud
 from sceneprint_client.http import (
     ServiceConnection,
     error_of,
@@ -180,15 +181,10 @@ class JobMethods(ServiceConnection):
         """
         if not isinstance(archive, Path):
             return await self._send_archive(map_name, archive, options or ImportOptions())
-        try:
-            with archive.open("rb") as file:
-                name = archive.name.partition(".")[0][:64] or "import"
-                own = options or checked(ImportOptions, "The archive's name", name=name)
-                return await self._send_archive(map_name, file, own)
-        except OSError as error:
-            raise UnreadableArchive(
-                f"{archive}: The file cannot be read ({error.strerror}). Check its path."
-            ) from error
+        name = archive.name.partition(".")[0][:64] or "import"
+        own = options or checked(ImportOptions, "The archive's name", name=name)
+        with _opened(archive, UnreadableArchive) as file:
+            return await self._send_archive(map_name, file, own)
 
     @Call
     async def import_map(
@@ -216,15 +212,9 @@ class JobMethods(ServiceConnection):
         """
         if not isinstance(file, Path):
             return await self._send_archive(map_name, file, _map_import_options(options, None))
-        try:
-            with file.open("rb") as opened:
-                return await self._send_archive(
-                    map_name, opened, _map_import_options(options, file.name)
-                )
-        except OSError as error:
-            raise UnreadableCloud(
-                f"{file}: The file cannot be read ({error.strerror}). Check its path."
-            ) from error
+        own = _map_import_options(options, file.name)
+        with _opened(file, UnreadableCloud) as opened:
+            return await self._send_archive(map_name, opened, own)
 
     @Series
     def import_items(self, map_name: str, job_id: str) -> AsyncIterator[ImportItem]:
@@ -382,7 +372,6 @@ class JobMethods(ServiceConnection):
         UnknownMap, UnknownJob : If the map or job does not exist.
         InvalidRequest : If the overlap is out of range.
         """
-        _check_overlap(min_overlap)
         return self._pages(
             Page[Edge], f"{product_path(Association, map_name, job_id)}/edges",
             min_overlap=min_overlap, consistent=consistent,
@@ -409,13 +398,6 @@ class JobMethods(ServiceConnection):
         NotIndexed : If the job has not succeeded.
         InvalidRequest : If the file format is unknown, or the overlap is out of range.
         """
-        known = get_args(GraphFormat)
-        if kind not in known:
-            raise InvalidRequest(
-                f"A graph cannot have the format {kind!r:.80}. Pass one of {', '.join(known)}.",
-                (("format", f"pass one of {', '.join(known)}"),),
-            )
-        _check_overlap(min_overlap)
         parameters = {
             "format": kind, "min_overlap": min_overlap, "odometry": odometry,
             "consistent": consistent,
@@ -507,6 +489,18 @@ class JobMethods(ServiceConnection):
         return await self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
 
 
+@contextmanager
+def _opened(path: Path, kind: type[FrameError]) -> Iterator[BinaryIO]:
+    """Open a file for reading; raise an error of the kind if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            yield file
+    except OSError as error:
+        raise kind(
+            f"{path}: The file cannot be read ({error.strerror}). Check its path."
+        ) from error
+
+
 def _map_import_options(options: ImportOptions | None, name: str | None) -> ImportOptions:
     """Return the options of a map import; raise InvalidRequest for those of an archive."""
     if options is None:
@@ -518,11 +512,3 @@ def _map_import_options(options: ImportOptions | None, name: str | None) -> Impo
             (("as", "not `map`"),),
         )
     return options
-
-
-def _check_overlap(least: float) -> None:
-    if not 0.0 <= least <= 1.0:
-        raise InvalidRequest(
-            f"The smallest overlap is {least}. Pass a value from 0 to 1.",
-            (("min_overlap", "out of range"),),
-        )

@@ -25,11 +25,8 @@ from sceneprint_client.api.listing import (
     Trajectory,
 )
 from sceneprint_client.api.results import (
-    CLOUD_FRAMES,
     MOST_DRAWN,
-    VIEWS,
     WIDTH,
-    WIDTHS,
     CloudFrame,
     FramePatches,
     FrameSignature,
@@ -37,13 +34,11 @@ from sceneprint_client.api.results import (
 )
 from sceneprint_client.api.surface import (
     PLAN_WIDTH,
-    PLAN_WIDTHS,
     MapSurface,
     SurfaceSighting,
     SurfaceTile,
 )
 from sceneprint_client.calls import Call, Series
-from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.http import (
     ServiceConnection,
     deletion_path,
@@ -256,7 +251,7 @@ class MapMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         InvalidRequest : If you pass neither ids nor a filter, or both.
         """
-        body = without_none(frame_ids=_list_or_none(frame_ids), filter=filter)
+        body = without_none(frame_ids=frame_ids and list(frame_ids), filter=filter)
         count, deletions = 0, list[FrameDeletion]()
         while True:
             done = await self._call(
@@ -290,7 +285,7 @@ class MapMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         InvalidRequest : If there is nothing to change, or a frame would have too many tags.
         """
-        body = without_none(frame_ids=_list_or_none(frame_ids), filter=filter) | changes
+        body = without_none(frame_ids=frame_ids and list(frame_ids), filter=filter) | changes
         count, inverse = 0, list[dict[str, Any]]()
         while True:
             done = await self._call(
@@ -450,8 +445,6 @@ class MapMethods(ServiceConnection):
         NotIndexed : If the frame is not indexed.
         InvalidRequest : If the frame lacks the pose or the base that `within` requires.
         """
-        if within not in CLOUD_FRAMES:
-            raise _unknown("frame", within, CLOUD_FRAMES)
         return await self._bytes(
             f"{frame_path(map_name, frame_id)}/cloud.ply", params={"frame": within}
         )
@@ -470,8 +463,6 @@ class MapMethods(ServiceConnection):
         """
         from sceneprint_client.surface_encoding import decode_points  # loads numpy
 
-        if within not in CLOUD_FRAMES:
-            raise _unknown("frame", within, CLOUD_FRAMES)
         path = f"{frame_path(map_name, frame_id)}/points"
         return decode_points(await self._bytes(path, params={"frame": within, "limit": limit}))
 
@@ -482,13 +473,6 @@ class MapMethods(ServiceConnection):
         """Return a PNG picture of an indexed frame: "depth", "normals" or "patches". Errors are
         those of `cloud`.
         """
-        if view not in VIEWS:
-            raise _unknown("view", view, VIEWS)
-        if not WIDTHS[0] <= width <= WIDTHS[1]:
-            raise InvalidRequest(
-                f"The width is {width}. Pass a width from {WIDTHS[0]} to {WIDTHS[1]}.",
-                (("width", "out of range"),),
-            )
         return await self._bytes(
             f"{frame_path(map_name, frame_id)}/preview.png", params={"view": view, "width": width}
         )
@@ -548,10 +532,6 @@ class MapMethods(ServiceConnection):
         return await self._bytes(f"{map_path(map_name)}/copy/model")
 
 
-def _list_or_none(names: Sequence[str] | None) -> list[str] | None:
-    return None if names is None else list(names)
-
-
 def _names(names: str | Iterable[str]) -> list[str]:
     return [names] if isinstance(names, str) else list(names)
 
@@ -580,12 +560,6 @@ def _edit_request(changes: Mapping[str, Any], if_match: str | None) -> dict[str,
     if if_match is not None:
         headers["If-Match"] = f'"{if_match}"'
     return {"content": to_json(dict(changes)), "headers": headers}
-
-
-def _unknown(what: str, name: str, known: Iterable[str]) -> InvalidRequest:
-    return InvalidRequest(
-        f"There is no {what} {name!r:.40}. Pass one of {', '.join(known)}.", ((what, "unknown"),)
-    )
 
 
 class SurfaceMethods(ServiceConnection):
@@ -687,10 +661,5 @@ class SurfaceMethods(ServiceConnection):
         UnknownMap : If the map does not exist.
         NotFound : If no surface has this parent frame.
         """
-        if not PLAN_WIDTHS[0] <= width <= PLAN_WIDTHS[1]:
-            raise InvalidRequest(
-                f"The width is {width}. Pass a width from {PLAN_WIDTHS[0]} to {PLAN_WIDTHS[1]}.",
-                (("width", "out of range"),),
-            )
         parameters = without_none(parent=parent, width=width, low=low, high=high)
         return await self._bytes(f"{surface_path(map_name)}/plan.png", params=parameters)

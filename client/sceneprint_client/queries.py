@@ -20,9 +20,7 @@ from sceneprint_client.api import (
 )
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.results import (
-    COLOURS,
     MOST_DRAWN,
-    TRANSFORMS,
     MatchDetails,
     OverlayColour,
     OverlayTransform,
@@ -57,9 +55,6 @@ if TYPE_CHECKING:
 
     from sceneprint_client.http import FrameInput, MetaInput
     from sceneprint_client.surface_encoding import SurfacePoints
-
-#: Maximum number of frames with pairwise similarities.
-_MOST_ALIKE = 200
 
 
 class QueryMethods(ServiceConnection):
@@ -222,7 +217,7 @@ class QueryMethods(ServiceConnection):
         statuses = [status] if isinstance(status, str) else list(status)
         return self._pages(
             Page[QueryRecord], "/v1/queries", map=map_name, status=statuses or None, robot=robot,
-            since=_as_text(since), until=_as_text(until), kept=True if kept else None,
+            since=_as_text(since), until=_as_text(until), kept=kept or None,
         )  # fmt: skip
 
     @Call
@@ -307,11 +302,6 @@ class QueryMethods(ServiceConnection):
         UnknownQuery : If the answer is not stored.
         InvalidRequest : If a limit is out of range.
         """
-        if not 1 <= limit <= _MOST_ALIKE:
-            raise InvalidRequest(
-                f"{limit} frames cannot be compared with each other. Pass 1 to {_MOST_ALIKE}.",
-                (("limit", f"pass 1 to {_MOST_ALIKE}"),),
-            )
         return await self._call(
             Similarities, "GET", f"{query_path(query_id)}/similarities", params={"limit": limit}
         )
@@ -355,12 +345,6 @@ class QueryMethods(ServiceConnection):
         UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `match_details`.
         InvalidRequest : If the transform or color is not supported.
         """
-        for name, value, known in (("color", color, COLOURS), ("transform", transform, TRANSFORMS)):
-            if value not in known:
-                raise InvalidRequest(
-                    f"An overlay has no {name} {value!r:.80}. Pass one of {', '.join(known)}.",
-                    ((name, f"pass one of {', '.join(known)}"),),
-                )
         return await self._bytes(
             f"{match_path(query_id, frame_id)}/overlay.ply",
             params=without_none(map=map_name, color=color, transform=transform),

@@ -8,8 +8,10 @@ text  --read_pose-->  T_parent_sensor (4, 4)
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -17,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client.api.base import Intrinsics
-from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose
+from sceneprint_client.errors import DatasetError, InvalidIntrinsics, InvalidPose, SceneprintError
 from sceneprint_client.files import naming, read_object, read_text
 from sceneprint_client.formats import CloudFormat
 from sceneprint_client.poses import TOLERANCE, rigid_transform
@@ -81,11 +83,8 @@ def find_camera(folder: Path) -> Camera:
     Raise DatasetError if there is no such file; the message shows an example. Raise
     InvalidIntrinsics if the file is invalid; see `read_camera`.
     """
-    absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
-    for place in (absolute, *absolute.parents[:_PARENTS]):
-        candidate = place / INTRINSICS_FILE
-        if candidate.is_file():
-            return read_camera(candidate)
+    if (file := _nearest(folder, INTRINSICS_FILE)) is not None:
+        return read_camera(file)
     raise DatasetError(
         f"{folder}: There is no {INTRINSICS_FILE} here or in the {_PARENTS} folders above, so the "
         f"camera is unknown. Write a file such as {_INTRINSICS_EXAMPLE} (pixels; depth_scale is "
@@ -128,29 +127,21 @@ def _camera(fields: dict[str, object]) -> Camera:
     along_ray = fields.get("depth_along_ray", False)
     if not isinstance(along_ray, bool):
         raise InvalidIntrinsics("depth_along_ray is not a boolean. Write true or false.")
+    number = partial(_number, error=InvalidIntrinsics)
     return Camera(
         Intrinsics(
             width=_whole(fields, "width"),
             height=_whole(fields, "height"),
-            fx=_intrinsics_number("fx", fields["fx"]),
-            fy=_intrinsics_number("fy", fields["fy"]),
-            cx=_intrinsics_number("cx", fields["cx"]),
-            cy=_intrinsics_number("cy", fields["cy"]),
-            distortion=tuple(_intrinsics_number("distortion", value) for value in distortion),
+            fx=number("fx", fields["fx"]),
+            fy=number("fy", fields["fy"]),
+            cx=number("cx", fields["cx"]),
+            cy=number("cy", fields["cy"]),
+            distortion=tuple(number("distortion", value) for value in distortion),
         ),
-        depth_scale=_intrinsics_number("depth_scale", fields.get("depth_scale", 1000)),
+        depth_scale=number("depth_scale", fields.get("depth_scale", 1000)),
         along_ray=along_ray,
-        up=_camera_up(fields.get("up")),
+        up=_up(fields.get("up"), InvalidIntrinsics),
     )
-
-
-def _camera_up(value: object) -> Position | None:
-    if value is None:
-        return None
-    if not isinstance(value, list) or len(value) != len("xyz"):
-        raise InvalidIntrinsics(_NO_UP.format(f"{value!r:.60}"))
-    x, y, z = (_intrinsics_number("up", number) for number in value)
-    return x, y, z
 
 
 def _whole(fields: dict[str, object], name: str) -> int:
@@ -162,14 +153,30 @@ def _whole(fields: dict[str, object], name: str) -> int:
     return value
 
 
-def _intrinsics_number(name: str, value: object) -> float:
+def _number(name: str, value: object, error: type[SceneprintError]) -> float:
     # bool is a subclass of int, but true is not a length in pixels.
     if not isinstance(value, bool) and isinstance(value, int | float):
-        try:
+        with suppress(OverflowError):  # integers in JSON have no upper limit
             return float(value)
-        except OverflowError:
-            pass
-    raise InvalidIntrinsics(f"{name} is {value!r:.40}, not a number. Write a number.")
+    raise error(f"{name} is {value!r:.40}, not a number. Write a number.")
+
+
+def _up(value: object, error: type[SceneprintError]) -> Position | None:
+    """Return an optional direction of length 1."""
+    if value is None:
+        return None
+    if isinstance(value, list) and len(value) == len("xyz"):
+        x, y, z = (_number("up", number, error) for number in value)
+        if is_unit((x, y, z)):
+            return x, y, z
+    raise error(_NO_UP.format(f"{value!r:.60}"))
+
+
+def _nearest(folder: Path, name: str) -> Path | None:
+    """Return the nearest file of a name, in this folder or up to 4 above."""
+    absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
+    places = (absolute, *absolute.parents[:_PARENTS])
+    return next((place / name for place in places if (place / name).is_file()), None)
 
 
 # Layout of points.
@@ -235,15 +242,9 @@ def find_cloud_source(folder: Path) -> CloudSource:
 
     Raise DatasetError if the file cannot be read, is not a JSON object, or has an invalid field.
     """
-    absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
-    for place in (absolute, *absolute.parents[:_PARENTS]):
-        candidate = place / CLOUDS_FILE
-        if candidate.is_file():
-            return _read_source(candidate)
-    return CloudSource()
-
-
-def _read_source(path: Path) -> CloudSource:
+    path = _nearest(folder, CLOUDS_FILE)
+    if path is None:
+        return CloudSource()
     fields = read_object(path, _MAXIMUM_BYTES, DatasetError, _CLOUDS_EXAMPLE)
     with naming(str(path)):
         unknown = sorted(set(fields) - {*_FIELDS})
@@ -267,19 +268,9 @@ def _read_source(path: Path) -> CloudSource:
                 "two."
             )
         return CloudSource(
-            file_format, _viewpoint(fields), units, _cloud_up(fields.get("up")),
+            file_format, _viewpoint(fields), units, _up(fields.get("up"), DatasetError),
             None if row is None else row_of(str(row)),
         )  # fmt: skip
-
-
-def _cloud_up(value: object) -> Position | None:
-    if value is None:
-        return None
-    if isinstance(value, list) and len(value) == len("xyz"):
-        x, y, z = (_cloud_number("up", number) for number in value)
-        if is_unit((x, y, z)):
-            return x, y, z
-    raise DatasetError(_NO_UP.format(f"{value!r:.60}"))
 
 
 def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
@@ -293,22 +284,15 @@ def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
             f"viewpoint is {value!r:.60}. Write it like {_CLOUDS_EXAMPLE}, or null for points "
             "without a common viewpoint."
         )
-    return (
-        _cloud_number("x", value["x"]),
-        _cloud_number("y", value["y"]),
-        _cloud_number("z", value["z"]),
-    )
+    x, y, z = (_cloud_number(axis, value[axis]) for axis in "xyz")
+    return x, y, z
 
 
 def _cloud_number(name: str, value: object) -> float:
-    if not isinstance(value, bool) and isinstance(value, int | float):
-        try:
-            number = float(value)
-        except OverflowError:  # integers in JSON have no upper limit
-            number = math.inf
-        if math.isfinite(number):
-            return number
-    raise DatasetError(f"{name} is {value!r:.40}, not a finite number. Write a finite number.")
+    number = _number(name, value, DatasetError)
+    if not math.isfinite(number):
+        raise DatasetError(f"{name} is {number}, not a finite number. Write a finite number.")
+    return number
 
 
 # Poses.
@@ -328,10 +312,11 @@ def read_pose(path: Path) -> NDArray[np.float64]:
                 f"The file holds {len(words)} words, but a pose has 16 numbers. "
                 "Write 4 rows of 4 numbers, sensor to parent."
             )
-        return rigid_transform(np.array(_numbers(words)).reshape(4, 4))
+        return rigid_transform(np.array(pose_numbers(words)).reshape(4, 4))
 
 
-def _numbers(words: list[str]) -> list[float]:
+def pose_numbers(words: list[str]) -> list[float]:
+    """Return the numbers of the words of a pose; raise InvalidPose if one is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError as cause:

@@ -80,7 +80,7 @@ def decode_points(data: bytes) -> SurfacePoints:
 
 def _refusal(why: str) -> Refused:
     return Refused(
-        f"The service sent invalid points: {why}. Install a client of the service's version, which "
+        f"The service sent invalid data: {why}. Install a client of the service's version, which "
         "`sceneprint doctor` shows.",
         200,
         {},
@@ -146,12 +146,7 @@ def decode_tile(data: bytes, tile: SurfaceTile, tile_m: float) -> SurfaceCells:
     Refused : If the length does not match the number of cells of the tile.
     """
     if len(data) != tile.cells * CELL.itemsize:
-        raise Refused(
-            f"The service sent {len(data)} bytes, which do not hold {tile.cells} cells. Install a "
-            "client of the service's version, which `sceneprint doctor` shows.",
-            200,
-            {},
-        )
+        raise _refusal(f"{len(data)} bytes do not hold {tile.cells} cells")
     rows = np.frombuffer(data, CELL)
     sessions, taken = rows["session"].astype(np.int32), rows["taken"].astype(np.int32)
     return SurfaceCells(

@@ -36,7 +36,7 @@ def test_what_an_answer_rests_on(
     with pytest.raises(UnknownFrame):
         client.match_details(answer.query_id, "nobody")
     for how in ({"color": "pink"}, {"transform": "best"}):
-        with pytest.raises(InvalidRequest, match="Pass one of"):
+        with pytest.raises(InvalidRequest, match=next(iter(how))):
             client.overlay(answer.query_id, best, **how)  # type: ignore[arg-type]
-    with pytest.raises(InvalidRequest, match="1 to 200"):
+    with pytest.raises(InvalidRequest, match="limit"):
         client.similarities(answer.query_id, 0)

@@ -83,12 +83,12 @@ def test_what_a_surface_refuses(fused: Client) -> None:
         fused.surface_tile(MAP, "0" * 32)
     with pytest.raises(NotFound):
         fused.surface_plan(MAP, "elsewhere")
-    with pytest.raises(InvalidRequest, match="The width is 5000"):
+    with pytest.raises(InvalidRequest, match="width"):
         fused.surface_plan(MAP, width=5000)
     with pytest.raises(InvalidRequest, match="Specify either `at` or `box`"):
         list(fused.surface_frames(MAP))
     tile = SurfaceTile(column=0, row=0, floor=0, cells=2, bytes=16, digest="x")
-    with pytest.raises(Refused, match="sent 15 bytes, which do not hold 2 cells"):
+    with pytest.raises(Refused, match="15 bytes do not hold 2 cells"):
         decode_tile(bytes(15), tile, 1.0)
 
 

@@ -18,7 +18,7 @@ from sceneprint.types import AnyFrame, DepthFrame, Floats
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, data_lines, naming, read_bytes, read_text
 from sceneprint_client.frame_files import FrameFile, is_kitti, meta_of
 from sceneprint_client.poses import SensorTrajectory
-from sceneprint_client.sidecars import CloudSource
+from sceneprint_client.sidecars import CloudSource, pose_numbers
 
 if TYPE_CHECKING:
     from sceneprint_client.api import FrameMeta
@@ -44,7 +44,7 @@ def read_trajectory(path: Path) -> SensorTrajectory:
                 raise InvalidPose(
                     f"The line has {len(words)} words, not 8. Write t tx ty tz qx qy qz qw."
                 )
-            rows.append(_numbers(words))
+            rows.append(pose_numbers(words))
         numbers.append(number)
     if not rows:
         raise InvalidPose(f"{path}: The file has no pose. Remove the file, or add poses.")
@@ -62,13 +62,6 @@ def read_trajectory(path: Path) -> SensorTrajectory:
     quaternions = table[first, 4:]
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return SensorTrajectory(stamps, table[first, 1:4], quaternions)
-
-
-def _numbers(words: list[str]) -> list[float]:
-    try:
-        return [float(word) for word in words]
-    except ValueError as cause:
-        raise InvalidPose(f"A word is not a number ({cause}). Write only numbers.") from cause
 
 
 def read_cloud(
