@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sceneprint.formats.points import decode_cloud
+from sceneprint.formats.points.cloud import decode_cloud
 
 #: Edge length of a voxel, metres.
 VOXEL_M = 0.1

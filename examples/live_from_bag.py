@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from sceneprint.formats.dataset import FrameReference, find_sequences
-from sceneprint.formats.recording import RecordingOptions
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint.types import Floats
 from sceneprint_client import Client, Tracker
 from sceneprint_client.http import DEFAULT_URL

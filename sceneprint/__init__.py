@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sceneprint.formats.artifact import read_geometry, write_geometry
     from sceneprint.formats.dataset import find_sequences, make_frame, read_frame
-    from sceneprint.formats.points import decode_cloud
+    from sceneprint.formats.points.cloud import decode_cloud
     from sceneprint.geometry.validation.validation import PairValidation
     from sceneprint.localization import PoseEstimate, localize, views_of_rows
     from sceneprint.models import Model, read_model
@@ -90,7 +90,7 @@ _MODULES = {
     "Signer": "pipeline",
     "PairValidation": "geometry.validation.validation",
     "associate": "pipeline",
-    "decode_cloud": "formats.points",
+    "decode_cloud": "formats.points.cloud",
     "distance": "pipeline",
     "diversify": "pipeline",
     "find_sequences": "formats.dataset",

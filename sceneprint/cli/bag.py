@@ -14,7 +14,8 @@ from sceneprint.cli.output import one_line, print_error, progress_bar
 from sceneprint.errors import InvalidRequest
 from sceneprint.formats.dataset import FrameSequence, find_recordings, find_sequences
 from sceneprint.formats.dataset.frame_reference import Layout
-from sceneprint.formats.recording import BagOutline, RecordingOptions, bag_outline
+from sceneprint.formats.recording.outline import BagOutline, bag_outline
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint_client.formats import titles_of
 from sceneprint_client.sidecars import Camera
 

@@ -19,6 +19,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -161,11 +162,15 @@ def load_decoders(kernels: bool) -> None:
         return
     for data, form in text_samples():
         read_points(data, form, UNSAID, 1.0)
-    for module in (rows, pcd, ply):
-        for one in vars(module).values():
-            # kernels without signatures are inlined
-            if isinstance(one, Kernel) and one.compiler.signatures:
-                one.compiler.disable_compile()
+    end_compilation(rows, pcd, ply)
+
+
+def end_compilation(*modules: ModuleType) -> None:
+    """Let the kernels of modules use only what they have compiled."""
+    for one in (one for module in modules for one in vars(module).values()):
+        # kernels without signatures are inlined
+        if isinstance(one, Kernel) and one.compiler.signatures:
+            one.compiler.disable_compile()
 
 
 def _images() -> list[bytes]:

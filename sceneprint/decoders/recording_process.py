@@ -23,8 +23,9 @@ from sceneprint.decoders.child_process import load_decoders, mapped, serve
 from sceneprint.errors import DatasetError, UnreadableArchive
 from sceneprint.formats.dataset.frame_reference import import_meta, numbered_sequences
 from sceneprint.formats.points.rows import FileBytes
-from sceneprint.formats.recording import RecordingOptions, bag_outline
 from sceneprint.formats.recording.bag import BagTopic, load_readers, shared_bag
+from sceneprint.formats.recording.outline import bag_outline
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint.formats.recording.topics import BagSource
 from sceneprint_client.api.frames import (
     MOST_RECORDING_TOPICS,

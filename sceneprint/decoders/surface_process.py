@@ -19,13 +19,18 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.decoders.child_process import array_samples, mapped, serve, text_samples
+from sceneprint.decoders.child_process import (
+    array_samples,
+    end_compilation,
+    mapped,
+    serve,
+    text_samples,
+)
 from sceneprint.errors import SceneprintError
 from sceneprint.formats.points import pcd, ply, rows
 from sceneprint.formats.points.cloud import thinned
-from sceneprint.formats.surface_file import SurfaceOptions, ply_faces, read_surface
-from sceneprint.formats.surface_file.reading import SurfaceFormat
-from sceneprint.geometry.kernel import Kernel
+from sceneprint.formats.surface_file import ply_faces
+from sceneprint.formats.surface_file.reading import SurfaceFormat, SurfaceOptions, read_surface
 from sceneprint.geometry.surface.upright import estimate_up
 
 
@@ -63,11 +68,7 @@ def _load(form: SurfaceFormat) -> None:
         if one == form:
             with suppress(SceneprintError):  # an optional reader is absent, or a sample has no mesh
                 read_surface(data, "", None, form)
-    for module in (rows, pcd, ply, ply_faces):
-        for kernel in vars(module).values():
-            # kernels without signatures are inlined
-            if isinstance(kernel, Kernel) and kernel.compiler.signatures:
-                kernel.compiler.disable_compile()
+    end_compilation(rows, pcd, ply, ply_faces)
 
 
 def mesh_samples() -> list[tuple[bytes, Any]]:

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import find_sequences, write_pose
 from sceneprint.formats.export import write_ply
-from sceneprint.formats.points import decode_cloud
+from sceneprint.formats.points.cloud import decode_cloud
 from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.pipeline import open_signer, sign
 from sceneprint.types import DepthFrame, Floats

@@ -17,7 +17,7 @@ from sceneprint.decoders.pool import DecoderProcess
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
 from sceneprint.decoders.surface_process import mesh_samples
 from sceneprint.errors import DecoderFailure, UnreadableCloud
-from sceneprint.formats.surface_file import ReadSurface, SurfaceOptions, read_surface
+from sceneprint.formats.surface_file.reading import ReadSurface, SurfaceOptions, read_surface
 
 STATED = SurfaceOptions(units_per_metre=2.0, up="-y")
 

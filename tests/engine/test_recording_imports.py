@@ -22,7 +22,7 @@ from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.jobs.lifecycle import cancel
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.errors import Busy, InvalidRequest, QuotaExceeded, UnreadableArchive
-from sceneprint.formats.recording import RecordingOptions, recording_sequences
+from sceneprint.formats.recording.selection import RecordingOptions, recording_sequences
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import files_of
 from sceneprint_client.api import Job, JobState, NewMap

@@ -15,7 +15,8 @@ import pytest
 from sceneprint.errors import DatasetError, InvalidIntrinsics, UnreadableFrame
 from sceneprint.formats.dataset import FrameSequence, Layout, find_sequences
 from sceneprint.formats.dataset.frame_reference import session_of
-from sceneprint.formats.recording import RecordingOptions, bag_outline
+from sceneprint.formats.recording.outline import bag_outline
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint.types import Cloud, DepthFrame, Floats
 from sceneprint_client.frame_files import meta_of
 

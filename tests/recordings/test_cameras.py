@@ -13,7 +13,8 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 
 from sceneprint.errors import DatasetError, UnreadableFrame
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.formats.recording import RecordingOptions, bag_outline
+from sceneprint.formats.recording.outline import bag_outline
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint_client.ros_messages import compressed_depth, rvl_samples
 
 ALL = RecordingOptions(keyframe_m=0, keyframe_s=0)

@@ -17,7 +17,8 @@ import pytest
 
 from sceneprint.errors import DatasetError, SceneprintError, UnreadableCloud, UnreadableFrame
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.formats.recording import RecordingOptions, bag_outline
+from sceneprint.formats.recording.outline import bag_outline
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint.types import Floats
 
 Walk = list[tuple[float, Floats]]

@@ -13,9 +13,9 @@ import pytest
 
 from sceneprint.errors import DatasetError, UnreadableCloud
 from sceneprint.formats.dataset import FrameSequence, find_sequences
-from sceneprint.formats.recording import RecordingOptions
 from sceneprint.formats.recording.scan import BagScan
 from sceneprint.formats.recording.scan_window import scan_windows
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint.types import Floats
 from sceneprint_client import Client, Tracker
 from sceneprint_client.frame_files import meta_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import FrameReference, decode_png, find_sequences
-from sceneprint.formats.recording import RecordingOptions
+from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint.types import Cloud, DepthFrame, Floats
 
 STEP, COUNT = 10, 12

@@ -14,7 +14,7 @@ import pytest
 
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import FrameSequence, find_sequences
-from sceneprint.formats.recording import RecordingOptions
+from sceneprint.formats.recording.selection import RecordingOptions
 
 ALL = RecordingOptions(keyframe_m=0, keyframe_s=0)
 IMAGE = np.full((60, 80), 2000, np.uint16)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import FrameError
-from sceneprint.formats.points import decode_scan
+from sceneprint.formats.points.cloud import decode_scan
 from sceneprint_client.formats import CloudFormat
 
 Write = Callable[..., bytes]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import MissingDependency, UnreadableCloud
-from sceneprint.formats.points import decode_cloud, decode_scan, format_of
+from sceneprint.formats.points.cloud import decode_cloud, decode_scan
+from sceneprint_client.formats import format_of
 
 Write = Callable[..., bytes]
 

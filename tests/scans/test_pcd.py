@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.errors import FrameError, UnreadableCloud
-from sceneprint.formats.points import decode_cloud, decode_scan
+from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 from sceneprint.formats.points.pcd import inflate
 
 Write = Callable[..., bytes]

@@ -8,7 +8,7 @@ import pytest
 
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.export import write_ply
-from sceneprint.formats.points import decode_cloud, decode_scan
+from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 
 Write = Callable[..., bytes]
 

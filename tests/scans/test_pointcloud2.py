@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import FrameError, UnreadableCloud, UselessFrame
-from sceneprint.formats.points import decode_scan, format_of
+from sceneprint.formats.points.cloud import decode_scan
 from sceneprint_client.files import read_point_cloud
+from sceneprint_client.formats import format_of
 from sceneprint_client.ros_messages import cloud_points
 
 NAME = "sensor_msgs/msg/PointCloud2"

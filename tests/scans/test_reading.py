@@ -8,8 +8,7 @@ import pytest
 
 from sceneprint.errors import InvalidPose, UnreadableCloud, UselessFrame
 from sceneprint.formats.points import cloud as reading
-from sceneprint.formats.points import decode_cloud, decode_scan
-from sceneprint.formats.points.cloud import thinned
+from sceneprint.formats.points.cloud import decode_cloud, decode_scan, thinned
 
 Write = Callable[..., bytes]
 

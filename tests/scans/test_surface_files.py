@@ -16,8 +16,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud, UselessFrame
-from sceneprint.formats.surface_file import SurfaceOptions, read_surface
 from sceneprint.formats.surface_file.raw_surface import gather
+from sceneprint.formats.surface_file.reading import SurfaceOptions, read_surface
 from sceneprint.types import ReferenceSurface
 
 Points = NDArray[np.float64]

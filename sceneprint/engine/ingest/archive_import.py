@@ -33,7 +33,7 @@ from sceneprint.formats.dataset.frame_reference import (
     import_meta,
     numbered_sequences,
 )
-from sceneprint.formats.surface_file import surface_format
+from sceneprint.formats.surface_file.reading import surface_format
 from sceneprint.geometry.views import ViewParameters, view_parameters
 from sceneprint.models import ModelParameters, parse_model
 from sceneprint.store import queue

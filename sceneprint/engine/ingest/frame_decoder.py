@@ -17,15 +17,16 @@ from sceneprint import errors
 from sceneprint.decoders import Decoder, Decoders
 from sceneprint.errors import InvalidPose
 from sceneprint.formats.dataset import decode_frame, rigid_transform
-from sceneprint.formats.points import UNSAID, decode_cloud, decode_scan, format_of
+from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 from sceneprint.store.tables import FrameRow
 from sceneprint.types import AnyFrame, Cloud, Floats, Intrinsics
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.api.base import GivenBase, GivenTransform
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.files import naming
-from sceneprint_client.formats import CloudFormat, format_at, titles_of
+from sceneprint_client.formats import CloudFormat, format_at, format_of, titles_of
 from sceneprint_client.poses import rotation_of
+from sceneprint_client.sidecars import UNSAID
 
 #: Name of the base frame of a cloud that has its own coordinate frame: its viewpoint is not the
 #: origin.

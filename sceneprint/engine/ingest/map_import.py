@@ -41,7 +41,7 @@ from sceneprint.errors import (
     UnreadableCloud,
 )
 from sceneprint.formats.depth_file import encode_npy, encode_png
-from sceneprint.formats.surface_file import SurfaceOptions
+from sceneprint.formats.surface_file.reading import SurfaceOptions
 from sceneprint.geometry.views import Renderer, ViewParameters, choose_views
 from sceneprint.store import queue
 from sceneprint.store.database_errors import unusable

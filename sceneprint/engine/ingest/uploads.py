@@ -212,7 +212,7 @@ class Upload:
 
     Parameters
     ----------
-    data : file of a depth image (PNG or NPY), or of a point cloud (see `sceneprint.formats.points`)
+    data : file of a depth image (PNG or NPY), or of a point cloud (`sceneprint_client.formats`)
     priority : priority of the job; ignored if the frame exists
     if_novel : minimum distance from the nearest frame of the map, as a share of the mean distance
         between unrelated frames; None accepts any distance. If the frame exists and is not signed

@@ -13,7 +13,7 @@ import numpy as np
 
 from sceneprint.errors import DatasetError, InvalidPose, UnreadableCloud
 from sceneprint.formats.depth_file import decode_frame
-from sceneprint.formats.points import Scan, decode_scan
+from sceneprint.formats.points.cloud import Scan, decode_scan
 from sceneprint.types import AnyFrame, DepthFrame, Floats
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, data_lines, naming, read_bytes, read_text
 from sceneprint_client.frame_files import FrameFile, is_kitti, meta_of

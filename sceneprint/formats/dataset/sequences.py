@@ -35,6 +35,7 @@ from sceneprint.formats.dataset.frame_reference import (
     Split,
     read_trajectory,
 )
+from sceneprint.formats.recording.bag import is_recording
 from sceneprint.types import Floats, Floats32
 from sceneprint_client.files import data_lines, read_text
 from sceneprint_client.formats import format_named, is_cloud, titles_of
@@ -55,13 +56,14 @@ from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     INTRINSICS_FILE,
     Camera,
+    CloudSource,
     find_camera,
     find_cloud_source,
 )
 from sceneprint_client.transforms import TOLERANCE_S
 
 if TYPE_CHECKING:
-    from sceneprint.formats.recording import RecordingOptions
+    from sceneprint.formats.recording.selection import RecordingOptions
 
 _DEPTH_LIST, _TRAJECTORY = "depth.txt", "groundtruth.txt"
 _MAXIMUM_LIST_BYTES = 2**26
@@ -132,14 +134,21 @@ def references(
     camera. Raise InvalidPose if a line of groundtruth.txt is not a pose.
     """
     unposed = NO_POSE_FILE
-    if layout is Layout.SEVEN_SCENES:
-        frames = _seven_scenes(folder, files, name, camera)
-    elif layout is Layout.TUM:
+    if layout is Layout.TUM:
         frames, unposed = _tum(folder, files, name)
     elif layout is Layout.CLOUDS:
-        frames = _clouds(folder, files, name)
+        # a clouds.json says that the .npy files beside it are points
+        wanted = filter(_may_be_cloud if CLOUDS_FILE in files else is_cloud, files)
+        frames = _posed_files(folder, wanted, name, cloud=find_cloud_source(folder))
     else:
-        frames = _plain(folder, files, name)
+        is_scene = layout is Layout.SEVEN_SCENES
+        try:
+            camera = find_camera(folder)
+        except DatasetError:
+            if camera is None or not is_scene:
+                raise
+        wanted = filter(SEVEN_SCENES.fullmatch if is_scene else is_depth, files)
+        frames = _posed_files(folder, wanted, name, camera)
     first: dict[str, Path] = {}
     for frame in frames:
         if frame.name in first:
@@ -163,43 +172,17 @@ def _numbered(folder: Path, frame: FrameReference, place: int) -> FrameReference
     )
 
 
-def _seven_scenes(
-    folder: Path, files: list[str], name: str, camera: Camera | None
-) -> tuple[FrameReference, ...]:
-    try:
-        camera = find_camera(folder)
-    except DatasetError:
-        if camera is None:
-            raise
+def _posed_files(
+    folder: Path, files: Iterable[str], name: str, camera: Camera | None = None,
+    cloud: CloudSource | None = None,
+) -> tuple[FrameReference, ...]:  # fmt: skip
+    """Return the frames of files, with the pose files beside them."""
     frames = []
     for file in files:
-        if SEVEN_SCENES.fullmatch(file):
-            stem = file.removesuffix(".depth.png")
-            pose = find_pose_file(folder, stem)
-            frames.append(FrameReference(f"{name}/{stem}", folder / file, camera, pose_source=pose))
-    return tuple(frames)
-
-
-def _plain(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
-    camera = find_camera(folder)
-    frames = []
-    for file in filter(is_depth, files):
-        stem = Path(file).stem
-        pose = find_pose_file(folder, stem)
-        frames.append(FrameReference(f"{name}/{stem}", folder / file, camera, pose_source=pose))
-    return tuple(frames)
-
-
-def _clouds(folder: Path, files: list[str], name: str) -> tuple[FrameReference, ...]:
-    source = find_cloud_source(folder)
-    # a clouds.json says that the .npy files beside it are points
-    is_wanted = _may_be_cloud if CLOUDS_FILE in files else is_cloud
-    frames = []
-    for file in filter(is_wanted, files):
-        stem = Path(file).stem
+        stem = file.removesuffix(".depth.png") if SEVEN_SCENES.fullmatch(file) else Path(file).stem
         pose = find_pose_file(folder, stem)
         frames.append(
-            FrameReference(f"{name}/{stem}", folder / file, None, pose_source=pose, cloud=source)
+            FrameReference(f"{name}/{stem}", folder / file, camera, pose_source=pose, cloud=cloud)
         )
     return tuple(frames)
 
@@ -321,9 +304,9 @@ def find_sequences(
     path = Path(path)
     root = path.resolve() if ".." in path.parts else path.absolute()
     from sceneprint.formats import exports
-    from sceneprint.formats import recording as ros  # only recordings need this import
+    from sceneprint.formats.recording import selection as ros  # only recordings need this import
 
-    if ros.is_recording(root) and root.exists():
+    if is_recording(root) and root.exists():
         return ros.recording_sequences(root, recording or ros.RecordingOptions())
     if root.is_file():
         return exports.file_sequences(root) if exports.is_export(root) else (_single(root),)
@@ -366,8 +349,6 @@ def _note_of(left_out: list[Path], root: Path) -> str:
 
 def find_recordings(path: Path) -> list[Path]:
     """Return the ROS recordings at a path or up to 4 folders below it, in natural order."""
-    from sceneprint.formats.recording import is_recording
-
     if is_recording(path):
         return [path]
     return _bags(_walk(path)) if path.is_dir() else []
@@ -387,7 +368,7 @@ def _recordings(
     Raise DatasetError if there are other frames too, two recordings have the same name, or
     `recording_sequences` raises the error.
     """
-    from sceneprint.formats.recording import recording_name, recording_sequences
+    from sceneprint.formats.recording.selection import recording_name, recording_sequences
 
     bags = _bags(walked)
     other = next((one for one in walked if one[2] is not Layout.RECORDING), None)
@@ -473,8 +454,10 @@ def _walk(
                 "Specify the folder of the data set."
             )
         files, folders = list_folder(folder)
-        bags = _recordings_in(folder, files, folders)
+        bags = [name for name in files if format_named(name, "recording")]
+        bags += [name for name in folders if is_recording(folder / name)]
         if bags:
+            bags.sort(key=natural)
             yield folder, bags, Layout.RECORDING
             folders = [name for name in folders if name not in bags]
         layout = exports.folder_layout(folder, files, folders)
@@ -497,15 +480,6 @@ def _walk(
             yield from ((path, [], Layout.E57) for path in exported)
             entered = [name for name in reversed(folders) if not is_beside_depth(name)]
             waiting += [(folder / name, depth + 1) for name in entered]
-
-
-def _recordings_in(folder: Path, files: list[str], folders: list[str]) -> list[str]:
-    """Return the names of the ROS recordings in a folder."""
-    from sceneprint.formats.recording import is_recording
-
-    names = [name for name in files if format_named(name, "recording")]
-    names += [name for name in folders if is_recording(folder / name)]
-    return sorted(names, key=natural)
 
 
 def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: int) -> bool:
@@ -655,14 +629,9 @@ def write_intrinsics(folder: Path, camera: Camera) -> Path:
     """Write `intrinsics.json` into the folder and return its path."""
     lens = camera.intrinsics
     fields: dict[str, object] = {
-        "width": lens.width,
-        "height": lens.height,
-        "fx": lens.fx,
-        "fy": lens.fy,
-        "cx": lens.cx,
-        "cy": lens.cy,
-        "depth_scale": camera.depth_scale,
-    }
+        "width": lens.width, "height": lens.height, "fx": lens.fx, "fy": lens.fy, "cx": lens.cx,
+        "cy": lens.cy, "depth_scale": camera.depth_scale,
+    }  # fmt: skip
     if lens.distortion:
         fields["distortion"] = list(lens.distortion)
     if camera.along_ray:
