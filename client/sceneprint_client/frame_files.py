@@ -34,12 +34,7 @@ from sceneprint_client.errors import (
     UnreadableCloud,
     UnreadableFrame,
 )
-from sceneprint_client.files import (
-    MAXIMUM_CLOUD_BYTES,
-    MAXIMUM_IMAGE_BYTES,
-    naming,
-    read_bytes,
-)
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, naming, read_bytes
 from sceneprint_client.formats import HEAD, format_named, format_of, is_cloud
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,

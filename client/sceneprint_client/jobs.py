@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import httpx
 
-from sceneprint_client.api import (
-    Answer,
-    Job,
-    JobState,
-    Page,
-)
+from sceneprint_client.api import Answer, Job, JobState, Page
 from sceneprint_client.api.admin import Product, RetriedJobs
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.coverage import (
@@ -25,12 +20,7 @@ from sceneprint_client.api.coverage import (
     MapCoverage,
 )
 from sceneprint_client.api.frames import ImportItem, ImportOptions
-from sceneprint_client.api.sessions import (
-    Association,
-    Difference,
-    Edge,
-    GraphFormat,
-)
+from sceneprint_client.api.sessions import Association, Difference, Edge, GraphFormat
 from sceneprint_client.api.surface import NewReconstruction, Reconstruction
 from sceneprint_client.calls import Call, Series
 from sceneprint_client.errors import FrameError, InvalidRequest, UnreadableArchive, UnreadableCloud

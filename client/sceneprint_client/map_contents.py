@@ -32,12 +32,7 @@ from sceneprint_client.api.results import (
     FrameSignature,
     View,
 )
-from sceneprint_client.api.surface import (
-    PLAN_WIDTH,
-    MapSurface,
-    SurfaceSighting,
-    SurfaceTile,
-)
+from sceneprint_client.api.surface import PLAN_WIDTH, MapSurface, SurfaceSighting, SurfaceTile
 from sceneprint_client.calls import Call, Series
 from sceneprint_client.http import (
     ServiceConnection,

@@ -23,12 +23,7 @@ from sceneprint_client.api.base import CameraIntrinsics
 from sceneprint_client.errors import SceneprintError
 from sceneprint_client.files import read_livox_scan
 from sceneprint_client.joiner import Joiner
-from sceneprint_client.poses import (
-    WINDOW_S,
-    Accelerations,
-    Floats,
-    quaternion_of,
-)
+from sceneprint_client.poses import WINDOW_S, Accelerations, Floats, quaternion_of
 from sceneprint_client.ros_messages import (
     camera_intrinsics,
     cloud_points,

@@ -20,12 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client.api.base import MAXIMUM_SAMPLES, Intrinsics
-from sceneprint_client.errors import (
-    InvalidIntrinsics,
-    UnreadableCloud,
-    UnreadableFrame,
-    printable,
-)
+from sceneprint_client.errors import InvalidIntrinsics, UnreadableCloud, UnreadableFrame, printable
 from sceneprint_client.files import PNG_SIGNATURE
 from sceneprint_client.poses import Floats
 

@@ -19,13 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint_client.errors import DatasetError, printable
-from sceneprint_client.poses import (
-    Floats,
-    SensorTrajectory,
-    first_since,
-    interpolate,
-    rotation_of,
-)
+from sceneprint_client.poses import Floats, SensorTrajectory, first_since, interpolate, rotation_of
 
 #: Longest interval between two samples in which to interpolate, seconds.
 LONGEST_GAP_S = 0.5

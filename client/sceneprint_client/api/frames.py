@@ -8,14 +8,7 @@ from datetime import datetime
 from statistics import fmean, median
 from typing import Annotated, Literal, get_args
 
-from pydantic import (
-    Discriminator,
-    Field,
-    StringConstraints,
-    Tag,
-    computed_field,
-    model_validator,
-)
+from pydantic import Discriminator, Field, StringConstraints, Tag, computed_field, model_validator
 
 from sceneprint_client.api.base import (
     FOLDER_NAME,

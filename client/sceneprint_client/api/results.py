@@ -7,14 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from sceneprint_client.api.base import (
-    ApiRecord,
-    Given,
-    Note,
-    Quaternion,
-    Transform,
-    Vector,
-)
+from sceneprint_client.api.base import ApiRecord, Given, Note, Quaternion, Transform, Vector
 from sceneprint_client.api.frames import Kind
 from sceneprint_client.api.maps import Preset
 from sceneprint_client.api.query import (

@@ -135,11 +135,7 @@ def _write_lookalike(
     out: Path, seed: int, queries: int, lidar: bool, perfect: bool, kind: str, index: int
 ) -> None:
     """Write a scene with two sequences, or two scenes if the map lacks the queries' place."""
-    from sceneprint_lab.synth import (
-        KinectNoise,
-        synthesise_lookalike,
-        synthesise_lookalike_survey,
-    )
+    from sceneprint_lab.synth import KinectNoise, synthesise_lookalike, synthesise_lookalike_survey
 
     noise = None if perfect else KinectNoise()
     site: LookalikeSite[AnyFrame] = (

@@ -46,12 +46,7 @@ from sceneprint_client.frame_files import (
     find_pose_file,
     seven_scenes_number,
 )
-from sceneprint_client.poses import (
-    SensorTrajectory,
-    interpolate,
-    quaternion_of,
-    rigid_transform,
-)
+from sceneprint_client.poses import SensorTrajectory, interpolate, quaternion_of, rigid_transform
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     INTRINSICS_FILE,
