@@ -46,7 +46,7 @@ from sceneprint.pipeline import Signer, open_signer
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
-from sceneprint.types import DepthFrame
+from sceneprint.types import DepthFrame, Intrinsics
 from sceneprint_client.api import CameraIntrinsics
 from sceneprint_lab.cli.demo import serving, write_building
 from sceneprint_lab.synth import KINECT, SynthRoom, synthesise_room
@@ -61,15 +61,14 @@ TOGETHER = {
 #: Long files in these folders that share nothing and run beside the others.
 APART = (
     "service/test_lifecycle.py", "service/test_hostile.py",
-    "service/test_kill.py", "service/test_connections.py",
+    "service/test_connections.py",
     "service/test_tenancy.py", "service/test_server.py", "service/test_overload.py",
     "service/test_hostile_files.py", "service/test_faults.py", "client/test_tracker.py",
-    "client/test_keyed.py",
 )  # fmt: skip
 #: Long files that start next, so that no process ends up alone with one of them.
 LONG = (
     "test_shared_index.py", "test_lifecycle.py", "test_survival.py", "test_surfaces.py",
-    "test_commands.py", "test_kill.py", "test_quality.py", "test_map_copy.py", "test_sequences.py",
+    "test_commands.py", "test_quality.py", "test_map_copy.py", "test_sequences.py",
     "test_associations.py", "test_hostile.py", "test_decoders.py", "test_cli.py",
     "test_evaluate.py", "test_inspecting.py", "test_reencoding_switch.py", "test_fuzz.py",
     "test_failover.py", "test_purging.py", "test_work.py", "test_recovery.py",
@@ -504,6 +503,13 @@ def room_views(once: Once) -> Callable[..., SynthRoom]:
         return SynthRoom(name, seed, index, tuple(frames))
 
     return views
+
+
+def halved(frame: DepthFrame) -> DepthFrame:
+    """Return a frame with every second sample of each row and column."""
+    k = frame.intrinsics
+    lens = Intrinsics(k.width // 2, k.height // 2, k.fx / 2, k.fy / 2, k.cx / 2, k.cy / 2)
+    return replace(frame, depth=np.ascontiguousarray(frame.depth[::2, ::2]), intrinsics=lens)
 
 
 @pytest.fixture(scope="session")

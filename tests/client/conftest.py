@@ -24,8 +24,9 @@ from sceneprint.formats.dataset import (
 )
 from sceneprint.types import DepthFrame
 from sceneprint_client import Client, http
-from sceneprint_client.api import FrameMeta
+from sceneprint_client.api import FrameMeta, JobState
 from sceneprint_lab.synth import SynthRoom
+from tests.conftest import halved
 
 
 @pytest.fixture
@@ -51,6 +52,12 @@ def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
 def map_name(request: pytest.FixtureRequest) -> str:
     """A name that no other test uses."""
     return "m" + f"{abs(hash(request.node.nodeid)):x}"[:20]
+
+
+@pytest.fixture(scope="session")
+def room_frames(room_frames: tuple[DepthFrame, ...]) -> tuple[DepthFrame, ...]:
+    """The frames of `tests/conftest.py` with a quarter of their samples, which are fast to sign."""
+    return tuple(map(halved, room_frames))
 
 
 @pytest.fixture(scope="session")
@@ -80,7 +87,7 @@ def walk(
         count: int = 4, sessions: str = "a", parent: str | None = None, **options: Any
     ) -> list[tuple[bytes, FrameMeta]]:
         found = []
-        frames = room_views(21, 0, count, along_path=True, **options).frames
+        frames = map(halved, room_views(21, 0, count, along_path=True, **options).frames)
         for i, frame in enumerate(frames):
             write_depth_png(path, frame.depth, 1000.0)
             k = frame.intrinsics
@@ -97,6 +104,19 @@ def walk(
         return found
 
     return make
+
+
+@pytest.fixture(scope="session")
+def produced(
+    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
+) -> Iterator[Client]:
+    """A client of the map `produced`: sessions a and b of two frames each in one parent frame."""
+    with Client(service_url) as client:
+        client.create_map("produced", model="depth")
+        frames = walk(sessions="ab", parent="room")
+        jobs = [client.upload("produced", *frame).job_id for frame in frames]
+        assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
+        yield client
 
 
 @pytest.fixture(scope="session")

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
 from sceneprint_client import Client
-from sceneprint_client.api import FrameMeta, JobState
+from sceneprint_client.api import JobState
 from sceneprint_client.api.sessions import Association
 
 MAP = "associated"
@@ -27,9 +25,7 @@ class Filled:
 
 
 @pytest.fixture(scope="module")
-def associated(
-    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
-) -> Iterator[Filled]:
+def associated(service_url, walk):
     """Six frames along a path, some two degrees apart, one to each of two runs in turn."""
     with Client(service_url) as client:
         client.create_map(MAP, model="depth")
@@ -39,7 +35,7 @@ def associated(
         yield Filled(client, {frame_id: i for i, frame_id in enumerate(ids)})
 
 
-def test_edges_and_graphs(associated: Filled) -> None:
+def test_edges_and_graphs(associated):
     client, steps = associated.client, []
     found = client.compute(
         Association, MAP, sessions=["a", "b"], k=2, seed=3, progress=lambda *n: steps.append(n)
@@ -47,7 +43,6 @@ def test_edges_and_graphs(associated: Filled) -> None:
     assert found.state is JobState.SUCCEEDED
     name = found.job_id
     edges = list(client.edges(MAP, name))
-    assert found.result is not None
     assert found.result.edges == len(edges) > 4
     assert found.result.joins[0].transform is not None
     assert {one.from_frame for one in edges} <= associated.numbers.keys()
@@ -58,12 +53,8 @@ def test_edges_and_graphs(associated: Filled) -> None:
     assert client.graph(MAP, name, odometry=True).count("EDGE_SE3:QUAT") > len(edges)
     rows = [line.split() for line in client.graph(MAP, name, "tum").splitlines()]
     assert len([row for row in rows if row[0] != "#"]) == 6
-
-
-def test_graphs_and_edges_over_http(associated: Filled) -> None:
-    client = associated.client
-    found, http = client.compute(Association, MAP, sessions=["a", "b"]), client._http
-    place = f"/v1/maps/{MAP}/associations/{found.job_id}"
+    # over HTTP
+    http, place = client._http, f"/v1/maps/{MAP}/associations/{name}"
     for kind, media in (
         ("g2o", "text/x-g2o"), ("tum", "text/plain; charset=utf-8"), ("json", "application/json"),
     ):  # fmt: skip
@@ -71,7 +62,7 @@ def test_graphs_and_edges_over_http(associated: Filled) -> None:
         by_type = http.get(f"{place}/graph", headers={"Accept": media.partition(";")[0]})
         assert by_name.headers["Content-Type"].partition(";")[0] == media.partition(";")[0]
         assert by_name.content == by_type.content
-        assert by_name.text == client.graph(MAP, found.job_id, kind)  # type: ignore[arg-type]
+        assert by_name.text == client.graph(MAP, name, kind)
     page = http.get(f"{place}/edges", params={"limit": 3, "consistent": "true"}).json()
     assert [edge["number"] for edge in page["items"]] == [0, 1, 2]
     rest = http.get(f"{place}/edges", params={"cursor": page["next_cursor"]}).json()
@@ -80,16 +71,12 @@ def test_graphs_and_edges_over_http(associated: Filled) -> None:
         assert http.get(f"{place}/{path}", params=more).status_code == 422
 
 
-def test_the_command(
-    associated: Filled, service_url: str, tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+def test_the_command(associated, service_url, tmp_path, capsys):
     client, out = associated.client, tmp_path / "graph.g2o"
     of = ["make", "association", MAP, "--url", service_url, "--session", "a"]
     assert main([*of, "--session", "b", "--out", str(out), "--odometry"]) == 0
     lines = capsys.readouterr().out.splitlines()
     newest = next(iter(client.products(Association, MAP)))
-    assert newest.result is not None
     assert lines[0].startswith(f"association {newest.job_id}: {newest.result.edges} edges")
     assert lines[2].startswith("joined strongly, ann/a onto ann/b: ") or lines[2].startswith(
         "joined weakly (check it before you rely on it)"

@@ -7,7 +7,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import pytest
@@ -21,14 +20,14 @@ BINARY = {"Content-Type": "application/octet-stream"}
 
 
 @pytest.fixture
-def local(tmp_path: Path) -> Iterator[httpx.Client]:
+def local(tmp_path):
     """Plain HTTP to a service in this process."""
     transport = LocalService(tmp_path / "local")
     with httpx.Client(base_url="http://here", transport=transport) as http:
         yield http
 
 
-def test_a_body_is_read_in_parts_by_who_asks(local: httpx.Client) -> None:
+def test_a_body_is_read_in_parts_by_who_asks(local):
     local.post("/v1/maps", json={"name": "m"}).raise_for_status()
     threads = set()
 
@@ -50,7 +49,7 @@ def test_a_body_is_read_in_parts_by_who_asks(local: httpx.Client) -> None:
     assert local.get("/v1/maps/m").json()["name"] == "m"
 
 
-def test_a_response_streams_until_it_is_closed(local: httpx.Client) -> None:
+def test_a_response_streams_until_it_is_closed(local):
     with local.stream("GET", "/v1/events", headers={"Accept": "text/event-stream"}) as stream:
         parts = stream.iter_text()
         assert next(parts).startswith("retry: ")
@@ -59,9 +58,7 @@ def test_a_response_streams_until_it_is_closed(local: httpx.Client) -> None:
     assert local.get("/v1/stats").json()["maps"] == 1
 
 
-def test_no_key_and_no_limit_whatever_the_environment_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_key_and_no_limit_whatever_the_environment_says(tmp_path, monkeypatch):
     for name, value in (
         ("REQUIRE_KEYS", "1"), ("HOST", "0.0.0.0"), ("TENANT_REQUESTS_PER_S", "0.1"),
         ("QUEUED_REQUESTS", "0"), ("CORS_ORIGINS", "*"), ("MAX_UPLOAD_BYTES", "1024"),
@@ -78,7 +75,7 @@ def test_no_key_and_no_limit_whatever_the_environment_says(
     )  # more than a service may be given
 
 
-def test_closing_ends_streams_and_threads(tmp_path: Path) -> None:
+def test_closing_ends_streams_and_threads(tmp_path):
     before = set(threading.enumerate())
     client = Client.embedded(tmp_path)
     client.create_map("m")
@@ -105,7 +102,7 @@ def test_closing_ends_streams_and_threads(tmp_path: Path) -> None:
         client.maps()
 
 
-def test_a_program_that_closes_nothing_ends(tmp_path: Path) -> None:
+def test_a_program_that_closes_nothing_ends(tmp_path):
     code = (
         "from sceneprint_client import Client\n"
         f"client = Client.embedded({str(tmp_path)!r})\n"
@@ -121,9 +118,7 @@ def test_a_program_that_closes_nothing_ends(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "m\n", "")
 
 
-def test_a_temporary_folder_with_a_long_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_temporary_folder_with_a_long_name(tmp_path, monkeypatch):
     """The address of a socket has at most 107 bytes."""
     folder = tmp_path / ("long" * 25)
     folder.mkdir()
@@ -132,7 +127,7 @@ def test_a_temporary_folder_with_a_long_name(
         assert client.create_map("m").name == "m"
 
 
-def test_a_folder_that_cannot_be_opened(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_opened(tmp_path):
     (tmp_path / "file").write_text("no folder")
     before = threading.active_count()
     with pytest.raises(errors.UnusableStore):
@@ -140,9 +135,7 @@ def test_a_folder_that_cannot_be_opened(tmp_path: Path) -> None:
     assert threading.active_count() <= before + 1
 
 
-def test_without_the_package_of_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_package_of_the_service(tmp_path, monkeypatch):
     monkeypatch.setattr(client, "find_spec", lambda name: None)
     with pytest.raises(errors.MissingDependency, match=r"In a clone, run: pip install \."):
         Client.embedded(tmp_path)

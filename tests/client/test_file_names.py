@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.formats.dataset import FrameReference
-from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta
 from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.frame_files import file_name, meta_of, sendable, seven_scenes_number
@@ -26,21 +23,19 @@ from sceneprint_client.frame_files import file_name, meta_of, sendable, seven_sc
         ("x../" + "y" * 252, "y" * 252), ("/", None), ("", None),
     ],
 )  # fmt: skip
-def test_whatever_a_file_is_called_it_can_be_sent(name: str, sent: str | None) -> None:
+def test_whatever_a_file_is_called_it_can_be_sent(name, sent):
     assert file_name(name) == sent
     if sent is not None:
         assert FrameMeta(name=sent).name == sent
 
 
-def test_the_number_of_a_file_is_its_place() -> None:
+def test_the_number_of_a_file_is_its_place():
     assert seven_scenes_number("frame-000123.depth.png") == 123
     assert seven_scenes_number("frame-" + "9" * 16 + ".depth.png") is None
     assert seven_scenes_number("frame-000123.png") is None
 
 
-def test_a_frame_is_sent_with_its_name_and_a_query_without(
-    references: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_a_frame_is_sent_with_its_name_and_a_query_without(references, tmp_path):
     one = references[1]
     path, depth = one.path, np.full((4, 4), 1.5, np.float32)
     meta, camera = meta_of(one), (5.0, 5.0, 2.0, 2.0)
@@ -63,9 +58,7 @@ def test_a_frame_is_sent_with_its_name_and_a_query_without(
     assert labels(alone, meta.intrinsics) == ("alone.npy", None)
 
 
-def test_names_come_back_in_matches_and_are_searched(
-    client: Client, references: tuple[FrameReference, ...], map_name: str
-) -> None:
+def test_names_come_back_in_matches_and_are_searched(client, references, map_name):
     client.create_map(map_name)
     for one in reversed(references[:3]):
         client.upload(map_name, one, wait_s=PATIENCE_S)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,11 +17,10 @@ from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.frame_files import sendable
 
 
-def test_what_is_sent_of_a_data_set(references: tuple[FrameReference, ...], tmp_path: Path) -> None:
+def test_what_is_sent_of_a_data_set(references, tmp_path):
     meta = meta_of(references[4], robot="r", session="s", tags=("a", "b"), parent_frame="p")
     assert (meta.robot, meta.session, meta.tags) == ("r", "s", ["a", "b"])
     assert (meta.depth_scale, meta.depth_along_ray, meta.captured_at) == (1000.0, False, None)
-    assert meta.pose is not None
     assert (meta.pose.parent_frame, meta.pose.translation) == ("p", None)
     np.testing.assert_array_equal(meta.pose.matrix, references[4].pose)
     assert meta_of(references[4], with_pose=False).pose is None
@@ -36,12 +34,9 @@ def test_what_is_sent_of_a_data_set(references: tuple[FrameReference, ...], tmp_
         assert (None if dated is None else dated.year) == year
 
 
-def test_a_path_is_sent_with_the_camera_beside_it(
-    references: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_a_path_is_sent_with_the_camera_beside_it(references, tmp_path):
     data, meta = sendable(references[2].path, None, with_pose=True)
     assert data == references[2].path.read_bytes()
-    assert meta.pose is not None
     np.testing.assert_array_equal(meta.pose.matrix, references[2].pose)
     assert meta.intrinsics == meta_of(references[2]).intrinsics
     given = meta.model_copy(update={"depth_scale": 5000.0})
@@ -56,12 +51,9 @@ def test_a_path_is_sent_with_the_camera_beside_it(
         sendable(tmp_path / "absent.png", meta, with_pose=False)
 
 
-def test_up_is_sent_as_given_or_as_beside_the_frame(
-    references: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_up_is_sent_as_given_or_as_beside_the_frame(references, tmp_path):
     assert meta_of(references[0]).up is None
     told = meta_of(references[0], up=(0, -1, 0)).up
-    assert told is not None
     assert told.unit == [0.0, -1.0, 0.0]
     for name in (references[0].path.name, "intrinsics.json"):
         source = references[0].path.with_name(name)
@@ -71,21 +63,17 @@ def test_up_is_sent_as_given_or_as_beside_the_frame(
     path = tmp_path / references[0].path.name
     for up, expected in ((None, [0.6, -0.8, 0.0]), ([0, 0, 1], [0.0, 0.0, 1.0])):
         _, meta = sendable(path, None, with_pose=False, up=up)
-        assert meta.up is not None
         assert meta.up.unit == pytest.approx(expected)
     _, bare = sendable(path, None, with_pose=False)
     data, other = sendable(path.read_bytes(), bare, with_pose=False, up=[1, 0, 0])
     assert other == bare.model_copy(update={"up": other.up})
-    assert other.up is not None
     assert other.up.x == 1.0
     for wrong in ([0, 0, 2], [0, 1], []):
         with pytest.raises(errors.InvalidRequest, match="The up vector"):
             sendable(data, bare, with_pose=False, up=wrong)
 
 
-def test_a_query_needs_no_pose(
-    embedded: Client, references: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_a_query_needs_no_pose(embedded, references, tmp_path):
     folder = tmp_path / "seq-01"
     shutil.copytree(references[0].path.parent, folder)
     (folder / "frame-000000.pose.txt").write_text("no pose")
@@ -97,9 +85,7 @@ def test_a_query_needs_no_pose(
         embedded.upload("m", path)
 
 
-def test_a_stopped_job_waits_for_the_next_worker(
-    embedded: Client, references: tuple[FrameReference, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stopped_job_waits_for_the_next_worker(embedded, references, monkeypatch):
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -115,7 +101,7 @@ def test_a_stopped_job_waits_for_the_next_worker(
     assert (job.state, job.attempts) == (JobState.SUCCEEDED, 1)
 
 
-def test_a_folder_is_all_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_is_all_there_is(tmp_path, monkeypatch):
     monkeypatch.setenv("SCENEPRINT_DATABASE_URL", f"sqlite:///{tmp_path}/elsewhere.db")
     monkeypatch.setenv("SCENEPRINT_INDEX_DIR", str(tmp_path / "elsewhere"))
     with sceneprint.Client.embedded(tmp_path / "here") as client:

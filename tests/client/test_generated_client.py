@@ -7,20 +7,18 @@ import io
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
 
 
+@pytest.mark.thorough
 def test_a_generated_client_maps_and_localizes(
-    service_url: str, map_name: str, tmp_path: Path, references: tuple[FrameReference, ...],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    service_url, map_name, tmp_path, references, monkeypatch
+):
     pytest.importorskip("openapi_python_client")
     document, options = tmp_path / "openapi.json", tmp_path / "options.yaml"
     found = httpx.get(f"{service_url}/openapi.json", timeout=PATIENCE_S)

@@ -31,7 +31,7 @@ def along_x(metres_per_second: float, *, yaw: float = 0.0) -> Joiner:
     return Joiner(odometry, 2.0)
 
 
-def test_points_of_a_moving_scan_by_hand() -> None:
+def test_points_of_a_moving_scan_by_hand():
     """At 10 m/s, a wall seen at x = 5 after 0.1 s is 6 m ahead of the sensor at the stamp."""
     joiner = along_x(10.0)
     points = np.array([[6.0, 0, 0], [5.5, 1, 0], [5.0, 2, 0]])
@@ -43,7 +43,7 @@ def test_points_of_a_moving_scan_by_hand() -> None:
     np.testing.assert_allclose(joiner.cloud(), [[5, 10, 0], [5, 11, 0], [5, 12, 0]], atol=1e-6)
 
 
-def test_a_quarter_turn_by_hand() -> None:
+def test_a_quarter_turn_by_hand():
     """At a quarter turn a second, a point ahead after a tenth is 9 degrees to the left."""
     joiner = along_x(0.0, yaw=np.pi / 2)
     assert joiner.add(0, np.array([[10.0, 0, 0]]), np.array([0.1]))
@@ -52,7 +52,7 @@ def test_a_quarter_turn_by_hand() -> None:
     np.testing.assert_allclose(joiner.cloud(), expected, atol=1e-5)
 
 
-def test_every_point_is_where_its_own_pose_puts_it() -> None:
+def test_every_point_is_where_its_own_pose_puts_it():
     """Odometry of 20 Hz along a bend, and an oracle that interpolates the pose of each point."""
     rng = np.random.default_rng(3)
     tree, rows, stamps = TransformTree(), [], np.arange(0, 1.0, 0.05)
@@ -82,7 +82,7 @@ def test_every_point_is_where_its_own_pose_puts_it() -> None:
     np.testing.assert_allclose(found, np.vstack([moved[500:], moved[:500]]), atol=2e-3)
 
 
-def test_scans_of_the_last_metres_are_joined_and_thinned() -> None:
+def test_scans_of_the_last_metres_are_joined_and_thinned():
     joiner = along_x(1.0)
     for i in range(5):  # one wall, seen from every metre
         assert joiner.add(i * SECOND, np.array([[10.0 - i, 0.05, 0.05], [10.0 - i, i + 0.5, 0.05]]))
@@ -95,13 +95,13 @@ def test_scans_of_the_last_metres_are_joined_and_thinned() -> None:
     assert found.dtype == np.float32
 
 
-def test_windows_end_at_a_length_or_a_number() -> None:
+def test_windows_end_at_a_length_or_a_number():
     line = np.array([[x, 0.0, 0.0] for x in (0, 1, 2, 2.5, 4)])
     assert [window_start(line, metres) for metres in (0.5, 1.5, 2.0, 9.0)] == [4, 3, 2, 0]
     assert window_start(np.zeros((MOST_SCANS + 7, 3)), 1.0) == 7
 
 
-def test_scans_that_the_odometry_does_not_cover_are_left_out() -> None:
+def test_scans_that_the_odometry_does_not_cover_are_left_out():
     tree = TransformTree()
     for t, x in ((0.0, 0.0), (0.2, 0.2), (0.4, 30.0), (0.6, 30.2), (0.8, 30.4), (2.8, 30.5)):
         tree.add("odom", "lidar", round(t * SECOND), [x, 0, 0, 0, 0, 0, 1], fixed=False)
@@ -124,7 +124,7 @@ def test_scans_that_the_odometry_does_not_cover_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("last", [1.5, -1.5, 1e9, np.nan, np.inf])
-def test_times_that_are_not_seconds_of_one_scan_are_refused(last: float) -> None:
+def test_times_that_are_not_seconds_of_one_scan_are_refused(last):
     joiner = along_x(1.0)
     with pytest.raises(ValueError, match="from the stamp of its scan"):
         joiner.add(0, np.ones((2, 3)), np.array([0.0, last]))
@@ -132,7 +132,7 @@ def test_times_that_are_not_seconds_of_one_scan_are_refused(last: float) -> None
     assert len(joiner) == 1
 
 
-def test_a_jump_within_a_scan_of_other_odometry_is_found() -> None:
+def test_a_jump_within_a_scan_of_other_odometry_is_found():
     def odometry(stamps_ns: Sequence[int]) -> list[Floats | None]:
         return [pose(0.0 if ns < SECOND // 20 else 1.0) for ns in stamps_ns]
 
@@ -142,7 +142,7 @@ def test_a_jump_within_a_scan_of_other_odometry_is_found() -> None:
     assert joiner.counts["without_odometry"] == 1
 
 
-def test_a_clock_that_is_set_back_starts_again() -> None:
+def test_a_clock_that_is_set_back_starts_again():
     joiner = along_x(0.1)
     for stamp in (5, 6, 1):
         assert joiner.add(stamp * SECOND, np.full((1, 3), float(stamp)))
@@ -151,7 +151,7 @@ def test_a_clock_that_is_set_back_starts_again() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_small_scans(count: int) -> None:
+def test_small_scans(count):
     joiner = along_x(1.0)
     assert joiner.cloud().shape == (0, 3)
     assert joiner.add(0, np.ones((count, 3)), np.zeros(count))

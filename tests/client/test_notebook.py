@@ -39,7 +39,7 @@ def cells(table: ElementTree.Element) -> list[list[str | None]]:
     return [[cell.text for cell in row] for row in table]
 
 
-def test_an_answer_has_a_plan_and_its_matches() -> None:
+def test_an_answer_has_a_plan_and_its_matches():
     answer = Answer.model_construct(
         query_id="q1", status="ambiguous", reason=EVIL, location=None, maps=["hall"], seed=7,
         alternatives=[Alternative(pose=pose(0, 0), confidence=0.6, support=2),
@@ -48,7 +48,7 @@ def test_an_answer_has_a_plan_and_its_matches() -> None:
     )  # fmt: skip
     html = elements(answer)
     fields, plan, matches = html[1], html[2], html[3]
-    assert dict(cells(fields)) == {  # type: ignore[arg-type]
+    assert dict(cells(fields)) == {
         "query_id": "q1", "status": "ambiguous", "reason": EVIL, "maps": "hall", "frames": "1",
         "alternatives": "0.00, 0.00, 1.50 m in hall, confidence 0.60; 4.00, 2.00, 1.50 m in hall",
         "kind": "depth",
@@ -62,7 +62,7 @@ def test_an_answer_has_a_plan_and_its_matches() -> None:
     assert len(answer._repr_html_()) < 2_500
 
 
-def test_a_found_pose_is_filled() -> None:
+def test_a_found_pose_is_filled():
     located = Location(pose=pose(1, 1), confidence=0.995, support=3, votes=3, spread_m=0.1,
                        spread_deg=1.0)  # fmt: skip
     answer = Answer.model_construct(query_id="q", status="found", location=located, matches=[])
@@ -72,7 +72,7 @@ def test_a_found_pose_is_filled() -> None:
     assert len(html.findall("table")) == 1
 
 
-def test_maps_and_frames_are_tables() -> None:
+def test_maps_and_frames_are_tables():
     at = datetime(2026, 11, 30, 12, tzinfo=UTC)
     shown = Map(
         name="hall", title=EVIL, model="depth-1", model_id="1" * 64, created_at=at, revision=3,
@@ -88,7 +88,7 @@ def test_maps_and_frames_are_tables() -> None:
     frame = Frame.model_construct(
         frame_id="f", intrinsics=camera, pose=pose(1, 2), tags=["a", EVIL], name="x" * 300
     )
-    rows = dict(cells(elements(frame)[1]))  # type: ignore[arg-type]
+    rows = dict(cells(elements(frame)[1]))
     assert rows["intrinsics"] == "640 x 480 pixels"
     assert rows["pose"] == "1.00, 2.00, 1.50 m in hall"
     assert rows["tags"] == f"a; {EVIL}"

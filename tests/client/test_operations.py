@@ -11,16 +11,13 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, Unreachable
-from sceneprint.formats.dataset import FrameReference
 from sceneprint.models import PRESETS, read_model
 from sceneprint_client import Client
 from sceneprint_client.api.admin import Event
 from sceneprint_client.http import ServiceConnection, StreamPosition
 
 
-def test_events_that_are_kept(
-    client: Client, map_name: str, references: tuple[FrameReference, ...]
-) -> None:
+def test_events_that_are_kept(client, map_name, references):
     client.create_map(map_name, model="depth")
     added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     client.delete_frame(map_name, added.frame_id)
@@ -40,21 +37,16 @@ def test_events_that_are_kept(
     assert client.event_page(map_name).newest == found[-1].id
     assert list(client.events(map_name, after="0", follow=False)) == found
     assert list(client.events(map_name, after=found[2].id, follow=False)) == found[3:]
-    for wrong in (["%"], ["x" * 40], ["a"] * 21):
-        with pytest.raises(InvalidRequest):
-            client.event_page(kinds=wrong)
-    for wrong in ("none", "12", "0" * 32):
-        with pytest.raises(InvalidRequest, match="is not valid"):
-            client.event_page(cursor=wrong)
-        for follow in (False, True):
-            with pytest.raises(InvalidRequest, match="Start again"):
-                next(client.events(after=wrong, follow=follow))
+    with pytest.raises(InvalidRequest, match="is not valid"):
+        client.event_page(cursor="none")
     for follow in (False, True):
+        with pytest.raises(InvalidRequest, match="Start again"):
+            next(client.events(after="none", follow=follow))
         with pytest.raises(UnknownMap):
             next(client.events("nowhere", follow=follow))
 
 
-def test_events_as_they_happen(client: Client, map_name: str) -> None:
+def test_events_as_they_happen(client, map_name):
     before = client.event_page().newest
     client.create_map(map_name, model="depth")
     (made,) = client.events(map_name, follow=False)
@@ -71,10 +63,10 @@ def test_events_as_they_happen(client: Client, map_name: str) -> None:
     found = list(itertools.islice((one for one in stream if one.map in names), 3))
     writer.join()
     assert [one.map for one in found] == names
-    stream.close()  # type: ignore[attr-defined]
+    stream.close()
 
 
-def test_figures(client: Client, map_name: str, references: tuple[FrameReference, ...]) -> None:
+def test_figures(client, map_name, references):
     client.create_map(map_name, model="depth")
     client.upload(map_name, references[0], wait_s=PATIENCE_S)
     own = client.stats(map_name, minutes=2)
@@ -87,43 +79,31 @@ def test_figures(client: Client, map_name: str, references: tuple[FrameReference
     every = client.stats(minutes=1)
     assert every.maps == len(client.maps())
     assert every.frames["indexed"] >= 1
-    assert every.bytes is not None
     assert every.bytes.blobs > 0
-    for minutes in (0, 61):
-        with pytest.raises(InvalidRequest):
-            client.stats(minutes=minutes)
     with pytest.raises(UnknownMap):
         client.stats("nowhere")
 
 
-def test_models_and_reencoding(client: Client, map_name: str) -> None:
-    client.create_map(map_name, model="depth")
+def test_models_and_reencoding(embedded, map_name):
+    """Nobody works here, so that it is surely under way."""
+    client = embedded
+    made = client.create_map(map_name, model="depth")
     listed = client.models()
     assert [one.name for one in listed][: len(PRESETS)] == list(PRESETS)
     depth = next(one for one in listed if one.name == "depth")
     assert depth.model_id == read_model("depth").id
     assert map_name in depth.maps
-    told = client.reencode(map_name, "paper")
-    if told.reencoding is not None:  # no frame waits: a worker may have switched it already
-        assert told.reencoding.model_id == read_model("paper").id
-        with pytest.raises(Conflict):
-            client.reencode(map_name, depth.model_id)
-    for wrong in ("small", "/etc/passwd"):
-        with pytest.raises(InvalidRequest):
-            client.reencode(map_name, wrong)
-    with pytest.raises(UnknownMap):
-        client.reencode("nowhere", "paper")
+    told = client.reencode(map_name, read_model("paper").label)
+    assert told.reencoding.model_id == read_model("paper").id
+    with pytest.raises(Conflict):
+        client.reencode(map_name, depth.model_id)
+    with pytest.raises(InvalidRequest):
+        client.reencode(map_name, "small")
+    assert client.cancel_reencoding(map_name) == made
+    with pytest.raises(Conflict):
+        client.cancel_reencoding(map_name)
     with pytest.raises(UnknownMap):
         client.cancel_reencoding("nowhere")
-
-
-def test_reencoding_is_given_up(embedded: Client, map_name: str) -> None:
-    """Where nobody works, so that it is surely under way."""
-    made = embedded.create_map(map_name, model="depth")
-    embedded.reencode(map_name, read_model("paper").label)
-    assert embedded.cancel_reencoding(map_name) == made
-    with pytest.raises(Conflict):
-        embedded.cancel_reencoding(map_name)
 
 
 EVENT = Event(
@@ -132,7 +112,7 @@ EVENT = Event(
 )  # fmt: skip
 
 
-def test_a_stream_is_read_as_the_standard_says() -> None:
+def test_a_stream_is_read_as_the_standard_says():
     data = EVENT.model_dump_json()
     half = data.index(",") + 1
     lines = [
@@ -169,7 +149,7 @@ class Stream:
         return httpx.Response(200, text=body)
 
 
-def test_a_broken_stream_continues_where_it_broke() -> None:
+def test_a_broken_stream_continues_where_it_broke():
     stream = Stream()
     client = Client.__new__(Client)
     ServiceConnection.__init__(client, "http://x", None, 5.0, httpx.MockTransport(stream))
@@ -178,6 +158,6 @@ def test_a_broken_stream_continues_where_it_broke() -> None:
     assert stream.after == [None, "5", "5", "8"]
 
 
-def test_where_no_service_is_that_is_said_at_once() -> None:
+def test_where_no_service_is_that_is_said_at_once():
     with Client("http://127.0.0.1:9") as client, pytest.raises(Unreachable):
         next(client.events())

@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any
-
 import httpx
 import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, UnknownJob, UnknownMap
-from sceneprint_client import Client
-from sceneprint_client.api import FrameMeta, JobState
-from sceneprint_client.api.admin import Product
+from sceneprint_client.api import JobState
 from sceneprint_client.api.coverage import MapCoverage
 from sceneprint_client.api.sessions import SAME, Association, Difference
 
 MAP = "produced"
 
 
-@pytest.fixture(scope="module")
-def client(
-    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
-) -> Iterator[Client]:
-    """A client of a map with sessions a and b, of two frames each in one parent frame."""
-    with Client(service_url) as client:
-        client.create_map(MAP, model="depth")
-        frames = walk(sessions="ab", parent="room")
-        jobs = [client.upload(MAP, *frame).job_id for frame in frames]
-        assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
-        yield client
+@pytest.fixture
+def client(produced):
+    return produced
 
 
 @pytest.mark.parametrize(
@@ -42,9 +29,8 @@ def client(
     ],
 )
 def test_a_product_from_request_to_deletion(
-    client: Client, service_url: str, kind: type[Product], job_kind: str,
-    request_: dict[str, Any], bad: dict[str, Any], steps: int,
-) -> None:  # fmt: skip
+    client, service_url, kind, job_kind, request_, bad, steps
+):
     root = f"/v1/maps/{MAP}/{kind.collection}"
     with httpx.Client(base_url=service_url, trust_env=False, timeout=PATIENCE_S) as http:
         first, second = (http.post(root, json=request_) for _ in range(2))
@@ -86,10 +72,9 @@ def test_a_product_from_request_to_deletion(
         next(client.products(kind, "nowhere"))
 
 
-def test_the_cells_of_a_difference_are_sent(client: Client, service_url: str) -> None:
+def test_the_cells_of_a_difference_are_sent(client, service_url):
     told = client.compute(Difference, MAP, before="a", after="b")
     result = told.result
-    assert result is not None
     assert result.same > 500
     assert (result.parent_frame, result.frames_before, result.frames_after) == ("room", 2, 2)
     of = MAP, told.job_id
@@ -104,8 +89,26 @@ def test_the_cells_of_a_difference_are_sent(client: Client, service_url: str) ->
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_what_cannot_be_compared_is_refused(client: Client) -> None:
+def test_what_cannot_be_compared_is_refused(client):
     with pytest.raises(InvalidRequest, match="Specify two sessions"):
         client.compute(Difference, MAP, before="a", after="a")
     with pytest.raises(InvalidRequest, match=r"'z' of map .* has no indexed frame with a pose"):
         client.compute(Difference, MAP, before="a", after="z")
+
+
+def test_frames_and_changes_of_coverage(client):
+    first, second = (
+        client.compute(MapCoverage, MAP, not_within_s=0.0, cell_m=0.5) for _ in range(2)
+    )
+    assert (first.result, first.plans) == (second.result, second.plans)
+    assert (first.result.frames, first.result.found) == (4, 4)
+    frames = list(client.coverage_frames(MAP, first.job_id))
+    assert {frame.frame_id for frame in frames} == {one.frame_id for one in client.frames(MAP)}
+    assert list(client.coverage_frames(MAP, first.job_id, "not_found")) == []
+    told = client.coverage_changes(MAP, second.job_id, first.job_id)
+    assert set(told.trends) - {"same"} == {"better", "worse", "new", "gone"}
+    assert told.trends["same"] == sum(len(plan.cells) for plan in told.plans) > 0
+    url = f"/v1/maps/{MAP}/coverage/{first.job_id}/frames"
+    page = client._http.get(url, params={"limit": 3}).json()
+    rest = client._http.get(url, params={"cursor": page["next_cursor"]}).json()
+    assert [frame["number"] for frame in page["items"] + rest["items"]] == [0, 1, 2, 3]

@@ -11,14 +11,13 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob, UnknownQuery
 from sceneprint.formats.dataset import (
     Camera,
-    FrameReference,
     find_sequences,
     write_depth_png,
     write_intrinsics,
     write_pose,
 )
 from sceneprint_client import Client
-from sceneprint_client.api import Answer, JobState
+from sceneprint_client.api import JobState
 from sceneprint_client.api.surface import Reconstruction
 from sceneprint_lab.synth import synthesise_room
 
@@ -26,7 +25,7 @@ NAME = "rebuilt"
 
 
 @pytest.fixture(scope="module")
-def views(tmp_path_factory: pytest.TempPathFactory) -> list[FrameReference]:
+def views(tmp_path_factory):
     """Eight neighbouring views of one room: most can be validated against each other."""
     folder = tmp_path_factory.mktemp("walk") / "room" / "seq-01"
     folder.mkdir(parents=True)
@@ -39,7 +38,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> list[FrameReference]:
 
 
 @pytest.fixture(scope="module")
-def answered(client: Client, views: list[FrameReference], with_open3d: None) -> Answer:
+def answered(client, views, with_open3d):
     """The answer to a query of a map with the other views."""
     client.create_map(NAME, model="depth")
     for view in views[1:]:
@@ -64,7 +63,7 @@ def ply(data: bytes) -> tuple[int, int, str]:
     return points, faces, next(line for line in lines if line.startswith("comment"))
 
 
-def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
+def test_a_surface_and_its_figures(client, answered):
     made = client.reconstruct(answered, voxel_m=0.04)
     assert made.state == JobState.QUEUED
     assert (made.query_id, made.maps, made.result) == (answered.query_id, [NAME], None)
@@ -72,7 +71,6 @@ def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
     assert (job.state, job.kind, job.map) == ("succeeded", "reconstruct", NAME), job.error
     done = client.product(Reconstruction, None, made.job_id)
     coverage = done.result
-    assert coverage is not None
     mesh = client.reconstruction_mesh(made.job_id)
     points, triangles, comment = ply(mesh)
     assert (points, triangles) == (coverage.points, coverage.triangles)
@@ -91,7 +89,7 @@ def test_a_surface_and_its_figures(client: Client, answered: Answer) -> None:
     assert coverage.left_out == []
 
 
-def test_what_is_wanted_is_what_is_fused(client: Client, answered: Answer) -> None:
+def test_what_is_wanted_is_what_is_fused(client, answered):
     answer = answered
     first = next(match for match in answer.matches if match.validation.status == "accepted")
     made = client.reconstruct(
@@ -106,13 +104,10 @@ def test_what_is_wanted_is_what_is_fused(client: Client, answered: Answer) -> No
     assert (points, triangles) == (made.result.points, 0)
 
 
-def test_the_surface_lies_where_the_query_saw_it(
-    client: Client, answered: Answer, views: list[FrameReference]
-) -> None:
+def test_the_surface_lies_where_the_query_saw_it(client, answered, views):
     """Matches alone, in the query's camera: their points project onto the query's depth."""
     made = client.reconstruct(answered, include_query=False, strength="strong", wait_s=PATIENCE_S)
     data = client.reconstruction_mesh(made.job_id).partition(b"end_header\n")[2]
-    assert made.result is not None
     rows = np.frombuffer(data[: 27 * made.result.points], np.uint8).reshape(-1, 27)
     points = rows[:, :12].copy().view("<f4").astype(float)
     query = views[0].read()
@@ -128,7 +123,7 @@ def test_the_surface_lies_where_the_query_saw_it(
     assert np.median(np.abs(behind[visible])) < 0.02
 
 
-def test_refusals(client: Client, answered: Answer) -> None:
+def test_refusals(client, answered):
     with pytest.raises(UnknownQuery, match="no answer"):
         client.reconstruct("0" * 32)
     with pytest.raises(InvalidRequest, match="'nobody' is not an accepted match"):
@@ -154,9 +149,7 @@ def test_refusals(client: Client, answered: Answer) -> None:
 
 
 @pytest.mark.usefixtures("with_open3d")
-def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
-    views: list[FrameReference], tmp_path: Path
-) -> None:
+def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(views, tmp_path):
     with Client.embedded(tmp_path) as client:
         client.create_map(NAME, model="depth")
         client.wait([client.upload(NAME, view).job_id for view in views[1:]])
@@ -174,7 +167,6 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
         assert job.state == "succeeded", job.error
         coverage = client.product(Reconstruction, None, made.job_id).result
-        assert coverage is not None
         sources = {one.frame_id: one.source for one in coverage.views}
         assert sources[lost] == "geometry"
         assert [one.frame_id for one in coverage.left_out] == [deleted]
@@ -185,7 +177,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(
         assert len(before - files(tmp_path)) == 1
 
 
-def test_files_are_sent_in_ranges(client: Client, answered: Answer) -> None:
+def test_files_are_sent_in_ranges(client, answered):
     made = client.reconstruct(answered, voxel_m=0.05, wait_s=PATIENCE_S)
     whole = client.reconstruction_mesh(made.job_id)
     url = f"/v1/reconstructions/{made.job_id}/mesh.ply"

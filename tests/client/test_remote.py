@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 
-from sceneprint import errors
-from sceneprint.formats.dataset import FrameReference
-from sceneprint_client import Client, http, meta_of
+from sceneprint import errors as our_errors
+from sceneprint_client import Client, errors, http, meta_of
+from sceneprint_client.api.base import is_loopback
 from sceneprint_client.api.frames import ImportOptions
 from sceneprint_client.http import retry_after_s
+from service.problems import type_of
 
 MAP = {
     "name": "m", "title": None, "model": "paper-0", "model_id": "0", "revision": 0,
@@ -33,7 +34,7 @@ def problem(kind: str, status: int, **more: object) -> tuple[int, dict[str, str]
     return status, {}, {**document, "detail": f"it is {kind}", **more}
 
 
-def test_a_busy_service_is_asked_again_when_it_said(scripted: Make) -> None:
+def test_a_busy_service_is_asked_again_when_it_said(scripted):
     busy = problem("busy", 503)
     server = scripted([(503, {"Retry-After": "1"}, busy[2]), (200, {}, MAP)])
     with Client(server.url) as client:
@@ -44,9 +45,7 @@ def test_a_busy_service_is_asked_again_when_it_said(scripted: Make) -> None:
 
 
 @pytest.mark.usefixtures("hasty")
-def test_an_upload_survives_a_broken_connection_whole(
-    scripted: Make, references: tuple[FrameReference, ...]
-) -> None:
+def test_an_upload_survives_a_broken_connection_whole(scripted, references):
     server = scripted([(0, {}, None), (429, {}, None), (202, {}, ADDED)])
     with Client(server.url, "secret") as client:
         added, new = client.add("m", references[0], wait_s=7.9)
@@ -62,7 +61,7 @@ def test_an_upload_survives_a_broken_connection_whole(
 
 
 @pytest.mark.usefixtures("hasty")
-def test_patience_ends(scripted: Make) -> None:
+def test_patience_ends(scripted):
     server = scripted([problem("busy", 503)])
     with Client(server.url) as client, pytest.raises(errors.Busy, match="it is busy"):
         client.maps()
@@ -79,7 +78,7 @@ def test_patience_ends(scripted: Make) -> None:
 
 @pytest.mark.usefixtures("hasty")
 @pytest.mark.parametrize("status", [502, 503, 504])
-def test_a_proxy_without_a_service_is_out_of_reach(scripted: Make, status: int) -> None:
+def test_a_proxy_without_a_service_is_out_of_reach(scripted, status):
     server = scripted([(status, {}, "<h1>Nobody is there</h1>")])
     with (
         Client(server.url) as client,
@@ -88,7 +87,7 @@ def test_a_proxy_without_a_service_is_out_of_reach(scripted: Make, status: int) 
         client.maps()
 
 
-def test_other_refusals_are_not_repeated(scripted: Make) -> None:
+def test_other_refusals_are_not_repeated(scripted):
     server = scripted([problem("internal-error", 500, instance="/requests/7")])
     with Client(server.url) as client, pytest.raises(errors.Refused, match="it is intern") as told:
         client.maps()
@@ -98,7 +97,7 @@ def test_other_refusals_are_not_repeated(scripted: Make) -> None:
 
 
 @pytest.mark.usefixtures("hasty")
-def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted: Make) -> None:
+def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted):
     server = scripted([(0, {}, None), problem("unknown-frame", 404)])
     with Client(server.url) as client:
         client.delete_frame("m", "f")
@@ -111,36 +110,19 @@ def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted: Make) -> 
 @pytest.mark.parametrize(
     ("kind", "status", "error"),
     [
-        ("unknown-map", 404, errors.UnknownMap),
-        ("unknown-job", 404, errors.UnknownJob),
-        ("not-found", 404, errors.NotFound),
-        ("map-exists", 409, errors.MapExists),
-        ("frame-conflict", 409, errors.FrameConflict),
-        ("unreadable-frame", 422, errors.UnreadableFrame),
-        ("useless-frame", 422, errors.UselessFrame),
-        ("invalid-pose", 422, errors.InvalidPose),
-        ("malformed-body", 400, errors.MalformedBody),
-        ("unsupported-type", 415, errors.UnsupportedType),
-        ("too-large", 413, errors.TooLarge),
-        ("key-required", 401, errors.KeyRequired),
-        ("misdirected", 421, errors.Misdirected),
-        ("foreign-origin", 403, errors.ForeignOrigin),
         ("damaged-blob", 500, errors.DamagedBlob),
-        ("refused", 418, errors.Refused),
         ("method-not-allowed", 405, errors.Refused),
         ("of-the-future", 400, errors.Refused),
     ],
 )
-def test_problems_become_errors(
-    scripted: Make, kind: str, status: int, error: type[Exception]
-) -> None:
+def test_problems_become_errors(scripted, kind, status, error):
     server = scripted([problem(kind, status)])
     with Client(server.url) as client, pytest.raises(error, match=f"it is {kind}") as told:
         client.map("m")
     assert type(told.value) is error
 
 
-def test_fields_at_fault_are_told(scripted: Make) -> None:
+def test_fields_at_fault_are_told(scripted):
     fields = [{"field": "k", "reason": "too large"}, "nonsense", {"field": "seed"}]
     server = scripted([problem("invalid-request", 422, errors=fields)])
     with Client(server.url) as client, pytest.raises(errors.InvalidRequest) as told:
@@ -148,7 +130,7 @@ def test_fields_at_fault_are_told(scripted: Make) -> None:
     assert told.value.fields == (("k", "too large"),)
 
 
-def test_another_kind_of_server(scripted: Make) -> None:
+def test_another_kind_of_server(scripted):
     for reply, message in (
         ((404, {}, {"message": "nothing here"}), "answered 404 Not Found without a reason"),
         ((301, {"Location": "https://x/"}, None), "answered 301 Moved Permanently without"),
@@ -161,7 +143,7 @@ def test_another_kind_of_server(scripted: Make) -> None:
             assert not client.healthy()
 
 
-def test_a_head_that_is_too_long(scripted: Make) -> None:
+def test_a_head_that_is_too_long(scripted):
     server = scripted([(400, {}, "Invalid HTTP request received.")])
     options = ImportOptions(tags=["地" * 121] * 16)
     with Client(server.url) as client, pytest.raises(errors.Refused, match="fewer or shorter tags"):
@@ -170,7 +152,7 @@ def test_a_head_that_is_too_long(scripted: Make) -> None:
         client.map("m")
 
 
-def test_pages_are_followed(scripted: Make) -> None:
+def test_pages_are_followed(scripted):
     frame = {
         "map": "m", "state": "received", "reason": None, "job_id": "j", "content_id": "c",
         "bytes": 1, "depth_scale": 1000, "depth_along_ray": False, "robot": None, "session": None,
@@ -193,13 +175,13 @@ def test_pages_are_followed(scripted: Make) -> None:
 
 
 @pytest.mark.parametrize("url", ["foo", "ftp://host", "http://", "http://[::1", "", "host:8008"])
-def test_addresses_that_are_none(url: str) -> None:
+def test_addresses_that_are_none(url):
     with pytest.raises(errors.Unreachable, match="not the address of a service"):
         Client(url)
 
 
 @pytest.mark.usefixtures("hasty")
-def test_nobody_there() -> None:
+def test_nobody_there():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{taken.getsockname()[1]}"
@@ -211,7 +193,7 @@ def test_nobody_there() -> None:
     assert str(told.value).startswith(url)
 
 
-def test_who_answered_before_is_waited_for(scripted: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_answered_before_is_waited_for(scripted, monkeypatch):
     def tries_on(client: Client) -> int:
         pauses: list[float] = []
         with monkeypatch.context() as patch:
@@ -230,7 +212,7 @@ def test_who_answered_before_is_waited_for(scripted: Make, monkeypatch: pytest.M
 
 
 @pytest.mark.usefixtures("hasty")
-def test_a_silent_service() -> None:
+def test_a_silent_service():
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         with (
@@ -241,13 +223,13 @@ def test_a_silent_service() -> None:
 
 
 @pytest.mark.parametrize("key", ["schlüssel☃", "top\nsecret", "top secret", "\n", ""])
-def test_a_key_that_cannot_be_sent_is_not_shown(key: str) -> None:
+def test_a_key_that_cannot_be_sent_is_not_shown(key):
     with pytest.raises(errors.KeyRequired, match="Copy it again") as told:
         Client("http://127.0.0.1:8008", key)
     assert not key.strip() or key not in str(told.value)
 
 
-def test_a_key_is_sent_without_the_newline_of_its_file(scripted: Make) -> None:
+def test_a_key_is_sent_without_the_newline_of_its_file(scripted):
     server = scripted([(200, {}, MAP)])
     with Client(server.url, " secret\r\n") as client:
         client.map("m")
@@ -255,24 +237,20 @@ def test_a_key_is_sent_without_the_newline_of_its_file(scripted: Make) -> None:
 
 
 @pytest.mark.skipif(find_spec("socksio") is not None, reason="SOCKS proxies work here")
-def test_a_socks_proxy_needs_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_socks_proxy_needs_its_package(monkeypatch):
     monkeypatch.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
     with pytest.raises(errors.MissingDependency, match=r"httpx\[socks\]"):
         Client("http://maps.example")
 
 
-def test_too_large_a_body_is_refused_by_the_service(
-    remote: Client, map_name: str, references: tuple[FrameReference, ...]
-) -> None:
+def test_too_large_a_body_is_refused_by_the_service(remote, map_name, references):
     remote.create_map(map_name)
     with pytest.raises(errors.TooLarge, match="the limit of 2097152 bytes"):
         remote.upload(map_name, bytes(3 << 20), meta_of(references[0]))
     remote.delete_map(map_name)
 
 
-def test_no_line_a_request_in_the_users_log(
-    remote: Client, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_line_a_request_in_the_users_log(remote, caplog):
     caplog.set_level(logging.INFO)
     remote.maps()
     assert [record for record in caplog.records if record.name.startswith("http")] == []
@@ -280,9 +258,48 @@ def test_no_line_a_request_in_the_users_log(
     assert len(caplog.records) == 1  # what is not ours is left alone
 
 
-def test_retry_after() -> None:
+def test_retry_after():
     assert retry_after_s("7") == 7.0
     assert retry_after_s("") == retry_after_s("soon") == retry_after_s("-1") == 0.0
     in_a_minute = datetime.now(UTC) + timedelta(seconds=60)
     assert 58.0 < retry_after_s(format_datetime(in_a_minute, usegmt=True)) <= 60.0
     assert retry_after_s("Wed, 21 Oct 2015 07:28:00 GMT") == 0.0
+
+
+KINDS = [
+    kind
+    for kind in vars(errors).values()
+    if isinstance(kind, type)
+    and issubclass(kind, errors.SceneprintError)
+    and not issubclass(kind, errors.ServiceError)
+]
+
+
+def test_every_error_keeps_its_name_over_http():
+    assert errors.kebab_case("UnknownMap") == "unknown-map"
+    assert errors.kebab_case("Busy") == "busy"
+    assert len(KINDS) > 25
+    told = {type_of(kind.__name__).removeprefix("/problems/"): kind for kind in KINDS}
+    assert http.problem_kinds() == told
+    assert our_errors.kebab_case is errors.kebab_case  # both ask the same place
+
+
+@pytest.mark.parametrize(
+    ("host", "proxied"),
+    [("127.0.0.1", False), ("127.9.9.9", False), ("[::1]", False), ("LOCALHOST", False),
+     ("192.0.2.1", True), ("localhost.example", True)],
+)  # fmt: skip
+def test_no_proxy_stands_before_this_machine(monkeypatch, host, proxied):
+    monkeypatch.delenv("NO_PROXY", raising=False)
+    monkeypatch.delenv("no_proxy", raising=False)
+    monkeypatch.setenv("http_proxy", "http://192.0.2.7:3128")
+    asked: list[str] = []
+
+    def noted(given: str) -> bool:
+        asked.append(given)
+        return is_loopback(given)
+
+    monkeypatch.setattr("sceneprint_client.http.is_loopback", noted)
+    with Client(f"http://{host}:8008") as client:
+        mounts = client._http._mounts
+    assert (len(mounts) > 0, asked) == (proxied, [host.strip("[]").lower()])

@@ -6,13 +6,9 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, UnknownDeletion, UnknownFrame, UnknownQuery
-from sceneprint.formats.dataset import FrameReference
-from sceneprint_client import Client
 
 
-def test_frames_are_deleted_edited_and_restored(
-    client: Client, map_name: str, references: tuple[FrameReference, ...]
-) -> None:
+def test_frames_are_deleted_edited_and_restored(client, map_name, references):
     client.create_map(map_name)
     ids = [client.upload(map_name, one).frame_id for one in references[:3]]
     client.edit_frames(map_name, ids, session="monday", add_tags=["door"])
@@ -48,9 +44,7 @@ def test_frames_are_deleted_edited_and_restored(
         client.delete_frames(map_name, filter={})
 
 
-def test_an_answer_is_kept_and_released(
-    client: Client, map_name: str, references: tuple[FrameReference, ...]
-) -> None:
+def test_an_answer_is_kept_and_released(client, map_name, references):
     client.create_map(map_name)
     added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     answer = client.query(map_name, frame_id=added.frame_id, robot="cart")

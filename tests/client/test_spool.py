@@ -24,7 +24,6 @@ import pytest
 from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, Spool, meta_of
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.api.base import GivenPose
@@ -99,7 +98,7 @@ def names(path: Path) -> list[str]:
         return [json.loads(text)["name"] for (text,) in rows]
 
 
-def test_what_its_robot_can_still_mend_is_not_kept(tmp_path: Path) -> None:
+def test_what_its_robot_can_still_mend_is_not_kept(tmp_path):
     png = png_of(depth(1))
     with Spool(tmp_path / "spool") as spool:
         with pytest.raises(UnreadableFrame, match="The frame is empty"):
@@ -113,7 +112,7 @@ def test_what_its_robot_can_still_mend_is_not_kept(tmp_path: Path) -> None:
 # What a full spool gives up.
 
 
-def test_a_metre_thirty_degrees_and_a_minute_weigh_the_same() -> None:
+def test_a_metre_thirty_degrees_and_a_minute_weigh_the_same():
     here, there = np.eye(4), np.eye(4)
     there[:3, :3] = [[np.sqrt(3) / 2, -0.5, 0], [0.5, np.sqrt(3) / 2, 0], [0, 0, 1]]  # 30 degrees
     there[:3, 3] = 0, 0.6, 0.8
@@ -124,7 +123,7 @@ def test_a_metre_thirty_degrees_and_a_minute_weigh_the_same() -> None:
     assert separation(SpoolPlace(0, here), SpoolPlace(0, back)) == pytest.approx(6.0)
 
 
-def test_a_pose_is_read_in_both_forms() -> None:
+def test_a_pose_is_read_in_both_forms():
     given = GivenPose.model_validate(
         {
             "translation": {"x": 1, "y": 2, "z": 3},
@@ -141,7 +140,7 @@ def test_a_pose_is_read_in_both_forms() -> None:
     assert pose_matrix(GivenPose.model_validate(nowhere)) is None
 
 
-def test_a_full_spool_gives_up_the_frame_nearest_to_its_neighbours(tmp_path: Path) -> None:
+def test_a_full_spool_gives_up_the_frame_nearest_to_its_neighbours(tmp_path):
     """Sums of the distances to the frames before and after, by hand."""
     path, kept = tmp_path / "spool", []
     with Spool(path, 5 * CHARGE) as spool:
@@ -158,7 +157,7 @@ def test_a_full_spool_gives_up_the_frame_nearest_to_its_neighbours(tmp_path: Pat
     assert (now.waiting, now.thinned, now.bytes) == (5, 3, 5 * CHARGE)
 
 
-def test_without_poses_time_alone_decides_and_the_oldest_of_equals_goes(tmp_path: Path) -> None:
+def test_without_poses_time_alone_decides_and_the_oldest_of_equals_goes(tmp_path):
     path, kept = tmp_path / "spool", []
     with Spool(path, 5 * CHARGE) as spool:
         for minute in range(7):
@@ -167,7 +166,7 @@ def test_without_poses_time_alone_decides_and_the_oldest_of_equals_goes(tmp_path
     assert kept[5:] == ["0 2 3 4 5", "0 2 4 5 6"]  # all 2; then 2: 2 + 1, 3 and 4: 1 + 1
 
 
-def test_runs_are_thinned_apart_and_their_ends_stay(tmp_path: Path) -> None:
+def test_runs_are_thinned_apart_and_their_ends_stay(tmp_path):
     """Where only ends are left, the oldest goes."""
     path, kept = tmp_path / "spool", []
     drives = (("a", 0), ("b", 0), ("a", 9), ("b", 0.1), ("a", 9.5), ("a", 20), ("b", 5), ("b", 6))
@@ -189,7 +188,7 @@ def test_runs_are_thinned_apart_and_their_ends_stay(tmp_path: Path) -> None:
 # What a spool takes.
 
 
-def test_a_frame_is_there_once_and_survives(tmp_path: Path) -> None:
+def test_a_frame_is_there_once_and_survives(tmp_path):
     path = tmp_path / "spool"
     with Spool(path, 100 * CHARGE) as spool:
         assert spool.add(depth(1), meta(0))
@@ -204,7 +203,7 @@ def test_a_frame_is_there_once_and_survives(tmp_path: Path) -> None:
     assert (now.uploaded, now.refused, now.thinned, now.oldest) == (0, 0, 0, START)
 
 
-def test_what_a_spool_cannot_take_is_refused(tmp_path: Path) -> None:
+def test_what_a_spool_cannot_take_is_refused(tmp_path):
     with Spool(tmp_path / "spool", CHARGE) as spool:
         with pytest.raises(InvalidRequest, match=r"takes 16384 bytes.*limit of 8192"):
             spool.add(np.full((64, 64), 2000, np.uint16), meta())
@@ -242,7 +241,7 @@ def fill(spool: Spool) -> None:
         spool.add(*large(number, meta(name=f"{number}")))
 
 
-def test_a_full_disk_leaves_the_spool_as_it_was(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_the_spool_as_it_was(tmp_path):
     path = tmp_path / "spool"
     with Spool(path) as spool:
         with longest_file(path.stat().st_size + 10 * CHARGE):
@@ -283,8 +282,8 @@ with Spool(path) as spool:
 @pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "most"), [("large", 600), ("wide", 160), ("broken", 160)])
 def test_a_full_file_system_is_told_and_emptied_by_sync(
-    remote: Client, service_url: str, map_name: str, tmp_path: Path, kind: str, most: int
-) -> None:
+    remote, service_url, map_name, tmp_path, kind, most
+):
     """A real file system of 5 MB or 20 MB, where this user may mount one."""
     mount = f"mount -t tmpfs -o size={'5m' if kind == 'large' else '20m'} t {tmp_path} && exec"
     may = (
@@ -322,7 +321,7 @@ def test_a_full_file_system_is_told_and_emptied_by_sync(
 
 
 @pytest.mark.parametrize("refused", [False, True])
-def test_a_frame_larger_than_the_journal_leaves_it_as_large(tmp_path: Path, refused: bool) -> None:
+def test_a_frame_larger_than_the_journal_leaves_it_as_large(tmp_path, refused):
     """A full disk has no room for more."""
     journal = tmp_path / "spool-journal"
     with Spool(tmp_path / "spool") as spool:
@@ -337,7 +336,7 @@ def test_a_frame_larger_than_the_journal_leaves_it_as_large(tmp_path: Path, refu
         assert journal.stat().st_size == before
 
 
-def test_a_reason_without_room_is_told_to_be_missing(tmp_path: Path) -> None:
+def test_a_reason_without_room_is_told_to_be_missing(tmp_path):
     with Spool(tmp_path / "spool") as spool:
         spool.add(depth(1), meta(name="a"))
         spool._database.execute(
@@ -353,9 +352,7 @@ def test_a_reason_without_room_is_told_to_be_missing(tmp_path: Path) -> None:
 # Uploads.
 
 
-def test_nothing_is_sent_from_a_spool_that_cannot_be_written(
-    remote: Client, map_name: str, tmp_path: Path
-) -> None:
+def test_nothing_is_sent_from_a_spool_that_cannot_be_written(remote, map_name, tmp_path):
     remote.create_map(map_name, model="depth")
     with Spool(tmp_path / "spool") as spool:
         spool.add(depth(1), meta())
@@ -368,9 +365,7 @@ def test_nothing_is_sent_from_a_spool_that_cannot_be_written(
     assert list(remote.frames(map_name)) == []
 
 
-def test_what_waits_is_uploaded_and_refusals_are_set_aside(
-    remote: Client, map_name: str, references: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, references, tmp_path):
     remote.create_map(map_name, model="depth")
     there = remote.upload(map_name, references[0], meta_of(references[0]))
     told: list[tuple[int, int]] = []
@@ -407,9 +402,7 @@ def test_what_waits_is_uploaded_and_refusals_are_set_aside(
     assert len(list(remote.frames(map_name))) == 4
 
 
-def test_refused_frames_go_before_any_that_waits(
-    remote: Client, map_name: str, tmp_path: Path
-) -> None:
+def test_refused_frames_go_before_any_that_waits(remote, map_name, tmp_path):
     remote.create_map(map_name, model="depth")
     path = tmp_path / "spool"
     with Spool(path, 2 * CHARGE) as spool:
@@ -422,9 +415,7 @@ def test_refused_frames_go_before_any_that_waits(
     assert (now.refused, now.discarded, now.thinned, names(path)) == (0, 1, 0, ["1", "2"])
 
 
-def test_a_request_that_is_too_large_is_halved(
-    remote: Client, map_name: str, tmp_path: Path
-) -> None:
+def test_a_request_that_is_too_large_is_halved(remote, map_name, tmp_path):
     """The service of these tests takes 2 MiB; the third frame alone is larger."""
     remote.create_map(map_name, model="depth")
     sizes = {"a": 600, "b": 600, "c": 1100, "d": 600}
@@ -442,9 +433,7 @@ def test_a_request_that_is_too_large_is_halved(
     assert "2097152" in refusal.reason
 
 
-def test_a_service_that_asks_to_come_back_is_waited_for(
-    scripted: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_service_that_asks_to_come_back_is_waited_for(scripted, monkeypatch, tmp_path):
     problem = {"type": "/problems/rate-limited", "title": "", "status": 429, "detail": "Later."}
     frame = {"frame_id": "f", "job_id": "j", "state": "received"}
     done = {"items": [{"status": 202, "frame": frame, "problem": None}]}
@@ -529,8 +518,8 @@ def add_until(path: Path, first: int, count: int, acknowledged: int, room: int =
 
 
 def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
-    remote: Client, service_url: str, map_name: str, tmp_path: Path
-) -> None:
+    remote, service_url, map_name, tmp_path
+):
     remote.create_map(map_name, model="depth")
     path = tmp_path / "spool"
     said = add_until(path, 0, 10_000, 70)
@@ -551,7 +540,7 @@ def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
     assert [one.name for one in remote.frames(map_name)] == waiting
 
 
-def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
+def test_a_spool_of_another_version_is_left_as_it_is(tmp_path):
     path = tmp_path / "spool"
     Spool(path).close()
     with closing(sqlite3.connect(path)) as database:
@@ -564,7 +553,7 @@ def test_a_spool_of_another_version_is_left_as_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
+def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path):
     """3,600 frames, a frame a second: the bound of an offline robot."""
     count, chance = 3600, random.Random(1)
     path, data = tmp_path / "spool", tmp_path / "data"
@@ -588,7 +577,6 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
             env=dict(os.environ), start_new_session=True,
         )  # fmt: skip
     try:
-        assert service.stdout is not None
         url = service.stdout.readline().decode().split()[-1]
         syncs = 0
         with Client(url) as client:
@@ -615,7 +603,7 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path: Path) -> None:
     assert syncs >= 10
 
 
-def test_a_full_spool_reports_what_it_gave_up_of_a_drive(tmp_path: Path) -> None:
+def test_a_full_spool_reports_what_it_gave_up_of_a_drive(tmp_path):
     """Every frame added is either waiting or counted, and the file keeps its bound."""
     path, most = tmp_path / "spool", 50 * CHARGE
     with Spool(path, most) as spool:

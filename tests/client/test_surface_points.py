@@ -9,16 +9,14 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, NotIndexed, Refused
-from sceneprint.formats.dataset import FrameReference
 from sceneprint.formats.export import encode_points
-from sceneprint_client import Client
 from sceneprint_client.surface_encoding import decode_points
 
 #: All of these are numbers of 32 bits, so corners of a box of them are told exactly.
 CORNERS = np.array([[x, y, z] for x in (-1.5, 2.25) for y in (0.0, 8.0) for z in (0.125, 0.5)])
 
 
-def test_corners_are_exact_and_all_others_within_half_a_step() -> None:
+def test_corners_are_exact_and_all_others_within_half_a_step():
     rng = np.random.default_rng(1)
     points = np.concatenate([CORNERS, rng.uniform(CORNERS.min(0), CORNERS.max(0), (200, 3))])
     told = decode_points(encode_points(points, total=900))
@@ -29,23 +27,20 @@ def test_corners_are_exact_and_all_others_within_half_a_step() -> None:
     assert told.normals is told.patches is told.residuals is None
 
 
-def test_what_is_told_of_points() -> None:
+def test_what_is_told_of_points():
     normals = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0.6, 0.8]])
     patches = np.array([4, -1, 0], np.int32)
     residuals = np.array([1, 250, 254], np.uint8)
     told = decode_points(encode_points(np.eye(3), normals, patches, residuals, scale=0.25))
-    assert told.normals is not None
     np.testing.assert_array_equal(told.normals[:2], normals[:2])
     np.testing.assert_allclose(told.normals[2], normals[2], atol=0.5 / 127)
-    assert told.patches is not None
     assert told.patches.tolist() == [4, -1, 0]
-    assert told.residuals is not None
     assert told.residuals.tolist() == [1, 250, 254]
     assert told.tolerance_m == 0.25
     assert len(decode_points(encode_points(np.zeros((0, 3)))).points) == 0
 
 
-def test_bytes_that_are_no_points_are_refused() -> None:
+def test_bytes_that_are_no_points_are_refused():
     data = encode_points(CORNERS)
     for bad, why in (
         (b"", "header is wrong"),
@@ -61,9 +56,7 @@ def test_bytes_that_are_no_points_are_refused() -> None:
             decode_points(bad)
 
 
-def test_points_of_frames_and_queries(
-    client: Client, map_name: str, references: tuple[FrameReference, ...]
-) -> None:
+def test_points_of_frames_and_queries(client, map_name, references):
     client.create_map(map_name)
     frame_id = client.upload(map_name, references[0], wait_s=PATIENCE_S).frame_id
     cloud = client.cloud(map_name, frame_id).partition(b"end_header\n")[2]
@@ -72,13 +65,12 @@ def test_points_of_frames_and_queries(
     assert told.total == len(told.points) == len(exact)
     np.testing.assert_allclose(told.points, exact, atol=1e-4)
     T = references[0].pose
-    assert T is not None
     some = client.frame_points(map_name, frame_id, "parent", limit=50)
     assert (some.points.shape, some.total) == ((50, 3), told.total)
     back = (some.points - T[:3, 3]) @ T[:3, :3]
     assert all(np.linalg.norm(told.points - one, axis=1).min() < 2e-4 for one in back)
     with pytest.raises(InvalidRequest, match="frame"):
-        client.frame_points(map_name, frame_id, "world")  # type: ignore[arg-type]
+        client.frame_points(map_name, frame_id, "world")
     answer = client.query(map_name, references[0])
     np.testing.assert_array_equal(client.query_points(answer.query_id).points, told.points)
     unseen = client.query(map_name, references[0], stages=("retrieve",))

@@ -5,10 +5,9 @@ buildings with kidnapped robots and ambiguous places.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -29,7 +28,7 @@ from sceneprint_client.tracker_core import (
     observation_of,
     rotation_matrix,
 )
-from sceneprint_lab.synth import KINECT, SynthRoom, corridor, render, synthesise_lookalike
+from sceneprint_lab.synth import KINECT, corridor, render, synthesise_lookalike
 from sceneprint_lab.synth.trajectories import pose as camera_pose
 
 DEPTH = np.ones((3, 4), np.float32)
@@ -117,7 +116,7 @@ def equal(a: State, b: State) -> bool:
     return same and plain[0] == plain[1]
 
 
-def test_its_state_is_the_prior_of_the_next_question() -> None:
+def test_its_state_is_the_prior_of_the_next_question():
     client = fake(answer("found", 5.0), answer("found", 6.0), answer("not_found"))
     tracker = Tracker(client, "m", camera=K)
     state = tracker.update(DEPTH, ahead(0), stamp=0.0, up=(0, -1, 0))
@@ -136,7 +135,7 @@ def test_its_state_is_the_prior_of_the_next_question() -> None:
     assert tracker.update(DEPTH, ahead(2), stamp=2.0).age == 1.0
 
 
-def test_weak_answers_are_no_fix_alone() -> None:
+def test_weak_answers_are_no_fix_alone():
     for fields in ({"support": 1}, {"strength": "weak"}):
         tracker = Tracker(fake(answer("found", 5.0, **fields)), "m", camera=K)
         assert tracker.update(DEPTH, ahead(0), stamp=0.0).status == "lost"
@@ -146,7 +145,7 @@ def test_weak_answers_are_no_fix_alone() -> None:
     assert "no matching frame" in no_poses.update(DEPTH, ahead(0)).reason.lower()
 
 
-def test_a_service_that_is_away_leaves_it_to_odometry() -> None:
+def test_a_service_that_is_away_leaves_it_to_odometry():
     away = (errors.Unreachable("away"), errors.Busy("busy"), errors.Refused("bad", 502, {}))
     client = fake(answer("found", 5.0), *away, errors.UselessFrame("blank"))
     tracker = Tracker(client, "m", camera=K)
@@ -159,7 +158,7 @@ def test_a_service_that_is_away_leaves_it_to_odometry() -> None:
             Tracker(fake(wrong), "m", camera=K).update(DEPTH, ahead(0))
 
 
-def test_its_log_replays_to_the_same_states() -> None:
+def test_its_log_replays_to_the_same_states():
     told = [answer("found", 5.0), answer("ambiguous", 6.0), answer("found", 40.0),
             answer("found", 41.0), answer("not_found"), answer("found", 43.0)]  # fmt: skip
     log = io.StringIO()
@@ -177,7 +176,7 @@ def test_its_log_replays_to_the_same_states() -> None:
     assert {one.status for one in other} == {"lost", "ambiguous"}
 
 
-def test_a_thread_asks_for_the_latest_frame_alone() -> None:
+def test_a_thread_asks_for_the_latest_frame_alone():
     client = fake(answer("found", 5.0), answer("found", 8.0))
     client.may_answer.clear()
     log = io.StringIO()
@@ -198,7 +197,7 @@ def test_a_thread_asks_for_the_latest_frame_alone() -> None:
     assert equal(list(replay(log.getvalue().splitlines()))[-2], state)
 
 
-def test_an_answer_to_a_frame_from_before_a_reset_is_not_used() -> None:
+def test_an_answer_to_a_frame_from_before_a_reset_is_not_used():
     client = fake(answer("found", 5.0))
     client.may_answer.clear()
     inner = Tracker(client, "m", camera=K)
@@ -214,7 +213,7 @@ def test_an_answer_to_a_frame_from_before_a_reset_is_not_used() -> None:
         assert tracker.submit(DEPTH, ahead(0), stamp=0.6).status == "tracking"
 
 
-def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
+def test_what_the_thread_meets_is_raised_by_the_next_submit():
     with AsyncTracker(Tracker(fake(errors.UnknownMap("no map")), "m", camera=K)) as tracker:
         tracker.submit(DEPTH, ahead(0), stamp=0.0)
         assert tracker.wait(PATIENCE_S)
@@ -222,7 +221,7 @@ def test_what_the_thread_meets_is_raised_by_the_next_submit() -> None:
             tracker.submit(DEPTH, ahead(1), stamp=1.0)
 
 
-def test_alternatives_weigh_by_their_confidence() -> None:
+def test_alternatives_weigh_by_their_confidence():
     pose = answer("found", 5.0).pose
     alternatives = [
         Alternative(pose=pose, confidence=p, weight=2, support=1, score=0.9)
@@ -243,7 +242,7 @@ def asked_with(tracker: Tracker, xs: Sequence[float], client: FakeClient) -> lis
     return [one["frames"] for one in client.asked]
 
 
-def test_while_it_is_lost_it_asks_with_the_latest_frames_that_differ() -> None:
+def test_while_it_is_lost_it_asks_with_the_latest_frames_that_differ():
     client = fake(answer("not_found"), answer("ambiguous"))
     tracker = Tracker(client, "m", camera=K)
     told = asked_with(tracker, [5, 5.05, 5.2, 5.4, 5.41, 5.8, 8.75], client)
@@ -261,7 +260,7 @@ def test_while_it_is_lost_it_asks_with_the_latest_frames_that_differ() -> None:
     assert third["keep"] is False
 
 
-def test_it_asks_with_one_frame_while_it_tracks_or_where_only_one_is_wanted() -> None:
+def test_it_asks_with_one_frame_while_it_tracks_or_where_only_one_is_wanted():
     client = fake(answer("not_found"), answer("found", 6.0), answer("not_found"))
     assert asked_with(Tracker(client, "m", camera=K), [5, 6, 7, 8], client) == [
         [5.0], [5.0, 6.0], [7.0], [8.0]
@@ -274,7 +273,7 @@ def test_it_asks_with_one_frame_while_it_tracks_or_where_only_one_is_wanted() ->
             TrackerParameters(frames=wrong)
 
 
-def test_after_a_kidnapping_no_frame_from_before_is_sent() -> None:
+def test_after_a_kidnapping_no_frame_from_before_is_sent():
     # at 2 it is carried away: both answers there contradict the tracked place
     told = [answer("found", 0.0), answer("found", 1.0), answer("found", 40.0)]
     client = fake(*told, answer("found", 41.0), answer("not_found"))
@@ -286,7 +285,7 @@ def test_after_a_kidnapping_no_frame_from_before_is_sent() -> None:
     assert client.asked[-1]["frames"] == [5.0]
 
 
-def test_frames_that_were_not_answered_or_are_old_are_not_sent_again() -> None:
+def test_frames_that_were_not_answered_or_are_old_are_not_sent_again():
     not_found = answer("not_found")
     client = fake(not_found, errors.Busy("busy"), errors.UselessFrame("blank"), not_found)
     tracker = Tracker(client, "m", camera=K)
@@ -301,14 +300,14 @@ def test_frames_that_were_not_answered_or_are_old_are_not_sent_again() -> None:
 
 
 @pytest.mark.parametrize("error", [errors.UselessFrame("blank"), errors.TooLarge("3 MB")])
-def test_where_earlier_frames_are_refused_it_asks_with_the_last_alone(error: Exception) -> None:
+def test_where_earlier_frames_are_refused_it_asks_with_the_last_alone(error):
     client = fake(answer("not_found"), error, answer("not_found"))
     tracker = Tracker(client, "m", camera=K)
     told = asked_with(tracker, [1, 2, 3], client)
     assert told == [[1.0], [1.0, 2.0], [2.0], [2.0, 3.0]]
 
 
-def test_answers_that_share_frames_or_nearly_are_one_view() -> None:
+def test_answers_that_share_frames_or_nearly_are_one_view():
     # weak answers are a fix where their frames lie more than 0.3 m apart, each from each
     way = (1.0, 1.2, 1.4, 1.6, 1.8)
     for frames, tracks_from in ((1, 1.4), (2, 1.6), (3, 1.8)):
@@ -345,7 +344,6 @@ def drifted(poses: list[Floats], seed: int, share: float = 0.01) -> list[Floats]
 
 
 def shifted(frame: DepthFrame, x: float) -> Seen:
-    assert frame.pose is not None
     T = frame.pose.copy()
     T[0, 3] += x
     return Seen(frame.depth, T)
@@ -380,7 +378,7 @@ class Building:
 
 
 @pytest.fixture
-def building(client: Client, map_name: str) -> Callable[[Intrinsics], Building]:
+def building(client, map_name):
     def make(k: Intrinsics) -> Building:
         return Building(client, map_name, camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height)))
 
@@ -388,7 +386,7 @@ def building(client: Client, map_name: str) -> Callable[[Intrinsics], Building]:
 
 
 @pytest.fixture
-def walked(room_views: Callable[..., SynthRoom]) -> Callable[..., tuple[list[Seen], list[Seen]]]:
+def walked(room_views):
     """Of a walk in a room every third frame for the map, and the others."""
 
     def walk(seed: int, index: int, views: int) -> tuple[list[Seen], list[Seen]]:
@@ -423,22 +421,8 @@ def check_kidnapping(site: Building, runs: list[list[Seen]]) -> None:
 
 
 @pytest.mark.thorough
-def test_it_tracks_and_is_found_again_after_a_kidnapping(
-    building: Callable[[Intrinsics], Building], walked: Callable[..., tuple[list[Seen], list[Seen]]]
-) -> None:
-    rooms = [walked(5, index, 24) for index in (0, 1)]
-    site = building(KINECT)
-    site.fill([view for seen, _ in rooms for view in seen])
-    check_kidnapping(site, [rooms[0][1][::2], rooms[1][1][::2]])
-
-
-@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [5, 6])
-def test_it_tracks_through_a_building(
-    building: Callable[[Intrinsics], Building],
-    walked: Callable[..., tuple[list[Seen], list[Seen]]],
-    seed: int,
-) -> None:
+def test_it_tracks_through_a_building(building, walked, seed):
     rooms = [walked(seed, index, 60) for index in range(3)]
     site = building(KINECT)
     site.fill([view for seen, _ in rooms for view in seen])
@@ -446,9 +430,7 @@ def test_it_tracks_through_a_building(
 
 
 @pytest.mark.thorough
-def test_it_tracks_through_a_kitchen_that_was_recorded(
-    client: Client, map_name: str, data_root: Path
-) -> None:
+def test_it_tracks_through_a_kitchen_that_was_recorded(client, map_name, data_root):
     frames = find_sequences(data_root / "7scenes" / "redkitchen")[0].frames
     client.create_map(map_name, "a kitchen", model="depth")
     client.wait([client.upload(map_name, one).job_id for one in frames[0:600:4]])
@@ -469,9 +451,7 @@ def test_it_tracks_through_a_kitchen_that_was_recorded(
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["object", "offices"])
 @pytest.mark.parametrize("index", range(4))
-def test_beside_what_looks_alike_it_never_tracks_wrongly(
-    building: Callable[[Intrinsics], Building], kind: str, index: int
-) -> None:
+def test_beside_what_looks_alike_it_never_tracks_wrongly(building, kind, index):
     site = synthesise_lookalike(kind, 7000, index, queries=12)
     place = building(site.map[0].intrinsics)
     place.fill([shifted(one, 0.0) for one in site.map])
@@ -486,9 +466,7 @@ def test_beside_what_looks_alike_it_never_tracks_wrongly(
 
 
 @pytest.mark.thorough
-def test_in_a_corridor_of_equal_doors_it_never_tracks_wrongly(
-    building: Callable[[Intrinsics], Building],
-) -> None:
+def test_in_a_corridor_of_equal_doors_it_never_tracks_wrongly(building):
     hall = corridor(8)
 
     def looking(x: float, yaw: float) -> Seen:

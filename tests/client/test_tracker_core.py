@@ -66,7 +66,7 @@ def step(core: TrackerCore, stamp: float, x: float, observation: Observation) ->
     return core.update(stamp, at(x), observation)
 
 
-def test_views_of_a_question_differ_and_lie_close_behind_the_last() -> None:
+def test_views_of_a_question_differ_and_lie_close_behind_the_last():
     assert spaced_views([at(0)], 3) == [0]
     assert spaced_views([at(0), at(1), at(2), at(2.9)], 3) == [1, 2, 3]
     assert spaced_views([at(0), at(1), at(1.95), at(2)], 3) == [0, 1, 3]
@@ -80,7 +80,7 @@ def test_views_of_a_question_differ_and_lie_close_behind_the_last() -> None:
     assert spaced_views([at(0), at(50), at(50.5), at(51)], 4) == [1, 2, 3]
 
 
-def test_a_strong_answer_is_a_fix() -> None:
+def test_a_strong_answer_is_a_fix():
     core = TrackerCore()
     assert core.move(0.0, at(3)).status == "lost"
     state = core.update(1.0, at(3), found(at(10, 23, 0, 90)))
@@ -93,7 +93,7 @@ def test_a_strong_answer_is_a_fix() -> None:
     np.testing.assert_allclose(np.diag(state.covariance), [0.0025] * 3 + [turned] * 3)
 
 
-def test_a_weak_answer_needs_another_from_another_place() -> None:
+def test_a_weak_answer_needs_another_from_another_place():
     core = TrackerCore()
     assert step(core, 0, 0, found(T_MAP_ODOM, strong=False)).status == "lost"
     assert step(core, 1, 0.1, found(at(10, 20.1, 0, 90), strong=False)).status == "lost"
@@ -102,14 +102,14 @@ def test_a_weak_answer_needs_another_from_another_place() -> None:
     np.testing.assert_allclose(state.T_map_sensor, at(10.05, 20.5, 0, 90), atol=1e-12)
 
 
-def test_answers_by_the_prior_are_no_fix_and_neither_are_alternatives() -> None:
+def test_answers_by_the_prior_are_no_fix_and_neither_are_alternatives():
     core = TrackerCore()
     for i in range(9):
         assert step(core, i, i, found(at(10, 20 + i, 0, 90), by_prior=True)).status == "lost"
         assert step(core, i + 0.5, i, several(at(10, 20 + i, 0, 90))).status == "ambiguous"
 
 
-def test_views_of_two_places_alike_are_ambiguous_until_one_is_found() -> None:
+def test_views_of_two_places_alike_are_ambiguous_until_one_is_found():
     core = TrackerCore()
     for i in range(5):
         here, there = at(10, 20 + i, 0, 90), at(50, 20 + i, 0, 90)
@@ -119,7 +119,7 @@ def test_views_of_two_places_alike_are_ambiguous_until_one_is_found() -> None:
     assert step(core, 5, 5, found(at(50, 25, 0, 90))).status == "tracking"
 
 
-def test_two_answers_that_contradict_each_other_are_ambiguous() -> None:
+def test_two_answers_that_contradict_each_other_are_ambiguous():
     core = TrackerCore()
     assert step(core, 0, 0, found(T_MAP_ODOM, strong=False)).status == "lost"
     assert step(core, 1, 1, found(at(50, 21, 0, 90), strong=False)).status == "ambiguous"
@@ -128,14 +128,14 @@ def test_two_answers_that_contradict_each_other_are_ambiguous() -> None:
     assert step(core, 4, 4, found(at(10, 24, 0, 90), strong=False)).status == "tracking"
 
 
-def test_parent_frames_are_places_apart() -> None:
+def test_parent_frames_are_places_apart():
     core = TrackerCore()
     assert step(core, 0, 0, found(T_MAP_ODOM, strong=False)).status == "lost"
     other = found(at(10, 21, 0, 90), strong=False, parent="attic")
     assert step(core, 1, 1, other).status == "ambiguous"
 
 
-def test_one_answer_never_moves_it() -> None:
+def test_one_answer_never_moves_it():
     core = tracking()
     wrong = found(at(50, 21, 0, 90))
     state = step(core, 1, 1, wrong)
@@ -148,7 +148,7 @@ def test_one_answer_never_moves_it() -> None:
     assert step(core, 3, 3, found(at(50, 23, 0, 90))).status == "tracking"
 
 
-def test_kidnapped_it_is_lost_by_answers_from_places_apart_and_found_again() -> None:
+def test_kidnapped_it_is_lost_by_answers_from_places_apart_and_found_again():
     core = tracking()
     assert step(core, 1.0, 1.0, found(at(50, 21, 0, 90))).status == "tracking"
     state = step(core, 1.5, 1.5, found(at(50, 21.5, 0, 90)))
@@ -160,7 +160,7 @@ def test_kidnapped_it_is_lost_by_answers_from_places_apart_and_found_again() -> 
     np.testing.assert_allclose(state.T_map_sensor, at(50, 22, 0, 90), atol=1e-12)
 
 
-def test_contradicted_from_one_place_it_is_ambiguous_and_soon_lost() -> None:
+def test_contradicted_from_one_place_it_is_ambiguous_and_soon_lost():
     core = tracking()
     wrong = found(at(50, 20, 0, 90))
     assert step(core, 1.0, 0, wrong).status == "tracking"
@@ -173,14 +173,14 @@ def test_contradicted_from_one_place_it_is_ambiguous_and_soon_lost() -> None:
     assert step(core, 1.6, 0, found(T_MAP_ODOM)).status == "tracking"
 
 
-def test_ambiguous_answers_without_the_tracked_place_count_half() -> None:
+def test_ambiguous_answers_without_the_tracked_place_count_half():
     core = tracking()
     elsewhere = [at(50, 20, 0, 90), at(70, 20, 0, 90)]
     patient = [step(core, 0.1 * i, i, several(*elsewhere)).status for i in range(1, 5)]
     assert patient == ["tracking", "ambiguous", "ambiguous", "lost"]
 
 
-def test_the_deviation_grows_by_a_hundredth_of_the_way() -> None:
+def test_the_deviation_grows_by_a_hundredth_of_the_way():
     core = tracking(TrackerParameters(heading_drift_deg=0.0))
     state = core.move(10.0, at(6))
     assert state.covariance is not None
@@ -192,21 +192,18 @@ def test_the_deviation_grows_by_a_hundredth_of_the_way() -> None:
     assert core.move(20.0, at(16)).status == "lost"
 
 
-def test_an_answer_that_agrees_is_weighed_by_its_covariance() -> None:
+def test_an_answer_that_agrees_is_weighed_by_its_covariance():
     core = tracking(TrackerParameters(heading_drift_deg=0.0, drift=0.0))
     state = step(core, 1, 1, found(at(10, 21.1, 0, 90)))
-    assert state.T_map_sensor is not None
-    assert state.covariance is not None
     # both deviate by 5 cm along y: halfway
     np.testing.assert_allclose(state.T_map_sensor[:3, 3], [10, 21.05, 0], atol=1e-9)
     assert state.covariance[1, 1] == pytest.approx(0.00125)
     # from the same place it says nothing new
     again = step(core, 2, 1.1, found(at(10, 21.3, 0, 90)))
-    assert again.T_map_sensor is not None
     np.testing.assert_allclose(again.T_map_sensor[:3, 3], [10, 21.15, 0], atol=1e-9)
 
 
-def test_the_prior_is_left_out_every_fourth_time_and_after_a_contradiction() -> None:
+def test_the_prior_is_left_out_every_fourth_time_and_after_a_contradiction():
     core = TrackerCore()
     assert core.prior(at(0)) is None
     step(core, 0, 0, found(T_MAP_ODOM))
@@ -223,7 +220,7 @@ def test_the_prior_is_left_out_every_fourth_time_and_after_a_contradiction() -> 
     assert core.prior(at(10)) is None
 
 
-def test_the_prior_does_not_confirm_itself_for_ever() -> None:
+def test_the_prior_does_not_confirm_itself_for_ever():
     """A lift between equal floors: each is found by the prior, and neither without it."""
     core = tracking()
     statuses = []
@@ -239,7 +236,7 @@ def test_the_prior_does_not_confirm_itself_for_ever() -> None:
     assert (state.status, state.age) == ("tracking", 0)
 
 
-def test_after_a_lift_that_it_is_told_of_equal_floors_are_ambiguous() -> None:
+def test_after_a_lift_that_it_is_told_of_equal_floors_are_ambiguous():
     core = tracking()
     assert core.reset("in a lift").reason == "in a lift"
     for i in range(1, 6):
@@ -248,14 +245,14 @@ def test_after_a_lift_that_it_is_told_of_equal_floors_are_ambiguous() -> None:
     assert step(core, 6, 6, found(at(10, 26, 3, 90))).status == "tracking"
 
 
-def test_a_corridor_of_equal_doors_is_never_decided_by_alternatives() -> None:
+def test_a_corridor_of_equal_doors_is_never_decided_by_alternatives():
     core = TrackerCore()
     for i in range(30):
         doors = [at(10, 20 + i + 2 * n, 0, 90) for n in range(-2, 3)]
         assert step(core, i, i, several(*doors)).status == "ambiguous"
 
 
-def test_no_answer_is_neither_for_nor_against() -> None:
+def test_no_answer_is_neither_for_nor_against():
     core = tracking()
     state = step(core, 1, 1, Observation("unanswered", reason="no answer: away"))
     assert state.status == "tracking"
@@ -263,7 +260,7 @@ def test_no_answer_is_neither_for_nor_against() -> None:
     assert (lost.status, lost.reason) == ("lost", "no answer: away")
 
 
-def test_a_late_answer_counts_where_its_frame_was_taken() -> None:
+def test_a_late_answer_counts_where_its_frame_was_taken():
     core = TrackerCore()
     for i in range(5):
         core.move(i, at(i))
@@ -272,7 +269,7 @@ def test_a_late_answer_counts_where_its_frame_was_taken() -> None:
     np.testing.assert_allclose(state.T_map_sensor, at(10, 24, 0, 90), atol=1e-12)
 
 
-def test_stamps_that_do_not_rise_are_refused() -> None:
+def test_stamps_that_do_not_rise_are_refused():
     core = tracking()
     core.move(1.0, at(1))
     core.move(1.0, at(1))  # the same once more
@@ -300,7 +297,7 @@ def walk() -> list[tuple[float, np.ndarray, Observation]]:
     return calls
 
 
-def test_equal_calls_give_equal_states_and_the_order_of_alternatives_none() -> None:
+def test_equal_calls_give_equal_states_and_the_order_of_alternatives_none():
     one, other, turned = TrackerCore(), TrackerCore(), TrackerCore()
     statuses = set()
     for stamp, odometry, answer in walk():
@@ -322,7 +319,7 @@ def test_equal_calls_give_equal_states_and_the_order_of_alternatives_none() -> N
     assert "tracking" in statuses
 
 
-def test_a_long_run_forgets_votes() -> None:
+def test_a_long_run_forgets_votes():
     core = TrackerCore(TrackerParameters(most_votes=4))
     for i in range(20):
         step(core, i, i, several(at(10, 20 + i), at(40, 20 + i)))
@@ -331,7 +328,7 @@ def test_a_long_run_forgets_votes() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1.0, 3.0, math.pi - 1e-8, math.pi])
-def test_rotations_and_their_vectors(angle: float) -> None:
+def test_rotations_and_their_vectors(angle):
     axis = np.array([1.0, -2.0, 2.0]) / 3
     R = rotation_matrix(axis * angle)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
