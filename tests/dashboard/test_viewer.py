@@ -382,7 +382,7 @@ def test_hands_on_it(stage):
     assert now["azimuth"] == pytest.approx(before["azimuth"] + 0.1)
     assert now["elevation"] == pytest.approx(0.1)
     stage.keyboard.press("+")
-    assert stage.evaluate("view.camera.distance") == pytest.approx(2 * 0.87)
+    assert stage.evaluate("view.camera.distance") == pytest.approx(2 / 1.25)
     stage.keyboard.press("Shift+ArrowLeft")
     assert stage.evaluate("view.camera.target") != before["target"]
     stage.evaluate("view.look({ target: [0, 0, 0], distance: 2, azimuth: 0, elevation: 0 })")

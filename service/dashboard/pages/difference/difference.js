@@ -7,6 +7,7 @@ import { followJob, goesOn } from "../lib/products.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { empty } from "../lib/states.js";
+import { axesFor } from "../plan/axes.js";
 import { parsePoints } from "../viewer/points.js";
 import { createViewer } from "../viewer/viewer.js";
 
@@ -184,9 +185,7 @@ class Page {
 }
 
 /** What turns a direction up: 16 numbers, column-major. @param {number[]} up unit vector */
-function upright([x, y, z]) {
-  const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-  const along = Math.abs(x) > 0.9 ? [0, 1, 0] : [1, 0, 0], ahead = cross([x, y, z], along);
-  const long = Math.hypot(...ahead), second = ahead.map((v) => v / long), first = cross(second, [x, y, z]);
-  return [0, 1, 2].flatMap((k) => [first[k], second[k], [x, y, z][k], 0]).concat(0, 0, 0, 1);
+function upright(up) {
+  const { x, y } = axesFor(up);
+  return [0, 1, 2].flatMap((k) => [x[k], y[k], up[k], 0]).concat(0, 0, 0, 1);
 }

@@ -1,7 +1,7 @@
 // Edit who took a frame: sent with If-Match, so that nobody's edit is overwritten unseen.
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { coded } from "../lib/prose.js";
+import { reasonOf, saveFrom } from "../lib/form.js";
 import { sheet, toast } from "../lib/states.js";
 
 const NAMES = { robot: "Robot", session: "Session", name: "File name", tags: "Tags" };
@@ -27,26 +27,16 @@ export function editFrame(frame, edited) {
   });
   let base = frame;
 
-  dialog.querySelector("form").addEventListener("submit", async (event) => {
-    event.preventDefault();
+  saveFrom(dialog, async () => {
     const patch = changes();
-    if (!Object.keys(patch).length) { dialog.close(); return; }
-    save.disabled = true;
-    try {
-      const { data } = await send("PATCH", path, {
-        json: patch, type: "application/merge-patch+json", headers: { "If-Match": `"${base.etag}"` },
-      });
-      dialog.close();
-      toast("The frame was edited.");
-      edited(data);
-    } catch (error) {
-      if (error.status === 401 || !dialog.open) throw error; // told elsewhere
-      if (error.status === 412) await meet();
-      else put(said, h("p", { class: "field-error" }, coded(error.message)), (error.errors ?? []).map((one) => h("p", { class: "field-error" }, coded(one.field ? `${one.field}: ${one.reason}` : one.reason))));
-    } finally {
-      save.disabled = false;
-    }
-  });
+    if (!Object.keys(patch).length) return;
+    const { data } = await send("PATCH", path, {
+      json: patch, type: "application/merge-patch+json", headers: { "If-Match": `"${base.etag}"` },
+    });
+    dialog.close();
+    toast("The frame was edited.");
+    edited(data);
+  }, (error) => (error.status === 412 ? meet() : put(said, h("p", { class: "field-error" }, reasonOf(error)))));
 
   /** What was typed and is other than what the dialog began with. */
   function changes() {

@@ -5,6 +5,7 @@ import { h, put } from "../lib/dom.js";
 import { count, metres } from "../lib/format.js";
 import { failed, loading } from "../lib/states.js";
 import { manyColours } from "../viewer/colours.js";
+import { cross, scale } from "../viewer/matrix.js";
 import { parsePoints } from "../viewer/points.js";
 import { createViewer, frustum } from "../viewer/viewer.js";
 import { viewSwitch } from "./views.js";
@@ -118,7 +119,7 @@ function discs({ mean, normal, area_m2, colours }) {
     const n = normal[i];
     // any direction that is not the normal's spans the disc's plane with it
     const other = Math.abs(n[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0];
-    const u = unit(cross(n, other));
+    const side = cross(n, other), u = scale(side, 1 / Math.hypot(...side));
     const v = cross(n, u);
     const radius = Math.sqrt(area_m2[i] / Math.PI);
     const middle = centre.map((x, k) => x + LIFT * n[k]);
@@ -133,15 +134,6 @@ function discs({ mean, normal, area_m2, colours }) {
     }
   });
   return { positions, colours: painted };
-}
-
-function cross(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-}
-
-function unit(v) {
-  const length = Math.hypot(...v) || 1;
-  return v.map((x) => x / length);
 }
 
 function tableOf(level) {

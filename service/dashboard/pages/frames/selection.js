@@ -1,6 +1,7 @@
 // Frames of the gallery that are ticked, or all that pass its filters: deleted, tagged or moved.
 import { h, put } from "../lib/dom.js";
 import { count } from "../lib/format.js";
+import { saveFrom } from "../lib/form.js";
 import { confirm, sheet } from "../lib/states.js";
 import { deleteFrames, editFrames, framesText } from "./changes.js";
 
@@ -77,22 +78,11 @@ export function selectionBar(map, { filter, total, changed }) {
 
   /** A dialog that edits what is selected, and stays while that is refused. */
   function form(title, rows, edit) {
-    const why = h("p", { class: "field-error", role: "alert" });
-    const save = h("button", { class: "button primary" }, "Save");
-    const dialog = sheet({ title, buttons: save, children: [h("p", { class: "dialog-text muted" }, `Of ${shown()}.`), rows, why] });
-    dialog.querySelector("form").addEventListener("submit", async (event) => {
-      event.preventDefault();
+    const dialog = sheet({ title, buttons: h("button", { class: "button primary" }, "Save"),
+      children: [h("p", { class: "dialog-text muted" }, `Of ${shown()}.`), rows, h("p", { class: "field-error", role: "alert" })] });
+    saveFrom(dialog, async () => {
       const json = edit();
-      if (!json || save.disabled) return;
-      save.disabled = true;
-      put(why);
-      try {
-        await editFrames(map, { ...chosen(), ...json }, how);
-        dialog.close();
-      } catch (error) {
-        if (error.status === undefined || error.status === 401) { dialog.close(); throw error; }
-        put(why, error.errors?.length ? error.errors.map((part) => part.reason).join(". ") : error.message);
-      } finally { save.disabled = false; }
+      return json && editFrames(map, { ...chosen(), ...json }, how).then(() => true);
     });
   }
 

@@ -13,17 +13,26 @@ import { plain } from "./prose.js";
  */
 export function picture(path, params, { alt, width, height, signal }) {
   const canvas = h("canvas", { role: "img", "aria-label": alt, width, height, class: "picture" });
-  return Object.assign(canvas, { ready: draw(canvas, path, params, alt, signal) });
+  return Object.assign(canvas, { ready: drawPicture(canvas, bitmapOf(path, params, signal), alt) });
 }
 
-async function draw(canvas, path, params, alt, signal) {
+/** Fetch and decode a picture of the API. @param {string} path @param {Object<string, any>} params @param {AbortSignal} [signal] */
+export async function bitmapOf(path, params, signal) {
+  const data = await bytes(path, { params, signal, accept: "image/png" });
+  return createImageBitmap(new Blob([data], { type: "image/png" }));
+}
+
+/**
+ * Draw a picture when it has come, or why it has not.
+ * @param {HTMLCanvasElement} canvas @param {Promise<ImageBitmap>} coming @param {string} alt
+ * @returns {Promise<boolean>} whether it was drawn
+ */
+export async function drawPicture(canvas, coming, alt) {
   try {
-    const data = await bytes(path, { params, signal, accept: "image/png" });
-    const bitmap = await createImageBitmap(new Blob([data], { type: "image/png" }));
+    const bitmap = await coming;
     canvas.width = bitmap.width;
     canvas.height = bitmap.height;
-    canvas.getContext("2d").drawImage(bitmap, 0, 0);
-    bitmap.close();
+    canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
     return true;
   } catch (error) {
     if (error.name === "AbortError") return false;

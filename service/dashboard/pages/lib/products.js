@@ -1,7 +1,6 @@
 // Products of a map: each is computed by a long job, which a page follows until it is over.
 import { get, send } from "./api.js";
-import { put } from "./dom.js";
-import { coded } from "./prose.js";
+import { saveFrom } from "./form.js";
 
 const POLL_MS = 700;
 const OVER = new Set(["succeeded", "failed", "dead", "cancelled"]);
@@ -50,20 +49,9 @@ export async function repeat(request, signal) {
  * @param {(begun: Object<string, any>) => void} onbegun
  */
 export function beginFrom(dialog, path, request, onbegun) {
-  const wrong = /** @type {HTMLElement} */ (dialog.querySelector(".field-error")), button = /** @type {HTMLButtonElement} */ (dialog.querySelector(".primary"));
-  dialog.querySelector("form").addEventListener("submit", async (event) => {
-    event.preventDefault();
-    if (button.disabled) return;
-    button.disabled = true;
-    put(wrong);
-    try {
-      const { data } = await send("POST", path, { json: request() });
-      dialog.close();
-      onbegun(data);
-    } catch (error) {
-      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
-      put(wrong, coded(error.errors?.length ? error.errors.map((one) => `${one.field}: ${one.reason}`).join(". ") : error.detail));
-      button.disabled = false;
-    }
+  saveFrom(dialog, async () => {
+    const { data } = await send("POST", path, { json: request() });
+    dialog.close();
+    onbegun(data);
   });
 }

@@ -13,7 +13,6 @@ export const ROUTES = [
   { path: "maps/:map/queries", page: "history/queries.js", area: "maps", section: "queries", title: "Queries" },
   { path: "maps/:map/coverage", page: "coverage/coverage.js", area: "maps", section: "coverage", title: "Coverage" },
   { path: "maps/:map/place", page: "place/place.js", area: "maps", section: "place", title: "Place" },
-  { path: "maps/:map/paths", page: "place/place.js", area: "maps", section: "place", title: "Place" }, // as it was called
   { path: "queries/:query", page: "query/answer.js", area: "maps", title: "Answer" },
   { path: "queries/:query/matches/:frame", page: "overlay/overlay.js", area: "maps", title: "Overlay" },
   { path: "operations", page: "operations/operations.js", area: "operations", title: "Operations" },

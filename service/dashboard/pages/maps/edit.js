@@ -2,6 +2,7 @@
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { bytes, count } from "../lib/format.js";
+import { saveFrom } from "../lib/form.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { confirm, sheet, toast } from "../lib/states.js";
@@ -83,27 +84,13 @@ export async function deleteMap(map, changed) {
 /** A dialog that stays until what it asks for is saved; refusals are told at their fields. */
 async function form({ title, action, children, save, place }) {
   const rest = h("p", { class: "field-error", role: "alert" });
-  const button = h("button", { class: "button primary" }, action);
-  const dialog = sheet({ title, children: [children, rest], buttons: button });
-  dialog.querySelector("form").addEventListener("submit", async (event) => {
-    event.preventDefault();
-    if (button.disabled) return;
-    button.disabled = true;
-    for (const one of dialog.querySelectorAll(".field-error")) put(one);
-    for (const one of dialog.querySelectorAll("[aria-invalid]")) one.removeAttribute("aria-invalid");
-    try {
-      await save(dialog);
-      dialog.close();
-    } catch (error) {
-      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
-      const own = await place(error);
-      const told = own ? [{ field: own, reason: error.detail }] : error.errors;
-      const left = told.filter((one) => !tell(dialog, one));
-      if (left.length || !told.length) put(rest, coded(error.detail));
-      dialog.querySelector("[aria-invalid]")?.focus();
-    } finally {
-      button.disabled = false;
-    }
+  const dialog = sheet({ title, children: [children, rest], buttons: h("button", { class: "button primary" }, action) });
+  saveFrom(dialog, () => save(dialog), async (error) => {
+    const own = await place(error);
+    const told = own ? [{ field: own, reason: error.detail ?? "" }] : error.errors ?? [];
+    const left = told.filter((one) => !tell(dialog, one));
+    if (left.length || !told.length) put(rest, coded(error.detail ?? error.message));
+    /** @type {HTMLElement | null} */ (dialog.querySelector("[aria-invalid]"))?.focus();
   });
 }
 

@@ -4,7 +4,7 @@ import { h, put } from "../lib/dom.js";
 import { shortId, time } from "../lib/format.js";
 import { go, link } from "../lib/router.js";
 import { mapField } from "./mapfield.js";
-import { renewTimes, rows } from "./poll.js";
+import { rows } from "./poll.js";
 
 const KIND = {
   indexed: "good", created: "good", done: "good", found: "good", reencoded: "good",
@@ -13,7 +13,6 @@ const KIND = {
 const KINDS = [["", "All kinds"], ["frame.", "Frames"], ["frame.failed", "Failures"], ["map.", "Maps"], ["query.", "Queries"], ["import.", "Imports"], ["association.", "Associations"], ["coverage.", "Coverage"], ["difference.", "Differences"], ["surface.", "Surfaces"], ["key.", "Keys"]];
 const AT_ONCE = 100;
 const MOST = 500; // rows: a page that is left open for a day stays light
-const RENEW_S = 20;
 
 /** See operations.js. */
 export async function renderTab(root, { search, signal }) {
@@ -74,8 +73,6 @@ export async function events({ map, kind, limit, older = false, signal, onstate,
   await Promise.race([before(), heard.then(() => new Promise(() => {}))]);
   first = false;
   take(early.reverse(), false);
-  const timer = setInterval(() => renewTimes(list), 1000 * RENEW_S);
-  signal.addEventListener("abort", () => clearInterval(timer), { once: true });
   return h("div", { class: "feed" }, none, list, more);
 }
 

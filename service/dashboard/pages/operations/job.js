@@ -1,11 +1,12 @@
 // One job: what it is about, how far it is, what broke it, and trying it again.
+import { badge } from "../frames/badge.js";
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, shortId, time } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { go, link } from "../lib/router.js";
-import { actions, progress, span, stateBadge, took, traceback } from "./joblist.js";
-import { poll, renewTimes } from "./poll.js";
+import { actions, progress, span, took, traceback } from "./joblist.js";
+import { poll } from "./poll.js";
 
 export const styles = ["operations/operations.css"];
 
@@ -33,7 +34,7 @@ export async function render(root, { params, signal, title, actions: head }) {
   async function look() {
     const job = await get(place, { signal });
     const text = JSON.stringify(job);
-    if (text === shown) { renewTimes(body); return; }
+    if (text === shown) return;
     shown = text;
     if (state !== null && state !== job.state) put(said, `The job is ${job.state}`);
     state = job.state;
@@ -63,7 +64,7 @@ function describe(job, open) {
   ];
   return [
     h("section", { class: "card", "aria-label": "State" },
-      h("p", { class: "job-state" }, stateBadge(job.state), " ", SENTENCES[job.state] ?? ""),
+      h("p", { class: "job-state" }, badge(job.state), " ", SENTENCES[job.state] ?? ""),
       job.progress && progress(job.progress),
       h("dl", { class: "facts" }, facts.filter(([, value]) => value).map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))))),
     job.error && h("section", { class: "card", "aria-labelledby": "job-error" }, h("h2", { id: "job-error" }, "Error"),

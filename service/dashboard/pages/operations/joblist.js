@@ -1,4 +1,5 @@
 // Jobs as rows: what each is about, how it went, its traceback folded, and trying it again.
+import { badge } from "../frames/badge.js";
 import { at, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, ms, seconds, shortId, time } from "../lib/format.js";
@@ -7,16 +8,7 @@ import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { confirm, toast } from "../lib/states.js";
 
-/** Kinds of badge by state. */
-export const STATES = {
-  queued: "neutral", running: "warn", succeeded: "good", failed: "bad", cancelled: "neutral", dead: "bad",
-};
 const GIVEN_UP = new Set(["dead", "cancelled", "failed"]);
-
-/** A state with its shape. @param {string} state @returns {HTMLElement} */
-export function stateBadge(state) {
-  return h("span", { class: "badge", dataset: { kind: STATES[state] ?? "neutral" } }, state);
-}
 
 /** Whether to try again: given up, by nobody tried since, and not as its frame cannot be used. */
 export function canRetry(job) {
@@ -54,7 +46,7 @@ export function jobRow(job, changed) {
     job.finished_at && took(job) !== null && `took ${span(took(job) ?? 0)}`,
   ].filter(Boolean).flatMap((one, i) => (i ? [" · ", one] : one));
   return h("li", { class: "job", dataset: { job: job.job_id } },
-    h("div", { class: "job-line" }, stateBadge(job.state),
+    h("div", { class: "job-line" }, badge(job.state),
       h("a", { class: "job-kind", href: link("operations", "jobs", job.job_id), dataset: { part: "job" }, "aria-label": `${job.kind}, job ${shortId(job.job_id)}` }, job.kind),
       h("span", { class: "job-about" }, about),
       h("span", { class: "job-facts muted" }, facts),

@@ -7,7 +7,7 @@ import { may, me } from "../lib/session.js";
 import { empty } from "../lib/states.js";
 import { jobRow, retryAllButton } from "./joblist.js";
 import { mapField } from "./mapfield.js";
-import { poll, renewTimes, rows } from "./poll.js";
+import { poll, rows } from "./poll.js";
 
 const STATES = ["queued", "running", "dead", "failed", "cancelled", "succeeded"];
 const KINDS = ["sign", "import", "import-map", "import-bag", "associate", "coverage", "difference", "surface", "reconstruct", "reencode"];
@@ -42,7 +42,6 @@ export async function renderTab(root, { search, signal }) {
     more.hidden = cursor === null;
     nothing.hidden = items.length > 0;
     show(items);
-    renewTimes(list);
     const known = await counts(asked.map, signal);
     tell(known);
     button.hidden = !writes || (known !== null && !known.dead);

@@ -74,8 +74,11 @@ export function room() {
   };
 }
 
-/** @type {[number, string][]} */
-const TIGHT = [[0.95, "bad"], [0.85, "warn"]];
+/** A bar of how full something is; its `data-kind` tells when little room is left. @param {number} full share */
+export function gauge(full) {
+  const kind = full >= 0.95 ? "bad" : full >= 0.85 ? "warn" : null;
+  return h("span", { class: "gauge", dataset: { kind } }, h("span", { style: { width: `${100 * full}%` } }));
+}
 
 /**
  * What one map has of what it may have, and for how long.
@@ -99,7 +102,5 @@ export function limits() {
 /** So much, of so much where there is a quota. */
 function share(used, quota, told) {
   if (quota === null) return `${told(used)}, no quota`;
-  const full = quota > 0 ? Math.min(used / quota, 1) : 1;
-  const kind = TIGHT.find(([least]) => full >= least)?.[1] ?? null;
-  return [`${told(used)} of ${told(quota)}`, h("span", { class: "gauge", dataset: { kind } }, h("span", { style: { width: `${100 * full}%` } }))];
+  return [`${told(used)} of ${told(quota)}`, gauge(quota > 0 ? Math.min(used / quota, 1) : 1)];
 }

@@ -1,7 +1,7 @@
 // Making a key, and showing its secret the one time that it can be shown.
 import { get, send } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
-import { coded } from "../lib/prose.js";
+import { h } from "../lib/dom.js";
+import { saveFrom } from "../lib/form.js";
 import { sheet, toast } from "../lib/states.js";
 
 const SCOPES = [["read", "read: view and query"], ["write", "write: also upload and edit frames"], ["admin", "admin: also change the map itself"]];
@@ -18,38 +18,26 @@ export async function newKey(signal, made, isFirst) {
   const expires = h("input", { type: "datetime-local" });
   const lines = h("div", { class: "grants" });
   const add = (map, scope = "read") => lines.append(grantLine(map, scope));
-  const why = h("p", { class: "field-error", role: "alert" });
-  const button = h("button", { class: "button primary", type: "submit" }, "Create key");
-  const dialog = sheet({ title: "Create a key", buttons: button, children: [
+  const dialog = sheet({ title: "Create a key", buttons: h("button", { class: "button primary", type: "submit" }, "Create key"), children: [
     h("label", { class: "field" }, h("span", {}, "Name of its user"), name),
     h("fieldset", { class: "grants-set" }, h("legend", {}, "Permissions"), lines,
       h("datalist", { id: "key-maps" }, ["*", ...names].map((one) => h("option", { value: one }))),
       h("p", { class: "muted" }, "* stands for all maps and everything outside of maps."),
       h("button", { class: "button quiet", type: "button", onClick: () => add("") }, "Another map")),
-    h("label", { class: "field" }, h("span", {}, "Expires (never, if empty)"), expires), why,
+    h("label", { class: "field" }, h("span", {}, "Expires (never, if empty)"), expires), h("p", { class: "field-error", role: "alert" }),
   ] });
   if (isFirst) add("*", "admin"); else add(names[0] ?? "*");
-  dialog.querySelector("form").addEventListener("submit", async (event) => {
-    event.preventDefault();
+  saveFrom(dialog, async () => {
     const grants = {};
     for (const line of lines.children) {
       const map = /** @type {HTMLInputElement} */ (line.querySelector("input")).value.trim();
       if (map) grants[map] = /** @type {HTMLSelectElement} */ (line.querySelector("select")).value;
     }
     const until = expires.value ? new Date(expires.value).toISOString() : null;
-    button.disabled = true;
-    try {
-      const { data } = await send("POST", "keys", { json: { name: name.value.trim(), grants, expires_at: until } }); // even if the page is left: only this answer has the secret
-      dialog.close();
-      secret(data);
-      if (!signal.aborted) await made();
-    } catch (error) {
-      if (error.status === undefined) throw error;
-      const fields = error.errors.map((one) => `${one.field}: ${one.reason}`);
-      put(why, coded(fields.length ? fields.join(". ") : error.message));
-    } finally {
-      button.disabled = false;
-    }
+    const { data } = await send("POST", "keys", { json: { name: name.value.trim(), grants, expires_at: until } }); // even if the page is left: only this answer has the secret
+    dialog.close();
+    secret(data);
+    if (!signal.aborted) await made();
   });
 }
 

@@ -10,7 +10,7 @@ import { history } from "./history.js";
 import { canRetry, jobRow, retryAllButton } from "./joblist.js";
 import { indexes, limits, room, workers } from "./machines.js";
 import { mapField } from "./mapfield.js";
-import { poll, renewTimes, rows } from "./poll.js";
+import { poll, rows } from "./poll.js";
 import { tiles } from "./tiles.js";
 
 const POLL_S = 5;
@@ -42,7 +42,6 @@ export async function renderTab(root, { search, signal }) {
   async function look() {
     const [stats] = await Promise.all([get("stats", { params: { map }, signal }), line.look(signal), failures.look()]);
     for (const one of parts) one.update(stats);
-    renewTimes(failures.element);
   }
 
   /** @type {Timer} */

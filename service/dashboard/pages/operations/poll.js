@@ -1,5 +1,4 @@
 // Lists and figures that follow what happens, without flicker and without taking the focus away.
-import { ago } from "../lib/format.js";
 
 /**
  * Ask at once and then every few seconds, as long as the page is seen: a hidden tab asks nothing,
@@ -99,14 +98,5 @@ export function rows(parent, key, make) {
     const [element, part] = wanted;
     wanted = null;
     /** @type {HTMLElement | null} */ (element.querySelector(`[data-part="${part}"]`) ?? element.querySelector("a, button, summary"))?.focus();
-  }
-}
-
-
-/** Let all times under an element say again how long ago they are. @param {Element} root */
-export function renewTimes(root) {
-  for (const one of root.querySelectorAll("time")) {
-    const text = ago(one.dateTime);
-    if (one.textContent !== text) one.textContent = text;
   }
 }

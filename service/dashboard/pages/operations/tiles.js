@@ -2,10 +2,9 @@
 import { h, put } from "../lib/dom.js";
 import { bytes, count, percent, seconds } from "../lib/format.js";
 import { sparkline } from "../lib/sparkline.js";
+import { gauge } from "./machines.js";
 
 const REMEMBERED = 60; // polls of the queue that the little line shows
-/** @type {[number, string][]} */
-const FULL = [[0.95, "bad"], [0.85, "warn"]];
 const OLD_S = 300; // a frame that waits longer than this needs attention
 
 /**
@@ -42,10 +41,8 @@ export function tiles(whole) {
       const { requests: asked, refused, busy: later, broken } = stats.total;
       requests.set(count(asked), [part(refused, "refused"), part(later, "busy"), part(broken, "broken", "bad")], null);
       const { free, disk: room } = stats.bytes;
-      const full = room > 0 ? 1 - free / room : null;
-      const kind = FULL.find(([share]) => full !== null && full >= share)?.[1] ?? null;
-      disk.set(full === null ? "–" : `${percent(full)} full`, [`${bytes(free)} free of ${bytes(room)}`,
-        full !== null && h("span", { class: "gauge", dataset: { kind } }, h("span", { style: { width: `${100 * full}%` } }))], kind);
+      const full = room > 0 ? 1 - free / room : null, bar = full !== null && gauge(full);
+      disk.set(full === null ? "–" : `${percent(full)} full`, [`${bytes(free)} free of ${bytes(room)}`, bar], bar ? bar.dataset.kind ?? null : null);
     },
   };
 }

@@ -53,6 +53,13 @@ export function runsOf(sessions) {
   return { runs, without };
 }
 
+/** The frame that most frames have poses in; null without runs. @param {Run[]} runs @returns {string | null} */
+export function commonest(runs) {
+  const counts = new Map();
+  for (const one of runs) counts.set(one.parent, (counts.get(one.parent) ?? 0) + one.frames);
+  return [...counts].sort((a, b) => b[1] - a[1] || a[0].localeCompare(b[0]))[0]?.[0] ?? null;
+}
+
 /** Give each run a colour; those that began first choose first. @param {Run[]} runs changed in place */
 function colourRuns(runs) {
   const name = (one) => JSON.stringify([one.session, one.robot, one.parent]);

@@ -13,7 +13,7 @@ import { multiply, ofRows } from "../viewer/matrix.js";
 import { askedPanel } from "./asked.js";
 import { associationsPanel, begin, kindOf, undo } from "./associations.js";
 import { chooser } from "./card.js";
-import { edgesOf, MOST_DRAWN, MOST_RUNS, pathOf } from "./data.js";
+import { commonest, edgesOf, MOST_DRAWN, MOST_RUNS, pathOf } from "./data.js";
 import { bridges, reach } from "./joined.js";
 import { leftOut, legend } from "./legend.js";
 import { placeOf, upright } from "./shapes.js";
@@ -76,7 +76,7 @@ export class Runs {
     this.onreveal = told.onreveal;
     this.#joins = bridges(this.associations);
     this.names = [...new Set([...told.names, ...this.runs.map((one) => one.parent)])];
-    this.parent = [search.get("parent"), this.asked?.parent, told.names[0], most(this.runs)].find((one) => this.names.includes(one)) ?? "";
+    this.parent = [search.get("parent"), this.asked?.parent, told.names[0], commonest(this.runs)].find((one) => one && this.names.includes(one)) ?? "";
     this.joined = search.get("joined") !== "no";
     const wanted = search.get("association");
     const over = this.associations.find((one) => one.state === "succeeded");
@@ -298,11 +298,4 @@ export class Runs {
       association: this.association?.job_id ?? (this.associations.length ? "none" : null),
     };
   }
-}
-
-/** The frame that most frames have poses in. @param {import("./data.js").Run[]} runs */
-function most(runs) {
-  const counts = new Map();
-  for (const one of runs) counts.set(one.parent, (counts.get(one.parent) ?? 0) + one.frames);
-  return [...counts].sort((a, b) => b[1] - a[1] || a[0].localeCompare(b[0]))[0]?.[0];
 }

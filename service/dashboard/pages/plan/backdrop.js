@@ -1,8 +1,9 @@
 // What stands behind a plan: the surface of a map, and where its runs went, seen from above.
-import { at, bytes, get } from "../lib/api.js";
+import { at, get } from "../lib/api.js";
 import { h, svg } from "../lib/dom.js";
+import { bitmapOf } from "../lib/picture.js";
 import { linePath } from "../lib/scales.js";
-import { pathOf, runsOf, sessionsOf } from "../paths/data.js";
+import { commonest, pathOf, runsOf, sessionsOf } from "../paths/data.js";
 import { placeOf } from "../paths/shapes.js";
 import { dot } from "../viewer/matrix.js";
 import { axesFor, flat, uprightOf } from "./axes.js";
@@ -61,8 +62,7 @@ export const surfaceOf = (map, signal) => get(at("maps", map, "surface"), { sign
  */
 export async function laySurface(plan, axes, map, surface, signal) {
   if (dot(axes.x, surface.x_axis) < SAME || dot(axes.y, surface.y_axis) < SAME) return;
-  const png = await bytes(`${at("maps", map, "surface")}/plan.png`, { params: { parent: surface.parent_frame }, signal, accept: "image/png" });
-  const bitmap = await createImageBitmap(new Blob([png], { type: "image/png" }));
+  const bitmap = await bitmapOf(`${at("maps", map, "surface")}/plan.png`, { parent: surface.parent_frame }, signal);
   const { left, top, m_per_pixel: step, width } = surface.plan;
   const canvas = h("canvas", { width: bitmap.width, height: bitmap.height });
   canvas.getContext("2d")?.drawImage(bitmap, 0, 0);
@@ -96,13 +96,6 @@ export function cornersOf(surface, places) {
 /** A surface that went or changed meanwhile leaves a plan without a picture. */
 export function unseen(error) {
   if (error.status === 401) throw error;
-}
-
-/** The frame that most frames have poses in. @param {import("../paths/data.js").Run[]} runs @returns {string | null} */
-export function commonest(runs) {
-  const counts = new Map();
-  for (const one of runs) counts.set(one.parent, (counts.get(one.parent) ?? 0) + one.frames);
-  return [...counts].sort((a, b) => b[1] - a[1] || a[0].localeCompare(b[0]))[0]?.[0] ?? null;
 }
 
 /**

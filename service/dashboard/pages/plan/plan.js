@@ -2,9 +2,10 @@
 // and the picture beneath are here. Places are metres along the axes of the plan, y to the top.
 import { h, put, svg } from "../lib/dom.js";
 import { metres } from "../lib/format.js";
+import { hands, NEARER } from "../lib/hands.js";
 import { nice } from "../paths/shapes.js";
 
-const NEARER = 1.25, STEP = 0.12; // of a key
+const STEP = 0.12; // of a key
 const EDGE_PX = 28, FOOT_PX = 48; // between what is shown and the edge, and the scale bar below
 const LEAST_M = 0.5; // of what is fitted: a plan of one place shows its surroundings
 const CLOSEST = 20_000; // pixels of a metre
@@ -174,45 +175,14 @@ export class Plan {
   }
 
   #hands(signal, onpick) {
-    const on = (type, act, options) => this.svg.addEventListener(type, act, { signal, ...options });
-    const held = new Map();
-    let moved = 0;
-    const at = (event) => { const box = this.svg.getBoundingClientRect(); return /** @type {[number, number]} */ ([event.clientX - box.left, event.clientY - box.top]); };
-    on("pointerdown", (event) => {
-      held.set(event.pointerId, at(event));
-      if (held.size === 1) moved = 0;
-    });
-    on("pointermove", (event) => {
-      const before = held.get(event.pointerId), now = at(event);
-      if (!before) return;
-      const [dx, dy] = [now[0] - before[0], now[1] - before[1]];
-      moved += Math.hypot(dx, dy);
-      if (moved > STILL_PX && !this.svg.hasPointerCapture(event.pointerId)) this.svg.setPointerCapture(event.pointerId);
-      if (held.size === 2) {
-        const [other] = [...held].filter(([id]) => id !== event.pointerId).map(([, where]) => where);
-        const apart = (p) => Math.max(Math.hypot(p[0] - other[0], p[1] - other[1]), 1);
-        this.zoom(apart(now) / apart(before), [(now[0] + other[0]) / 2, (now[1] + other[1]) / 2]);
-      } else if (moved > STILL_PX) this.move(dx, dy);
-      held.set(event.pointerId, now);
-    });
-    for (const type of ["pointerup", "pointercancel"]) on(type, (event) => held.delete(event.pointerId));
-    on("click", (event) => { if (moved <= STILL_PX) onpick(this.place(at(event)), this.view); });
-    // a page is scrolled over a plan that nobody has chosen
-    on("wheel", (event) => {
-      if (!event.ctrlKey && document.activeElement !== this.svg) return;
-      event.preventDefault();
-      this.zoom(Math.exp(-0.0015 * Math.min(Math.max(event.deltaY * (event.deltaMode === 1 ? 33 : 1), -300), 300)), at(event));
-    }, { passive: false });
-    on("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
-      const arrow = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
-      if (arrow) this.move(arrow[0] * STEP * this.#size[0], arrow[1] * STEP * this.#size[1]);
-      else if (event.key === "+" || event.key === "=") this.zoom(NEARER);
-      else if (event.key === "-" || event.key === "_") this.zoom(1 / NEARER);
-      else if (event.key === "0") this.fit();
-      else return;
-      event.preventDefault();
-    });
+    const move = (right, down) => this.move(right, down);
+    hands(this.svg, {
+      drag: move, move, zoom: (factor, at) => this.zoom(factor, at), fit: () => this.fit(),
+      arrow: (right, up) => this.move(-right * STEP * this.#size[0], up * STEP * this.#size[1]),
+      click: (at) => onpick(this.place(at), this.view),
+      // a page is scrolled over a plan that nobody has chosen
+      wheels: ({ ctrlKey }) => ctrlKey || document.activeElement === this.svg,
+    }, { signal, still: STILL_PX });
   }
 }
 

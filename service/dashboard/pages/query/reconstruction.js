@@ -1,13 +1,12 @@
 // The surface that the accepted matches of an answer show together: started, followed and shown.
-import { at, get, save, send } from "../lib/api.js";
+import { at, save, send } from "../lib/api.js";
 import { h, once, put } from "../lib/dom.js";
 import { count, percent } from "../lib/format.js";
+import { followJob, goesOn } from "../lib/products.js";
 import { go, link, parse } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { failed } from "../lib/states.js";
-import { poll } from "../operations/poll.js";
 
-const POLL_S = 1;
 const WAITING = { queued: "Waiting for a worker…", running: "Fusing the views…" };
 
 /**
@@ -35,14 +34,12 @@ export function reconstructionPanel(answer, signal) {
 
   async function watch(id) {
     const ended = new AbortController();
-    const look = async () => {
-      const told = await get(at("reconstructions", id), { signal });
-      if (told.query_id !== answer.query_id) { ended.abort(); idle(); return; } // of an answer before this one
-      if (told.state in WAITING) { put(body, h("p", { class: "muted" }, WAITING[told.state])); return; }
-      ended.abort();
-      if (told.state === "succeeded") show(told); else lost(told);
-    };
-    await poll(look, POLL_S, AbortSignal.any([signal, ended.signal]), (error) => { ended.abort(); refused(error, start); });
+    await followJob(at("reconstructions", id), (told) => {
+      // it was deleted, or is of an answer before this one
+      if (told === null || told.query_id !== answer.query_id) { ended.abort(); idle(); return; }
+      if (goesOn(told)) put(body, h("p", { class: "muted" }, WAITING[told.state]));
+      else if (told.state === "succeeded") show(told); else lost(told);
+    }, AbortSignal.any([signal, ended.signal]));
   }
 
   function show(told) {
@@ -56,6 +53,7 @@ export function reconstructionPanel(answer, signal) {
         h("a", { class: "button quiet", href: link("operations", "jobs", told.job_id) }, "The job")));
   }
 
+  /** @param {Object<string, any>} told */
   function lost({ state, error }) {
     const detail = error ?? `The job is ${state}.`;
     put(body, failed({ name: "Problem", message: detail, status: 409, title: "The reconstruction failed", detail }, mayStart ? start : undefined));
@@ -69,10 +67,10 @@ export function reconstructionPanel(answer, signal) {
 
   function idle() {
     put(body, h("p", { class: "muted" }, `Fuse the ${count(accepted.length + 1)} views, of the query and its accepted matches, to one surface. A worker does it within a minute.`),
-      h("div", { class: "toolbar" }, h("button", { class: "button", type: "button", onClick: start }, "Reconstruct")));
+      mayStart && h("div", { class: "toolbar" }, h("button", { class: "button", type: "button", onClick: start }, "Reconstruct")));
   }
 
-  if (known === null) idle(); else watch(known).catch((error) => { if (error.status === 404 && mayStart) idle(); else refused(error, start); });
+  if (known === null) idle(); else watch(known).catch((error) => refused(error, start));
   return h("section", { class: "card", "aria-labelledby": "fused-title" }, h("h3", { id: "fused-title" }, "Reconstruction"), said, body);
 }
 

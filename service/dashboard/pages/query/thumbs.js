@@ -1,8 +1,8 @@
 // Previews of frames on tiles. One frame stands in several rows, and rows are drawn anew with every
 // answer: each picture is fetched and decoded once, and only when its tile comes into view.
-import { at, bytes } from "../lib/api.js";
+import { at } from "../lib/api.js";
 import { h } from "../lib/dom.js";
-import { plain } from "../lib/prose.js";
+import { bitmapOf, drawPicture } from "../lib/picture.js";
 
 const WIDTH = 192;
 const MOST = 400;
@@ -28,8 +28,7 @@ export function thumbs(signal) {
     const name = `${view} ${path}`;
     let found = known.get(name);
     if (!found) {
-      found = bytes(path, { params: { view, width: WIDTH }, signal, accept: "image/png" })
-        .then((data) => createImageBitmap(new Blob([data], { type: "image/png" })));
+      found = bitmapOf(path, { view, width: WIDTH }, signal);
       found.catch(() => known.delete(name)); // asked for again when it is looked at again
       known.set(name, found);
       if (known.size > MOST) known.delete(known.keys().next().value);
@@ -39,7 +38,7 @@ export function thumbs(signal) {
 
   function canvas(path, view, alt) {
     const element = h("canvas", { role: "img", "aria-label": alt, width: WIDTH, height: WIDTH * 3 / 4, class: "query-thumb" });
-    waiting.set(element, () => draw(element, bitmap(path, view), alt));
+    waiting.set(element, () => drawPicture(element, bitmap(path, view), alt));
     watcher.observe(element);
     return element;
   }
@@ -48,31 +47,4 @@ export function thumbs(signal) {
     frame: (map, id, view, alt) => canvas(`${at("maps", map, "frames", id)}/preview.png`, view, alt),
     query: (id, view, alt) => canvas(`${at("queries", id)}/preview.png`, view === "patches" ? "depth" : view, alt),
   };
-}
-
-async function draw(element, coming, alt) {
-  try {
-    const drawn = await coming;
-    element.width = drawn.width;
-    element.height = drawn.height;
-    element.getContext("2d").drawImage(drawn, 0, 0);
-    element.dataset.drawn = "true";
-  } catch (error) {
-    if (error.name === "AbortError") return;
-    const why = error.status === 404 ? "deleted" : error.status === 409 ? "no preview" : "not available";
-    element.setAttribute("aria-label", `${alt}: ${why}. ${plain(error.message)}`);
-    element.title = plain(error.message);
-    element.dataset.drawn = why;
-    write(element, why);
-  }
-}
-
-function write(element, text) {
-  const theme = getComputedStyle(element);
-  const pen = element.getContext("2d");
-  pen.fillStyle = theme.getPropertyValue("--muted");
-  pen.font = "20px system-ui, sans-serif";
-  pen.textAlign = "center";
-  pen.textBaseline = "middle";
-  pen.fillText(text, element.width / 2, element.height / 2, element.width * 0.9);
 }

@@ -1,7 +1,7 @@
 // A session renamed, tagged or deleted, each of which can be undone.
 import { deleteFrames, editFrames, framesText as of } from "../frames/changes.js";
 import { h, put } from "../lib/dom.js";
-import { coded } from "../lib/prose.js";
+import { reasonOf, saveFrom } from "../lib/form.js";
 import { confirm, sheet } from "../lib/states.js";
 
 /**
@@ -64,29 +64,15 @@ function edit(map, one, changes, how, dialog) {
 function form(one, all, { title, label, value, action, hint = "", save }) {
   const input = h("input", { id: "session-field", autocomplete: "off", spellcheck: "false", value, "aria-describedby": "session-why session-hint" });
   const why = h("p", { class: "field-error", id: "session-why", role: "alert" });
-  const button = h("button", { class: "button primary" }, action);
-  const dialog = sheet({ title, buttons: button, children: [
+  const dialog = sheet({ title, buttons: h("button", { class: "button primary" }, action), children: [
     h("p", { class: "dialog-text muted" }, `${one.session}: ${of(framesOf(one, all))}`), others(one, all),
     h("div", { class: "field" }, h("label", { for: input.id }, label), input, why, h("p", { class: "muted", id: "session-hint" }, hint)),
     h("p", { class: "muted sessions-left", role: "status" }),
   ] });
-  dialog.querySelector("form").addEventListener("submit", async (event) => {
-    event.preventDefault();
-    if (button.disabled) return;
-    button.disabled = true;
-    put(why);
-    input.removeAttribute("aria-invalid");
-    try {
-      await save(input.value.trim(), dialog);
-      dialog.close();
-    } catch (error) {
-      if (error.status === undefined || error.status === 401 || !dialog.open) { dialog.close(); throw error; }
-      put(why, coded(error.errors?.length ? error.errors.map((part) => part.reason).join(". ") : error.message));
-      input.setAttribute("aria-invalid", "true");
-      input.focus();
-    } finally {
-      button.disabled = false;
-    }
+  saveFrom(dialog, () => save(input.value.trim(), dialog), (error) => {
+    put(why, reasonOf(error));
+    input.setAttribute("aria-invalid", "true");
+    input.focus();
   });
 }
 

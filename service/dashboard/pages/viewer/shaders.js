@@ -42,15 +42,12 @@ void main() {
   gl_Position = clip * world;
   gl_PointSize = clamp(size / max(gl_Position.w, 1e-6), pixels.x, pixels.y);
   vec3 turned = mat3(model) * normal;
+  float light = 1.0 - shade * (1.0 - abs(dot(turned, normalize(eye - world.xyz))));
   if (mode == 1) colour = (turned + 1.0) * 0.5;
-  else if (mode == 2) colour = grouped();
+  else if (mode == 2) colour = light * grouped();
   else if (mode == 3) colour = kept();
-  else if (mode == 4) {
-    colour = ramped((dot(world.xyz, above) - heights.x) / max(heights.y - heights.x, 1e-6));
-  } else {
-    float facing = abs(dot(turned, normalize(eye - world.xyz)));
-    colour = tint * (1.0 - shade * (1.0 - facing));
-  }
+  else if (mode == 4) colour = light * ramped((dot(world.xyz, above) - heights.x) / max(heights.y - heights.x, 1e-6));
+  else colour = light * tint;
 }`;
 
 const POINT_COLOUR = `#version 300 es

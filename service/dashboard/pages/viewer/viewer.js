@@ -1,8 +1,8 @@
 // Points, lines and triangles in 3-D: one canvas, drawn when something has changed and not before.
 
+import { hands } from "../lib/hands.js";
 import { Orbit, VIEW } from "./camera.js";
 import { colourOf, onTheme } from "./colours.js";
-import { hands } from "./controls.js";
 import { CellsLayer } from "./cells.js";
 import { CloudLayer, ShapeLayer, around } from "./layers.js";
 import { dot, transformed } from "./matrix.js";
@@ -13,6 +13,9 @@ export { frustum } from "./shapes.js";
 const KEYS = "Arrow keys turn, with Shift they move; plus and minus zoom; 0 shows all.";
 const PLAN_KEYS = "Arrow keys move, with Shift they turn; plus and minus zoom; 0 shows all.";
 const NOTHING = { low: [-1, -1, -1], high: [1, 1, 1] };
+const TURN = 0.1, STEP = 0.05; // of an arrow key: radians, and share of the height
+/** Radians for a drag across the height of the canvas. */
+const ACROSS = Math.PI;
 /** More pixels than that per CSS pixel nobody sees, and each costs. */
 const DENSEST = 2;
 
@@ -46,8 +49,7 @@ export class Viewer {
   #dirty = 0;
   /** @type {ResizeObserver} */
   #watcher;
-  /** @type {(() => void)[]} */
-  #stops = [];
+  #end = new AbortController();
   /** @type {number[][] | null} what is in view, until one looks elsewhere */
   #fitted = null;
   #lost = false;
@@ -78,27 +80,19 @@ export class Viewer {
     canvas.setAttribute("aria-roledescription", "3-D view");
     this.#name();
     canvas.style.setProperty("touch-action", "none");
-    const changed = () => { this.#fitted = null; this.redraw(); };
-    this.#stops.push(
-      hands(canvas, this.orbit, { changed, fit: () => this.fit() }),
-      onTheme(() => this.redraw()),
-    );
-    const lost = (event) => {
+    const { signal } = this.#end;
+    this.#hands(signal);
+    signal.addEventListener("abort", onTheme(() => this.redraw()));
+    canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault(); // or it never comes back
       this.#lost = true;
       onlost(true);
-    };
-    const back = () => {
+    }, { signal });
+    canvas.addEventListener("webglcontextrestored", () => {
       this.#lost = false;
       this.#begin();
       onlost(false);
-    };
-    canvas.addEventListener("webglcontextlost", lost);
-    canvas.addEventListener("webglcontextrestored", back);
-    this.#stops.push(() => {
-      canvas.removeEventListener("webglcontextlost", lost);
-      canvas.removeEventListener("webglcontextrestored", back);
-    });
+    }, { signal });
     this.#watcher = new ResizeObserver(() => {
       if (this.#fitted) this.orbit.fit(this.#fitted, this.#aspect());
       this.redraw();
@@ -239,7 +233,7 @@ export class Viewer {
 
   destroy() {
     if (!this.available) return;
-    for (const stop of this.#stops) stop();
+    this.#end.abort();
     this.#watcher.disconnect();
     cancelAnimationFrame(this.#dirty);
     for (const layer of this.#layers.values()) layer.free(this.#gl);
@@ -247,6 +241,24 @@ export class Viewer {
     this.available = false;
     // browsers keep only a few; one that is lost already has no extensions
     if (!this.#gl.isContextLost()) this.#gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+
+  #hands(signal) {
+    const { canvas, orbit } = this, size = () => canvas.clientHeight || 1;
+    const changed = () => { this.#fitted = null; this.redraw(); };
+    const move = (right, down) => { orbit.pan(right / size(), -down / size()); changed(); };
+    const turn = (right, down) => { orbit.orbit(right, orbit.flat ? 0 : down); changed(); };
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault(), { signal }); // the right button moves
+    hands(canvas, {
+      move, fit: () => this.fit(), zoom: (factor) => { orbit.zoom(1 / factor); changed(); },
+      drag: (right, down, { shiftKey, buttons }) => {
+        // a plan is rather moved than turned
+        if ((shiftKey || (buttons & 6) !== 0) !== orbit.flat) move(right, down); else turn((right / size()) * ACROSS, (down / size()) * ACROSS);
+      },
+      arrow: (right, up, { shiftKey }) => {
+        if (shiftKey !== orbit.flat) move(-right * STEP * size(), up * STEP * size()); else turn(right * TURN, up * TURN);
+      },
+    }, { signal });
   }
 
   #begin() {
