@@ -493,7 +493,7 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
 
     page.goto(f"{station.home}#/queries/{answer['query_id']}?why=open")
     settle(page)
-    assert page.locator(".query-asked canvas").get_attribute("title") is None  # it says why there is no picture
+    assert page.locator(".query-asked canvas").get_attribute("title") is None  # no fault
     assert "with an uploaded depth image" in page.locator(".query-note").first.inner_text()
     similar = station.client.get(f"/v1/queries/{answer['query_id']}/similarities").json()
     heat = page.locator("canvas.heatmap")

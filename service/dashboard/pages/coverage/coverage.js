@@ -1,5 +1,5 @@
 // Where a robot would get lost: results of coverage jobs as plans, begun, followed and compared here.
-import { at, get, save, send } from "../lib/api.js";
+import { at, get, list, save, send } from "../lib/api.js";
 import { h, once, put } from "../lib/dom.js";
 import { count, metres, percent, time } from "../lib/format.js";
 import { followJob, goesOn } from "../lib/products.js";
@@ -79,21 +79,10 @@ class Page {
     if (!wanted) { put(this.body, this.#nothing()); return; }
     const id = wanted.job_id;
     const [shown, frames, changes] = await Promise.all([
-      get(`${this.path}/${id}`, { signal: this.signal }), this.#framesOf(id), this.#changesOf(id)]);
+      get(`${this.path}/${id}`, { signal: this.signal }), list(`${this.path}/${id}/frames`, { signal: this.signal }), this.#changesOf(id)]);
     if (turn !== this.#turn || this.signal.aborted) return;
-    Object.assign(this, { shown, frames, changes });
+    Object.assign(this, { shown, frames: frames.items, changes });
     this.#draw();
-  }
-
-  async #framesOf(id) {
-    const found = [];
-    let cursor = null;
-    do {
-      const page = await get(`${this.path}/${id}/frames`, { params: { limit: 1000, cursor }, signal: this.signal });
-      found.push(...page.items);
-      cursor = page.next_cursor;
-    } while (cursor !== null);
-    return found;
   }
 
   async #changesOf(id) {

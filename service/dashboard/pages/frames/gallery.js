@@ -1,6 +1,6 @@
 // Frames of a map, 24 at a time, by whatever the address says; their states change as they happen.
 import { at, get } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { h, put, throttle } from "../lib/dom.js";
 import { count } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
@@ -184,19 +184,14 @@ export async function render(root, { params, search, signal, go, title, actions 
   })]);
   counted.catch((error) => { if (error.name !== "AbortError") toast(error.message, { kind: "bad" }); });
   const isFirst = () => !wanted.has("cursor") && wanted.get("order") !== "asc";
-  /** @type {Timer} */
-  let filling = null;
-  signal.addEventListener("abort", () => clearTimeout(filling), { once: true });
-  const look = () => {
-    filling = null;
-    Promise.all([fetchList(), fetchRuns()]).catch(shownFault);
-  };
+  const look = () => { Promise.all([fetchList(), fetchRuns()]).catch(shownFault); };
+  const fill = throttle(look, FILL_MS, signal);
   const more = h("button", { class: "button", type: "button", onClick: look });
 
   function arrived(id) {
     if (!isFirst()) return;
     // a page that is not full fills by itself; a full one is not pulled away under the reader
-    if (tiles.size < PAGE && clear.hidden) { filling ??= setTimeout(look, FILL_MS); return; }
+    if (tiles.size < PAGE && clear.hidden) { fill(); return; }
     if (come.size < MOST_COME) come.add(id);
     put(more, `${count(come.size)}${come.size < MOST_COME ? "" : " or more"} new ${come.size === 1 ? "frame" : "frames"}: show`);
     if (!more.isConnected) put(news, more);

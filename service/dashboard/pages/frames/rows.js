@@ -1,5 +1,5 @@
 // The files of a queue as rows: how far each one is, and why it was refused in the API's words.
-import { h, put } from "../lib/dom.js";
+import { h, put, throttle } from "../lib/dom.js";
 import { bytes, count, percent, seconds, shortId } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
@@ -31,8 +31,6 @@ export function groupOf(state) {
 export function rowsOf(queue, signal) {
   let group = "all";
   let most = STEP;
-  /** @type {Timer} */
-  let timer = null;
   let all = false; // many have changed
   const rows = new Map();
   const dirty = new Set();
@@ -42,7 +40,6 @@ export function rowsOf(queue, signal) {
   const element = Object.assign(h("section", { class: "rows-place", "aria-label": "Files" }, choose, list, more), { update });
 
   function draw() {
-    timer = null;
     const counts = Object.fromEntries(GROUPS.map(([name]) => [name, 0]));
     counts.all = queue.items.length;
     for (const item of queue.items) counts[groupOf(item.state)] += 1;
@@ -72,9 +69,9 @@ export function rowsOf(queue, signal) {
   // a transfer tells of itself many times a second, and several are under way
   function update(item) {
     if (item) dirty.add(item); else all = true;
-    timer ??= setTimeout(draw, 80);
+    drawSoon();
   }
-  signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
+  const drawSoon = throttle(draw, 80, signal);
   draw();
   return element;
 }

@@ -1,6 +1,6 @@
 // Upload: files dropped or chosen, what is said of them, and what became of each.
 import { at, get } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { h, put, throttle } from "../lib/dom.js";
 import { bytes, count } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may, me } from "../lib/session.js";
@@ -80,13 +80,11 @@ export async function render(root, { params, signal, title, actions }) {
     root.querySelector(`.upload-said [name="${name}"]`).focus();
   }
 
-  /** @type {Timer} */
-
-  let timer = null;
+  const sumSoon = throttle(sum, 200, signal);
   function show(item) {
     if (item?.frame_id) following?.look(item.frame_id);
     rows.update(item);
-    timer ??= setTimeout(() => { timer = null; sum(); }, 200);
+    sumSoon();
   }
 
   function sum() {
@@ -126,14 +124,11 @@ export async function render(root, { params, signal, title, actions }) {
     tell(parts.join(" · "));
   }
 
-  /** @type {Timer} */
-
-  let telling = null;
   let toTell = "";
+  const tellSoon = throttle(() => put(aloud, toTell), ALOUD_MS, signal);
   function tell(words) { // a count that moves five times a second is no speech
     toTell = words;
-    if (toTell === aloud.textContent) return;
-    telling ??= setTimeout(() => { telling = null; put(aloud, toTell); }, ALOUD_MS);
+    if (toTell !== aloud.textContent) tellSoon();
   }
 
   document.addEventListener("drop", (event) => { // that misses its zone
@@ -151,7 +146,7 @@ export async function render(root, { params, signal, title, actions }) {
     else if (found.length > 0 && found.every((one) => isImport(one.source))) begin();
   });
   queue.listeners.add(show);
-  signal.addEventListener("abort", () => { queue.listeners.delete(show); clearTimeout(timer); clearTimeout(telling); }, { once: true });
+  signal.addEventListener("abort", () => queue.listeners.delete(show), { once: true });
   sum();
   const following = follow({
     map: params.map, signal,

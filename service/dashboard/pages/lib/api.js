@@ -20,6 +20,23 @@ export async function get(path, { params, signal, accept = "application/json" } 
 }
 
 /**
+ * Items of a list, page by page.
+ * @param {string} path
+ * @param {{params?: Object<string, any>, signal: AbortSignal, most?: number}} how most: of items, about
+ * @returns {Promise<{items: any[], cursor: string | null}>} cursor: of those that are left; null: none
+ */
+export async function list(path, { params, signal, most = Infinity }) {
+  const items = [];
+  let cursor = null;
+  do {
+    const page = await get(path, { params: { limit: 1000, ...params, cursor }, signal });
+    items.push(...page.items);
+    cursor = page.next_cursor;
+  } while (cursor !== null && items.length < most);
+  return { items, cursor };
+}
+
+/**
  * Change something.
  * @param {string} method
  * @param {string} path

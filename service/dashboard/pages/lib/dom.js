@@ -50,6 +50,19 @@ export function once(act) {
   return () => (turn ??= act().finally(() => { turn = null; }));
 }
 
+/**
+ * Act once for calls that come in bursts.
+ * @param {() => any} act @param {number} pause milliseconds from the first call of a burst until then
+ * @param {AbortSignal} signal after which it acts no more
+ * @returns {() => void}
+ */
+export function throttle(act, pause, signal) {
+  /** @type {Timer} */
+  let timer = null;
+  signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
+  return () => { timer ??= setTimeout(() => { timer = null; act(); }, pause); };
+}
+
 function made(element, props, children) {
   const isProps = props === null || props === undefined
     || (typeof props === "object" && !Array.isArray(props) && !(props instanceof Node));

@@ -1,6 +1,6 @@
 // How the service does, on one page: what waits, the last hour, what failed, what happens now.
 import { get } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { h, put, throttle } from "../lib/dom.js";
 import { go, link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { empty } from "../lib/states.js";
@@ -8,7 +8,7 @@ import { events } from "./events.js";
 import { health } from "./health.js";
 import { history } from "./history.js";
 import { canRetry, jobRow, retryAllButton } from "./joblist.js";
-import { indexes, limits, room, workers } from "./machines.js";
+import { CARDS } from "./machines.js";
 import { mapField } from "./mapfield.js";
 import { poll, rows } from "./poll.js";
 import { tiles } from "./tiles.js";
@@ -34,30 +34,26 @@ export async function renderTab(root, { search, signal }) {
   const whole = map === null;
   const line = health(signal);
   const failures = failureList(map, signal);
-  const figures = tiles(whole);
+  const now = tiles(whole), figures = h("div", {});
   const hour = history(whole);
-  const index = indexes();
-  const parts = whole ? [figures, hour, index, workers(), room()] : [figures, hour, index, limits(), room()];
+  const columns = h("div", { class: "columns" });
+  const show = rows(columns, ({ part }) => part, ({ part, ...stats }) => CARDS[part](stats));
 
   async function look() {
     const [stats] = await Promise.all([get("stats", { params: { map }, signal }), line.look(signal), failures.look()]);
-    for (const one of parts) one.update(stats);
+    put(figures, now(stats));
+    hour.update(stats);
+    show(["indexes", whole ? "workers" : "use", "bytes"].map((part) => ({ part, [part]: stats[part] })));
   }
 
-  /** @type {Timer} */
-
-  let timer = null;
   const again = await poll(look, POLL_S, signal, () => line.look(signal).catch(() => {}));
-  const soon = () => { timer ??= setTimeout(() => { timer = null; again(); }, SOON_MS); };
-  signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
   failures.onchange = again;
-  const feed = await events({ map, kind: CHANGES, limit: EVENTS, signal, onstate: line.live, onevent: soon });
+  const feed = await events({ map, kind: CHANGES, limit: EVENTS, signal, onstate: line.live, onevent: throttle(again, SOON_MS, signal) });
   const choose = await mapField(map, signal, (name) => go(link("operations", { map: name })), all);
   put(root, h("div", { class: "toolbar spread" }, line.element, choose),
     !whole && h("p", { class: "muted" }, all ? "Figures of this map only. Workers, requests, query times and disk space cover all maps."
       : "Figures of this map only: workers, requests, query times and disk space need a key for all maps."),
-    figures.element, hour.element,
-    h("div", { class: "columns" }, parts.slice(2).map((one) => one.element)),
+    figures, hour.element, columns,
     failures.element,
     h("section", { class: "card", "aria-labelledby": "events" }, h("div", { class: "card-head" }, h("h2", { id: "events" }, "Recent events"),
       h("a", { href: link("operations", { tab: "events", map: whole ? null : map }) }, "All events")), feed));

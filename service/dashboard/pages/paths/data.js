@@ -1,6 +1,6 @@
 // What the API knows of the paths of a map, a part of it at a time: never a full list of frames.
 
-import { at, get } from "../lib/api.js";
+import { at, get, list } from "../lib/api.js";
 import { paletteOf } from "../lib/palette.js";
 import { ofQuaternion } from "../viewer/matrix.js";
 
@@ -107,13 +107,6 @@ export async function associationsOf(map, signal) {
 
 /** Edges of an association in the order in which they were found, up to MOST_EDGES. */
 export async function edgesOf(map, association, signal) {
-  const found = [];
-  let cursor = null;
-  do {
-    const params = { limit: 1000, cursor };
-    const page = await get(at("maps", map, "associations", association, "edges"), { params, signal });
-    found.push(...page.items);
-    cursor = page.next_cursor;
-  } while (cursor !== null && found.length < MOST_EDGES);
-  return { edges: found, more: cursor !== null };
+  const { items, cursor } = await list(at("maps", map, "associations", association, "edges"), { signal, most: MOST_EDGES });
+  return { edges: items, more: cursor !== null };
 }

@@ -1,8 +1,8 @@
 // Robots in the picture of a map: where each was found last, and where it got lost, by the records of
 // its queries. A time line goes back through them. Nothing is asked again, and nothing is counted.
 
-import { get } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { get, list } from "../lib/api.js";
+import { h, put, throttle } from "../lib/dom.js";
 import { count, time } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { robotTokens } from "../lib/palette.js";
@@ -57,8 +57,7 @@ export class Robots {
   #more = false;
   /** @type {Timer} */
   #player = null;
-  /** @type {Timer} */
-  #waiting = null;
+  #later;
   /** @type {string | null | undefined} the period that the list of periods tells */
   #period;
   /** @type {any} elements of the section */
@@ -97,7 +96,8 @@ export class Robots {
     this.at = when("at");
     this.#build();
     window.addEventListener("sceneprint:theme", () => this.draw(), { signal });
-    signal.addEventListener("abort", () => { clearTimeout(this.#player); clearTimeout(this.#waiting); }, { once: true });
+    signal.addEventListener("abort", () => clearTimeout(this.#player), { once: true });
+    this.#later = throttle(() => this.#newest(), TOGETHER_MS, signal);
   }
 
   #build() {
@@ -117,34 +117,23 @@ export class Robots {
 
   /** Read the records of the period. */
   async load() {
-    const found = [], most = this.since || this.until ? MOST : LATEST;
-    let cursor = null;
-    do {
-      const page = await this.#page({ since: this.since, until: this.until, cursor, limit: Math.min(PAGE, most - found.length) });
-      found.push(...page.items);
-      cursor = page.next_cursor;
-    } while (cursor !== null && found.length < most);
-    this.#records = found.reverse();
+    const { since, until } = this, params = { map: this.map, since, until, limit: PAGE };
+    const { items, cursor } = await list("queries", { params, signal: this.signal, most: since || until ? MOST : LATEST });
+    this.#records = items.reverse();
     this.#more = cursor !== null;
     this.draw();
   }
 
-  #page(params) {
-    return get("queries", { params: { map: this.map, ...params }, signal: this.signal });
-  }
-
   /** A query was answered: read what is new. */
-  heard() {
-    if (this.until !== null) return;
-    this.#waiting ??= setTimeout(async () => {
-      this.#waiting = null;
-      const page = await this.#page({ limit: 100 });
-      const known = new Set(this.#records.map((one) => one.query_id));
-      this.#records.push(...page.items.reverse().filter((one) => !known.has(one.query_id)));
-      this.#records.sort((a, b) => Date.parse(a.at) - Date.parse(b.at)); // a robot may send old ones later
-      this.#records = this.#records.slice(-MOST);
-      this.draw();
-    }, TOGETHER_MS);
+  heard() { if (this.until === null) this.#later(); }
+
+  async #newest() {
+    const page = await get("queries", { params: { map: this.map, limit: 100 }, signal: this.signal });
+    const known = new Set(this.#records.map((one) => one.query_id));
+    this.#records.push(...page.items.reverse().filter((one) => !known.has(one.query_id)));
+    this.#records.sort((a, b) => Date.parse(a.at) - Date.parse(b.at)); // a robot may send old ones later
+    this.#records = this.#records.slice(-MOST);
+    this.draw();
   }
 
   /** How many records are shown: those up to the time that was chosen. */

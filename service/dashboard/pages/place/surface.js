@@ -1,6 +1,7 @@
 // The surface of a map in the picture: what the API has of it, and which tiles are fetched and drawn.
 
-import { at, bytes, get } from "../lib/api.js";
+import { at, bytes, get, list } from "../lib/api.js";
+import { throttle } from "../lib/dom.js";
 import { tintOf } from "../paths/scene.js";
 import { reachAlong } from "../paths/shapes.js";
 import { cellUnder, cornersOf, isInView, placeIn, STRIDE } from "../viewer/cells.js";
@@ -16,7 +17,7 @@ const BUDGET = 60_000, FAST_BUDGET = 400_000;
 const FINE_PX = 2.5;
 const AT_ONCE = 6;
 /** Tiles of a level that are listed: of a larger map the next coarser level is drawn. */
-const MOST_LISTED = 20_000, PAGE = 1000;
+const MOST_LISTED = 20_000;
 /** Cells that stay in memory, if they are not needed. */
 const KEPT = 1_000_000;
 const PAUSE_MS = 120;
@@ -46,8 +47,7 @@ export class Surface {
   /** @type {any[]} drawn now, see viewer/cells.js */
   #tiles = [];
   #drawn = "";
-  /** @type {Timer} */
-  #timer = null;
+  #later;
   /** @type {number[] | null} heights that colours reach from and to; null before they are known */
   range = null;
   #isMeasured = false;
@@ -76,7 +76,7 @@ export class Surface {
     this.signal = signal;
     this.scene = scene;
     this.onready = onready;
-    signal.addEventListener("abort", () => clearTimeout(this.#timer), { once: true });
+    this.#later = throttle(() => this.update(), PAUSE_MS, signal);
     window.addEventListener("sceneprint:theme", () => this.paint({}), { signal });
   }
 
@@ -136,24 +136,15 @@ export class Surface {
     if (pyramid.knows(place) || pyramid.coming.has(place) || isMuch) return;
     pyramid.coming.add(place);
     try {
-      const found = [];
-      let cursor = null;
-      do {
-        const params = { parent: pyramid.parent, level: pyramid.levels[place].level, cursor, limit: PAGE };
-        const page = await get(at("maps", this.map, "surface", "tiles"), { params, signal: this.signal });
-        found.push(...page.items);
-        cursor = page.next_cursor;
-      } while (cursor !== null);
-      pyramid.list(place, found);
+      const params = { parent: pyramid.parent, level: pyramid.levels[place].level };
+      pyramid.list(place, (await list(at("maps", this.map, "surface", "tiles"), { params, signal: this.signal })).items);
     } finally {
       pyramid.coming.delete(place);
     }
   }
 
   /** What should be drawn may have changed: soon. */
-  later() {
-    this.#timer ??= setTimeout(() => { this.#timer = null; this.update(); }, PAUSE_MS);
-  }
+  later() { this.#later(); }
 
   /** Choose tiles for what is looked at, fetch what is missing, and draw what is there. */
   update() {
