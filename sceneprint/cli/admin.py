@@ -109,7 +109,13 @@ def run_keys(options: argparse.Namespace) -> int:
             revoke_key(store, options.revoke)
             print(f"key {one_line(options.revoke)} is revoked")
         elif options.list_tenants:
-            _print_tenants(store)
+            from sceneprint.store.tenants import list_tenants
+
+            with store.database.read() as connection:
+                tenants = list_tenants(connection)
+            for one in tenants:
+                at = datetime.fromtimestamp(one.created_at, UTC)
+                print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(one.name)}  {count_of(one.keys, 'key')}")
         elif options.delete_tenant is not None:
             delete_tenant(store, options.delete_tenant)
             print(f"tenant {one_line(options.delete_tenant)} is deleted")
@@ -146,16 +152,6 @@ def _print_keys(store: Store) -> None:
     if soon:
         names = ", ".join(soon)
         print_error(f"expiring within {SOON.days} days: {names}. Create new keys with --create.")
-
-
-def _print_tenants(store: Store) -> None:
-    from sceneprint.store.tenants import list_tenants
-
-    with store.database.read() as connection:
-        tenants = list_tenants(connection)
-    for one in tenants:
-        at = datetime.fromtimestamp(one.created_at, UTC)
-        print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(one.name)}  {count_of(one.keys, 'key')}")
 
 
 def _key_line(key: Key) -> str:

@@ -39,8 +39,10 @@ def open_signer_of(options: argparse.Namespace, settings: Settings, *, psi: bool
     name = options.model or options.preset or ("paper" if psi else PRESETS[0])
     model = read_model(name)
     signer = _open_signer(model.without_whitening if psi else model, str(name), settings)
+    camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, like most images
+    wall = DepthFrame(np.full((192, 256), 2.0, np.float32), camera)
     with suppress(FrameError):  # the wall may be outside of the model's range
-        sign(_wall(), signer)  # loads everything, so that the first frame takes no extra time
+        sign(wall, signer)  # loads everything, so that the first frame takes no extra time
     return signer
 
 
@@ -71,9 +73,3 @@ def _print(text: str) -> None:
 def _open_signer(model: Model, name: str, settings: Settings) -> Signer:
     with progress_bar(f"pair table of {name}", "bin", unit_scale=True, delay=0.5) as progress:
         return open_signer(model, settings.cache_dir, progress)
-
-
-def _wall() -> DepthFrame:
-    """Return a frame of a flat wall at 2 m."""
-    camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, like most images
-    return DepthFrame(np.full((192, 256), 2.0, np.float32), camera)

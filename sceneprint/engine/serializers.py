@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import BaseModel
 from sqlalchemy import Connection
 
 from sceneprint.store.deletion import DAY_S, count_old_frames, without_content
@@ -23,7 +24,6 @@ from sceneprint.store.reencoding_rows import switch_progress
 from sceneprint.store.tables import FrameRow, JobRow, MapRow
 from sceneprint.types import Floats
 from sceneprint_client.api import (
-    CameraIntrinsics,
     Frame,
     FrameName,
     Job,
@@ -37,6 +37,8 @@ from sceneprint_client.api import (
 from sceneprint_client.api.base import Direction
 from sceneprint_client.api.frames import Kind, SampleRange
 from sceneprint_client.poses import quaternion_of
+
+Record = TypeVar("Record", bound=BaseModel)
 
 #: Editable columns of a frame.
 EDITABLE = (
@@ -81,6 +83,17 @@ def transform(T: Floats, parent_frame: str, child_frame: str) -> Transform:
 def when(seconds: float | None) -> Any:
     """Convert seconds since 1970 to a time in UTC; None remains None."""
     return None if seconds is None else datetime.fromtimestamp(seconds, UTC)
+
+
+def vector(at: Iterable[float]) -> Vector:
+    """Return the API record of three coordinates."""
+    return Vector(**dict(zip("xyz", at, strict=True)))
+
+
+def copy_fields(record: type[Record], source: object, /, **own: Any) -> Record:
+    """Return a record with some values of its own, and those that `source` has for other fields."""
+    names = record.model_fields
+    return record(**{k: x for k, x in vars(source).items() if k in names} | own)
 
 
 def model_label(name: str, model_id: str) -> str:
@@ -136,24 +149,17 @@ def map_record(connection: Connection, row: MapRow, recent: Mapping[str, int] | 
         now = switch_progress(connection, row)
         reencoding = Reencoding(model=label, model_id=row.next_model_id, **asdict(now))
     posed, parents = count_poses(connection, row.number)
-    return Map(
-        name=row.name,
-        title=row.title,
+    return copy_fields(
+        Map,
+        row,
         model=model_label(names[row.model_id], row.model_id),
-        model_id=row.model_id,
         reencoding=reencoding,
         created_at=when(row.created_at),
-        revision=row.revision,
         frames=count_states(connection, row.number),
         posed_frames=posed,
         parent_frames=parents,
         recent_queries=dict(recent),
-        used_frames=row.used_frames,
-        used_bytes=row.used_bytes,
-        quota_frames=row.quota_frames,
-        quota_bytes=row.quota_bytes,
-        retention_days=row.retention_days,
-        up=_direction(row.up),
+        up=row.up and direction(row.up),
         overdue=overdue,
         etag=map_tag(row),
     )
@@ -177,23 +183,11 @@ def job_record(
     job: JobRow, frame_id: str | None, map_name: str | None, followed_by: str | None = None
 ) -> Job:
     """Return the API record of a job."""
-    return Job(
-        job_id=job.id,
-        kind=job.kind,
-        state=job.state,
-        map=map_name,
-        frame_id=frame_id,
-        priority=job.priority,
-        attempts=job.attempts,
-        created_at=when(job.created_at),
-        started_at=when(job.started_at),
-        finished_at=when(job.finished_at),
-        error=job.error,
-        traceback=job.traceback,
-        progress=job_progress(job),
-        result=job.result,
-        followed_by=followed_by,
-    )
+    return copy_fields(
+        Job, job, job_id=job.id, map=map_name, frame_id=frame_id, created_at=when(job.created_at),
+        started_at=when(job.started_at), finished_at=when(job.finished_at),
+        progress=job_progress(job), followed_by=followed_by,
+    )  # fmt: skip
 
 
 def _frame(row: MapRow, frame: FrameRow, job_id: str) -> Frame:
@@ -206,34 +200,27 @@ def _frame(row: MapRow, frame: FrameRow, job_id: str) -> Frame:
     base = None
     if frame.base is not None and frame.base_frame is not None:
         base = transform(np.array(frame.base), frame.base_frame, sensor_of(frame))
-    return Frame(
+    return copy_fields(
+        Frame,
+        frame,
         frame_id=frame.id,
         map=row.name,
-        state=frame.state,
-        reason=frame.reason,
         job_id=job_id,
-        content_id=frame.content_id,
-        bytes=frame.bytes,
         **_sensor_record(frame),
-        robot=frame.robot,
-        session=frame.session,
-        name=frame.name,
-        sequence=frame.sequence,
         captured_at=when(frame.captured_at),
         received_at=when(frame.received_at),
         indexed_at=when(frame.indexed_at),
         pose=pose,
         sent_pose=sent,
-        base_frame=frame.base_frame,
         T_base_sensor=base,
-        up=_direction(frame.up),
-        tags=frame.tags,
+        up=frame.up and direction(frame.up),
         etag=frame_tag(frame),
     )
 
 
-def _direction(up: Sequence[float] | None) -> Direction | None:
-    return None if up is None else Direction(**dict(zip("xyz", up, strict=True)))
+def direction(up: Iterable[float]) -> Direction:
+    """Return the API record of a unit vector."""
+    return Direction(**dict(zip("xyz", up, strict=True)))
 
 
 def sample_range_of(frame: FrameRow) -> SampleRange | None:
@@ -242,25 +229,13 @@ def sample_range_of(frame: FrameRow) -> SampleRange | None:
 
 
 def _sensor_record(frame: FrameRow) -> dict[str, Any]:
-    """Return the fields of a frame record that describe its samples or points."""
+    """Return the fields of a frame record that depend on its kind."""
     if frame.cloud is None:
-        return {
-            "kind": "depth",
-            "trust_depth": None if frame.samples is None else frame.samples["trusted"],
-            "samples": sample_range_of(frame),
-            "intrinsics": CameraIntrinsics.model_validate(frame.intrinsics),
-            "depth_scale": frame.depth_scale,
-            "depth_along_ray": frame.depth_along_ray,
-        }
+        trusted = None if frame.samples is None else frame.samples["trusted"]
+        return {"kind": "depth", "trust_depth": trusted}
     eye = frame.cloud["viewpoint"]
     return {
-        "kind": "cloud",
-        "samples": sample_range_of(frame),
-        "intrinsics": None,
-        "depth_scale": None,
-        "depth_along_ray": None,
-        "points": frame.cloud["points"],
-        "viewpoint": None if eye is None else Vector(**dict(zip("xyz", eye, strict=True))),
-        "units_per_metre": frame.cloud["units_per_metre"],
-        "note": frame.cloud["note"],
-    }
+        "kind": "cloud", "depth_scale": None, "depth_along_ray": None,
+        "viewpoint": None if eye is None else vector(eye),
+        **{name: frame.cloud[name] for name in ("points", "units_per_metre", "note")},
+    }  # fmt: skip

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from sqlalchemy import Connection
 
 from sceneprint.engine.admin.statistics import anchors
-from sceneprint.engine.serializers import when
+from sceneprint.engine.serializers import copy_fields, when
 from sceneprint.errors import InvalidRequest, SceneprintError
 from sceneprint.process import COMMAND, Actor
 from sceneprint.settings import Settings
@@ -212,10 +212,7 @@ class Events:
 
 def event_record(seals: OpaqueIds, row: EventRow) -> Event:
     """Return the API record of an event."""
-    return Event(
-        id=seals.seal("event", row.number), at=when(row.at), kind=row.kind, map=row.map,
-        frame_id=row.frame_id, job_id=row.job_id, data=row.data,
-    )  # fmt: skip
+    return copy_fields(Event, row, id=seals.seal("event", row.number), at=when(row.at))
 
 
 #: Seconds between removals of expired lines of the audit log.
@@ -305,8 +302,7 @@ class Audit:
 
 
 def _audit_line(row: AuditRow) -> AuditLine:
-    values = vars(row) | {"at": when(row.at), "actor": row.actor or None}
-    return AuditLine.model_validate(values)
+    return copy_fields(AuditLine, row, at=when(row.at), actor=row.actor or None)
 
 
 def create_key(
@@ -445,10 +441,9 @@ def _until(expires_at: datetime) -> float:
 
 def _key_record(row: stored.KeyRow) -> Key:
     previous = row.previous_until if (row.previous_until or 0) > time.time() else None
-    return Key(
-        name=row.name, grants=row.grants, created_at=when(row.created_at),
-        expires_at=when(row.expires_at), tenant=row.tenant, previous_until=when(previous),
-        last_used_at=when(row.last_used_at),
+    return copy_fields(
+        Key, row, created_at=when(row.created_at), expires_at=when(row.expires_at),
+        previous_until=when(previous), last_used_at=when(row.last_used_at),
     )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from sqlalchemy import Connection, func, select
 from sceneprint.atomic_files import nearest_folder
 from sceneprint.engine.context import Context
 from sceneprint.engine.search.local_index import index_folder, is_index_folder
-from sceneprint.engine.serializers import when
+from sceneprint.engine.serializers import copy_fields, when
 from sceneprint.errors import DamagedIndex, SceneprintError, UnusableStore
 from sceneprint.index.index_manifest import IndexManifest, manifests, read_manifest
 from sceneprint.process import merged, quantile
@@ -33,7 +33,7 @@ from sceneprint.store.events import anchor_number, newest_number, number_events
 from sceneprint.store.frames import count_states
 from sceneprint.store.maps import find_map, list_maps
 from sceneprint.store.queue import PENDING, count_jobs, read_clock, waiting_by_tenant
-from sceneprint.store.scrub_rows import ScrubRow, read_scrub
+from sceneprint.store.scrub_rows import read_scrub
 from sceneprint.store.signatures import count_indexed
 from sceneprint.store.tables import MapRow
 from sceneprint_client.api import JobState
@@ -327,23 +327,25 @@ class Statistics:
             else:
                 frames = count_states(connection, row.number)
                 jobs = count_jobs(connection, row.number)
-                maps, indexes = 1, [index_state(connection, self._indexes, row)]
+                maps, indexes = 1, [index_state(connection, self._settings.indexes, row)]
                 oldest, workers = store_counts.oldest_waiting(connection, row.number), None
-            scrub = None if row is not None else _scrub_seen(read_scrub(connection))
+            scrub = None if row is not None else read_scrub(connection)
             used = counted.sizes if row is None else self._sizes_of_map(connection, row)
         return Stats(
             at=when(now), counted_at=when(now if row is not None else counted.at), map=map_name,
             maps=maps, frames=frames, jobs=jobs, waiting=jobs.get(JobState.QUEUED, 0),
             oldest_waiting_s={kind: max(now - at, 0.0) for kind, at in sorted(oldest.items())},
-            indexes=indexes,
-            workers=workers, bytes=used, use=None if row is None else _use(row), scrub=scrub,
+            indexes=indexes, workers=workers, bytes=used,
+            use=None if row is None else copy_fields(
+                MapUse, row, frames=row.used_frames, bytes=row.used_bytes
+            ),
+            scrub=None if scrub is None else copy_fields(
+                ScrubSeen, scrub, began_at=when(scrub.began_at),
+                finished_at=when(scrub.finished_at),
+            ),
             total=Counted(**_recent_counts(happened, range(minutes), samples)),
             minutes=_minutes(happened, samples, start, minutes),
         )  # fmt: skip
-
-    @property
-    def _indexes(self) -> Path:
-        return self._settings.indexes
 
     def figures(self) -> Figures:
         """Return the metrics of the whole store, at most a second old."""
@@ -389,7 +391,7 @@ class Statistics:
         began, start = time.time(), time.monotonic()
         self._counts = StoreCounts(
             frames=count_states(connection), jobs=count_jobs(connection),
-            indexes=index_states(connection, self._indexes), sizes=self.sizes(), at=began,
+            indexes=index_states(connection, self._settings.indexes), sizes=self.sizes(), at=began,
             seconds=time.monotonic() - start,
         )  # fmt: skip
         return self._counts
@@ -419,25 +421,10 @@ class Statistics:
         now = time.monotonic()
         recent = {n: one for n, one in list(self._sizes_of.items()) if now - one[0] <= MEASURED_S}
         if row.number not in recent:
-            recent[row.number] = now, sizes_of_map(connection, self._store, self._indexes, row)
+            measured = sizes_of_map(connection, self._store, self._settings.indexes, row)
+            recent[row.number] = now, measured
             self._sizes_of = recent
         return recent[row.number][1]
-
-
-def _scrub_seen(row: ScrubRow | None) -> ScrubSeen | None:
-    if row is None:
-        return None
-    return ScrubSeen(
-        began_at=when(row.began_at), finished_at=when(row.finished_at), blobs=row.blobs,
-        bytes=row.bytes, damaged=row.damaged,
-    )  # fmt: skip
-
-
-def _use(row: MapRow) -> MapUse:
-    return MapUse(
-        frames=row.used_frames, bytes=row.used_bytes, quota_frames=row.quota_frames,
-        quota_bytes=row.quota_bytes, retention_days=row.retention_days,
-    )  # fmt: skip
 
 
 def _minutes(

@@ -22,8 +22,7 @@ from sqlalchemy import Connection, func, select
 
 from sceneprint import errors
 from sceneprint.engine.context import Context
-from sceneprint.engine.ingest.uploads import Upload, Uploads, item_of
-from sceneprint.engine.ingest.uploads import UploadResult as UploadOutcome
+from sceneprint.engine.ingest.uploads import Upload, UploadResult, Uploads, item_of
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, Swept, queue_task
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.formats.archive import BLOCK, Archive, Inflater, is_archive, open_archive
@@ -102,11 +101,7 @@ def add_block(
     ----------
     block : name and reading function of each frame
     """
-
-    def fence(connection: Connection) -> None:
-        queue.check_held(connection, task.job)
-
-    outcomes: list[UploadOutcome | None] = []
+    outcomes: list[UploadResult | None] = []
     uploaded = []
     for _, read in block:
         try:
@@ -115,9 +110,10 @@ def add_block(
         except (errors.StoreError, errors.Busy):  # temporary, so the slice is repeated
             raise
         except errors.SceneprintError as error:
-            outcomes.append(UploadOutcome(None, error=error))
+            outcomes.append(UploadResult(None, error=error))
         except MemoryError:
             outcomes.append(_too_large())
+    fence = partial(queue.check_held, held=task.job)
     rest = iter(_add_frames(uploads, task.of_map.name, uploaded, fence))
     return [
         import_item(name, outcome or next(rest))
@@ -127,7 +123,7 @@ def add_block(
 
 def _add_frames(
     uploads: Uploads, map_name: str, block: list[Upload], fence: Callable[[Connection], None]
-) -> list[UploadOutcome]:
+) -> list[UploadResult]:
     """Add frames in one commit, or one by one if memory does not suffice; return their results."""
     if not block:
         return []
@@ -139,9 +135,9 @@ def _add_frames(
     return [_add_frames(uploads, map_name, [upload], fence)[0] for upload in block]
 
 
-def _too_large() -> UploadOutcome:
+def _too_large() -> UploadResult:
     reason = "The frame needs more memory than a worker may use. Send a smaller frame."
-    return UploadOutcome(None, error=errors.UnreadableFrame(reason))
+    return UploadResult(None, error=errors.UnreadableFrame(reason))
 
 
 def _upload(archive: Archive, step: Step, options: ImportOptions) -> Upload:
@@ -176,18 +172,13 @@ def _summary_of(
     )  # fmt: skip
 
 
-def import_item(name: str, outcome: UploadOutcome) -> ImportItem:
+def import_item(name: str, outcome: UploadResult) -> ImportItem:
     """Convert the result of one upload to an item of an import."""
     item = item_of(outcome)
-    if item.frame is None:
-        return ImportItem(
-            name=name, status=item.status, frame_id=None, job_id=None, problem=item.problem
-        )
-    frame = item.frame
-    return ImportItem(
-        name=name, status=item.status, frame_id=frame.frame_id, job_id=frame.job_id,
-        problem=item.problem, samples=frame.samples, has_pose=frame.has_pose,
-    )  # fmt: skip
+    own: dict[str, Any] = {"frame_id": None, "job_id": None}
+    if item.frame is not None:
+        own = item.frame.model_dump(include={"frame_id", "job_id", "samples", "has_pose"})
+    return ImportItem(name=name, status=item.status, problem=item.problem, **own)
 
 
 #: Job kinds of imports by the field `as` of a request.

@@ -74,7 +74,9 @@ def _read(data: bytes, meta: FrameMeta, decoder: Decoder) -> Read:
     base = None if meta.T_base_sensor is None else base_of(meta.T_base_sensor, None)
     if pose is not None and base is not None and meta.pose is not None and meta.pose.of == "base":
         pose = pose @ base[1]
-    if _is_cloud(data, meta):
+    found = format_of(data)
+    # an NPY array with a camera is an image
+    if meta.format or (found and (found != "npy" or meta.intrinsics is None)):
         return _read_cloud(data, meta, pose, decoder)
     _refuse(meta, "depth image", {"viewpoint": "file", "units_per_metre": 1.0, "format": None})
     if meta.intrinsics is None:
@@ -221,14 +223,6 @@ def base_of(
 def _file_format(data: bytes) -> CloudFormat:
     """Return the file format of an accepted cloud; one without magic bytes is a KITTI scan."""
     return format_of(data) or "kitti"
-
-
-def _is_cloud(data: bytes, meta: FrameMeta) -> bool:
-    """Return whether an upload is a point cloud; an NPY array with intrinsics is a depth image."""
-    if meta.format is not None:
-        return True
-    cloud_format = format_of(data)
-    return cloud_format is not None and (cloud_format != "npy" or meta.intrinsics is None)
 
 
 def _read_cloud(data: bytes, meta: FrameMeta, pose: Floats | None, decoder: Decoder) -> Read:

@@ -11,12 +11,12 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import PurePath
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
-from sqlalchemy import Connection
 
 from sceneprint.decoders.pool import inheritable
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
@@ -33,6 +33,7 @@ from sceneprint.engine.products.map_coverage import outcome_of
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_upload
 from sceneprint.engine.search.up_vectors import PlanAxes, plan_axes
+from sceneprint.engine.serializers import copy_fields, direction, vector
 from sceneprint.errors import (
     DecoderFailure,
     FrameError,
@@ -52,11 +53,9 @@ from sceneprint.types import Floats, Intrinsics, ReferenceSurface
 from sceneprint_client.api import Answer, Filter, FrameMeta, FrameState, Query
 from sceneprint_client.api.base import (
     CameraIntrinsics,
-    Direction,
     GivenDirection,
     GivenPose,
     GivenVector,
-    Vector,
 )
 from sceneprint_client.api.coverage import COVERAGE_OUTCOMES, NewMapCoverage
 from sceneprint_client.api.frames import VIRTUAL, ImportOptions, MapImportResult, WeakArea
@@ -107,14 +106,6 @@ class StoredSurface:
 _NO_POSES: Floats = np.empty((0, 4, 4))
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """A rendered view: bytes and metadata of an upload."""
-
-    data: bytes
-    meta: FrameMeta
-
-
 class _Views:
     """Renderer of the views of a job.
 
@@ -156,18 +147,15 @@ class _Views:
         frame_id = hashlib.sha256(place + view.data).hexdigest()[:32]
         return Upload(view.data, meta, options.priority, options.if_novel, frame_id)
 
-    def view(self, pose: Floats) -> _View:
+    def view(self, pose: Floats) -> Upload:
         """Render a view at T_map_sensor (4, 4); the metadata does not contain the pose."""
         seen, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
-            return _View(encode_npy(seen), FrameMeta())
+            return Upload(encode_npy(seen), FrameMeta())
         scale = min(_DEPTH_SCALE, _FARTHEST / self._p.farthest)
         samples = np.round(seen * scale).astype(np.uint16)
-        intrinsics = CameraIntrinsics(
-            width=camera.width, height=camera.height, fx=camera.fx, fy=camera.fy, cx=camera.cx,
-            cy=camera.cy,
-        )  # fmt: skip
-        return _View(encode_png(samples), FrameMeta(intrinsics=intrinsics, depth_scale=scale))
+        intrinsics = copy_fields(CameraIntrinsics, camera)
+        return Upload(encode_png(samples), FrameMeta(intrinsics=intrinsics, depth_scale=scale))
 
 
 def names_of(options: ImportOptions) -> tuple[str, str]:
@@ -268,10 +256,7 @@ class MapImporter:
         progress, items = dict(task.progress), list[dict[str, Any]]()
         if not progress["rendered"] and options.offset is None and stored.surface.offset.any():
             self._require_one_offset(task, options, stored.surface.offset, views)
-
-        def fence(connection: Connection) -> None:
-            queue.check_held(connection, task.job)
-
+        fence = partial(queue.check_held, held=task.job)
         while progress["rendered"] < progress["views"] and (not items or not is_over()):
             first = progress["rendered"]
             block = [
@@ -417,7 +402,7 @@ class MapImporter:
         # no view is unchecked, since all have a pose in the parent frame of the map
         facts |= {name: counts[name] for name in COVERAGE_OUTCOMES if name != "unchecked"}
         return MapImportResult(
-            **facts, up=Direction(**_xyz(surface.up)), offset=Vector(**_xyz(surface.offset)),
+            **facts, up=direction(surface.up), offset=vector(surface.offset),
             session=session, parent_frame=parent, views=self._states(task)[FrameState.INDEXED],
             refused=progress["refused"], seen=progress["seen"], tested=len(outcomes),
             coverage=counts["found"] / len(outcomes) if outcomes else None,
@@ -476,11 +461,7 @@ def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
         if 2 * cell.found < views:
             column, row = width * (cell.column + 0.5), width * (cell.row + 0.5)
             centre = column * flat[0] + row * flat[1] + stored.floor * up
-            vector = Vector(**_xyz(centre))
-            areas.append(WeakArea(centre=vector, width_m=width, views=views, found=cell.found))
+            areas.append(
+                WeakArea(centre=vector(centre), width_m=width, views=views, found=cell.found)
+            )
     return sorted(areas, key=lambda one: one.found - one.views)[:_MOST_WEAK]
-
-
-def _xyz(vector: Floats) -> dict[str, float]:
-    x, y, z = vector.tolist()
-    return {"x": x, "y": y, "z": z}

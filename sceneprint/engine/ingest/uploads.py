@@ -92,25 +92,21 @@ def find_duplicate(
     return None
 
 
-def _sent_value(frame: FrameRow, name: str) -> Any:
-    """Return a column of a frame as uploaded, that is, before a join changed its pose."""
-    if frame.sent_parent is not None and name in ("pose", "pose_parent"):
-        return frame.sent_pose if name == "pose" else frame.sent_parent
-    return getattr(frame, name)
-
-
 def _differing(frame: FrameRow, metadata: dict[str, Any]) -> list[str]:
+    """Return the fields that differ from those that the caller of the frame sent."""
+    stored = vars(frame)
+    if frame.sent_parent is not None:  # a join has moved the pose
+        stored = {**stored, "pose": frame.sent_pose, "pose_parent": frame.sent_parent}
+
+    def sent(name: str, value: Any) -> Any:  # of a cloud, only its units
+        return value["units_per_metre"] if name == "cloud" and value is not None else value
+
+    names = [name for name in metadata if name not in _LABELS]
     return [
         _FIELDS.get(name, name)
-        for name, value in metadata.items()
-        if name not in _LABELS
-        and _caller_value(name, _sent_value(frame, name)) != _caller_value(name, value)
+        for name in names
+        if sent(name, stored[name]) != sent(name, metadata[name])
     ]
-
-
-def _caller_value(name: str, value: Any) -> Any:
-    """Return the part of a column that the caller supplied: of `cloud`, only the units."""
-    return value["units_per_metre"] if name == "cloud" and value is not None else value
 
 
 def is_retried(state: FrameState) -> bool:
@@ -166,17 +162,15 @@ def _added(frame: FrameRow, job_id: str, reason: str | None = None) -> Added:
     )  # fmt: skip
 
 
-def replayed(
-    connection: Connection, row: MapRow, data: dict[str, Any]
+def _before(
+    connection: Connection, row: MapRow, once: IdempotentRequest | None
 ) -> list[UploadResult] | None:
-    """Return the results of an earlier request with the current states of its frames.
-
-    Return None if the map was deleted and created again.
-
-    Parameters
-    ----------
-    data : results as stored by `IdempotentRequest`
+    """Return the results of an earlier request with the key of `once`, with the current states of
+    its frames; None if there is none, or if the map was deleted and created again.
     """
+    data = None if once is None else once.stored_result(connection)
+    if data is None:
+        return None
     results = []
     for stored in data["frames"]:
         if "error" in stored:
@@ -497,7 +491,13 @@ class Uploads:
                 request.left[:] = request.blobs
                 return list(before), True
         request.left.clear()
-        written = _insert_new(connection, row, request.todo)
+        new = {
+            i: _new_frame(row, prepared)
+            for i, prepared in request.todo.items()
+            if prepared.upload.frame_id is None
+        }
+        ids = receive_frames(connection, list(new.values()))
+        written = {i: _new_result(frame) for i, frame in new.items() if frame.frame_id in ids}
         for i, prepared in request.todo.items():
             if i in written:
                 continue
@@ -524,14 +524,6 @@ class Uploads:
             return group
 
 
-def _before(
-    connection: Connection, row: MapRow, once: IdempotentRequest | None
-) -> list[UploadResult] | None:
-    """Return the results of an earlier request with the key of `once`; None if there is none."""
-    data = None if once is None else once.stored_result(connection)
-    return None if data is None else replayed(connection, row, data)
-
-
 def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
     """Return the row of a frame to insert unless it exists.
 
@@ -552,18 +544,6 @@ def _new_result(new: NewFrame) -> UploadResult:
         has_pose=new.values["pose"] is not None,
     )  # fmt: skip
     return UploadResult(added, new=True)
-
-
-def _insert_new(
-    connection: Connection, row: MapRow, todo: dict[int, _Prepared]
-) -> dict[int, UploadResult]:
-    """Insert the uploads that are new frames, and return their results by index."""
-    new = {
-        i: _new_frame(row, prepared)
-        for i, prepared in todo.items() if prepared.upload.frame_id is None
-    }  # fmt: skip
-    ids = receive_frames(connection, list(new.values()))
-    return {i: _new_result(frame) for i, frame in new.items() if frame.frame_id in ids}
 
 
 def _store_single(

@@ -77,19 +77,15 @@ class _Group(Generic[W]):
                     self._waiting.remove(mine)
             raise
         finally:
-            if mine.leads:
-                self._hand_over()
+            if mine.leads:  # pass the lead to the next thread
+                with self._list:
+                    self._led = bool(self._waiting)
+                    if self._waiting:
+                        self._waiting[0].leads = True
+                        self._waiting[0].ready.set()
         if mine.error is not None:
             raise mine.error
         return mine.result
-
-    def _hand_over(self) -> None:
-        """Make the thread of the next waiting write the leader."""
-        with self._list:
-            self._led = bool(self._waiting)
-            if self._waiting:
-                self._waiting[0].leads = True
-                self._waiting[0].ready.set()
 
     def _write(self) -> None:
         """Perform a batch of waiting writes, oldest first."""
@@ -159,18 +155,14 @@ class Grouping(_Group[_Work]):
                     write.result, write.error = None, error
             else:
                 for write in batch:
-                    self._write_alone(write)
+                    try:
+                        with self._database.write(map_number=self._map_number) as connection:
+                            _do(write, connection)
+                    except Exception as own_error:
+                        write.result, write.error = None, own_error
                     write.done = True
         for write in batch:
             write.done = True
-
-    def _write_alone(self, write: _Waiting[_Work]) -> None:
-        write.result = write.error = None
-        try:
-            with self._database.write(map_number=self._map_number) as connection:
-                _do(write, connection)
-        except Exception as error:
-            write.result, write.error = None, error
 
 
 def _do(write: _Waiting[_Work], connection: Connection) -> None:

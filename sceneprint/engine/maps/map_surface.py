@@ -16,7 +16,7 @@ from sceneprint.engine.maps.map_frames import Output
 from sceneprint.engine.maps.map_plans import PlanFrame, plan_frame, surface_picture
 from sceneprint.engine.maps.surface_job import SURFACE, scale_of, surface_points, tile_cells
 from sceneprint.engine.products.product import BACKGROUND
-from sceneprint.engine.serializers import tag_of, when
+from sceneprint.engine.serializers import copy_fields, tag_of, vector, when
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
     DamagedBlob,
@@ -37,7 +37,7 @@ from sceneprint.store.surface_rows import LevelTotals, SightingFrame, SurfaceRow
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.store.wakeup import Wakeup
 from sceneprint.types import Floats
-from sceneprint_client.api import JobState, Page, Vector
+from sceneprint_client.api import JobState, Page
 from sceneprint_client.api.surface import (
     PLAN_WIDTH,
     MapSurface,
@@ -450,7 +450,15 @@ class SurfaceUpkeep:
             return
         self._seen[row.number] = at, _DONE
         with self._store.database.read() as connection:  # usually none is due: avoid a write lock
-            if not self._is_due(connection, row, surface):
+            job = _job_of(connection, surface)
+            if (
+                job is not None
+                and job.state.over
+                and job.state != JobState.SUCCEEDED
+                and job.data == {"revision": row.revision, "edits": surface.pose_edits}
+            ):
+                return  # the user has to retry a job that failed with the same frames
+            if not self._auto and not stored.frames_to_remove(connection, surface, 1):
                 return
         with self._store.database.write(map_number=row.number) as connection:
             row = map_of_number(connection, row.number)
@@ -462,31 +470,14 @@ class SurfaceUpkeep:
         if pending:
             self._bell.ring()
 
-    def _is_due(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
-        """Return whether an outdated surface should be updated without a request."""
-        if self._has_failed(connection, row, surface):
-            return False
-        return self._auto or bool(stored.frames_to_remove(connection, surface, 1))
-
-    def _has_failed(self, connection: Connection, row: MapRow, surface: SurfaceRow) -> bool:
-        """Return whether the last job failed, and the frames have not changed since."""
-        job = _job_of(connection, surface)
-        if job is None or not job.state.over or job.state == JobState.SUCCEEDED:
-            return False
-        return job.data == {"revision": row.revision, "edits": surface.pose_edits}
-
     def _add_rows(self, rows: Sequence[MapRow]) -> None:
         if not rows:
             return
         with self._store.database.write() as connection:
             for row in rows[:_ROWS_AT_ONCE]:
                 with suppress(SceneprintError):
-                    if (
-                        stored.find_surface(
-                            connection, map_of_number(connection, row.number).number
-                        )
-                        is None
-                    ):
+                    number = map_of_number(connection, row.number).number
+                    if stored.find_surface(connection, number) is None:
                         stored.add_surface(connection, row)
 
 
@@ -545,9 +536,9 @@ def _parent_record(
     finest = totals[0]
     plan = plan_frame(np.array(parent["axes"]), finest.low, finest.high, surface.cell_m, PLAN_WIDTH)
     return SurfaceParent(
-        parent_frame=parent["parent_frame"], frames=parent["frames"], up=_vector(parent["up"]),
+        parent_frame=parent["parent_frame"], frames=parent["frames"], up=vector(parent["up"]),
         up_from=parent["up_from"], x_axis=parent["axes"][0], y_axis=parent["axes"][1],
-        low=_vector(finest.low), high=_vector(finest.high),
+        low=vector(finest.low), high=vector(finest.high),
         levels=[
             SurfaceLevel(
                 level=one.level, cell_m=surface.cell_m * FACTOR**one.level,
@@ -556,10 +547,7 @@ def _parent_record(
             )
             for one in totals
         ],
-        plan=SurfacePlan(
-            m_per_pixel=plan.m_per_pixel, width=plan.width, height=plan.height, left=plan.left,
-            top=plan.top,
-        ),
+        plan=copy_fields(SurfacePlan, plan),
     )  # fmt: skip
 
 
@@ -574,13 +562,9 @@ def _sighting(frame: SightingFrame, parent: str, distance: float | None) -> Surf
     return SurfaceSighting(
         frame_id=frame.id, name=frame.name, kind="cloud" if frame.is_cloud else "depth",
         robot=frame.robot, session=frame.session, captured_at=when(frame.captured_at),
-        parent_frame=parent, position=_vector([frame.pose[i][3] for i in range(3)]),
+        parent_frame=parent, position=vector(frame.pose[i][3] for i in range(3)),
         distance_m=distance,
     )  # fmt: skip
-
-
-def _vector(at: Sequence[float]) -> Vector:
-    return Vector(**dict(zip("xyz", at, strict=True)))
 
 
 def _parent_name(surface: SurfaceRow | None, parent: str | None) -> str | None:

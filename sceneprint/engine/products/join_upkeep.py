@@ -65,7 +65,8 @@ class JoinUpkeep:
     def _look(self, row: MapRow) -> bool:
         """Start an association if one is due; return whether the map needs no further check."""
         with self._store.database.read() as connection:  # usually none is due: avoid a write lock
-            if _is_busy(connection, row):
+            states = count_states(connection, row.number)
+            if states.get(FrameState.RECEIVED) or states.get(FrameState.SIGNING):
                 return False
             if _due(connection, row) is None:
                 return True
@@ -78,12 +79,6 @@ class JoinUpkeep:
                 enqueue(connection, kind, None, BACKGROUND, map_number=row.number, data=data)
         self._bell.ring()
         return False
-
-
-def _is_busy(connection: Connection, row: MapRow) -> bool:
-    """Return whether frames of a map wait for a signature."""
-    states = count_states(connection, row.number)
-    return bool(states.get(FrameState.RECEIVED) or states.get(FrameState.SIGNING))
 
 
 def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
@@ -109,14 +104,11 @@ def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
 
 def _largest(runs: Sequence[ParentRun]) -> list[ParentRun]:
     """Return the largest named session of each parent frame, starting with the root frame."""
-    runs_by_parent: dict[str, ParentRun] = {}
+    largest: dict[str, ParentRun] = {}
     for run in runs:
-        if run.session is not None and run.frames > runs_by_parent.get(run.parent, _NONE).frames:
-            runs_by_parent[run.parent] = run
-    return list(runs_by_parent.values())
-
-
-_NONE = ParentRun("", None, None, 0, 0)
+        if run.session is not None and run.frames > largest.setdefault(run.parent, run).frames:
+            largest[run.parent] = run
+    return list(largest.values())
 
 
 def _request(run: ParentRun, root: ParentRun) -> NewAssociation | None:

@@ -20,11 +20,11 @@ from sqlalchemy import Connection
 from sceneprint.engine.context import Context
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.maps.map_plans import QueriedPosition, coverage_plans, plan_changes
-from sceneprint.engine.products.product import StepwiseProducts
+from sceneprint.engine.products.product import StepwiseProducts, spread_evenly
 from sceneprint.engine.search.query import Queries, steadily
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.search.up_vectors import parent_axes
-from sceneprint.engine.serializers import model_label
+from sceneprint.engine.serializers import model_label, vector
 from sceneprint.errors import (
     DamagedBlob,
     DamagedSignature,
@@ -45,7 +45,7 @@ from sceneprint.store.maps import current_map, living_frame, model_names
 from sceneprint.store.queue import items_of
 from sceneprint.store.tables import JobRow, MapRow
 from sceneprint.types import Floats
-from sceneprint_client.api import Answer, Filter, Page, Query, Transform, Vector
+from sceneprint_client.api import Answer, Filter, Page, Query, Transform
 from sceneprint_client.api.coverage import (
     CELL_TRENDS,
     COVERAGE_OUTCOMES,
@@ -96,10 +96,7 @@ def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage
             f"Map {row.name!r} has no indexed frame{whose}. See GET /v1/maps/{row.name}/sessions.",
             (("session", "no indexed frame"),) if whose else (),
         )
-    if len(numbers) <= request.most:
-        return numbers
-    chosen = np.arange(request.most) * len(numbers) // request.most
-    return [numbers[place] for place in chosen.tolist()]
+    return spread_evenly(numbers, request.most)
 
 
 class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
@@ -289,7 +286,7 @@ def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> Coverage
     return CoverageFrame(
         frame_id=stop.id, robot=stop.robot, session=stop.session,
         parent_frame=None if pose is None else stop.parent,
-        position=None if pose is None else Vector(x=pose[0][3], y=pose[1][3], z=pose[2][3]),
+        position=None if pose is None else vector(row[3] for row in pose[:3]),
         look_alikes=[stops[one].id for one in item["look_alikes"] if one in stops],
         **{name: item[name] for name in same},
     )  # fmt: skip

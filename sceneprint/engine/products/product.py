@@ -282,6 +282,13 @@ class Products(ABC, Generic[Request, Record]):
         return page[:limit], str(page[limit - 1].number) if len(page) > limit else None
 
 
+def spread_evenly(numbers: list[int], most: int) -> list[int]:
+    """Return at most `most` of some numbers, evenly spaced."""
+    if len(numbers) <= most:
+        return numbers
+    return [numbers[i * len(numbers) // most] for i in range(most)]
+
+
 class StepwiseProducts(Products[Request, Record]):
     """Products whose jobs consist of equal steps, such as one step per frame."""
 

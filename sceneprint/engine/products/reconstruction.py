@@ -217,16 +217,10 @@ def _no_image(name: str) -> UselessFrame:
 
 
 def _fused_view(view: JobView | None, frame: DepthFrame, source: Source) -> FusedView:
+    names = ("frame_id", "map", "rank", "strength")
+    own: dict[str, Any] = {name: getattr(view, name, None) for name in names}
     samples = int(np.count_nonzero(frame.depth))
-    return FusedView(
-        frame_id=None if view is None else view.frame_id,
-        map=None if view is None else view.map,
-        rank=None if view is None else view.rank,
-        strength=None if view is None else view.strength,
-        source=source,
-        samples=samples,
-        added_m2=0.0,
-    )
+    return FusedView(**own, source=source, samples=samples, added_m2=0.0)
 
 
 #: Names of the files of a job: geometry of the query (until the end of the job), and surface.

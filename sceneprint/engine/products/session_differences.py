@@ -10,7 +10,6 @@ A file of the job stores the state between slices.
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +17,7 @@ from sqlalchemy import Connection
 
 from sceneprint.engine.jobs.tasks import IsOver, LongJob, SliceResult, ends_within
 from sceneprint.engine.maps.surface_job import cell_width, surface_points
-from sceneprint.engine.products.product import SLICE_S, Products
+from sceneprint.engine.products.product import SLICE_S, Products, spread_evenly
 from sceneprint.engine.search.up_vectors import parent_axes
 from sceneprint.errors import DamagedBlob, InvalidRequest, UnreadableGeometry
 from sceneprint.formats.artifact import read_geometry
@@ -112,7 +111,7 @@ class Differences(Products[NewDifference, Difference]):
         """Return the initial progress with the frames to compare, and their parent frame."""
         parent = shared_parent(connection, row, request)
         frames = {
-            side: _spread(
+            side: spread_evenly(
                 posed_in_session(connection, row.number, getattr(request, side), parent),
                 api.MOST_COMPARED,
             )
@@ -125,7 +124,8 @@ class Differences(Products[NewDifference, Difference]):
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
         """Return whether a frame of a job was deleted."""
-        return any_purged(connection, _frames_of(job))
+        frames: dict[Side, list[int]] = (job.progress or {}).get("frames", {})
+        return any_purged(connection, [number for own in frames.values() for number in own])
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Fuse or compare at least one frame; conclude the job in its last slice."""
@@ -277,16 +277,3 @@ class _State:
 def _order(frames: dict[Side, list[int]]) -> list[tuple[Side, int]]:
     """Return session side and number of all frames, in the order of processing."""
     return [(side, number) for side in SIDES for number in frames[side]]
-
-
-def _frames_of(job: JobRow) -> list[int]:
-    """Return the numbers of the frames that a job compares."""
-    frames: dict[Side, list[int]] = (job.progress or {}).get("frames", {})
-    return [number for _, number in _order(frames)] if frames else []
-
-
-def _spread(numbers: Sequence[int], most: int) -> list[int]:
-    """Return up to `most` of the numbers, evenly spaced."""
-    if len(numbers) <= most:
-        return list(numbers)
-    return [numbers[i * len(numbers) // most] for i in range(most)]

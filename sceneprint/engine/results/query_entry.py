@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, field, replace
 import numpy as np
 from pydantic import ValidationError
 
-from sceneprint.engine.serializers import when
+from sceneprint.engine.serializers import copy_fields, when
 from sceneprint.errors import SceneprintError, UnknownQuery
 from sceneprint.store.deletion import DAY_S
 from sceneprint.store.frame_queries import QueryOrigin
@@ -180,12 +180,9 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
             parent_frame=row.pose_parent, translation=Vector(x=x, y=y, z=z),
             rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
         )  # fmt: skip
-    return QueryRecord(
-        query_id=row.id, at=when(row.at), map=row.map,
+    return copy_fields(
+        QueryRecord, row, query_id=row.id, at=when(row.at), pose=pose, frame=frame,
         maps=[one for one in row.searched if one == row.map or may_read(one)],
-        robot=row.robot, session=row.session, key=row.key, status=row.status, cause=row.cause,
-        reason=row.reason, pose=pose, confidence=row.confidence, support=row.support,
-        alternatives=row.alternatives, milliseconds=row.milliseconds, kind=row.kind, frame=frame,
         stored=row.bytes > 0, kept_at=when(row.kept_at),
         title=row.title if all(map(may_read, row.searched)) else None,
         expires_at=None if row.kept_at else when(row.at + DAY_S * days),

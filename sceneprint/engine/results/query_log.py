@@ -177,19 +177,22 @@ class QueryLog:
                     self._changed.wait_for(lambda: self._closed, AGAIN_S)
                 else:
                     since = time.monotonic() - self._written_at
-                    self._changed.wait_for(self._is_urgent, max(0.0, GATHER_S - since))
+                    self._changed.wait_for(
+                        lambda: self._closed or self._flushing or len(self._waiting) >= AT_ONCE,
+                        max(0.0, GATHER_S - since),
+                    )
                 batch = list(islice(self._waiting, AT_ONCE))
             if not self._stored(batch) and self._closed:
                 return
-
-    def _is_urgent(self) -> bool:
-        return self._closed or self._flushing or len(self._waiting) >= AT_ONCE
 
     def _stored(self, batch: Sequence[_Waiting]) -> bool:
         """Write a batch of queries; return False if the batch must be retried."""
         loss_reason = None
         try:
-            self._write_files(batch)
+            if not self._store.database.read_only:
+                # concurrently, since object stores are slow
+                with ThreadPoolExecutor(AT_ONCE_PUT, "query-log-put") as pool:
+                    list(pool.map(self._write_file, [one for one in batch if one.answer]))
             rows = [one.row for one in batch if one.row.listed or one.row.bytes]
             with self._store.database.write() as connection:
                 add_queries(connection, rows)
@@ -218,13 +221,6 @@ class QueryLog:
         if self._bytes_written > _SHARE * self._room:
             self.tidy(now=True)
         return True
-
-    def _write_files(self, batch: Sequence[_Waiting]) -> None:
-        """Write the answers of a batch concurrently, to hide the latency of object stores."""
-        if self._store.database.read_only:
-            return
-        with ThreadPoolExecutor(AT_ONCE_PUT, "query-log-put") as pool:
-            list(pool.map(self._write_file, [one for one in batch if one.answer is not None]))
 
     def _write_file(self, one: _Waiting) -> None:
         if one.answer is None or one.row.bytes:  # stored by an earlier attempt
@@ -323,11 +319,9 @@ class QueryLog:
             raise unknown_query(row.id)
         return data
 
-    def record(
-        self, query_id: str, may_read: Callable[[str], bool] = lambda _: True
-    ) -> QueryRecord:
+    def record(self, query_id: str) -> QueryRecord:
         """Return the API record of a query; raise UnknownQuery as `find_row` does."""
-        return query_record(self.find_row(query_id), self._days, may_read)
+        return query_record(self.find_row(query_id), self._days, lambda _: True)
 
     def keep(self, query_id: str, title: str | None) -> QueryRecord:
         """Make an answer permanent until `release`, and set its title.

@@ -24,7 +24,7 @@ from sceneprint.engine.results.query_entry import StoredAnswer
 from sceneprint.engine.search.response import uncertainty_record, validation_record
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import thresholds
-from sceneprint.engine.serializers import query_sensor, sensor_of, tag_of, transform
+from sceneprint.engine.serializers import copy_fields, query_sensor, sensor_of, tag_of, transform
 from sceneprint.engine.upkeep.repair import rebuild_frame, resign_frames
 from sceneprint.formats.artifact import read_geometry
 from sceneprint.formats.export import LIMIT, encode_points, points_of, thinned, write_ply
@@ -117,7 +117,14 @@ class Pairs:
         NotIndexed : If the query ran without validation, or the map has another model now.
         """
         stored = self._log.find(query_id)
-        match = _match_of(stored, frame_id, map_name)
+        named = (one for one in stored.answer.matches if one.frame_id == frame_id)
+        match = next((one for one in named if map_name in (None, one.map)), None)
+        if match is None:
+            where = "" if map_name is None else f" in map {map_name!r:.80}"
+            raise errors.UnknownFrame(
+                f"Query {query_id} has no match {frame_id!r:.80}{where}. Its answer lists the "
+                "matches."
+            )
         check_geometry(stored)
         with self._store.database.read() as connection:
             row = find_map(connection, match.map)
@@ -229,17 +236,6 @@ def _deleted(match: MatchRecord) -> errors.UnknownFrame:
     )
 
 
-def _match_of(stored: StoredAnswer, frame_id: str, map_name: str | None) -> MatchRecord:
-    for one in stored.answer.matches:
-        if one.frame_id == frame_id and map_name in (None, one.map):
-            return one
-    raise errors.UnknownFrame(
-        f"Query {stored.answer.query_id} has no match "
-        f"{frame_id!r:.80}{'' if map_name is None else f' in map {map_name!r:.80}'}. Its answer "
-        "lists the matches."
-    )
-
-
 class Inspection:
     """Data of stored answers for inspection."""
 
@@ -251,14 +247,9 @@ class Inspection:
         """Return a stored answer; raise UnknownQuery if it is not stored."""
         return self._log.find(query_id).answer
 
-    def question(
-        self, query_id: str, may_read: Callable[[str], bool] = lambda _: True
-    ) -> StoredQuery:
-        """Return the request of a query; raise UnknownQuery if its answer is not stored.
-
-        It omits the names of maps for which `may_read` returns False.
-        """
-        stored, record = self._log.find(query_id), self._log.record(query_id, may_read)
+    def question(self, query_id: str) -> StoredQuery:
+        """Return the request of a query; raise UnknownQuery if its answer is not stored."""
+        stored, record = self._log.find(query_id), self._log.record(query_id)
         return StoredQuery(
             **record.model_dump(),
             validates=stored.geometry is not None or stored.answer.frame is not None,
@@ -343,12 +334,10 @@ class Inspection:
         names = pair.sensor, _sensor(stored)
         T, rival = v.T_match_query, v.T_rival
         traces = None if T is None else trace(query, other, T, p.agreement, p.alignment.consensus)
-        return MatchDetails(
+        return copy_fields(
+            MatchDetails,
+            match,
             query_id=query_id,
-            frame_id=match.frame_id,
-            map=match.map,
-            name=match.name,
-            sequence=match.sequence,
             validation=validation_record(v),
             transform=None if T is None else transform(T, *names),
             uncertainty=uncertainty_record(v.covariance, PAIR_METHOD, p.covariance),

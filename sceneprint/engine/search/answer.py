@@ -263,9 +263,9 @@ def _answer(
     rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
     matches = [*(one for one in checks.matches if one.index in last.rows), *rivals_left]
     names = {place.row.number: place.row.name for place in places}
-    own = query_sensor(prepared.name, prepared.kind, list(names.values()))
+    sensor = query_sensor(prepared.name, prepared.kind, list(names.values()))
     candidates = Candidates(
-        names, ranking, last.selection, last.rows, checks.unreadable, checks.untried, own,
+        names, ranking, last.selection, last.rows, checks.unreadable, checks.untried, sensor,
         p.covariance, prepared.base,
     )  # fmt: skip
     explanations = explained = None
@@ -279,7 +279,8 @@ def _answer(
         clock.stage("explain")
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
     counts = [_counts(searched, i, candidates, checks, matches) for i in range(len(places))]
-    total = _sum(counts)
+    sums = {name: sum(getattr(one, name) for one in counts) for name in Counts.model_fields}
+    total = Counts(**sums)
     deciding = [*last.matches, *rivals_left]
     accepted = [last.rows[m.index] for m in deciding if m.validation.status == "accepted"]
     posed = any(row.pose is not None for row in accepted)
@@ -297,7 +298,7 @@ def _answer(
         alternatives=others,
         seed=query.seed,
         model=model.label,
-        index_version=min(map(_version, places)),
+        index_version=min(place.view.number for place in places),
         exact=searched.exact,
         counts=total,
         milliseconds=clock.spent,
@@ -362,7 +363,7 @@ def _selections(
 
 def _per_map(places: Sequence[SearchedMap], counts: Sequence[Counts]) -> dict[str, OfMap]:
     return {
-        place.row.name: OfMap(index_version=_version(place), counts=own)
+        place.row.name: OfMap(index_version=place.view.number, counts=own)
         for place, own in zip(places, counts, strict=True)
     }
 
@@ -390,15 +391,6 @@ def _counts(
         validated=len(statuses),
         accepted=statuses.count("accepted"),
     )
-
-
-def _sum(counts: Sequence[Counts]) -> Counts:
-    return Counts(**{name: sum(getattr(one, name) for one in counts)
-                     for name in Counts.model_fields})  # fmt: skip
-
-
-def _version(place: SearchedMap) -> int:
-    return place.view.number
 
 
 #: Minimum number of distinct planes for a distinctive frame.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from sceneprint.engine.context import Context
 from sceneprint.engine.results.query_entry import SentQuery, StoredAnswer, query_row
@@ -23,7 +23,7 @@ from sceneprint.engine.search.retrieval import (
     prepare_upload,
 )
 from sceneprint.engine.search.verification import thresholds
-from sceneprint.engine.serializers import model_label, sensor_frame, transform
+from sceneprint.engine.serializers import copy_fields, model_label, sensor_frame, transform
 from sceneprint.engine.signers import Signers
 from sceneprint.errors import (
     Busy,
@@ -485,29 +485,16 @@ def localization_of(answer: Answer) -> Localization:
     strength = location.strength if location is not None else None
     if location is None and status == "found":  # the accepted matches have no pose
         strength = accepted[0].validation.strength
-    return Localization(
-        status=status,
-        reason=answer.reason,
-        cause=answer.cause,
-        map=answer.maps[0],
-        pose=None if location is None else location.pose,
-        confidence=None if best_pose is None else best_pose.confidence,
-        evidence=None if best_pose is None else best_pose.evidence,
-        support=0 if location is None else location.support,
-        votes=0 if location is None else location.votes,
-        spread_m=None if location is None else location.spread_m,
-        spread_deg=None if location is None else location.spread_deg,
-        uncertainty=None if location is None else location.uncertainty,
-        base=None if location is None else location.base,
-        strength=strength,
-        verified_by=None if location is None else location.verified_by,
-        alternatives=answer.alternatives,
+    own: dict[str, Any] = {
+        "pose": None, "support": 0, "votes": 0, "spread_m": None, "spread_deg": None,
+        "uncertainty": None, "base": None, "verified_by": None,
+    }  # fmt: skip
+    if location is not None:
+        own = {name: getattr(location, name) for name in own}
+    if best_pose is not None:
+        own |= {"confidence": best_pose.confidence, "evidence": best_pose.evidence}
+    return copy_fields(
+        Localization, answer, **own, status=status, map=answer.maps[0], strength=strength,
         best=accepted[0] if accepted and status == "found" else None,
         matches=[one.frame_id for one in accepted],
-        frames=answer.frames,
-        query_id=answer.query_id,
-        seed=answer.seed,
-        model=answer.model,
-        deadline_reached=answer.deadline_reached,
-        milliseconds=answer.milliseconds,
-    )
+    )  # fmt: skip

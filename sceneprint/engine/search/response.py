@@ -15,7 +15,7 @@ import numpy as np
 from sceneprint.engine.search import retrieval
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.engine.search.verification import NOT_ASKED, Validated, thresholds
-from sceneprint.engine.serializers import sensor_of, transform
+from sceneprint.engine.serializers import copy_fields, sensor_of, transform, vector
 from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry
 from sceneprint.geometry.registration.icp import (
     PAIR_METHOD,
@@ -57,7 +57,6 @@ from sceneprint_client.api import (
 from sceneprint_client.api import Location as LocationRecord
 from sceneprint_client.api import Match as MatchRecord
 from sceneprint_client.api import Validation as ValidationRecord
-from sceneprint_client.api.base import Vector
 from sceneprint_client.api.query import FreeDirection, Lost, Outcome, Stage, Uncertainty
 
 
@@ -115,12 +114,14 @@ def match_records(
             continue
         if number in checks:
             validation = validation_record(checks[number])
-        elif number in candidates.unreadable:
-            validation = ValidationRecord(status="skipped", reason=candidates.unreadable[number])
         else:
-            validation = ValidationRecord(status="skipped", reason=candidates.untried)
+            validation = _skipped(candidates.unreadable.get(number, candidates.untried))
         records.append(_match(candidates, position[number], number, checks.get(number), validation))
     return records
+
+
+def _skipped(reason: str) -> ValidationRecord:
+    return ValidationRecord(status="skipped", reason=reason)
 
 
 def location_record(candidates: Candidates, estimate: PoseEstimate | None) -> LocationRecord | None:
@@ -192,13 +193,11 @@ def _match(
     in_map: Floats | None = None
     if T is not None and row.pose is not None and validation.status != "rejected":
         in_map = np.array(row.pose) @ T
-    return MatchRecord(
+    return copy_fields(
+        MatchRecord,
+        row,
         frame_id=row.id,
         map=candidates.maps[row.map_number],
-        robot=row.robot,
-        session=row.session,
-        name=row.name,
-        sequence=row.sequence,
         rank=position + 1,
         distance=int(candidates.ranking.distances[position]),
         similarity=float(candidates.ranking.similarities[position]),
@@ -234,8 +233,8 @@ def uncertainty_record(
         return None
     free = [
         FreeDirection(
-            translation=_vector(one.translation),
-            rotation=_vector(one.rotation),
+            translation=vector(one.translation.tolist()),
+            rotation=vector(one.rotation.tolist()),
             deviation=one.deviation,
         )
         for one in free_directions(covariance, p)
@@ -243,32 +242,17 @@ def uncertainty_record(
     return Uncertainty(covariance=covariance.ravel().tolist(), method=method, degenerate=free)
 
 
-def _vector(v: Floats) -> Vector:
-    x, y, z = v.tolist()
-    return Vector(x=x, y=y, z=z)
-
-
 def validation_record(v: PairValidation) -> ValidationRecord:
     """Return the API record of a validation."""
     residual = None
     if math.isfinite(v.residual_m):
         residual = Residual(translation_m=v.residual_m, rotation_deg=math.degrees(v.residual_rad))
-    return ValidationRecord(
-        status=v.status,
-        strength=v.strength,
-        reason=v.reason,
-        residual=residual,
-        overlap=v.overlap,
-        plane_overlap=v.plane_overlap,
-        free_space_violations=v.violations,
-        planes=v.planes,
+    return copy_fields(
+        ValidationRecord, v, residual=residual, free_space_violations=v.violations,
         plane_violations=None if v.violations is None else v.plane_violations,
-        inliers=v.inliers,
-        ambiguity=v.ambiguity,
-        search=v.search if v.directions else None,
-        directions=list(v.directions),
+        search=v.search if v.directions else None, directions=list(v.directions),
         tilt_deg=None if v.tilt_rad is None else math.degrees(v.tilt_rad),
-    )
+    )  # fmt: skip
 
 
 def explain(
@@ -510,22 +494,18 @@ def _aligned(
     aligned = earlier.get(row.number)
     if aligned is None:
         if not case.deadline.allows():
-            return ValidationRecord(
-                status="skipped", reason="the deadline passed before it was validated"
-            ), None
+            return _skipped("the deadline passed before it was validated"), None
         model_id = part.place.row.model_id
         with case.store.database.read() as connection:
             blob = geometry_blobs(connection, [row.number], model_id).get(row.number)
             ranked = case.searched.ranking.indices.tolist()
             up = known_ups(connection, [*ranked, row.number]).get(row.number)
         if blob is None:
-            return ValidationRecord(
-                status="skipped", reason="it was deleted during the query"
-            ), None
+            return _skipped("it was deleted during the query"), None
         try:
             own = case.store.geometries.read(blob)
         except (DamagedBlob, UnreadableGeometry) as error:
-            return ValidationRecord(status="skipped", reason=str(error)), None
+            return _skipped(str(error)), None
         query = case.query
         p = case.model.parameters.validation
         options = thresholds(query.validation, p)

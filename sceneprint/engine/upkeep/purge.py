@@ -16,11 +16,10 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
-
-from sqlalchemy import Connection
 
 from sceneprint.engine.context import Context
 from sceneprint.engine.maps.tombstones import Tombstones
@@ -109,13 +108,13 @@ class Retention:
             before = (read_clock(connection) if at is None else at) - self._rows_s
             rows = maps_with_ended(connection, before)
         for row in rows:
-            while count := self._write(row, lambda c, of: remove_ended(c, of, before, BLOCK)):
-                log.info("ended rows removed", extra={"map": row.name, "frames": count})
-                yield count
-
-    def _write(self, row: MapRow, do: Callable[[Connection, int], int]) -> int:
-        with self._store.database.write(map_number=row.number) as connection:
-            return do(connection, row.number)
+            count = BLOCK
+            while count:
+                with self._store.database.write(map_number=row.number) as connection:
+                    count = remove_ended(connection, row.number, before, BLOCK)
+                if count:
+                    log.info("ended rows removed", extra={"map": row.name, "frames": count})
+                    yield count
 
     def _block(self, row: MapRow, at: float | None) -> int:
         """Delete a block of the oldest frames of a map, and return its size."""
@@ -231,9 +230,9 @@ class Purging:
         self, before: float | None, selects: Callable[[MapRow], bool],
         failed: list[Exception] | None = None, seconds: float = math.inf,
     ) -> Purged:  # fmt: skip
-        def attempt(do: Callable[[], int]) -> int:
+        def attempt(do: Callable[[], int | None]) -> int:
             try:
-                return do()
+                return do() or 0
             except (UnknownMap, UnknownJob):
                 return 0
             except (SceneprintError, OSError, ValueError) as error:
@@ -251,15 +250,11 @@ class Purging:
             + attempt(lambda: collect_quarantined(self._store, self._quarantine)),
             products=sum(attempt(one.forget) for one in self._products),
             answers=attempt(self._log.purge),
-            indexes=attempt(lambda: self._sweep_shared(now=before is None))
+            indexes=attempt(partial(self._upkeep.sweep, now=before is None))
             + sum(attempt(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
         )
         self._store.database.shrink_log()
         return purged
-
-    def _sweep_shared(self, *, now: bool) -> int:
-        self._upkeep.sweep(now=now)
-        return 0
 
     def _index(self, row: MapRow) -> int:
         start = time.monotonic()
