@@ -1,4 +1,4 @@
-"""The settings of service, workers and command line, read once from the environment."""
+"""Settings of the service, its workers and the command line, read from the environment."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
 
 
 def _setting(help_text: str, change: str = "", *, shown: str = "", **field: Any) -> Any:
-    """Return a field with the help and the advice that docs/settings.md shows.
+    """Return a pydantic field with the texts that docs/settings.md shows.
 
     Parameters
     ----------
-    help_text : description of the value, and its unit
+    help_text : description of the value, with its unit
     change : advice on when to change the value
     shown : description of a computed default
     **field : arguments of `pydantic.Field`
@@ -45,7 +45,7 @@ class Settings(BaseSettings):
 
     model_config = SettingsConfigDict(
         env_prefix="SCENEPRINT_", frozen=True,
-        hide_input_in_errors=True,  # values may be URLs with passwords
+        hide_input_in_errors=True,  # a value may be a URL with a password
     )  # fmt: skip
 
     # Places
@@ -62,7 +62,7 @@ class Settings(BaseSettings):
         default=None,
     )
     blob_url: SecretStr | None = _setting(
-        "Store of uploads, artifacts and stored answers: `s3://bucket/prefix`, "
+        "Storage of uploads, artifacts and stored answers: `s3://bucket/prefix`, "
         "`gs://bucket/prefix`, `az://account/container/prefix`, `file:///folder` or `memory:///`, "
         "which is lost with the process. Credentials come from the cloud's environment variables, "
         "not from the URL.",
@@ -72,7 +72,7 @@ class Settings(BaseSettings):
     )
     index_dir: Path | None = _setting(
         "Folder of this machine's search indexes. Workers rebuild it if it is deleted.",
-        "To use a faster disk than that of the blobs.",
+        "To use a faster disk than for blobs.",
         shown="`index` in the data folder",
         default=None,
     )
@@ -131,44 +131,44 @@ class Settings(BaseSettings):
         default=(),
     )
     concurrent_requests: int = _setting(
-        "Maximum number of uploads, and of queries, that run concurrently.",
+        "Maximum number of concurrent uploads, and of concurrent queries.",
         "Rarely, since the number of processors limits the throughput.",
         shown="number of processors, at least 2",
         default_factory=lambda: max(os.cpu_count() or 1, 2), ge=1, le=256,
     )  # fmt: skip
     query_cores: int = _setting(
         "Number of cores that the queries of a service share. If a core is free, a query runs its "
-        "two halves in parallel, with the same answer.",
+        "two halves in parallel; the answer is the same.",
         "Fewer if workers on the same machine need the cores.",
         shown="number of processors",
         default_factory=lambda: os.cpu_count() or 1, ge=1, le=256,
     )  # fmt: skip
     geometry_cache_bytes: int = _setting(
-        "Memory of each process for the geometry of recently compared frames, bytes, 0.8 MB per "
-        "frame; 0 disables the cache. It accelerates further queries in the same place.",
+        "Size of each process's cache of the geometry of recently compared frames, bytes (0.8 MB "
+        "per frame); 0 disables it. It accelerates further queries in the same place.",
         "Lower if many services share a machine; higher for large maps.",
         default=256 << 20, ge=0,
     )  # fmt: skip
 
     # Limits of requests
     queued_requests: int = _setting(
-        "Maximum number of uploads, and of queries, that wait; further requests get 503.",
-        "Higher if many robots send at once.",
+        "Maximum number of waiting uploads, and of waiting queries; further requests get 503.",
+        "Higher if many robots send requests at once.",
         default=64, ge=0, le=10_000,
     )  # fmt: skip
     queue_timeout_s: float = _setting(
-        "Maximum wait of an upload or query before it starts, seconds; after that it gets 503.",
+        "Maximum waiting time of an upload or query, seconds; after that it gets 503.",
         "Lower if late answers are useless.",
         default=5.0, gt=0, le=3600,
     )  # fmt: skip
     max_upload_bytes: int = _setting(
-        "Maximum size of a request's body, bytes. The default fits a cloud of 6 million points of "
+        "Maximum size of a request body, bytes. The default fits a cloud of 6 million points of "
         "three float32.",
         "Higher for larger clouds; lower if all sensors are small.",
         default=72 << 20, ge=1024, le=512 << 20,
     )  # fmt: skip
     max_import_bytes: int = _setting(
-        "Maximum size of an imported archive, bytes. Its content may be four times as large.",
+        "Maximum size of an imported archive, bytes. It may unpack to four times its size.",
         "According to your recordings.",
         default=4 << 30, ge=1024,
     )  # fmt: skip
@@ -185,16 +185,16 @@ class Settings(BaseSettings):
     )  # fmt: skip
     max_event_streams: int = _setting(
         "Maximum number of open event streams per service process; further streams get 503. A "
-        "tenant may have three quarters of them; further streams of the tenant get 429.",
+        "tenant may have three quarters of them, and gets 429 for further streams.",
         "According to the number of dashboards.",
         default=64, ge=0, le=10_000,
     )  # fmt: skip
 
     # Workers and decoders
     workers: int = _setting(
-        "Number of worker processes; also `--workers`. They sign frames and run long jobs, at a "
+        "Number of worker processes; also `--workers`. They sign frames and run long jobs at a "
         "lower priority than requests.",
-        "Fewer if memory is short (220 MB each); 0 if `sceneprint work` runs them.",
+        "Fewer if memory is short (220 MB each); 0 if `sceneprint work` starts them.",
         shown="number of processors",
         default_factory=lambda: os.cpu_count() or 1, ge=0, le=256,
     )  # fmt: skip
@@ -216,7 +216,7 @@ class Settings(BaseSettings):
         default=120.0, ge=1, le=3600,
     )  # fmt: skip
     decoders: int = _setting(
-        "Number of confined processes in which a service decodes uploads. Each takes 100 MB, or "
+        "Number of confined processes in which a service decodes uploads. Each uses 100 MB, or "
         "240 MB after it has read PLY or PCD. Each worker has an additional decoder. 0 decodes "
         "uploads in the service and its workers.",
         "0 if all senders are trusted and memory is short.",
@@ -224,12 +224,12 @@ class Settings(BaseSettings):
         default_factory=lambda: min(max(os.cpu_count() or 1, 2), 8), ge=0, le=256,
     )  # fmt: skip
     decoder_memory_bytes: int = _setting(
-        "Maximum memory that a decoder may allocate for one upload, bytes; 0 sets no limit.",
+        "Maximum memory that a decoder may allocate for an upload, bytes; 0 sets no limit.",
         "Lower on small machines.",
         default=2 << 30, ge=0,
     )  # fmt: skip
     decoder_timeout_s: float = _setting(
-        "Maximum time of a decoder for one upload, seconds.",
+        "Maximum time for decoding an upload, seconds.",
         "Longer on very slow machines.",
         default=30.0, ge=0.1, le=3600,
     )  # fmt: skip
@@ -247,20 +247,20 @@ class Settings(BaseSettings):
         default=3600.0, ge=1, le=31_536_000,
     )  # fmt: skip
     blob_check_mb_per_s: float = _setting(
-        "Rate at which workers verify stored blobs, MB per second; 0 disables it.",
-        "Higher for more than 86 GB, which takes a day; 0 if an object store charges for reading "
+        "Rate at which workers verify stored blobs, MB per second; 0 disables verification.",
+        "Higher for more than 86 GB, which take a day; 0 if an object store charges for reads "
         "and verifies its bytes itself.",
         default=1.0, ge=0, le=10_000,
     )  # fmt: skip
     build_surfaces: Literal["auto", "on_request"] = _setting(
-        "Whether workers build the surface of each map (`auto`), or only on request "
-        "(`on_request`). Deleted frames are always removed from a surface that exists.",
+        "Whether workers build the surface of each map automatically (`auto`), or only on request "
+        "(`on_request`). Deleted frames are always removed from existing surfaces.",
         "If surfaces are not used, to reduce the load of workers and disk.",
         default="auto",
     )
     join_sessions: Literal["auto", "on_request"] = _setting(
-        "Whether workers associate sessions of different parent frames (`auto`), or only on "
-        "request (`on_request`). Only strong joins move poses.",
+        "Whether workers join sessions of different parent frames automatically (`auto`), or only "
+        "on request (`on_request`). Only strong joins change poses.",
         "If parent frames must remain separate, or to reduce the load of workers.",
         default="auto",
     )
@@ -274,7 +274,7 @@ class Settings(BaseSettings):
     purge_deadline_s: float = _setting(
         "Maximum time until all bytes of a deleted frame are erased on this host, seconds, from "
         "the end of `UNDO_WINDOW_S`.",
-        "According to your promises to the people in the frames.",
+        "According to your commitments to the people in the frames.",
         default=3600.0, ge=1, le=31_536_000,
     )  # fmt: skip
     deleted_rows_days: float = _setting(
@@ -286,23 +286,23 @@ class Settings(BaseSettings):
     query_log_days: float = _setting(
         "Time for which queries and their answers are stored, days. 0 stores no queries, and "
         "events do not report them.",
-        "According to your promises to the operators of the robots.",
+        "According to your commitments to the operators of the robots.",
         default=30.0, ge=0, le=36_500,
     )  # fmt: skip
     query_log_bytes: int = _setting(
-        "Maximum size of all stored answers, bytes; each takes 200 kB. The oldest are removed "
+        "Maximum size of all stored answers, bytes, about 200 kB each. The oldest are removed "
         "first; 0 stores no answers.",
         "According to the rate of queries.",
         default=256 << 20, ge=0,
     )  # fmt: skip
     events_per_map: int = _setting(
-        "Maximum number of stored events per map, 200 bytes each.",
+        "Maximum number of stored events per map, about 200 bytes each.",
         "According to the longest time for which a robot may be offline.",
         default=1_000_000, ge=1000,
     )  # fmt: skip
     audit_log_days: float = _setting(
         "Time for which entries of the audit log are stored, days. At most the newest "
-        "million entries of each tenant are kept.",
+        "million entries of each tenant are stored.",
         "According to the requirements of your auditors.",
         default=365.0, gt=0, le=36_500,
     )  # fmt: skip
@@ -325,7 +325,7 @@ class Settings(BaseSettings):
     @classmethod
     def _holds_objects(cls, value: SecretStr | str | None) -> SecretStr | str | None:
         if value is not None:
-            _require_objects(value if isinstance(value, str) else value.get_secret_value())
+            _require_object_store(value if isinstance(value, str) else value.get_secret_value())
         return value
 
     @field_validator("cors_origins", mode="before")
@@ -333,14 +333,14 @@ class Settings(BaseSettings):
     def _origins(cls, value: object) -> object:
         if not isinstance(value, str):
             return value
-        return tuple(one.strip() for one in value.split(",") if one.strip())
+        return tuple(origin.strip() for origin in value.split(",") if origin.strip())
 
     @field_validator("cors_origins")
     @classmethod
     def _are_origins(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        for one in value:
-            if one != "*" and not re.fullmatch(r"https?://[^/?#@\s*]+", one):
-                raise ValueError(f"{one!r:.80} is not an origin such as https://fleet.example")
+        for origin in value:
+            if origin != "*" and not re.fullmatch(r"https?://[^/?#@\s*]+", origin):
+                raise ValueError(f"{origin!r:.80} is not an origin such as https://fleet.example")
         return value
 
     @property
@@ -367,7 +367,7 @@ class Settings(BaseSettings):
 
     @property
     def served_blobs(self) -> Path | str:
-        """Return the folder or URL of the blobs of a service with separate worker processes.
+        """Return `blobs` for a service whose workers are separate processes.
 
         Raises
         ------
@@ -387,12 +387,12 @@ class Settings(BaseSettings):
 
     @property
     def quarantine_dir(self) -> Path:
-        """Return the folder of damaged blobs that `sceneprint fsck --repair` has moved."""
+        """Return the folder to which `sceneprint fsck --repair` moves damaged blobs."""
         return self.data_dir / "quarantine"
 
     @property
     def query_dir(self) -> Path:
-        """Return the folder of stored answers, whose deletion affects nothing else."""
+        """Return the folder of stored answers; deleting it affects nothing else."""
         return self._blob_root / "queries"
 
     @property
@@ -413,14 +413,14 @@ class Settings(BaseSettings):
         return self.index_dir or self.data_dir / "index"
 
 
-def _require_objects(url: str) -> None:
-    """Raise ValueError if a URL is not that of an object store or contains credentials.
+def _require_object_store(url: str) -> None:
+    """Raise ValueError if a URL does not name an object store, or contains credentials.
 
-    Messages must not contain the URL.
+    Messages do not contain the URL.
     """
     scheme, _, rest = url.partition("://")
     if scheme not in OBJECT_SCHEMES or "://" not in url:
-        known = ", ".join(f"{one}://" for one in OBJECT_SCHEMES)
+        known = ", ".join(f"{name}://" for name in OBJECT_SCHEMES)
         raise ValueError(f"the URL must start with one of {known}")
     try:
         holds = "@" in urlsplit(url).netloc or "?" in rest or "#" in rest
