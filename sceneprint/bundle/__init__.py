@@ -1,1 +1,1 @@
-"""Bundles: immutable states of a store, each a manifest and parts named by their digests."""
+"""Bundles: immutable snapshots of a store. A manifest lists parts, named by their digests."""

@@ -3,8 +3,8 @@
     database and blobs  --take_backup-->  bundle in a place
 
 A backup reads all rows in one transaction, and then copies the blobs that they refer to. Blobs
-never change, and none is removed during a backup, so the bundle holds one complete state. Parts
-that exist in the place are not written again.
+never change, and none is removed during a backup, so the bundle is consistent. Parts that exist
+in the place are not written again.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from sceneprint.store.postgres.connection import allow
 from sceneprint.store.read_only import inspect_blobs, require_present_schema
 from sceneprint_client.api import FrameState
 
-#: Number of parts and blobs to write concurrently, since writers wait for the disk or the network.
+#: Number of threads that write parts and blobs; they mostly wait for the disk or the network.
 THREADS = 8
-#: Number of blobs that one task of a thread copies; most of them are already in the place.
+#: Number of blobs per task of a thread; most of them are already in the place.
 _BATCH = 256
 #: Size in bytes above which a blob is streamed instead of read into memory.
 LARGE = 8 << 20
-#: Callback with the numbers of rows and blobs that are done, and of all.
+#: Callback with the number of finished rows and blobs, and their total.
 Progress = Callable[[int, int], None]
 #: Columns of a list of blobs: digest, size in bytes, and reason why the blob is not in the bundle.
 BLOB_COLUMNS = ("digest", "bytes", "lost")
 
-#: SQL query of the digests of all blobs that must exist.
+#: SQL query for the digests of all blobs that must exist.
 _REFERRED = (
     "SELECT blob AS digest FROM frames WHERE deletion IS NOT NULL OR state NOT IN"
     f" ('{FrameState.DELETED}', '{FrameState.REDUNDANT}')"
@@ -78,7 +78,7 @@ ListedBlob = tuple[str, int, Loss | None]
 
 @dataclass(frozen=True)
 class LostBlob:
-    """A blob that a backup does not hold because it was missing or damaged in the store."""
+    """A blob that is not in a bundle because it was missing or damaged in the store."""
 
     digest: str
     why: Loss
@@ -86,13 +86,13 @@ class LostBlob:
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle after it was written, verified or restored.
+    """The result of writing, verifying or restoring a bundle.
 
     Parameters
     ----------
-    manifest : list of its parts
+    manifest : manifest of the bundle
     lost : blobs that are not in the bundle
-    written : number of bytes that were not in the place before
+    written : number of bytes that the backup added to the place
     """
 
     manifest: BundleManifest
@@ -103,27 +103,30 @@ class Bundle:
 def take_backup(
     settings: Settings, place: str, progress: Progress | None = None, *, keep: int | None = None
 ) -> Bundle:
-    """Write a bundle of a store; service and workers may run in the meantime.
+    """Write a bundle of a store; the service and workers may run in the meantime.
 
-    The bundle holds everything that was acknowledged before the call, and possibly later changes. A
-    missing or damaged blob does not prevent the backup of the other blobs, and is reported.
+    The bundle contains all changes that were acknowledged before the call, and possibly later
+    changes. Missing or damaged blobs are reported; all other blobs are backed up.
 
     Parameters
     ----------
     settings : settings with the addresses of the database and the blobs
-    place : folder or URL of an object store; a missing folder is created
-    progress : callback with the numbers of rows and blobs that are done, and of all
-    keep : number of newest bundles to keep, including this one; None keeps all
+    place : folder, or URL of an object store; a missing folder is created
+    progress : see Progress
+    keep : number of newest bundles to retain, including this one; None retains all
 
     Raises
     ------
     BundleError : If the place belongs to another store, or another process is writing there.
     UnusableStore, NewerSchema : If the database or the place cannot be used, or is damaged.
     """
-    with _open(settings.database) as database, inspect_blobs(settings.blobs, database) as blobs:
+    with (
+        _open(settings.database) as database,
+        inspect_blobs(settings.blobs, database) as blobs,
+    ):
         target = BundlePlace.open(place, create=True)
         target.claim(OpaqueIds(database).owner)
-        with target.turn(), blobs.block_removals():  # referenced blobs must remain
+        with target.turn(), blobs.block_removals():  # referenced blobs must not be removed
             backup = _Backup(target, progress or (lambda _done, _total: None))
             bundle = backup.write(database, blobs)
             if keep is not None:
@@ -136,7 +139,7 @@ def take_backup(
 
 @contextmanager
 def _open(url: str) -> Iterator[Database]:
-    """Open a database, which may be in use, without writing to it."""
+    """Open a database that may be in use, without changing it; check its schema."""
     database = reach_database(url)
     with closing(database):
         if database.is_sqlite and database.file is None:
@@ -159,14 +162,14 @@ class _Backup:
         started_at, parts = datetime.now(UTC), list[Part]()
         with tempfile.TemporaryFile() as digests:
             with database.read() as connection:
-                allow(connection, 0)  # copying may take hours, so no timeout applies
+                allow(connection, 0)  # no timeout: copying may take hours
                 check_sound(connection, database.shown)
-                self._total = sum(_rows_of(connection, one.name) for one in tables())
+                self._total = sum(_count_rows(connection, table.name) for table in tables())
                 for digest in referred(connection):
                     digests.write(f"{digest}\n".encode())
                     self._total += 1
                 for table in tables():
-                    keys = [i for i, one in enumerate(table.columns) if one.primary_key]
+                    keys = [i for i, column in enumerate(table.columns) if column.primary_key]
                     rows = cut_rows(read_table(connection, table), keys)
                     parts += self._parts(f"rows/{table.name}", rows, partial(table_part, table))
                 summary = summary_of(connection)
@@ -176,7 +179,7 @@ class _Backup:
         manifest = BundleManifest(
             created_at=started_at, sceneprint=version("sceneprint"),
             schema_revision=known_revisions()[0],
-            blobs=sum(one.rows for one in lists) - len(self._lost), blob_bytes=self._blob_bytes,
+            blobs=sum(part.rows for part in lists) - len(self._lost), blob_bytes=self._blob_bytes,
             lost=len(self._lost), parts=(*parts, *lists), **summary,
         )  # fmt: skip
         self._place.publish(manifest)
@@ -186,7 +189,7 @@ class _Backup:
         self, kind: str, groups: Iterable[tuple[list[Row], str]],
         write: Callable[[list[Row]], bytes],
     ) -> Iterator[Part]:  # fmt: skip
-        """Write the parts whose rows differ from those of the previous bundle."""
+        """Yield the parts of all groups of rows; write those that the previous bundle lacks."""
 
         def changed() -> Iterator[Part | tuple[bytes, int, str]]:
             for rows, source in groups:
@@ -196,10 +199,10 @@ class _Backup:
                 else:
                     yield write(rows), len(rows), source
 
-        def put(one: Part | tuple[bytes, int, str]) -> tuple[Part, bool]:
-            if isinstance(one, Part):
-                return one, False
-            data, rows, source = one
+        def put(group: Part | tuple[bytes, int, str]) -> tuple[Part, bool]:
+            if isinstance(group, Part):
+                return group, False
+            data, rows, source = group
             digest, new = self._place.put(data)
             size = len(data)
             return Part(kind=kind, digest=digest, bytes=size, rows=rows, source=source), new
@@ -211,10 +214,14 @@ class _Backup:
             yield part
 
     def _blobs(self, blobs: Blobs, digests: IO[bytes]) -> Iterator[ListedBlob]:
-        """Copy blobs, and yield their entries in the list of blobs."""
+        """Copy the blobs of a file of digests, and yield their entries in the list of blobs."""
         names = (line.decode().rstrip("\n") for line in digests)
         batches = iter(lambda: list(islice(names, _BATCH)), [])
-        for entries in in_order(lambda block: [self._copy(blobs, one) for one in block], batches):
+
+        def copy(batch: list[str]) -> list[tuple[ListedBlob, int]]:
+            return [self._copy(blobs, digest) for digest in batch]
+
+        for entries in in_order(copy, batches):
             for listed, new in entries:
                 digest, size, why = listed
                 if why is not None:
@@ -254,20 +261,20 @@ class _Backup:
 def _reusable_parts(place: BundlePlace) -> dict[tuple[str, str], Part]:
     """Return the reusable parts of the newest bundle by kind and source.
 
-    Parts of another version of sceneprint are not reusable, since it may encode rows differently.
+    Parts of another version of sceneprint are not reusable: it may encode rows differently.
     """
     with suppress(BundleError):  # there is no bundle, or the newest is damaged
         manifest, own = place.read(), (version("sceneprint"), known_revisions()[0])
         if (manifest.sceneprint, manifest.schema_revision) == own:
-            return {(one.kind, one.source): one for one in manifest.parts}
+            return {(part.kind, part.source): part for part in manifest.parts}
     return {}
 
 
 def in_order(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
-    """Yield the results of `work` in the order of the items, computed by a pool of threads.
+    """Apply `work` to items in a pool of threads; yield the results in the order of the items.
 
     Closing the iterator early does not wait for the threads: the garbage collector may close it in
-    a thread that is just starting, which could then never join another.
+    a thread that is starting and could not join another thread without a deadlock.
     """
     pool, wait = ThreadPoolExecutor(THREADS, thread_name_prefix="bundle"), True
     waiting: deque[Future[B]] = deque()
@@ -286,8 +293,8 @@ def in_order(work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
 
 
 def referred(connection: Connection) -> Iterator[str]:
-    """Yield the digests of all blobs that must exist, each once, in ascending order."""
-    # a cast, since a database that was edited by hand may hold values of other types
+    """Yield the distinct digests of all blobs that must exist, in ascending order."""
+    # the cast covers databases that were edited by hand and may contain values of other types
     order = ' COLLATE "C"' if connection.dialect.name == "postgresql" else ""
     text = f"CAST(digest AS TEXT){order}"
     statement = f"SELECT DISTINCT {text} AS d FROM ({_REFERRED}) AS found ORDER BY d"
@@ -296,8 +303,8 @@ def referred(connection: Connection) -> Iterator[str]:
 
 def listed_blobs(place: BundlePlace, manifest: BundleManifest) -> Iterator[ListedBlob]:
     """Yield the entries of a bundle's lists of blobs."""
-    lists = (one for one in manifest.parts if one.kind == "blobs")
-    for data in in_order(lambda one: place.get(one.digest), lists):
+    lists = (part for part in manifest.parts if part.kind == "blobs")
+    for data in in_order(lambda part: place.get(part.digest), lists):
         for digest, size, why in read_rows(data, BLOB_COLUMNS):
             if not is_digest(digest) or not isinstance(size, int) or why not in (
                 None, "missing", "damaged",
@@ -308,25 +315,25 @@ def listed_blobs(place: BundlePlace, manifest: BundleManifest) -> Iterator[Liste
 
 def part_digests(place: BundlePlace, manifest: BundleManifest) -> Iterator[str]:
     """Yield the digests of all parts of a bundle, including its blobs."""
-    yield from (one.digest for one in manifest.parts)
+    yield from (part.digest for part in manifest.parts)
     yield from (digest for digest, _, why in listed_blobs(place, manifest) if why is None)
 
 
 def summary_of(connection: Connection) -> dict[str, Any]:
-    """Return the counts and the last row numbers for a manifest."""
+    """Return the counts of rows and the last row numbers for a manifest."""
     states = connection.exec_driver_sql(
         "SELECT state, count(*) FROM frames GROUP BY state ORDER BY state"
     )
     return {
-        "maps": _rows_of(connection, "maps"),
-        "frames": dict(tuple(one) for one in states),
-        "signatures": _rows_of(connection, "signatures"),
+        "maps": _count_rows(connection, "maps"),
+        "frames": dict(tuple(row) for row in states),
+        "signatures": _count_rows(connection, "signatures"),
         "numbers": last_numbers(connection),
     }
 
 
 def check_sound(connection: Connection, shown: str) -> None:
-    """Check the integrity of a SQLite database, since inconsistent rows could not be restored.
+    """Check the integrity of a SQLite database: inconsistent rows could not be restored.
 
     Raises
     ------
@@ -334,16 +341,16 @@ def check_sound(connection: Connection, shown: str) -> None:
     """
     if connection.dialect.name != "sqlite":
         return  # PostgreSQL enforces its constraints
-    wrong = str(connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one())
-    lost = connection.exec_driver_sql("PRAGMA foreign_key_check").first()
-    if lost is not None:
-        wrong = f"a row of {lost[0]} refers to one of {lost[2]} that is missing"
-    if wrong != "ok":
+    defect = str(connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one())
+    orphan = connection.exec_driver_sql("PRAGMA foreign_key_check").first()
+    if orphan is not None:
+        defect = f"a row of {orphan[0]} refers to a missing row of {orphan[2]}"
+    if defect != "ok":
         raise UnusableStore(
-            f"{shown}: the database is damaged ({' '.join(wrong.split())}), and a backup of it "
+            f"{shown}: the database is damaged ({' '.join(defect.split())}), and a backup of it "
             "could not be restored. Run `sceneprint fsck`, or restore an earlier bundle."
         )
 
 
-def _rows_of(connection: Connection, name: str) -> int:
+def _count_rows(connection: Connection, name: str) -> int:
     return int(connection.exec_driver_sql(f"SELECT count(*) FROM {name}").scalar_one())

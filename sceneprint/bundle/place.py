@@ -4,9 +4,8 @@
     PLACE/bundles/NAME.json     a manifest, written after all of its parts
     PLACE/parts/ab/SHA256       a part, named by the SHA-256 of its bytes
 
-Parts never change, and bundles share equal parts, so a bundle costs only what is new since the
-previous one. A writer that is killed leaves earlier bundles intact, and parts that a later `prune`
-removes.
+Parts never change, and bundles share equal parts, so a bundle adds only what changed since the
+previous bundle. A killed writer leaves earlier bundles intact; a later `prune` removes its parts.
 """
 
 from __future__ import annotations
@@ -34,9 +33,9 @@ from sceneprint.store.blobs.object_client import Objects, open_objects
 
 _MARK, _BUNDLES, _PARTS = "place.json", "bundles/", "parts/"
 _NAME = re.compile(r"bundles/(\d{8}T\d{6}-\d{6}Z)\.json")
-#: Maximum size of a manifest in bytes, which suffices for about ten million frames.
+#: Maximum size of a manifest in bytes; it suffices for about ten million frames.
 LONGEST = 1 << 27
-#: Age in seconds above which unlisted parts are removed; a backup in progress may list newer ones.
+#: Age in seconds above which unlisted parts are removed; a backup in progress may list newer parts.
 GRACE_S = 86_400.0
 
 
@@ -45,9 +44,9 @@ class Part(StrictRecord):
 
     Parameters
     ----------
-    kind : `rows/TABLE`, or `blobs` for a list of blobs, which are parts themselves
-    digest : SHA-256 of its bytes, and its name
-    source : digest of its rows in the store
+    kind : `rows/TABLE`, or `blobs` for a list of blobs; the blobs are parts too
+    digest : SHA-256 of the part's bytes; it names the part
+    source : digest of the rows before their encoding
     """
 
     kind: str = Field(pattern=r"^(rows/[a-z_]{1,63}|blobs)$")
@@ -58,18 +57,18 @@ class Part(StrictRecord):
 
 
 class BundleManifest(StrictRecord):
-    """The content of a bundle.
+    """The manifest of a bundle.
 
     Parameters
     ----------
-    created_at : start of the backup; the state of the bundle is not older
-    sceneprint, schema_revision : version and schema of the store that wrote it
-    maps, signatures, blobs : their numbers
+    created_at : start of the backup; the bundle contains all earlier changes
+    sceneprint, schema_revision : version and schema of the store that wrote the bundle
+    maps, signatures, blobs : number of maps, of signatures, and of blobs
     frames : number of frames by state
     lost : number of blobs that were missing or damaged in the store
     blob_bytes : total size of the blobs
     numbers : last row number that was assigned in each table
-    parts : parts with rows and with lists of blobs, in the order of their keys
+    parts : parts with rows and parts with lists of blobs, each kind in the order of the rows' keys
     """
 
     format: Literal["sceneprint-bundle"] = "sceneprint-bundle"
@@ -88,35 +87,35 @@ class BundleManifest(StrictRecord):
 
     @property
     def name(self) -> str:
-        """Name of the bundle; names sort by time."""
+        """Return the name of the bundle; names sort by time."""
         return f"{self.created_at:%Y%m%dT%H%M%S-%f}Z"
 
     @property
     def n_frames(self) -> int:
-        """Number of frames that are not deleted."""
+        """Return the number of frames that are not deleted."""
         return sum(n for state, n in self.frames.items() if state != "deleted")
 
     @property
     def bytes(self) -> int:
-        """Size of all parts, of which other bundles may share some."""
-        return self.blob_bytes + sum(one.bytes for one in self.parts)
+        """Return the size of all parts, including parts that other bundles share."""
+        return self.blob_bytes + sum(part.bytes for part in self.parts)
 
 
 class BundlePlace:
-    """A folder or an object store with bundles; safe to share between threads.
+    """A folder or an object store with bundles. Threads may share an instance.
 
     Every method raises UnusableStore if the place cannot be used.
     """
 
     def __init__(self, objects: Objects, folder: Path | None) -> None:
         self._objects, self._folder = objects, folder
-        #: Address without credentials, for messages.
+        #: Address without credentials, for messages
         self.shown = str(folder) if folder is not None else objects.url
-        self._sizes = cache(self._list)
+        self._sizes = cache(self._list_sizes)
 
     @classmethod
     def open(cls, place: str, *, create: bool = False) -> BundlePlace:
-        """Open a place.
+        """Open a folder or an object store.
 
         Parameters
         ----------
@@ -126,7 +125,7 @@ class BundlePlace:
         Raises
         ------
         BundleError : If the folder does not exist, or the path is not a folder.
-        UnusableStore : If the URL is not that of an object store.
+        UnusableStore : If the URL does not name an object store.
         """
         if "://" in place:
             return cls(open_objects(place, "the location of the bundles"), None)
@@ -143,7 +142,7 @@ class BundlePlace:
         return cls(open_objects(url, "the location of the bundles"), folder)
 
     def claim(self, owner: str) -> None:
-        """Mark the place as that of a store.
+        """Mark the place as owned by a store.
 
         Raises
         ------
@@ -152,7 +151,9 @@ class BundlePlace:
         data = json.dumps({"format": "sceneprint-place", "store": owner}).encode()
         if self._objects.put(_MARK, data, create=True):
             ours = (_MARK, _BUNDLES, _PARTS, ".lock")
-            others = (one.key for one in self._objects.list("") if not one.key.startswith(ours))
+            others = (
+                entry.key for entry in self._objects.list("") if not entry.key.startswith(ours)
+            )
             other = next(others, None)
             if other is not None:
                 self._objects.delete(_MARK)
@@ -166,16 +167,16 @@ class BundlePlace:
                 f"each store. If the other store no longer exists, remove {_MARK} there."
             )
         if self._folder is not None:
-            for name in (_BUNDLES, _PARTS):  # private, since frames show rooms
+            for name in (_BUNDLES, _PARTS):  # private folders, because frames show rooms
                 make_folder(self._folder / name)
 
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Lock a folder for writing; object stores have no lock.
+        """Lock the place for writing; object stores have no lock.
 
         Raises
         ------
-        BundleError : If another process is writing there.
+        BundleError : If another process is writing to the folder.
         """
         if self._folder is None:
             yield
@@ -189,15 +190,15 @@ class BundlePlace:
 
     def names(self) -> list[str]:
         """Return the names of all bundles, newest first."""
-        matches = (_NAME.fullmatch(one.key) for one in self._objects.list(_BUNDLES))
-        return sorted((one[1] for one in matches if one), reverse=True)
+        matches = (_NAME.fullmatch(entry.key) for entry in self._objects.list(_BUNDLES))
+        return sorted((match[1] for match in matches if match), reverse=True)
 
     def read(self, name: str | None = None) -> BundleManifest:
-        """Return the manifest of a bundle, by default the newest.
+        """Read the manifest of a bundle, by default the newest.
 
         Raises
         ------
-        BundleError : If the bundle does not exist, or its format has another version.
+        BundleError : If the bundle does not exist, or another version of the format wrote it.
         DamagedBundle : If the manifest is damaged.
         """
         names = self.names()
@@ -208,14 +209,14 @@ class BundlePlace:
         key = f"{_BUNDLES}{name or names[0]}.json"
         entry = self._objects.head(key)
         data = b"" if entry is None or entry.size > LONGEST else self._objects.get(key)
-        return _decode(data, f"{self.shown}/{key}")
+        return _decode_manifest(data, f"{self.shown}/{key}")
 
     def publish(self, manifest: BundleManifest) -> None:
-        """Write a manifest, all of whose parts must exist."""
+        """Write a manifest. All of its parts must exist."""
         self._objects.put(f"{_BUNDLES}{manifest.name}.json", seal(manifest))
 
     def size(self, digest: str) -> int | None:
-        """Return the size of a part in bytes, None if it is missing; listings are cached."""
+        """Return the size of a part in bytes; None if it is missing. Listings are cached."""
         return self._sizes(digest[:2]).get(digest)
 
     def put(self, data: bytes) -> tuple[str, bool]:
@@ -223,17 +224,17 @@ class BundlePlace:
         digest = hashlib.sha256(data).hexdigest()
         if self.size(digest) == len(data):
             return digest, False
-        self._objects.put(_key(digest), data)
+        self._objects.put(_part_key(digest), data)
         return digest, True
 
     def put_file(self, digest: str, file: BinaryIO) -> None:
-        """Write a large part from a file whose digest the caller has checked."""
-        self._objects.put_file(_key(digest), file)
+        """Write a large part from a file. The caller has checked its digest."""
+        self._objects.put_file(_part_key(digest), file)
 
     def get(self, digest: str) -> bytes:
         """Return the bytes of a part; raise DamagedBundle if it is missing or damaged."""
         try:
-            data = self._objects.get(_key(digest))
+            data = self._objects.get(_part_key(digest))
         except FileNotFoundError:
             raise self.damaged(digest, "is missing") from None
         if hashlib.sha256(data).hexdigest() != digest:
@@ -243,15 +244,15 @@ class BundlePlace:
     def chunks(self, digest: str) -> Iterator[bytes]:
         """Yield the bytes of a large part without checking its digest."""
         try:
-            yield from self._objects.chunks(_key(digest))
+            yield from self._objects.chunks(_part_key(digest))
         except FileNotFoundError:
             raise self.damaged(digest, "is missing") from None
 
     def condition(self, digest: str) -> Condition:
-        """Read a part and return its condition."""
+        """Read a part, and return its condition."""
         hashed = hashlib.sha256()
         try:
-            for chunk in self._objects.chunks(_key(digest)):
+            for chunk in self._objects.chunks(_part_key(digest)):
                 hashed.update(chunk)
         except FileNotFoundError:
             return "missing"
@@ -260,24 +261,23 @@ class BundlePlace:
     def damaged(self, digest: str, what: str) -> DamagedBundle:
         """Return the error for a damaged or missing part."""
         return DamagedBundle(
-            f"{self.shown}: the part {_key(digest)} {what}. Restore another bundle, or remove this "
-            "part and take a snapshot, which writes it again if the store still has its content."
+            f"{self.shown}: the part {_part_key(digest)} {what}. Restore another bundle, or remove "
+            "this part and take a snapshot: it writes the part if the store still has its content."
         )
 
     def prune(self, needed: Collection[str], keep: int) -> int:
-        """Remove old bundles, then the parts that are not needed and older than GRACE_S; return the
-        number of removed parts.
+        """Remove old bundles, then unneeded parts older than GRACE_S; return the number of parts.
 
         Parameters
         ----------
-        needed : digests of all parts of the bundles to keep
-        keep : number of newest bundles to keep
+        needed : digests of all parts of the retained bundles
+        keep : number of newest bundles to retain
         """
         self._objects.delete(*(f"{_BUNDLES}{name}.json" for name in self.names()[keep:]))
         before = time.time() - GRACE_S
         unneeded = [
-            one.key for one in self._objects.list(_PARTS)
-            if one.changed_at < before and is_digest(name := one.key.rpartition("/")[2])
+            entry.key for entry in self._objects.list(_PARTS)
+            if entry.changed_at < before and is_digest(name := entry.key.rpartition("/")[2])
             and name not in needed
         ]  # fmt: skip
         self._objects.delete(*unneeded)
@@ -287,13 +287,15 @@ class BundlePlace:
                     path.unlink(missing_ok=True)
         return len(unneeded)
 
-    def _list(self, first: str) -> dict[str, int]:
+    def _list_sizes(self, first: str) -> dict[str, int]:
         folder = f"{_PARTS}{first}/"
         if self._folder is None:
-            return {one.key.rpartition("/")[2]: one.size for one in self._objects.list(folder)}
-        try:  # takes half as long as listing through the client of object stores
+            return {
+                entry.key.rpartition("/")[2]: entry.size for entry in self._objects.list(folder)
+            }
+        try:  # twice as fast as listing through the client of object stores
             with os.scandir(self._folder / folder) as entries:
-                return {one.name: one.stat().st_size for one in entries}
+                return {entry.name: entry.stat().st_size for entry in entries}
         except FileNotFoundError:
             return {}
         except OSError as error:
@@ -302,11 +304,11 @@ class BundlePlace:
             ) from error
 
 
-def _key(digest: str) -> str:
+def _part_key(digest: str) -> str:
     return f"{_PARTS}{digest[:2]}/{digest}"
 
 
-def _decode(data: bytes, place: str) -> BundleManifest:
+def _decode_manifest(data: bytes, place: str) -> BundleManifest:
     try:
         record = unseal(data)
         if record.get("format") != "sceneprint-bundle":

@@ -1,11 +1,11 @@
-"""Verify bundles, and restore them into an empty store.
+"""Verification of bundles, and restoration into an empty store.
 
     bundle  --verify_bundle-->  Bundle
     bundle  --restore_to_folder-->  data folder with SQLite
-    bundle  --restore_to_server-->  empty database of PostgreSQL, and its place of blobs
+    bundle  --restore_to_server-->  empty PostgreSQL database, and its storage of blobs
 
-Blobs are durable before the first row is written, and all rows are one transaction. A restore that
-was killed leaves no usable store, and continues when it is run again.
+Blobs are durable before the first row is written, and one transaction writes all rows. A killed
+restore leaves no usable store, and continues when it is run again.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ from sceneprint.store.opaque_ids import OpaqueIds, owner_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.tables import keys, secrets
 
-#: Names of the database and the blobs in a data folder, and of the folder for unfinished ones.
+#: Names of the database, of the blobs, and of the folder for unfinished files in a data folder.
 _DATABASE, _BLOBS, _WORK = "sceneprint.db", "blobs", ".restoring"
-#: Tables that have rows in an unused database: its secret, samples of a service, the schema range,
-#: and the progress of a scrub.
+#: Tables that may have rows in an unused database: secrets, samples of a service's metrics, the
+#: schema range, and the progress of a scrub.
 _INITIAL_TABLES = ("secrets", "samples", "schema_range", "scrubs")
 #: Seconds after which a server no longer lists a closed connection.
 _DISCONNECT_S = 5.0
 
 
 class _Restoration:
-    """Reader of one bundle; see `verify_bundle` for its parameters and errors."""
+    """A reader of a bundle; see `verify_bundle` for the parameters and errors."""
 
     def __init__(self, place: str, name: str | None, progress: Progress | None) -> None:
         self.place = BundlePlace.open(place)
@@ -71,19 +71,19 @@ class _Restoration:
         self._progress = progress or (lambda _done, _total: None)
         self._done = 0
         listed = self.manifest.blobs + self.manifest.lost
-        rows = (one.rows for one in self.manifest.parts if one.kind != "blobs")
+        rows = (part.rows for part in self.manifest.parts if part.kind != "blobs")
         self._total = max(sum(rows) + listed, 1)
 
     def blobs(self, blobs: Blobs | None) -> tuple[LostBlob, ...]:
-        """Copy all blobs, or only verify them if `blobs` is None; return the lost ones."""
+        """Copy all blobs, or only verify them if `blobs` is None; return the lost blobs."""
         lost, count, size = list[LostBlob](), 0, 0
 
-        def take(one: ListedBlob) -> ListedBlob:
-            if one[2] is None:
-                self._take(blobs, *one[:2])
-            return one
+        def copy(entry: ListedBlob) -> ListedBlob:
+            if entry[2] is None:
+                self._copy_blob(blobs, *entry[:2])
+            return entry
 
-        for digest, length, why in in_order(take, listed_blobs(self.place, self.manifest)):
+        for digest, length, why in in_order(copy, listed_blobs(self.place, self.manifest)):
             if why is None:
                 count, size = count + 1, size + length
             else:
@@ -92,17 +92,17 @@ class _Restoration:
         if (count, size, len(lost)) != (
             self.manifest.blobs, self.manifest.blob_bytes, self.manifest.lost,
         ):  # fmt: skip
-            raise self._differing("its blobs")
+            raise self._mismatch("its blobs")
         return tuple(lost)
 
-    def _take(self, blobs: Blobs | None, digest: str, size: int) -> None:
+    def _copy_blob(self, blobs: Blobs | None, digest: str, size: int) -> None:
         place = self.place
         if blobs is None:
             condition = place.condition(digest)
             if condition != "sound":
                 raise place.damaged(digest, f"is {condition}")
         elif blobs.condition(digest) == "sound":
-            pass  # a restore that was killed copied it
+            pass  # an earlier, killed restore copied it
         elif size <= LARGE:
             blobs.put(place.get(digest))
         else:
@@ -117,7 +117,8 @@ class _Restoration:
 
         Parameters
         ----------
-        keep_keys : False revokes all keys of the bundle in the same transaction
+        keep_keys : whether the bundle's keys remain valid; False revokes them in the same
+            transaction
 
         Raises
         ------
@@ -132,21 +133,21 @@ class _Restoration:
         for name in _INITIAL_TABLES:
             connection.exec_driver_sql(f"DELETE FROM {name}")
         for table in tables():
-            read = self._read(table.name, [one.name for one in table.columns])
+            read = self._read_table(table.name, [column.name for column in table.columns])
             write_rows(connection, table, decoded_rows([*table.columns], read))
         set_numbers(connection, self.manifest.numbers)
         manifest, names = self.manifest, ("maps", "frames", "signatures")
         summary = summary_of(connection)
         if any(summary[name] != getattr(manifest, name) for name in names):
-            raise self._differing("its rows")
+            raise self._mismatch("its rows")
         try:
             check_sound(connection, self.place.shown)
         except UnusableStore as error:
             raise DamagedBundle(str(error)) from error
         listed = (digest for digest, _, _ in listed_blobs(self.place, self.manifest))
-        if any(one != other for one, other in zip_longest(listed, referred(connection))):
-            raise self._differing("the blobs that its rows refer to")
-        # a bundle holds no answers that are stored in files
+        if any(digest != other for digest, other in zip_longest(listed, referred(connection))):
+            raise self._mismatch("the blobs that its rows refer to")
+        # bundles contain no answers that are stored in files
         connection.exec_driver_sql("DELETE FROM queries WHERE NOT listed AND kept_at IS NULL")
         connection.exec_driver_sql(
             "UPDATE queries SET bytes = 0, shown = NULL WHERE bytes > 0 AND kept_at IS NULL"
@@ -157,30 +158,30 @@ class _Restoration:
 
     def key_names(self) -> list[str]:
         """Return the names of the keys in the bundle, sorted."""
-        columns = [one.name for one in keys.columns]
-        rows = self._read(keys.name, columns, counts=False)
+        columns = [column.name for column in keys.columns]
+        rows = self._read_table(keys.name, columns, counts=False)
         return sorted(str(row[columns.index("name")]) for row in rows)
 
     def secrets(self) -> list[Row]:
-        """Return the rows of the secrets, which identify a store."""
-        columns = [one.name for one in secrets.columns]
+        """Return the rows of the table of secrets, which identify a store."""
+        columns = [column.name for column in secrets.columns]
         return list(
-            decoded_rows([*secrets.columns], self._read(secrets.name, columns, counts=False))
+            decoded_rows([*secrets.columns], self._read_table(secrets.name, columns, counts=False))
         )
 
-    def _read(self, table: str, columns: list[str], *, counts: bool = True) -> Iterator[Row]:
-        parts = [one for one in self.manifest.parts if one.kind == f"rows/{table}"]
+    def _read_table(self, table: str, columns: list[str], *, counts: bool = True) -> Iterator[Row]:
+        parts = [part for part in self.manifest.parts if part.kind == f"rows/{table}"]
         for part, data in zip(
-            parts, in_order(lambda one: self.place.get(one.digest), parts), strict=True
+            parts, in_order(lambda part: self.place.get(part.digest), parts), strict=True
         ):
             rows = list(read_rows(data, columns))
             if len(rows) != part.rows:
-                raise self._differing(f"its rows of table {table}")
+                raise self._mismatch(f"its rows of table {table}")
             yield from rows
             if counts:
                 self._advance(len(rows))
 
-    def _differing(self, what: str) -> DamagedBundle:
+    def _mismatch(self, what: str) -> DamagedBundle:
         return DamagedBundle(
             f"{self.place.shown}: bundle {self.manifest.name} is damaged: {what} differ from its "
             "manifest. Nothing was restored. Restore another bundle."
@@ -214,23 +215,23 @@ def check_empty(connection: Connection) -> None:
 
 
 def list_bundle_keys(place: str, name: str | None = None) -> list[str]:
-    """Return the names of the keys in a bundle, which work again once it is restored.
+    """Return the names of the keys in a bundle. After a restore, these keys are valid again.
 
     Raises
     ------
-    BundleError, DamagedBundle, NewerSchema : As for `verify_bundle`.
+    BundleError, DamagedBundle, NewerSchema : See `verify_bundle`.
     """
     return _Restoration(place, name, None).key_names()
 
 
 def verify_bundle(place: str, name: str | None = None, progress: Progress | None = None) -> Bundle:
-    """Read and check a whole bundle, and write its rows into a temporary database.
+    """Check a bundle: read all of its parts, and write its rows into a temporary database.
 
     Parameters
     ----------
-    place : folder or URL of an object store
+    place : folder, or URL of an object store
     name : name of the bundle; None selects the newest
-    progress : callback with the numbers of rows and blobs that are done, and of all
+    progress : see Progress
 
     Raises
     ------
@@ -249,11 +250,11 @@ def restore_to_folder(
     place: str, folder: Path, name: str | None = None, progress: Progress | None = None,
     *, keep_keys: bool = True,
 ) -> Bundle:  # fmt: skip
-    """Restore a bundle to a data folder, and continue a restore that was killed there.
+    """Restore a bundle to a data folder; continue a killed restore if the folder contains one.
 
     Parameters
     ----------
-    folder : folder that is missing or empty
+    folder : missing or empty folder, or folder of a killed restore
     keep_keys : False revokes all keys of the bundle
 
     Raises
@@ -263,8 +264,8 @@ def restore_to_folder(
     DamagedBundle, NewerSchema : See `verify_bundle`.
     OSError : If the folder cannot be written.
     """
-    folder = Path(os.path.realpath(folder))  # a symbolic link is preserved
-    _check_folder(folder)
+    folder = Path(os.path.realpath(folder))  # resolve a symbolic link, so that it is preserved
+    _require_unused_folder(folder)
     reading, work = _Restoration(place, name, progress), folder / _WORK
     is_new = not folder.exists()
     make_folder(work)
@@ -277,7 +278,7 @@ def restore_to_folder(
             (folder / _BLOBS).rename(work / _BLOBS)
         for half in work.glob(f"{_BLOBS}/*/.*"):  # unfinished files of a killed restore
             half.unlink()
-        _check_room(folder, reading.manifest, work)
+        _require_space(folder, reading.manifest, work)
         with closing(FolderBlobs(work / _BLOBS)) as blobs:
             lost = reading.blobs(blobs)
         _write_file(work / _DATABASE, reading, keep_keys=keep_keys)
@@ -287,8 +288,8 @@ def restore_to_folder(
     return Bundle(reading.manifest, lost)
 
 
-def _check_folder(folder: Path) -> None:
-    """Check that a folder is missing, or has only files of a killed restore."""
+def _require_unused_folder(folder: Path) -> None:
+    """Raise BundleError unless a folder is missing, empty, or left by a killed restore."""
     if not folder.is_dir():
         if os.path.lexists(folder):
             raise BundleError(f"{folder} is not a folder. Pass another path with --data.")
@@ -296,7 +297,7 @@ def _check_folder(folder: Path) -> None:
     allowed = {_WORK, "lost+found"} if os.path.ismount(folder) else {_WORK}
     if (folder / _WORK / _DATABASE).exists() and not (folder / _WORK / _BLOBS).exists():
         allowed.add(_BLOBS)  # a restore was killed inside `_publish`
-    names = sorted({one.name for one in folder.iterdir()} - allowed)
+    names = sorted({path.name for path in folder.iterdir()} - allowed)
     if names:
         more = "" if len(names) <= 3 else f" and {len(names) - 3} more"
         raise BundleError(
@@ -305,9 +306,9 @@ def _check_folder(folder: Path) -> None:
         )
 
 
-def _check_room(folder: Path, manifest: BundleManifest, work: Path) -> None:
-    """Check that the disk has room for the parts of a bundle that were not restored yet."""
-    restored = sum(one.stat().st_size for one in work.rglob("*") if one.is_file())
+def _require_space(folder: Path, manifest: BundleManifest, work: Path) -> None:
+    """Raise BundleError if the disk has no room for the parts that are not restored yet."""
+    restored = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
     required, free = manifest.bytes - restored, shutil.disk_usage(folder).free
     if free < required:
         raise BundleError(
@@ -317,16 +318,16 @@ def _check_room(folder: Path, manifest: BundleManifest, work: Path) -> None:
 
 
 def _write_file(path: Path, reading: _Restoration, *, keep_keys: bool = True) -> None:
-    """Write the rows of a bundle into a new SQLite file, without a write-ahead log at the end."""
-    for one in path.parent.glob(f"{path.name}*"):
-        one.unlink()
+    """Write the rows of a bundle into a new SQLite file. No write-ahead log remains."""
+    for old in path.parent.glob(f"{path.name}*"):
+        old.unlink()
     url = URL.create("sqlite", database=str(path)).render_as_string(hide_password=False)
     with closing(open_database(url)) as database, database.write() as connection:
         reading.rows(connection, keep_keys=keep_keys)
 
 
 def _publish(work: Path, folder: Path) -> None:
-    """Move blobs and database to the data folder; the database comes last and makes it a store."""
+    """Move the blobs to the data folder, and then the database, which makes the folder a store."""
     try:
         (work / _BLOBS).rename(folder / _BLOBS)
         put_new(work / _DATABASE, folder / _DATABASE)
@@ -342,35 +343,35 @@ def restore_to_server(
     place: str, settings: Settings, name: str | None = None, progress: Progress | None = None,
     *, keep_keys: bool = True,
 ) -> Bundle:  # fmt: skip
-    """Restore a bundle to an empty database of PostgreSQL and its place of blobs.
+    """Restore a bundle to an empty PostgreSQL database and its storage of blobs.
 
     Parameters
     ----------
-    settings : settings with the addresses of the database, whose schema is created if it is
-        missing, and of the blobs
+    settings : settings with the addresses of the database and of the blobs; a missing schema is
+        created
     keep_keys : False revokes all keys of the bundle
 
     Raises
     ------
-    BundleError : If the bundle does not exist, the database is in use or not empty, or it cannot
-        store a row of the bundle.
+    BundleError : If the bundle does not exist, or if the database is in use, is not empty, or
+        cannot store a row of the bundle.
     DamagedBundle, NewerSchema : See `verify_bundle`.
     UnusableStore : If the database or the blobs cannot be reached or written.
     """
     if isinstance(settings.blobs, Path) and settings.blob_dir.with_name(_DATABASE).exists():
-        raise BundleError(  # each store would remove the blobs of the other
+        raise BundleError(  # the two stores would remove each other's blobs
             f"{settings.blob_dir.with_name(_DATABASE)} is the database of another store, whose "
             "blobs are in the same folder. Pass another folder with --data."
         )
     with closing(reach_database(settings.database)) as before:
-        _check_unused(before)
+        _require_unused_database(before)
     reading = _Restoration(place, name, progress)
     with closing(open_database(settings.database)) as database:
         names = reading.secrets()
         owner = next((owner_of(value) for name, value in names if name == "seals"), "")
         with database.read() as connection:
-            check_empty(connection)  # so a mark of its service at the blobs may be replaced
-        with _marked(settings, owner, OpaqueIds(database).owner):
+            check_empty(connection)  # then the blobs' owner mark may be replaced
+        with _owner_mark(settings, owner, OpaqueIds(database).owner):
             with database.write() as connection:  # opening the blobs checks their owner
                 check_empty(connection)
                 connection.exec_driver_sql("DELETE FROM secrets")
@@ -384,10 +385,10 @@ def restore_to_server(
 
 
 @contextmanager
-def _marked(settings: Settings, owner: str, before: str) -> Iterator[None]:
-    """Mark a place of blobs as that of a store while blobs are copied there.
+def _owner_mark(settings: Settings, owner: str, before: str) -> Iterator[None]:
+    """Mark the storage of blobs as owned by a store while blobs are copied there.
 
-    The original store has the same secret, but must not share the place with the restored one.
+    The original store has the same secret, but must not share the storage with the restored store.
     """
     if isinstance(settings.blobs, Path):
         make_folder(settings.blobs)
@@ -399,15 +400,15 @@ def _marked(settings: Settings, owner: str, before: str) -> Iterator[None]:
     mark.end(owner)
 
 
-def _check_unused(database: Database) -> None:
-    """Check that the database is empty and has no other connections of sceneprint.
+def _require_unused_database(database: Database) -> None:
+    """Raise BundleError unless the database is empty and has no other connections of sceneprint.
 
-    The check is repeated for a while, since a server still lists connections that were just closed.
+    The check is repeated until _DISCONNECT_S: a server lists connections for a while after closing.
     """
     with database.read() as connection:
         check_empty(connection)
     end = time.monotonic() + _DISCONNECT_S
-    while others := _connections_of(database):
+    while others := _count_other_connections(database):
         if time.monotonic() >= end:
             raise BundleError(
                 f"{database.shown} is in use by {others} connections of sceneprint. Stop "
@@ -416,8 +417,8 @@ def _check_unused(database: Database) -> None:
         time.sleep(0.1)
 
 
-def _connections_of(database: Database) -> int:
-    """Return the number of other connections of sceneprint that the server lists."""
+def _count_other_connections(database: Database) -> int:
+    """Return the number of other connections of sceneprint to a PostgreSQL database."""
     with database.read() as connection:
         return int(
             connection.exec_driver_sql(

@@ -1,11 +1,11 @@
-"""Rows of tables as parts of a bundle, in one format for SQLite and PostgreSQL.
+"""Conversion of tables to parts of a bundle, in the same format for SQLite and PostgreSQL.
 
     rows of a table  --cut_rows-->  rows of each part, and their digest
     --write_part-->  JSON lines, compressed  --read_rows-->  the same rows
 
-The hash of a row's key decides whether a part ends after the row. Therefore an inserted, changed or
-deleted row changes only its own part, and the previous bundle holds the other parts. Comparing
-digests of rows avoids writing these parts, which takes several times as long as reading their rows.
+The hash of a row's key decides whether a part ends after the row. Therefore, an inserted, changed
+or deleted row changes only its own part, and the previous bundle contains the other parts. Digests
+of the rows identify these parts before encoding, which takes several times as long as reading.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from sqlalchemy.exc import IntegrityError
 from sceneprint.errors import BundleError, DamagedBundle, UnusableStore
 from sceneprint.store.tables import events, metadata, pending_events
 
-#: Mean number of rows in a part, and size in bytes after which a part ends in any case.
+#: Mean number of rows in a part, and size in bytes at which a part ends in any case.
 _ROWS, _BYTES = 1024, 8 << 20
-#: Maximum uncompressed size of a part in bytes; one row may be as large as a request.
+#: Maximum uncompressed size of a part in bytes; a row may be as large as a request.
 _MOST_BYTES = 1 << 28
 #: Number of rows to read or write at once; a signature may have 125,000 bytes.
 _BLOCK = 200
@@ -54,11 +54,11 @@ Row = Sequence[Any]
 
 
 def tables() -> list[Table]:
-    """Return the tables of a bundle, each after those that it refers to.
+    """Return the tables of a bundle; a table follows those to which it refers.
 
-    The table of pending events is not among them, since `read_table` numbers its rows as events.
+    The table of pending events is omitted: `read_table` yields its rows as events.
     """
-    return [one for one in metadata.sorted_tables if one is not pending_events]
+    return [table for table in metadata.sorted_tables if table is not pending_events]
 
 
 def numbered(table: Table) -> bool:
@@ -68,23 +68,25 @@ def numbered(table: Table) -> bool:
 
 def column_names(table: Table) -> str:
     """Return the quoted names of all columns of a table, separated by commas."""
-    return ", ".join(f'"{one.name}"' for one in table.columns)
+    return ", ".join(f'"{column.name}"' for column in table.columns)
 
 
 def read_table(connection: Connection, table: Table) -> Iterator[Row]:
-    """Yield all rows of a table in the order of their keys, with the values of SQLite's driver.
+    """Yield all rows of a table in the order of their keys, with equal values for both databases.
 
     JSON documents are text, and Boolean values are integers.
     """
     server = connection.dialect.name == "postgresql"
-    columns = ", ".join(f'"{one.name}"' + (_cast(one) if server else "") for one in table.columns)
-    order = ", ".join(  # SQLite compares texts by their bytes
-        f'"{one.name}"' + (' COLLATE "C"' if server and isinstance(one.type, String) else "")
-        for one in table.primary_key.columns
+    columns = ", ".join(
+        f'"{column.name}"' + (_cast_suffix(column) if server else "") for column in table.columns
+    )
+    order = ", ".join(  # collation "C" compares text by bytes, like SQLite
+        f'"{column.name}"' + (' COLLATE "C"' if server and isinstance(column.type, String) else "")
+        for column in table.primary_key.columns
     )
     yield from fetch_rows(connection, f"SELECT {columns} FROM {table.name} ORDER BY {order}")
     if server and table is events:
-        yield from _pending(connection)
+        yield from _pending_events(connection)
 
 
 def fetch_rows(connection: Connection, statement: str) -> Iterator[Row]:
@@ -95,20 +97,20 @@ def fetch_rows(connection: Connection, statement: str) -> Iterator[Row]:
             yield from map(tuple, block)
 
 
-def _cast(column: Column[Any]) -> str:
+def _cast_suffix(column: Column[Any]) -> str:
     if isinstance(column.type, JSON):
         return "::text"
     return "::integer" if isinstance(column.type, Boolean) else ""
 
 
-def _pending(connection: Connection) -> Iterator[Row]:
-    """Yield the events that PostgreSQL has not numbered yet, with the next numbers."""
-    last = _last_of_server(connection, events.name)
+def _pending_events(connection: Connection) -> Iterator[Row]:
+    """Yield the events that PostgreSQL has not numbered yet; number them consecutively."""
+    last = _last_server_number(connection, events.name)
     for number, row in enumerate(read_table(connection, pending_events), last + 1):
         yield (number, *row[1:])
 
 
-def _last_of_server(connection: Connection, name: str) -> int:
+def _last_server_number(connection: Connection, name: str) -> int:
     sequence = connection.exec_driver_sql(
         f"SELECT pg_get_serial_sequence('{name}', 'number')"
     ).scalar_one()
@@ -117,26 +119,26 @@ def _last_of_server(connection: Connection, name: str) -> int:
 
 
 def last_numbers(connection: Connection) -> dict[str, int]:
-    """Return the last row number that was assigned in each numbered table, 0 if there is none."""
-    numbers = {one.name: 0 for one in tables() if numbered(one)}
+    """Return the last assigned row number of each numbered table; 0 if there is none."""
+    numbers = {table.name: 0 for table in tables() if numbered(table)}
     if connection.dialect.name == "sqlite":
         sequences = connection.exec_driver_sql(
             "SELECT name, seq FROM sqlite_sequence WHERE typeof(seq) = 'integer'"
         )
         return numbers | {name: seq for name, seq in sequences if name in numbers}
-    numbers = {name: _last_of_server(connection, name) for name in numbers}
+    numbers = {name: _last_server_number(connection, name) for name in numbers}
     pending = f"SELECT count(*) FROM {pending_events.name}"
     numbers[events.name] += int(connection.exec_driver_sql(pending).scalar_one())
     return numbers
 
 
 def cut_rows(rows: Iterable[Row], keys: Sequence[int]) -> Iterator[tuple[list[Row], str]]:
-    """Yield the rows of each part with their digest.
+    """Group rows into parts; yield the rows of each part and their digest.
 
     Parameters
     ----------
     rows : rows in the order of their keys
-    keys : positions of the key's values in a row
+    keys : positions of the key columns in a row
     """
     key = itemgetter(*keys)
     part, size, hashed = list[Row](), 0, hashlib.sha256()
@@ -144,25 +146,25 @@ def cut_rows(rows: Iterable[Row], keys: Sequence[int]) -> Iterator[tuple[list[Ro
         part.append(row)
         ends = zlib.crc32(repr(key(row)).encode()) % _ROWS == 0
         if ends or len(part) % _BATCH == 0:
-            size += _add(hashed, part)
+            size += _hash_batch(hashed, part)
         if ends or size >= _BYTES:
             yield part, hashed.hexdigest()
             part, size, hashed = [], 0, hashlib.sha256()
     if part:
-        _add(hashed, part)
+        _hash_batch(hashed, part)
         yield part, hashed.hexdigest()
 
 
-def _add(hashed: hashlib._Hash, part: list[Row]) -> int:
-    """Add the last rows of a part to its digest; return their size in bytes."""
+def _hash_batch(hashed: hashlib._Hash, part: list[Row]) -> int:
+    """Add the last batch of rows of a part to its digest; return the batch's size in bytes."""
     first = (len(part) - 1) // _BATCH * _BATCH
-    packed = marshal.dumps(part[first:], 2)  # later versions refer to equal objects
+    packed = marshal.dumps(part[first:], 2)  # later versions encode repeated objects by reference
     hashed.update(packed)
     return len(packed)
 
 
 def write_part(columns: Sequence[str], rows: Iterable[Row]) -> bytes:
-    """Return the bytes of a part: the names of the columns, and the rows, as lines of JSON."""
+    """Return the bytes of a part: compressed lines of JSON with the column names and the rows."""
     from isal import isal_zlib
 
     lines = "\n".join([json.dumps(list(columns)), *map(_encode, rows)])
@@ -170,14 +172,16 @@ def write_part(columns: Sequence[str], rows: Iterable[Row]) -> bytes:
 
 
 def table_part(table: Table, rows: Iterable[Row]) -> bytes:
-    """Return the bytes of a part with rows of a table.
+    """Encode rows of a table as the bytes of a part.
 
     Raises
     ------
-    UnusableStore : If a value does not have its column's type because the database was edited.
+    UnusableStore : If a value does not have its column's type, after edits of the database.
     """
     try:
-        return write_part([one.name for one in table.columns], encoded_rows(table.columns, rows))
+        return write_part(
+            [column.name for column in table.columns], encoded_rows(table.columns, rows)
+        )
     except (TypeError, ValueError) as error:
         raise UnusableStore(
             f"A row of table {table.name} cannot be read ({error}). Run `sceneprint fsck`."
@@ -185,8 +189,8 @@ def table_part(table: Table, rows: Iterable[Row]) -> bytes:
 
 
 def encoded_rows(columns: Iterable[Column[Any]], rows: Iterable[Row]) -> Iterator[Row]:
-    """Yield rows of a database with values for JSON: bytes as base64, documents as text."""
-    encoders = [_encoder(one) for one in columns]
+    """Convert rows of a database for JSON: bytes to base64, documents to text."""
+    encoders = [_encoder(column) for column in columns]
     for row in rows:
         yield [x if f is None or x is None else f(x) for f, x in zip(encoders, row, strict=True)]
 
@@ -197,13 +201,13 @@ def _encoder(column: Column[Any]) -> Callable[[Any], Any] | None:
         return lambda value: base64.b64encode(value).decode()
     if isinstance(column.type, Boolean):
         return bool
-    if isinstance(column.type, JSON):  # SQLite returns a bare number as a number
+    if isinstance(column.type, JSON):  # SQLite returns a document that is a number as a number
         return lambda value: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return None
 
 
 def read_rows(data: bytes, columns: Sequence[str]) -> Iterator[Row]:
-    """Yield the rows of a part.
+    """Decode the rows of a part.
 
     Parameters
     ----------
@@ -234,13 +238,13 @@ def read_rows(data: bytes, columns: Sequence[str]) -> Iterator[Row]:
 
 
 def decoded_rows(columns: Sequence[Column[Any]], rows: Iterable[Row]) -> Iterator[Row]:
-    """Yield rows of `encoded_rows` with values for the database, each of its column's type.
+    """Convert rows from `encoded_rows` to values of the columns' types.
 
     Raises
     ------
-    DamagedBundle : If a value has another type.
+    DamagedBundle : If a value cannot be converted.
     """
-    decoders = [_decoder(one) for one in columns]
+    decoders = [_decoder(column) for column in columns]
     for row in rows:
         try:
             yield [None if x is None else f(x) for f, x in zip(decoders, row, strict=True)]
@@ -286,7 +290,7 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
             while block := [tuple(row) for row in islice(rows, _BLOCK)]:
                 connection.exec_driver_sql(statement, block)
         except IntegrityError as error:
-            raise _contradiction(table, error.orig) from error
+            raise _inconsistency(table, error.orig) from error
         return
     import psycopg
 
@@ -297,9 +301,9 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
             for row in rows:
                 copy.write_row(row)
     except psycopg.IntegrityError as error:
-        raise _contradiction(table, error) from error
+        raise _inconsistency(table, error) from error
     except psycopg.DataError as error:
-        # SQLite does not check values, so a file that was edited may hold any
+        # SQLite does not check values, so an edited file may contain any value
         raise BundleError(
             f"PostgreSQL cannot store a row of table {table.name} "
             f"({str(error).partition(chr(10))[0]}). Nothing was restored. Restore the bundle to a "
@@ -307,7 +311,7 @@ def write_rows(connection: Connection, table: Table, rows: Iterator[Row]) -> Non
         ) from error
 
 
-def _contradiction(table: Table, error: object) -> DamagedBundle:
+def _inconsistency(table: Table, error: object) -> DamagedBundle:
     return DamagedBundle(
         f"The rows of table {table.name} in the bundle are inconsistent "
         f"({str(error).partition(chr(10))[0]}). Nothing was restored. Restore another bundle."
@@ -315,7 +319,7 @@ def _contradiction(table: Table, error: object) -> DamagedBundle:
 
 
 def set_numbers(connection: Connection, numbers: dict[str, int]) -> None:
-    """Make every numbered table continue after the last number that was assigned in it."""
+    """Make every numbered table continue after its last assigned number in `numbers`."""
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql("DELETE FROM sqlite_sequence")
     for table in tables():

@@ -350,7 +350,7 @@ def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
         database.execute("PRAGMA foreign_keys = OFF")
         database.execute("DELETE FROM maps")
         database.commit()
-    refused("refers to one of maps that is missing")
+    refused("refers to a missing row of maps")
     with closing(sqlite3.connect(data / "sceneprint.db")) as database:
         database.execute("UPDATE alembic_version SET version_num = '9999'")
         database.execute("UPDATE schema_range SET least_revision = '9999'")

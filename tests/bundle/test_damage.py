@@ -137,7 +137,7 @@ def test_manifests_that_lie(copy, place, refused):
     )
     lies(lambda one: one["parts"][0].update(rows=99), "its rows of table")
     without = [one for one in record["parts"] if one["kind"] != "rows/maps"]
-    lies(lambda one: one.update(parts=without), "refers to one of maps|its rows")
+    lies(lambda one: one.update(parts=without), "refers to a missing row of maps|its rows")
 
 
 def test_rows_that_are_none_of_ours(copy, place, refused):
@@ -163,7 +163,7 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
     lies("rows/frames", lambda lines: lines.insert(2, lines[1]), "UNIQUE constraint failed")
     lies("rows/frames", lambda lines: lines[1].__setitem__(blob, None), "NOT NULL constraint")
     of = lines_of(copy, "rows/frames")[0].index("map_number")
-    lies("rows/frames", lambda lines: lines[1].__setitem__(of, 9), "of maps that is missing")
+    lies("rows/frames", lambda lines: lines[1].__setitem__(of, 9), "a missing row of maps")
     lies("rows/secrets", lambda lines: lines[1].__setitem__(1, "?"), "A row of table secrets")
     for name in ("../evil", "0" * 64):
         lies(
