@@ -1,4 +1,4 @@
-"""Decode uploads in confined processes, or trusted data in this process.
+"""Decoding of uploads in confined processes, or of trusted data in this process.
 
 untrusted bytes  --Decoders.place-->  Decoder  --samples | points-->  arrays, checked again
 
@@ -19,7 +19,7 @@ from sceneprint_client.sidecars import Position, Unsaid
 
 
 class Decoder(Protocol):
-    """Decoder that converts the bytes of an upload to arrays."""
+    """A decoder of the bytes of an upload."""
 
     def samples(self, data: bytes) -> Samples:
         """Return the samples of a depth image; see `decode_samples`."""
@@ -32,17 +32,17 @@ class Decoder(Protocol):
 
 
 class Decoders(Protocol):
-    """Set of decoders that threads may share."""
+    """A set of decoders that threads may share."""
 
     def place(self) -> AbstractContextManager[Decoder]:
-        """Wait for a decoder and hold it.
+        """Wait for a free decoder, and reserve it within a `with` block.
 
-        Process the arrays within the context, so that the number of decoders also limits the use
-        of memory and processors.
+        Process the arrays within the block: then the number of decoders also limits memory and
+        processor usage.
         """
 
     def start(self) -> None:
-        """Start a decoder before the first upload needs it."""
+        """Start a decoder in advance, to decode the first upload faster."""
 
     def close(self) -> None:
         """Stop all decoders."""

@@ -1,10 +1,10 @@
-"""Decoder process, which loads its code, gives up all rights, and decodes until it is killed.
+"""Program of a decoder process: load all code, confine the process, and decode until it is killed.
 
     python -m sceneprint.decoders.child_process CONTROL MEMORY PARENT BYTES plain|kernels [MORE]
 
-CONTROL is a socket that carries one JSON request and one JSON reply per task. MEMORY is shared with
-the parent and holds the bytes of the upload, and then the array. MORE stands for the arguments of
-other programs that serve tasks. Nothing is pickled, and the parent checks every reply.
+CONTROL is a socket for one JSON request and one JSON reply per task. MEMORY is shared with the
+parent; it contains the bytes of the upload, and then the arrays. BYTES limits the memory for work.
+MORE stands for arguments of other programs. Nothing is pickled, and the parent checks every reply.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ from sceneprint.geometry.kernel import Kernel
 from sceneprint_client.formats import formats_of, function_at
 from sceneprint_client.sidecars import UNSAID
 
-#: Size of the shared memory, bytes. It holds the largest upload; arrays are smaller.
+#: Size of the shared memory, bytes, for the largest upload; arrays are smaller.
 SHARED_BYTES = 512 << 20
 #: Maximum size of a message, bytes, and maximum length of an error or traceback, characters.
 MESSAGE_BYTES, MOST_TEXT = 1 << 16, 8000
 
-#: One array, or several arrays that follow each other.
+#: An array, consecutive arrays, or none.
 Arrays = NDArray[Any] | tuple[NDArray[Any], ...] | None
-#: Function that takes an upload's bytes and the request, and returns the reply and its arrays.
+#: Function of an upload's bytes and a request that returns the reply and its arrays.
 Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], Arrays]]
 
 
-def _samples(data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
+def _read_samples(data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
     samples = decode_samples(data)
     return {"type": samples.dtype.str, "shape": samples.shape}, samples
 
 
-def _points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
+def _read_points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
     position = request["viewpoint"]
     viewpoint = (
         UNSAID if position == UNSAID.value else None if position is None else tuple(position)
@@ -64,11 +64,11 @@ def _points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArr
     return reply, cloud.points
 
 
-TASKS: Mapping[str, Task] = {"samples": _samples, "points": _points}
+TASKS: Mapping[str, Task] = {"samples": _read_samples, "points": _read_points}
 
 
 def mapped(descriptor: int) -> FileBytes:
-    """Map an open file into memory, since a confined process can neither open nor seek."""
+    """Map an open file into memory: a confined process can neither open files nor seek in them."""
     if os.fstat(descriptor).st_size == 0:
         return b""
     return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
@@ -80,11 +80,11 @@ def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None)
     Parameters
     ----------
     tasks : functions by name
-    warm : function that loads the code of the tasks, including kernels if its argument is true;
-        default: `load_decoders`
+    warm : function that loads the code of the tasks, and the kernels if its argument is true; None
+        selects `load_decoders`
     """
     control, memory, parent, more_bytes = map(int, sys.argv[1:5])
-    # a signal that stops the service reaches its whole process group; uploads must still finish
+    # signals that stop the service reach its process group, but uploads must finish
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     if not die_with_parent(parent):
@@ -105,11 +105,10 @@ def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None)
 def _run_task(
     tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap
 ) -> dict[str, Any]:
-    """Run a task on the first `bytes` of `shared`, and return its reply or error.
+    """Run a task on the first `request["bytes"]` bytes of `shared`; return its reply or an error.
 
-    The arrays of the result replace the upload in `shared`, one after another. The reply has
-    `error` and `text` for an error of the upload, `memory` if memory ran out, and `broke` for any
-    other error.
+    The arrays of the result replace the upload in `shared`, one after another. An error reply has
+    `error` and `text` if the upload is at fault, `memory` if memory ran out, or `broke`.
     """
     try:
         reply, arrays = tasks[request["task"]](shared[: request["bytes"]], request)
@@ -142,17 +141,17 @@ def _redirect_to_null() -> None:
     os.close(nowhere)
 
 
-# A confined process can neither import nor compile, so all code is used once before confinement.
+# A confined process can neither import nor compile, so all code runs once before confinement.
 
 
 def load_decoders(kernels: bool) -> None:
-    """Load the readers of all formats; the compiled ones (PCD and PLY) only if `kernels`."""
-    for data in _images():
+    """Load the readers of all formats; the compiled readers (PCD and PLY) only if `kernels`."""
+    for data in _image_samples():
         decode_samples(data)
     for data, form in array_samples():
         read_points(data, form, UNSAID, 1.0)
-    for one in formats_of("depth", "cloud"):
-        function_at(one.reader)
+    for form in formats_of("depth", "cloud"):
+        function_at(form.reader)
     with suppress(ImportError):  # lazrs is an optional dependency
         import lazrs  # noqa: F401
     for wrong in (b"\x89PNG\r\n\x1a\n" + bytes(40), b"\x93NUMPY\x01\x00\x02\x00{}", b"no image"):
@@ -166,21 +165,21 @@ def load_decoders(kernels: bool) -> None:
 
 
 def end_compilation(*modules: ModuleType) -> None:
-    """Let the kernels of modules use only what they have compiled."""
-    for one in (one for module in modules for one in vars(module).values()):
+    """Restrict the kernels of modules to the code that they have compiled."""
+    for value in (value for module in modules for value in vars(module).values()):
         # kernels without signatures are inlined
-        if isinstance(one, Kernel) and one.compiler.signatures:
-            one.compiler.disable_compile()
+        if isinstance(value, Kernel) and value.compiler.signatures:
+            value.compiler.disable_compile()
 
 
-def _images() -> list[bytes]:
+def _image_samples() -> list[bytes]:
     images = [encode_png(np.ones((2, 2), np.uint16))]
     images.append(bytes(12) + images[0])  # compressedDepth
     return images + [encode_npy(np.ones((2, 2), kind)) for kind in ("f2", "f4", "f8", "u2")]
 
 
 def array_samples() -> list[tuple[bytes, Any]]:
-    """Return small files, with their formats, whose readers need no kernels."""
+    """Return (content, format) of small files whose readers need no kernels."""
     points = np.ones((12, 3), np.float32)
     header = bytearray(227)
     struct.pack_into("<4s", header, 0, b"LASF")
@@ -193,9 +192,9 @@ def array_samples() -> list[tuple[bytes, Any]]:
 
 
 def text_samples() -> list[tuple[bytes, Any]]:
-    """Return small PCD and PLY files of all encodings, with their formats.
+    """Return (content, format) of small PCD and PLY files in all encodings.
 
-    The first read of each compiles its reader.
+    Reading them compiles the readers.
     """
     row = b"1 2 3\n"
     head = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 12\nHEIGHT 1\n"

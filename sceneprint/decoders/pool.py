@@ -1,10 +1,10 @@
-"""Pool of decoder processes, which start when needed, are shared fairly and replaced if they fail.
+"""Pool of decoder processes that start on demand, are shared fairly, and are replaced on failure.
 
     DecoderPool.place  -->  a decoder for one upload  --samples | points-->  arrays
 
 A compromised decoder can send any reply. Replies are therefore JSON and plain arrays, and the pool
-copies the arrays from the shared memory before it checks them. The memory is sealed, because a
-decoder that shrinks it would crash the service.
+copies the arrays from the shared memory before it checks them. The memory is sealed: a decoder that
+shrinks it would crash the service.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from sceneprint_client.sidecars import Position, Unsaid
 log = logging.getLogger(__name__)
 
 PROGRAM = "sceneprint.decoders.child_process"
-#: Formats with compiled readers, whose process takes 1 s longer to start and 140 MB more memory.
+#: Formats with compiled readers. Their processes start 1 s later and use 140 MB more memory.
 _COMPILED = ("ply", "pcd")
 #: Upload errors that a decoder may report, by name.
 _ERRORS = {
@@ -59,21 +59,21 @@ _ERRORS = {
         errors.UnreadableArchive, errors.InvalidIntrinsics, errors.MissingDependency,
     )
 }  # fmt: skip
-#: Time limit for the start of a process, which may compile kernels; interval between checks of its
-#: processor time; and time limit for an upload that waits for a decoder, seconds.
+#: Seconds: limit for the start of a process, including compilation; interval between checks of its
+#: processor time; and limit for the wait of an upload for a decoder.
 _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
-#: Maximum ratio of a task's wall time to its limit of processor time. Machines may be busy.
+#: Maximum wall time of a task, as a multiple of its processor time limit: machines may be busy.
 _PATIENCE = 8
-#: Maximum size of the shared memory that is erased after a task, bytes. Larger memory is freed.
+#: Maximum size of used shared memory that is overwritten after a task, bytes; more is freed.
 _ERASED_BYTES = 8 << 20
-#: Settings of glibc. A process keeps freed memory up to a maximum size: otherwise half of a
-#: decoder's time is spent on pages that it frees after each image and allocates for the next. It
-#: overwrites that memory, since the next image may be of another tenant.
+#: Settings of glibc. A process retains freed memory up to a maximum size: otherwise, a decoder
+#: would spend half of its time on freeing and allocating pages. Freed memory is overwritten, since
+#: the next image may be another tenant's.
 _MALLOC = {
     "MALLOC_TRIM_THRESHOLD_": f"{_ERASED_BYTES}", "MALLOC_MMAP_THRESHOLD_": f"{_ERASED_BYTES}",
     "MALLOC_PERTURB_": "85",
 }  # fmt: skip
-#: Environment variables that a decoder needs to find its code. Others may contain secrets.
+#: Environment variables that a decoder needs to find its code. Other variables may contain secrets.
 _ENVIRONMENT = (
     "PATH", "LANG", "LC_ALL", "HOME", "USER", "TMPDIR", "XDG_CACHE_HOME", "PYTHONPATH",
     "PYTHONHOME", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "NUMBA_CPU_NAME",
@@ -83,11 +83,11 @@ _ENVIRONMENT = (
 
 @contextmanager
 def inheritable(source: BinaryIO) -> Iterator[int]:
-    """Yield a descriptor of an open file that a decoder process can inherit."""
+    """Yield a file descriptor that a decoder process can inherit, for the content of `source`."""
     with tempfile.TemporaryFile() as copy:
         try:
             descriptor = source.fileno()
-        except OSError:  # a file of an object store has no descriptor
+        except OSError:  # files of object stores have no descriptor
             shutil.copyfileobj(source, copy)
             copy.flush()
             descriptor = copy.fileno()
@@ -95,18 +95,18 @@ def inheritable(source: BinaryIO) -> Iterator[int]:
 
 
 class DecoderEnded(Exception):
-    """Error for a decoder process that ended or sent an invalid reply; the message says why."""
+    """A decoder process ended or sent an invalid reply. The message is the cause."""
 
 
 class DecoderProcess:
-    """Decoder process with its socket and shared memory, which runs one task at a time.
+    """A decoder process with its socket and shared memory. It runs one task at a time.
 
     Parameters
     ----------
     program : name of the module that the process runs
     more_bytes : maximum memory that the process may allocate for its work, bytes; 0 for no limit
     compiled : whether the process loads kernels
-    files : file descriptors that the process may read; the program gets them as arguments
+    files : descriptors of files that the process inherits, passed as arguments to the program
     more : further arguments of the program
     """
 
@@ -149,11 +149,11 @@ class DecoderProcess:
 
     @property
     def pid(self) -> int:
-        """Id of the process."""
+        """Return the id of the process."""
         return self._process.pid
 
     def await_ready(self) -> None:
-        """Wait until the process is confined. Raise DecoderEnded if it fails."""
+        """Wait until the process is confined; raise DecoderEnded if it fails."""
         reply = self._receive(_BEGIN_S)
         walls = reply.get("ready")
         if not isinstance(walls, dict):
@@ -163,7 +163,13 @@ class DecoderProcess:
         )
 
     def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
-        """Run a task and return its unchecked reply; `array_of` returns its arrays.
+        """Run a task on an upload; return its unchecked reply.
+
+        Parameters
+        ----------
+        request : name of the task and its parameters
+        data : bytes of the upload
+        seconds : maximum processor time
 
         Raise DecoderEnded if the process ends during the task. Raise DecoderFailure if the task
         takes too long.
@@ -179,7 +185,7 @@ class DecoderProcess:
     def result(
         self, reply: dict[str, Any], checked: Callable[[DecoderProcess, dict[str, Any]], Any]
     ) -> Any:
-        """Return the checked result of a reply.
+        """Check a reply, and return its result.
 
         Parameters
         ----------
@@ -203,7 +209,7 @@ class DecoderProcess:
             raise RuntimeError(f"A decoder failed: {text.strip().rpartition(chr(10))[2][:200]}")
         self._used = self._sent
         if "error" in reply:
-            raise _error_of(reply)
+            raise _reported_error(reply)
         try:
             return checked(self, reply)
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
@@ -216,7 +222,7 @@ class DecoderProcess:
         return array.reshape(shape)
 
     def clear(self) -> None:
-        """Erase the shared memory, since the next upload may be another tenant's."""
+        """Erase the shared memory: the next upload may be another tenant's."""
         if self._used > _ERASED_BYTES:
             self._shared.madvise(mmap.MADV_REMOVE)  # frees the pages, which then read as zeros
         else:
@@ -275,7 +281,7 @@ class DecoderProcess:
 
 
 class _Slot:
-    """Place in the pool, which serves one upload at a time and starts its process when needed."""
+    """A place in the pool. It serves one upload at a time, and starts its process on demand."""
 
     def __init__(self, pool: DecoderPool) -> None:
         self._pool = pool
@@ -283,11 +289,11 @@ class _Slot:
 
     def samples(self, data: bytes) -> Samples:
         """See Decoder."""
-        if len(data) > MAXIMUM_IMAGE_BYTES:  # `decode_samples` refuses it by its size
+        if len(data) > MAXIMUM_IMAGE_BYTES:  # `decode_samples` rejects it without decoding
             return decode_samples(data)
 
         def checked(process: DecoderProcess, reply: dict[str, Any]) -> Samples:
-            kind, shape = reply["type"], _shape(reply, MAXIMUM_SAMPLES)
+            kind, shape = reply["type"], _checked_shape(reply, MAXIMUM_SAMPLES)
             if kind not in ("<u2", "<f4"):
                 raise ValueError(f"type {kind!r:.40}")
             return process.array_of(kind, shape)
@@ -307,7 +313,8 @@ class _Slot:
         }  # fmt: skip
 
         def checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadPoints:
-            shape, file_points = _shape(reply, 3 * MAXIMUM_POINTS), int(reply["file_points"])
+            shape = _checked_shape(reply, 3 * MAXIMUM_POINTS)
+            file_points = int(reply["file_points"])
             if shape[1] != 3 or not shape[0] <= file_points <= MAXIMUM_POINTS:
                 raise ValueError(f"{shape} points of {file_points}")
             place = reply["viewpoint"]
@@ -317,7 +324,7 @@ class _Slot:
                     raise ValueError("the viewpoint is not finite")
                 place = x, y, z
             points: Floats32 = process.array_of("<f4", shape)
-            # kernels use points as indices; comparisons with NaN are false
+            # kernels compute indices from points; NaN fails these comparisons too
             if len(points) and not (points.min() >= -FARTHEST_M and points.max() <= FARTHEST_M):
                 raise ValueError("a point is too far away")
             return ReadPoints(points, place, file_points)
@@ -329,11 +336,12 @@ class _Slot:
         self, request: dict[str, Any], data: bytes,
         checked: Callable[[DecoderProcess, dict[str, Any]], Any], *, compiled: bool = False,
     ) -> Any:  # fmt: skip
-        """Run a task, and retry it once in a new process if the process ends.
+        """Run a task; if its process ends, retry once in a new process. Return the checked result.
 
         Parameters
         ----------
         request : name of the task and its parameters
+        data : bytes of the upload
         checked : function that checks a reply and returns its result; it raises an error for an
             invalid reply
         compiled : whether the task needs kernels
@@ -378,14 +386,14 @@ class _Slot:
 
 
 class DecoderPool:
-    """Decoders in confined processes, which tenants use in turn (`sceneprint.turns`).
+    """Decoders in confined processes, shared fairly among tenants (`sceneprint.turns`).
 
     Parameters
     ----------
     count : maximum number of processes
     more_bytes : maximum memory that each process may allocate for its work, bytes; 0 for no limit
-    seconds : maximum processor time of an upload
-    whose : function that returns the tenant of this thread's request
+    seconds : maximum processor time per upload
+    whose : function that returns the tenant of the current request
     program : name of the module that the processes run
     """
 
@@ -399,7 +407,7 @@ class DecoderPool:
         self._free = [_Slot(self) for _ in range(count)]
         self._slots = tuple(self._free)
         self._closed = False
-        # the kernel kills a process when the thread that started it ends
+        # a process is killed when the thread that started it ends, so this thread must persist
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
         self._compiling = threading.Lock()
         #: Protections of the processes; None before the first process is ready.
@@ -407,14 +415,14 @@ class DecoderPool:
 
     @contextmanager
     def place(self) -> Iterator[_Slot]:
-        """See Decoders. Raise Busy if no decoder becomes free within the time limit."""
+        """See Decoders. Raise Busy if no decoder becomes free in time."""
         tenant = self._whose()
         if not self._turns.acquire(tenant, _WAIT_S):
             raise errors.Busy(
                 f"No decoder became free within {_WAIT_S:g} s. Nothing was stored. Retry in a "
                 "minute."
             )
-        slot = self._free.pop()  # last in, first out, so that a lightly loaded pool stays small
+        slot = self._free.pop()  # last in, first out: a lightly loaded pool uses few processes
         try:
             yield slot
         finally:
@@ -422,14 +430,14 @@ class DecoderPool:
             self._turns.release(tenant)
 
     def start(self) -> None:
-        """Start one process."""
+        """Start a process in advance."""
         with self.place() as slot, suppress(errors.Busy):
             if slot.process is None:
                 slot.process = self.start_process(compiled=False)
 
     def pids(self) -> list[int]:
         """Return the process ids of the running decoders."""
-        return [one.process.pid for one in self._slots if one.process is not None]
+        return [slot.process.pid for slot in self._slots if slot.process is not None]
 
     def close(self) -> None:
         """Kill all processes; uploads in progress fail."""
@@ -440,7 +448,7 @@ class DecoderPool:
         self._starter.shutdown()
 
     def start_process(self, *, compiled: bool) -> DecoderProcess:
-        """Start a process and wait until it is ready. Raise Busy if it fails."""
+        """Start a process and wait until it is ready; raise Busy if it fails."""
         try:
             if self._closed:
                 raise DecoderEnded("the service is stopping")
@@ -449,7 +457,7 @@ class DecoderPool:
             )
             process = starting.result()
             try:
-                if compiled:  # one process compiles, and the others load the result
+                if compiled:  # the first process compiles kernels, and later processes load them
                     with self._compiling:
                         process.await_ready()
                 else:
@@ -478,8 +486,8 @@ class DecoderPool:
         slot.end()
 
 
-def _shape(reply: dict[str, Any], most: int) -> tuple[int, int]:
-    """Return the shape of a two-dimensional array of at most `most` numbers."""
+def _checked_shape(reply: dict[str, Any], most: int) -> tuple[int, int]:
+    """Return the shape of a reply's array; raise ValueError if it is invalid or exceeds `most`."""
     height, width = reply["shape"]
     if not (type(height) is int and type(width) is int and height >= 0 and width >= 1):
         raise ValueError("the shape is invalid")
@@ -488,7 +496,7 @@ def _shape(reply: dict[str, Any], most: int) -> tuple[int, int]:
     return height, width
 
 
-def _error_of(reply: dict[str, Any]) -> errors.SceneprintError:
+def _reported_error(reply: dict[str, Any]) -> errors.SceneprintError:
     kind = _ERRORS.get(str(reply["error"]))
     if kind is None:
         raise DecoderEnded(f"it raised {str(reply['error'])[:40]!r}")

@@ -1,4 +1,4 @@
-"""Read a ROS recording in a confined process, which inherits the open file.
+"""Reading of ROS recordings in a confined process that inherits the open file.
 
 descriptor, name  --RecordingDecoder-->  outline(options), frame(topic, place)
 """
@@ -15,13 +15,13 @@ from sceneprint_client.api.frames import ImportOptions, RecordingOutline
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES
 
 _PROGRAM = "sceneprint.decoders.recording_process"
-#: Maximum memory of the process besides the file, bytes.
+#: Maximum memory that the process may allocate besides the file, bytes.
 _MORE_BYTES = 2 << 30
 
 
 @dataclass(frozen=True, eq=False)
 class RecordingIndex:
-    """The outline of a recording and its selected frames.
+    """The outline of a recording, and the frames that are selected for import.
 
     Parameters
     ----------
@@ -39,28 +39,31 @@ class RecordingIndex:
 
     @classmethod
     def parse(cls, text: bytes) -> RecordingIndex:
-        """Check a document of the process; raise ValueError, KeyError or TypeError if invalid."""
+        """Parse a document; raise ValueError, KeyError or TypeError if it is invalid."""
         document = json.loads(text)
         topic = document["topic"]
         return cls(
             RecordingOutline.model_validate(document["outline"]),
             None if topic is None else (str(topic[0]), str(topic[1])),
-            [{name: one[name] for name in ("name", "meta", "place")} for one in document["frames"]],
+            [
+                {name: frame[name] for name in ("name", "meta", "place")}
+                for frame in document["frames"]
+            ],
             [str(note) for note in document["notes"]],
             int(document["sequences"]),
         )
 
 
 class RecordingDecoder:
-    """A confined process that has a recording open, and is used by one thread.
+    """A confined process with an open recording, for use by one thread.
 
-    The process starts with the first request, and again with the first request after it failed.
+    The process starts with the first request, and restarts with the first request after a failure.
 
     Parameters
     ----------
     file : descriptor of the recording
-    name : name of its file, whose suffix identifies the format
-    seconds : maximum processor time of a request
+    name : name of the file; its suffix identifies the format
+    seconds : maximum processor time per request
     """
 
     def __init__(self, file: int, name: str, seconds: float) -> None:
@@ -68,13 +71,13 @@ class RecordingDecoder:
         self._process: DecoderProcess | None = None
 
     def close(self) -> None:
-        """End the process."""
+        """Kill the process."""
         process, self._process = self._process, None
         if process is not None:
             process.end()
 
     def outline(self, options: ImportOptions) -> tuple[bytes, RecordingIndex]:
-        """Return the index of the recording, and the document from which it can be parsed again.
+        """Return the index of the recording, as JSON for `RecordingIndex.parse` and parsed.
 
         Raise UnreadableArchive if the recording cannot be read with the memory and time of a
         process. Raise Busy if no process can be started.
@@ -87,7 +90,7 @@ class RecordingDecoder:
             raise UnreadableArchive(f"{self._name}: Its outline is invalid.") from error
 
     def frame(self, topic: tuple[str, str], place: list[Any]) -> bytes:
-        """Return the bytes of the frame at a place.
+        """Return the bytes of the frame at a `place` of `RecordingIndex.frames`.
 
         Raises
         ------
@@ -122,7 +125,7 @@ class RecordingDecoder:
             reply = process.run(request, b"", self._seconds)
             data: bytes = process.result(reply, checked)
         except (DecoderEnded, DecoderFailure) as error:
-            self.close()  # a late reply would answer the next request
+            self.close()  # a late reply must not answer the next request
             raise UnreadableArchive(
                 f"{self._name} cannot be read: {error}. Split the recording, or send only the "
                 "topics of the sensor, its camera, /tf and /tf_static."

@@ -1,8 +1,8 @@
-"""Process that reads one ROS recording.
+"""Program of a process that reads a ROS recording.
 
     python -m sceneprint.decoders.recording_process CONTROL MEMORY PARENT BYTES plain FILE NAME
 
-Before its confinement the process maps FILE into memory and loads the readers. See
+Before its confinement, the process maps FILE into memory and loads the readers. See
 child_process.py.
 """
 
@@ -44,7 +44,7 @@ Reply = tuple[dict[str, Any], NDArray[np.uint8]]
 
 
 class _MappedFile(io.RawIOBase):
-    """Open file whose bytes are in memory: the process may not position a real one."""
+    """A file in memory: the confined process may not seek in a real file."""
 
     def __init__(self, data: FileBytes) -> None:
         self._data, self._place = data, 0
@@ -67,7 +67,7 @@ class _MappedFile(io.RawIOBase):
 
 
 class _MappedPath(type(Path())):  # type: ignore[misc]  # the class of paths of this system
-    """Path of the mapped recording, the only file that this process can open."""
+    """The path of the mapped recording, the only file that this process can open."""
 
     data: ClassVar[FileBytes] = b""
 
@@ -78,7 +78,7 @@ class _MappedPath(type(Path())):  # type: ignore[misc]  # the class of paths of 
         return False
 
     def is_file(self, **_: Any) -> bool:
-        return False  # there is no camera beside the recording
+        return False  # the recording has no camera file beside it
 
     def absolute(self) -> _MappedPath:
         return self
@@ -88,7 +88,7 @@ class _MappedPath(type(Path())):  # type: ignore[misc]  # the class of paths of 
 
 
 def _outline(path: Path, request: dict[str, Any]) -> Reply:
-    """Return the outline of the recording and the selected frames as JSON; see `RecordingIndex`.
+    """Return the outline of a recording and its selected frames as JSON; see `RecordingIndex`.
 
     `request["options"]` contains ImportOptions. Raise UnreadableArchive if more than `MOST_FRAMES`
     frames are selected.
@@ -136,7 +136,7 @@ def _outline(path: Path, request: dict[str, Any]) -> Reply:
     return {}, np.frombuffer(json.dumps(document).encode(), np.uint8)
 
 
-#: Advice that only a user of the command line can follow; the outline lists all topics.
+#: Advice for the command line only.
 _FOR_COMMANDS = re.compile(
     r" `sceneprint bag` lists all topics\.|, or write an intrinsics\.json beside the recording"
 )
@@ -144,7 +144,7 @@ _OPTION = re.compile("--(topic|camera-info|pose-frame|sensor-frame|depth-scale)"
 
 
 def _over_http(text: str) -> str:
-    """Replace options of commands by fields of the request, and omit advice for commands."""
+    """Replace command options in a text by request fields, and omit advice for the command line."""
     text = _FOR_COMMANDS.sub("", text)
     return _OPTION.sub(lambda option: f"`{option[1].replace('-', '_')}`", text)
 
@@ -155,7 +155,7 @@ def _place_of(source: Any) -> list[Any]:
 
 
 def _frame(path: Path, request: dict[str, Any]) -> Reply:
-    """Return the bytes of one frame."""
+    """Return the bytes of the frame at `request["place"]` of `request["topic"]`."""
     log_ns, occurrence, T = request["place"]
     T_cloud_sensor = None if T is None else np.array(T)
     name, kind = request["topic"]
@@ -167,7 +167,7 @@ def _frame(path: Path, request: dict[str, Any]) -> Reply:
 def _main() -> None:
     data = _MappedPath.data = mapped(int(sys.argv[6]))
     form = format_at(bytes(data[:HEAD]), "recording")
-    suffix = "" if form is None else form.suffixes[0]  # readers identify formats by it
+    suffix = "" if form is None else form.suffixes[0]  # readers identify formats by their suffix
     path = _MappedPath(sys.argv[7].removesuffix(suffix) + suffix)
 
     def run(task: Any, request: dict[str, Any]) -> Reply:
@@ -187,7 +187,7 @@ def _main() -> None:
 
 
 def _load(kernels: bool) -> None:
-    """Load all code, since a confined process cannot import."""
+    """Load all code: a confined process cannot import."""
     load_decoders(kernels)
     load_readers()
 

@@ -1,10 +1,10 @@
-"""Confine a process before it reads untrusted bytes: no files, network, processes, or more memory.
+"""Confinement of a process that reads untrusted bytes: no new files, network, processes or memory.
 
 close_process  -->  Protections: the protections that this kernel supports
 
-The protections are independent of each other, and a kernel or container may lack some of them:
-resource limits (setrlimit), no new privileges, a filter of system calls (seccomp), and rules for
-files, TCP and signals (Landlock). Open files stay open. Import all code before confinement.
+The protections are independent, and a kernel or container may lack some of them: resource limits
+(setrlimit), no new privileges, a system call filter (seccomp), and rules for files, TCP and signals
+(Landlock). Open files remain open. Import all code before confinement.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
 
 @dataclass(frozen=True)
 class Protections:
-    """Protections of a process, besides limits on memory, files and processes.
+    """The protections of a process, in addition to limits on memory, files and processes.
 
     Parameters
     ----------
-    no_new_privileges : whether child programs cannot gain rights
+    no_new_privileges : whether programs that the process executes cannot gain privileges
     seccomp : whether only system calls for memory, time and open files are allowed
-    landlock : version of Landlock, which forbids files, TCP and signals; 0 if unavailable
+    landlock : version of Landlock that forbids files, TCP and signals; 0 if unavailable
     """
 
     no_new_privileges: bool
@@ -40,31 +40,31 @@ class Protections:
 
     @property
     def text(self) -> str:
-        """List of the protections for logs and pages."""
-        walls = ["limits on memory and time"]
-        walls += ["no new privileges"] if self.no_new_privileges else []
-        walls += ["seccomp"] if self.seccomp else []
-        walls += [f"Landlock {self.landlock}"] if self.landlock else []
-        return ", ".join(walls)
+        """Return a list of the protections for logs and pages."""
+        protections = ["limits on memory and time"]
+        protections += ["no new privileges"] if self.no_new_privileges else []
+        protections += ["seccomp"] if self.seccomp else []
+        protections += [f"Landlock {self.landlock}"] if self.landlock else []
+        return ", ".join(protections)
 
 
 def die_with_parent(parent: int) -> bool:
     """Let the kernel kill this process when the thread that started it ends.
 
-    Return False if the parent has already ended.
+    Return False if the process `parent` has already ended.
     """
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent
 
 
 def close_process(more_bytes: int) -> Protections:
-    """Irrevocably give up all rights except computation and open files.
+    """Confine this process irrevocably to computation and open files; return its protections.
 
     `more_bytes`: maximum memory that this process may still allocate, bytes; 0 for no limit.
     """
     limit_memory(more_bytes)
     no_new = _LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
-    # Landlock and seccomp require no new privileges; seccomp comes last, since it forbids the rest
+    # Landlock and seccomp require no_new_privs; seccomp is last, since it forbids the other calls
     landlock = _restrict_by_landlock() if no_new else 0
     for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE,
                   resource.RLIMIT_NPROC):  # fmt: skip
@@ -72,17 +72,17 @@ def close_process(more_bytes: int) -> Protections:
     return Protections(no_new, no_new and _filter_system_calls(), landlock)
 
 
-# Landlock: an empty ruleset forbids everything that Landlock controls.
+# Landlock: a ruleset without rules forbids all access that it handles.
 
-_CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system calls, the same on all processors
-_ASK_VERSION = 1
-#: Number of file access rights that each version can forbid.
+_CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system calls, equal on all processors
+_GET_VERSION = 1
+#: Number of file access rights by Landlock version.
 _FILE_BITS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
 
 
 def _restrict_by_landlock() -> int:
-    """Forbid everything that Landlock controls; return its version, or 0 if that fails."""
-    version = int(_LIBC.syscall(_CREATE_RULESET, None, 0, _ASK_VERSION))
+    """Forbid all access that Landlock handles; return its version, or 0 if unavailable."""
+    version = int(_LIBC.syscall(_CREATE_RULESET, None, 0, _GET_VERSION))
     if version < 1:
         return 0
     files = (1 << _FILE_BITS[min(version, max(_FILE_BITS))]) - 1
@@ -98,7 +98,7 @@ def _restrict_by_landlock() -> int:
     return version if closed else 0
 
 
-# seccomp: a classic BPF program on the number, architecture and arguments of a system call.
+# seccomp: a classic BPF program checks the number, architecture and arguments of a system call.
 
 _SECCOMP = {"x86_64": 317, "aarch64": 277}
 _ARCHITECTURE = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
@@ -127,12 +127,12 @@ _PROT_EXEC = 4
 _FIRST_X32 = 0x40000000  #: smallest number of an x32 system call on x86-64
 _LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
 _NUMBER, _ARCH, _THIRD_ARGUMENT = 0, 4, 32
-_ALLOW, _REFUSE, _KILL = 0x7FFF0000, 0x00050000 | 1, 0x80000000  #: a refused call fails with EPERM
+_ALLOW, _DENY, _KILL = 0x7FFF0000, 0x00050000 | 1, 0x80000000  #: a refused call fails with EPERM
 _SET_FILTER, _ALL_THREADS = 1, 1
 
 
 def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
-    """Return the filter as BPF instructions: code, jump if true, jump if false, operand.
+    """Return the system call filter as BPF instructions: code, jumps if true and false, operand.
 
     `machine`: result of `platform.machine()`, x86_64 or aarch64.
     """
@@ -146,15 +146,15 @@ def filter_program(machine: str) -> list[tuple[int, int, int, int]]:
         (_RETURN, 0, 0, _KILL),
     ]
     rest = len(allowed)
-    # the jumps lead to the instructions after the list: refuse, allow, check the protection
+    # jumps lead to the instructions after the comparisons: refuse, allow, check memory protection
     program += [(_EQUAL, rest + 1 - i + 2, 0, number) for i, number in enumerate(mapping)]
     program += [(_EQUAL, rest - i, 0, number) for i, number in enumerate(allowed)]
     program += [
-        (_RETURN, 0, 0, _REFUSE),
+        (_RETURN, 0, 0, _DENY),
         (_RETURN, 0, 0, _ALLOW),
         (_LOAD, 0, 0, _THIRD_ARGUMENT),
         (_ANY_BIT, 0, 1, _PROT_EXEC),
-        (_RETURN, 0, 0, _REFUSE),
+        (_RETURN, 0, 0, _DENY),
         (_RETURN, 0, 0, _ALLOW),
     ]
     return program
@@ -168,7 +168,7 @@ def _filter_system_calls() -> bool:
     machine = platform.machine()
     if machine not in _ALLOWED or struct.calcsize("P") != 8:
         return False
-    code = b"".join(struct.pack("=HBBI", *one) for one in filter_program(machine))
+    code = b"".join(struct.pack("=HBBI", *instruction) for instruction in filter_program(machine))
     program = _Program(len(code) // 8, code)
     return bool(
         _LIBC.syscall(_SECCOMP[machine], _SET_FILTER, _ALL_THREADS, ctypes.byref(program)) == 0

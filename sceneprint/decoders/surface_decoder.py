@@ -1,4 +1,4 @@
-"""Read the file of a whole map in a confined process.
+"""Reading of whole map files in a confined process.
 
 file, name, options  --read_surface_confined-->  ReadSurface, checked again
 
@@ -42,11 +42,11 @@ _MOST_NOTES, _LONGEST_NOTE = 20, 1000
 
 @dataclass(frozen=True)
 class SurfaceLimits:
-    """Limits for one file.
+    """Limits for the process that reads a map file.
 
     Parameters
     ----------
-    more_bytes : maximum memory besides the file and the result, bytes; 0 for no limit
+    more_bytes : maximum further memory, besides the file and the result, bytes; 0 for no limit
     seconds : maximum processor time
     """
 
@@ -62,14 +62,14 @@ def read_surface_confined(
 
     Parameters
     ----------
-    file : descriptor or path of a regular file, which must not change in the meantime
-    name : name of the file for errors; its suffix identifies formats without a signature
-    options : units and up direction that the user states
-    limits : limits for the process; default: 2 GiB and 10 minutes
+    file : descriptor or path of a regular file; the file must not change in the meantime
+    name : name of the file for errors; its suffix identifies formats without a magic number
+    options : units and up direction; None if the user states neither
+    limits : limits for the process; None selects 2 GiB and 10 minutes
 
     Raises
     ------
-    UnreadableCloud, UselessFrame, MissingDependency : If `read_surface` raises them.
+    UnreadableCloud, UselessFrame, MissingDependency : See `read_surface`.
     DecoderFailure : If the process crashes, takes too long, or needs too much memory.
     Busy : If no process can be started.
     OSError : If the file cannot be opened.
@@ -107,7 +107,7 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
                 "a minute."
             ) from error
         try:
-            read: ReadSurface = process.result(process.run(request, b"", limits.seconds), _checked)
+            read: ReadSurface = process.result(process.run(request, b"", limits.seconds), _check)
         except DecoderEnded as error:
             raise DecoderFailure(f"it crashes the decoder ({error})") from error
         return read
@@ -115,44 +115,44 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
         process.end()
 
 
-def _checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
-    """Check a reply and return its result; raise an error if the reply is invalid."""
+def _check(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
+    """Return the result of a reply; raise an error if the reply is invalid."""
     n, m, file_points = reply["points"], reply["triangles"], reply["file_points"]
-    _check(_is_whole(n, 1, MOST_VERTICES), "points")
-    _check(_is_whole(file_points, n, MOST_FILE_POINTS), "points of the file")
+    _require(_is_integer(n, 1, MOST_VERTICES), "points")
+    _require(_is_integer(file_points, n, MOST_FILE_POINTS), "points of the file")
     points: Floats32 = process.array_of("<f4", (n, 3))
     far = 2 * FARTHEST_M + FAR_M
-    _check(bool(points.min() >= -far and points.max() <= far), "a point is too far away")
+    _require(bool(points.min() >= -far and points.max() <= far), "a point is too far away")
     triangles: Ints32 | None = None
     if m is not None:
-        _check(_is_whole(m, 1, MOST_TRIANGLES), "triangles")
+        _require(_is_integer(m, 1, MOST_TRIANGLES), "triangles")
         triangles = process.array_of("<i4", (m, 3), points.nbytes)
-        _check(bool(triangles.min() >= 0 and triangles.max() < n), "indices of triangles")
-    offset, up = _numbers(reply["offset"]), _numbers(reply["up"])
-    _check(abs(float(np.linalg.norm(up)) - 1.0) < 1e-6, "up direction")
+        _require(bool(triangles.min() >= 0 and triangles.max() < n), "indices of triangles")
+    offset, up = _checked_vector(reply["offset"]), _checked_vector(reply["up"])
+    _require(abs(float(np.linalg.norm(up)) - 1.0) < 1e-6, "up direction")
     units, voxel, notes = reply["units_per_metre"], reply["voxel"], reply["notes"]
-    _check(math.isfinite(units) and units > 0 and (voxel is None or 0 < voxel < far), "lengths")
+    _require(math.isfinite(units) and units > 0 and (voxel is None or 0 < voxel < far), "lengths")
     sources = get_args(Source)
-    _check(reply["units"] in sources and reply["up_from"] in sources, "sources")
-    _check(isinstance(notes, list) and len(notes) <= _MOST_NOTES, "notes")
+    _require(reply["units"] in sources and reply["up_from"] in sources, "sources")
+    _require(isinstance(notes, list) and len(notes) <= _MOST_NOTES, "notes")
     return ReadSurface(
         ReferenceSurface(points, triangles, offset, up), reply["units"], reply["up_from"],
-        tuple(str(one)[:_LONGEST_NOTE] for one in notes), float(units), file_points,
+        tuple(str(note)[:_LONGEST_NOTE] for note in notes), float(units), file_points,
         voxel,
     )  # fmt: skip
 
 
-def _check(holds: bool, what: str) -> None:
+def _require(holds: bool, what: str) -> None:
     if not holds:
         raise ValueError(what)
 
 
-def _is_whole(value: object, least: int, most: int) -> bool:
+def _is_integer(value: object, least: int, most: int) -> bool:
     return type(value) is int and least <= value <= most
 
 
-def _numbers(values: list[float]) -> Floats:
+def _checked_vector(values: list[float]) -> Floats:
     x, y, z = map(float, values)
     numbers = np.array([x, y, z])
-    _check(bool(np.isfinite(numbers).all()), "coordinates")
+    _require(bool(np.isfinite(numbers).all()), "coordinates")
     return numbers

@@ -1,8 +1,8 @@
-"""Process that reads the file of one whole map.
+"""Program of a process that reads the file of a whole map.
 
     python -m sceneprint.decoders.surface_process CONTROL MEMORY PARENT BYTES kernels FILE FORMAT
 
-Before its confinement the process maps FILE into memory and loads the reader of FORMAT. See
+Before its confinement, the process maps FILE into memory and loads the reader of FORMAT. See
 child_process.py.
 """
 
@@ -55,11 +55,11 @@ def _main() -> None:
     serve({"surface": surface}, lambda _: _load(form))
 
 
-# A confined process can neither import nor compile, so all code is used once before confinement.
+# A confined process can neither import nor compile, so all code runs once before confinement.
 
 
 def _load(form: SurfaceFormat) -> None:
-    """Load the readers of a format by reading a sample of each of its variants."""
+    """Load the reader of a format: read a sample of each variant."""
     points = np.ones((20, 3), np.float32)
     thinned(points, 8)
     estimate_up(points, None, np.array([0.0, 0.0, 1.0]))
@@ -72,7 +72,7 @@ def _load(form: SurfaceFormat) -> None:
 
 
 def mesh_samples() -> list[tuple[bytes, Any]]:
-    """Return a sample of each variant of each mesh format, with its format."""
+    """Return (content, format) of a sample for each variant of each mesh format."""
     corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)]
     head = "element vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
     head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -96,7 +96,7 @@ def mesh_samples() -> list[tuple[bytes, Any]]:
 
 
 def _gltf(corners: list[tuple[int, int, int]]) -> bytes:
-    """Return a glTF file in JSON with points, lines, and triangles with and without indices."""
+    """Return a JSON glTF file with points, lines, and triangles with and without indices."""
     body = np.array(corners[:3], "<f4").tobytes() + struct.pack("<3I", 0, 1, 2)
     uri = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
     position = {"POSITION": 0}

@@ -20,7 +20,7 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint import errors
 from sceneprint.decoders import LocalDecoders
-from sceneprint.decoders.child_process import _images, array_samples, text_samples
+from sceneprint.decoders.child_process import _image_samples, array_samples, text_samples
 from sceneprint.decoders.pool import DecoderPool
 from sceneprint.decoders.sandbox import filter_program
 from sceneprint_client.sidecars import UNSAID
@@ -62,7 +62,7 @@ def await_end(pid: int) -> None:
 def test_arrays_are_the_same_as_in_this_process(pool: DecoderPool) -> None:
     local = LocalDecoders(1)
     with pool.place() as slot:
-        for data in _images():
+        for data in _image_samples():
             here, there = local.samples(data), slot.samples(data)
             assert (here.dtype, here.tobytes()) == (there.dtype, there.tobytes())
         for data, form in (*array_samples(), *text_samples()):
@@ -123,7 +123,7 @@ def test_time_is_limited_of_work_and_of_sleep(pool: DecoderPool, task: str, reas
 def test_nothing_of_an_upload_stays_in_the_shared_memory(pool: DecoderPool) -> None:
     points = np.full((500, 3), 2.0, np.float32).tobytes()  # of 16-byte rows, a part of one is left
     with pool.place() as slot:
-        for data in (_images()[0], b"no image"):
+        for data in (_image_samples()[0], b"no image"):
             with suppress(errors.UnreadableFrame):
                 slot.samples(data)
         with suppress(errors.UnreadableCloud, errors.UselessFrame):
@@ -159,7 +159,7 @@ def test_a_reply_that_lies_is_no_result(
         assert process is not None
         monkeypatch.setattr(type(process), "run", lambda *_: reply)
         with pytest.raises(errors.DecoderFailure, match="its reply is invalid"):
-            slot.samples(_images()[0])
+            slot.samples(_image_samples()[0])
 
 
 def test_processes_end_with_the_pool_and_with_a_killed_parent() -> None:
@@ -267,6 +267,6 @@ def test_samples_come_back_in_the_size_of_a_large_image(pool: DecoderPool) -> No
     depth = np.arange(4_000_000, dtype=np.uint16).reshape(2000, 2000)
     with pool.place() as slot:
         assert np.array_equal(slot.samples(encode_png(depth)), depth)
-        assert slot.samples(_images()[0]).shape == (2, 2)
+        assert slot.samples(_image_samples()[0]).shape == (2, 2)
         pfm = b"Pf\n2 2\n-1\n" + np.arange(4, dtype="<f4").tobytes()
         np.testing.assert_array_equal(slot.samples(pfm), [[2, 3], [0, 1]])
