@@ -1,14 +1,14 @@
-"""Read frames from tar and zip files without unpacking them, so that archives cannot choose paths.
+"""Reading of frames from tar and zip archives without unpacking: archives cannot choose paths.
 
 file  --open_archive-->  Archive: sequences, refused, frame_of(reference)
 file  --tar_entries, zip_entries-->  ArchiveEntry, ...  --read_entry-->  bytes
 name  --parts_of-->  parts of a relative path
 
 Only files with cameras, poses and lists are unpacked, into a private folder and with limits on size
-and name. The folder has an empty file for each image, so `find_each` finds sequences as on a disk.
-Images are read from the archive when they are needed.
+and name. The folder has an empty file for each image, so `find_each` finds sequences in it as in
+any folder. Images are read from the archive when they are needed.
 
-`tarfile` and `zipfile` trust the sizes in headers. This module therefore limits the number of
+`tarfile` and `zipfile` trust the sizes in headers. Therefore, this module limits the number of
 members, the size of headers, and the names.
 """
 
@@ -46,15 +46,15 @@ from sceneprint_client.formats import is_cloud, titles_of
 from sceneprint_client.frame_files import POSE_FOLDERS, rows_as_npy
 from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
-# Members of a tar or zip, which the standard library reads within limits.
+# The standard library reads the members of an archive, within limits.
 
-#: Maximum number of members: the files of one robot in a month.
+#: Maximum number of members: approximately a robot's files of a month.
 MOST_MEMBERS = 100_000
 #: Maximum length of a member's name, bytes, and maximum number of folders in it.
 LONGEST_NAME, DEEPEST = 1024, 16
 _LONGEST_PART = 200  #: bytes; file systems accept at most 255
-_ENCRYPTED = 0x1 | 0x40 | 0x2000  #: flags of an encrypted member of a zip
-_UNIX = 3  #: code of the system whose file modes a member of a zip may contain
+_ENCRYPTED = 0x1 | 0x40 | 0x2000  #: flags of an encrypted zip member
+_UNIX = 3  #: `create_system` of zip members with Unix file modes
 #: Exceptions that the standard library raises for malformed archives.
 _MALFORMED = (
     tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, EOFError, LookupError,
@@ -64,7 +64,7 @@ _MALFORMED = (
 
 @dataclass(frozen=True, slots=True)
 class ArchiveEntry:
-    """Member of an archive whose content has not been read.
+    """A member of an archive; its content has not been read.
 
     Parameters
     ----------
@@ -72,8 +72,8 @@ class ArchiveEntry:
     size : declared size of the content, bytes
     start : offset of the content in the archive, bytes
     packed : size of the content in the archive, bytes
-    open : function that opens the content of a member of a zip; None for a tar
-    trouble : reason why the member cannot be read, or None
+    open : function that opens the content of a zip member; None for a tar
+    trouble : reason why the member cannot be read; None if it can
     """
 
     name: str
@@ -85,15 +85,15 @@ class ArchiveEntry:
 
 
 class UnusableName(Exception):
-    """Error for a member's name that cannot be a relative path; the message says why."""
+    """A member's name cannot be a relative path. The message is the reason."""
 
 
 def parts_of(name: str) -> tuple[str, ...]:
-    """Return the parts of a member's name as a relative path.
+    """Split a member's name into the parts of a relative path.
 
     Returns
     -------
-    parts : printable names; none is empty, `.` or `..`
+    parts : printable names, without empty parts, `.` and `..`
 
     Raise UnusableName if the name is absolute, has a part `..`, is too long or too deep, or has a
     character that is not printable.
@@ -126,17 +126,17 @@ def _is_plain(part: str) -> bool:
     return not any(unicodedata.category(letter).startswith("C") for letter in part)
 
 
-#: Maximum size of the headers of a member, and of the directory of a zip, bytes. The standard
-#: library reads both into memory.
+#: Maximum size of a member's headers, and of a zip's directory, bytes. The standard library reads
+#: both into memory.
 _MAXIMUM_HEADERS, _MAXIMUM_DIRECTORY = 65_536, 64 << 20
 _DIRECTORY_ENTRY = b"PK\x01\x02"
 BLOCK = tarfile.BLOCKSIZE
-PIECE = 1 << 20  #: size of the pieces that are decompressed, bytes
+PIECE = 1 << 20  #: maximum size of decompressed pieces, bytes
 _DAMAGED = "the tar is damaged after this member, and the rest cannot be read"
 
 
 class _HeaderFile:
-    """File from which the standard library may read at most `allowance` more bytes."""
+    """A file from which the standard library may read at most `allowance` more bytes."""
 
     def __init__(self, file: BinaryIO, allowance: int) -> None:
         self.allowance = allowance
@@ -150,7 +150,7 @@ class _HeaderFile:
                 "The headers of the archive are too long. Pack the archive again."
             )
         if data.count(_DIRECTORY_ENTRY) > MOST_MEMBERS:
-            raise _too_many()
+            raise _too_many_members()
         return data
 
     def seekable(self) -> bool:
@@ -158,7 +158,7 @@ class _HeaderFile:
 
 
 def is_tar_header(block: bytes) -> bool:
-    """Return whether a block is the header of a member of a tar."""
+    """Return whether a block is the header of a tar member."""
     try:
         tarfile.TarInfo.frombuf(block[:BLOCK], "utf-8", "surrogateescape")
     except tarfile.HeaderError:
@@ -169,7 +169,7 @@ def is_tar_header(block: bytes) -> bool:
 def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
     """Yield the members of a tar except folders; unreadable members have `trouble`.
 
-    If the tar is damaged or truncated, the `trouble` of the last member says so.
+    If the tar is damaged or truncated, the last member has `trouble`.
 
     `file`: seekable tar without compression. Raise UnreadableArchive if the tar has too many
     members, or the first member is unreadable.
@@ -194,7 +194,7 @@ def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
             if any(file.read(BLOCK)):
                 yield ArchiveEntry(last, trouble=_DAMAGED)
             return
-        # TarFile would keep all members in memory; typeshed lacks the attribute
+        # TarFile stores all members in memory; typeshed lacks the attribute
         cast("Any", tar).members.clear()
         tar.pax_headers = {}
         if info.size < 0:
@@ -207,7 +207,7 @@ def tar_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
             yield ArchiveEntry(last, info.size, info.offset_data, info.size, trouble=trouble)
         if cut:
             return
-    raise _too_many()
+    raise _too_many_members()
 
 
 def _tar_trouble(info: tarfile.TarInfo) -> str | None:
@@ -229,7 +229,7 @@ def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
     end = file.seek(0, os.SEEK_END)
     headers = _HeaderFile(file, _MAXIMUM_DIRECTORY)
     try:
-        packed = _opened_zip(headers)
+        packed = _open_zip(headers)
     except _MALFORMED as error:
         raise UnreadableArchive(
             f"The zip is damaged or truncated ({error}). Copy or pack it again."
@@ -246,9 +246,9 @@ def zip_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
         )  # fmt: skip
 
 
-def _opened_zip(headers: _HeaderFile) -> zipfile.ZipFile:
+def _open_zip(headers: _HeaderFile) -> zipfile.ZipFile:
     file = cast("BinaryIO", headers)
-    try:  # most programs write UTF-8, with or without the flag
+    try:  # most programs write UTF-8, with or without the UTF-8 flag
         return zipfile.ZipFile(file, metadata_encoding="utf-8")
     except UnicodeDecodeError:
         return zipfile.ZipFile(file)
@@ -261,7 +261,7 @@ def _zip_trouble(info: zipfile.ZipInfo, mode: int, beyond: bool) -> str | None:
         return "it is a link"
     if stat.S_IFMT(mode) not in (0, stat.S_IFREG):
         return "it is not a regular file"
-    # LZMA is refused too, because the file determines how much memory its decoder needs
+    # LZMA is rejected too, because the file determines the memory of its decoder
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         return (
             f"it is compressed with method {info.compress_type}; only stored and deflated members "
@@ -271,7 +271,7 @@ def _zip_trouble(info: zipfile.ZipInfo, mode: int, beyond: bool) -> str | None:
 
 
 def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
-    """Return the content of a member without `trouble`.
+    """Read the content of a member without `trouble`.
 
     Raise UnreadableArchive if the content is damaged, or its size differs from the declared size.
     """
@@ -290,23 +290,23 @@ def read_entry(file: BinaryIO, entry: ArchiveEntry) -> bytes:
     return data
 
 
-def _too_many() -> UnreadableArchive:
+def _too_many_members() -> UnreadableArchive:
     return UnreadableArchive(
         f"The archive has more than {MOST_MEMBERS} members. Split it into several archives."
     )
 
 
-# Decompression of tars while they are received. Members are read later by random access, possibly
-# from an object store. `gzip.open` and similar functions pull bytes from a file, but the chunks of
-# a request are pushed. `Inflater` therefore calls the decompressors itself and stops a
-# decompression bomb early.
+# Tars are decompressed while they are received, because members are read later by random access,
+# possibly from an object store. `gzip.open` and similar functions pull bytes from a file, but the
+# chunks of a request are pushed. Therefore, `Inflater` calls the decompressors itself; it stops
+# decompression bombs early.
 #
 # chunks  --Inflater.pieces-->  bytes of a zip or of a plain tar
 
-#: Maximum ratio of content to archive size, and size of the content that is exempt, bytes. Depth
-#: images are already compressed; NPY files of noisy depth shrink to a fifth.
+#: Maximum ratio of the content's size to the archive's, and size of content that is exempt from it,
+#: bytes. Depth images are already compressed; NPY files of noisy depth shrink to a fifth.
 MOST_RATIO, FREE = 50, 64 << 20
-#: Maximum number of concatenated streams; parallel compressors write many.
+#: Maximum number of concatenated streams; parallel compressors write many streams.
 _MAXIMUM_STREAMS = 65_536
 _XZ_MEMORY = 192 << 20  #: bytes; `xz -9` needs less
 
@@ -331,7 +331,7 @@ def is_archive(head: bytes) -> bool:
 
 
 class Inflater:
-    """Decompressor of tars that receives chunks of any size; zips pass unchanged.
+    """A decompressor of tars that are received in chunks of any size; zips pass unchanged.
 
     `most_bytes`: maximum size of the decompressed archive.
     """
@@ -339,15 +339,15 @@ class Inflater:
     def __init__(self, most_bytes: int) -> None:
         self._most = most_bytes
         self._head: bytes | None = b""
-        self._packing: bytes | None = None  # magic number of the tar's compression
+        self._packing: bytes | None = None  # magic number of the compression
         self._stream: _Stream | None = None
         self._streams = 0
         self._start = b""  # first bytes of the tar
-        #: Numbers of received and of returned bytes.
+        #: Numbers of received bytes and of returned bytes
         self.bytes_in, self.bytes_out = 0, 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
-        """Yield the decompressed pieces of the archive for the next chunk.
+        """Decompress the next chunk of the archive; yield pieces of at most PIECE bytes.
 
         Raise UnreadableArchive if the file is not an archive, is damaged, or exceeds `most_bytes`.
         """
@@ -361,7 +361,7 @@ class Inflater:
         yield from self._checked_pieces(chunk)
 
     def end(self) -> Iterator[bytes]:
-        """Yield the remaining pieces after the last chunk; raise the errors of `pieces`."""
+        """Yield the remaining pieces after the last chunk; raise errors as `pieces` does."""
         if self._head is not None:  # shorter than a block, such as an empty zip
             chunk, self._head = self._head, None
             self._open(chunk)
@@ -381,10 +381,10 @@ class Inflater:
             )
         for magic in _MAGIC[1:]:
             if head.startswith(magic):
-                self._packing, self._stream = magic, _open_entry(magic)
+                self._packing, self._stream = magic, _open_stream(magic)
 
     def _checked_pieces(self, chunk: bytes) -> Iterator[bytes]:
-        for piece in [chunk] if self._packing is None else self._inflated(chunk):
+        for piece in [chunk] if self._packing is None else self._inflate(chunk):
             self.bytes_out += len(piece)
             if self.bytes_out > self._most or self.bytes_out > FREE + MOST_RATIO * self.bytes_in:
                 raise UnreadableArchive(
@@ -398,7 +398,7 @@ class Inflater:
                     raise UnreadableArchive(_NO_TAR)
             yield piece
 
-    def _inflated(self, chunk: bytes) -> Iterator[bytes]:
+    def _inflate(self, chunk: bytes) -> Iterator[bytes]:
         data = chunk
         while True:
             if self._stream is None:  # between two streams, or after the last stream
@@ -412,7 +412,7 @@ class Inflater:
                         f"The archive has more than {_MAXIMUM_STREAMS} compressed streams. Pack it "
                         "again as one stream."
                     )
-                self._stream = _open_entry(self._packing)
+                self._stream = _open_stream(self._packing)
             try:
                 piece = self._stream.decompress(data, PIECE)
             except (zlib.error, OSError, EOFError, ValueError, lzma.LZMAError) as cause:
@@ -424,13 +424,13 @@ class Inflater:
             if self._stream.eof:
                 data, self._stream = self._stream.unused_data, None
                 continue
-            # zlib returns unused input in this attribute; the other decompressors keep it
+            # zlib returns unused input in this attribute; the other decompressors buffer it
             data = getattr(self._stream, "unconsumed_tail", b"")
             if not data and len(piece) < PIECE:
                 return
 
 
-def _open_entry(magic: bytes) -> _Stream:
+def _open_stream(magic: bytes) -> _Stream:
     if magic == _MAGIC[1]:
         return zlib.decompressobj(16 + zlib.MAX_WBITS)
     if magic == _MAGIC[2]:
@@ -438,25 +438,23 @@ def _open_entry(magic: bytes) -> _Stream:
     return lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=_XZ_MEMORY)
 
 
-# Sequences in an archive.
-
 #: Default name of an archive and its sequence.
 DEFAULT_NAME = "import"
 _LISTS = ("depth.txt", "groundtruth.txt", TRANSFORMS)
 _TEXTS = (INTRINSICS_FILE, CLOUDS_FILE, "TrainSplit.txt", "TestSplit.txt")
-#: Maximum size of a list, of any other text, and of all texts together, bytes.
+#: Maximum size of a list, of any other text file, and of all text files together, bytes.
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27
-_HEAD_BYTES = 1024  #: number of first bytes of an image that state its size
-_PARENTS = ("0", "1", "2", "3", "4")  #: private parent folders, since camera files are sought above
+_HEAD_BYTES = 1024  #: number of first bytes that contain the size of an image
+_PARENTS = ("0", "1", "2", "3", "4")  #: private folders, since camera files are searched in parents
 
-#: Error codes for a name that both a file and a folder have, or that is invalid.
+#: Error codes for an invalid name, or for a file and a folder with the same name.
 _CLASHES = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
 Role = Literal["image", "text"]
 
 
 class Archive:
-    """Open archive; see `open_archive`.
+    """An open archive; see `open_archive`.
 
     `root`: private folder that represents the content of the archive.
     """
@@ -464,15 +462,15 @@ class Archive:
     def __init__(self, file: BinaryIO, root: Path) -> None:
         self._file, self._root = file, root
         self._members: dict[Path, ArchiveEntry] = {}
-        #: Folders that are omitted because of their names, so that a note can name them.
+        #: Folders that are omitted because of their names; a note lists them
         self._omitted: set[tuple[str, ...]] = set()
-        #: Names of refused members and sequences, each with the reason.
+        #: Names of rejected members and sequences, with the reasons
         self.refused: list[tuple[str, str]] = []
-        #: Number of members that belong to no sequence, such as colour images.
+        #: Number of members outside all sequences, such as colour images
         self.ignored = 0
-        #: Whether the archive has depth files of Record3D.
+        #: Whether the archive has depth files of Record3D
         self.is_record3d = False
-        #: Sequences in the archive; the content of their frames has not been read.
+        #: Sequences in the archive; the content of their frames has not been read
         self.sequences: tuple[FrameSequence, ...] = ()
 
     def name_of(self, reference: FrameReference) -> str:
@@ -492,7 +490,7 @@ class Archive:
         data = self._read(self._members[reference.path], limit)
         if reference.row is not None:
             return rows_as_npy(data, reference.row)
-        # a camera file cannot state the units of such depth images
+        # the frame's camera file cannot state the unit of such depth images, so they are converted
         return reference.source.converted(data) if isinstance(reference.source, ScaledNpy) else data
 
     def message_of(self, error: SceneprintError) -> str:
@@ -514,7 +512,7 @@ class Archive:
             raise UnreadableArchive(f"{name}: {error}. Pack it again.") from error
 
     def lay_out(self, name: str) -> None:
-        """Fill the private folder, and find the sequences in it.
+        """Create the files of the private folder, and find the sequences in it.
 
         `name`: name of the scene if the archive has no folder for it.
         """
@@ -523,7 +521,7 @@ class Archive:
         single = len(tops) == 1 and all(len(parts) > 1 for parts, _, _ in members)
         above = self._root.joinpath(name)
         weight = self._file.seek(0, 2)
-        # members of a zip may overlap, so their total size is not limited by the archive's size
+        # members of a zip may overlap, so the archive's size does not limit their total size
         unpacked = sum(member.size for _, member, _ in members)
         if unpacked > FREE + MOST_RATIO * weight:
             raise UnreadableArchive(
@@ -532,8 +530,8 @@ class Archive:
                 "less compression."
             )
         left = _MAXIMUM_TEXTS
-        # camera files of other systems describe colour images, so the size of depth is needed
-        of_exports = any(_is_of_export(parts) for parts, _, _ in members)
+        # camera files of exports describe colour images, so the sizes of depth images are needed
+        of_exports = any(_is_export_file(parts) for parts, _, _ in members)
         for parts, member, role in members:
             path = above.joinpath(*parts)
             if path in self._members:
@@ -564,11 +562,11 @@ class Archive:
             except DatasetError as error:
                 raise UnreadableArchive(self.message_of(error)) from error
             self.refused += [
-                (printable_name(one), self.message_of(error)) for one, error in refused
+                (printable_name(name), self.message_of(error)) for name, error in refused
             ]
 
     def _head(self, member: ArchiveEntry) -> bytes:
-        """Return the first bytes of a member; no bytes if the member is unreadable."""
+        """Return the first bytes of a member; b"" if the member is unreadable."""
         if member.open is None:
             self._file.seek(member.start)
             return self._file.read(min(_HEAD_BYTES, member.size))
@@ -579,7 +577,7 @@ class Archive:
             return b""
 
     def _unpack(self, path: Path, member: ArchiveEntry, left: int) -> int:
-        """Write a text file and return its size; the reader refuses a damaged one, left empty."""
+        """Unpack a text file, and return its size; an unreadable file remains empty."""
         limit = min(_MAXIMUM_LIST if path.name in _LISTS else _MAXIMUM_TEXT, left)
         try:
             data = self._read(member, limit)
@@ -590,17 +588,17 @@ class Archive:
         return len(data)
 
     def _sequence_members(self) -> list[tuple[tuple[str, ...], ArchiveEntry, Role]]:
-        """Return parts of the name, entry and role of each member that may belong to a sequence."""
+        """Return (name parts, entry, role) of each member that may belong to a sequence."""
         members: list[tuple[tuple[str, ...], ArchiveEntry, Role]] = []
-        for count, member in enumerate(_entries_of(self._file), start=1):
+        for count, member in enumerate(_read_entries(self._file), start=1):
             if count > MOST_MEMBERS:
-                raise _too_many()
+                raise _too_many_members()
             try:
                 parts = parts_of(member.name)
             except UnusableName as error:
                 self._refuse(member, str(error))
                 continue
-            role = _role_of(parts)
+            role = _select_role(parts)
             if role is not None:
                 members.append((parts, member, role))
             elif member.trouble is not None and not member.size:  # a link, or damage of the tar
@@ -621,7 +619,7 @@ class Archive:
 
 @contextmanager
 def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iterator[Archive]:
-    """Open an archive and find its sequences.
+    """Open an archive, and find its sequences.
 
     Parameters
     ----------
@@ -656,7 +654,7 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
         yield archive
 
 
-def _entries_of(file: BinaryIO) -> Iterator[ArchiveEntry]:
+def _read_entries(file: BinaryIO) -> Iterator[ArchiveEntry]:
     file.seek(0)
     head = file.read(BLOCK)
     if is_tar_header(head):
@@ -666,10 +664,10 @@ def _entries_of(file: BinaryIO) -> Iterator[ArchiveEntry]:
     raise UnreadableArchive("This is neither a zip nor a tar. Pack the sequence again.")
 
 
-def _is_of_export(parts: tuple[str, ...]) -> bool:
-    """Return whether the name is that of a camera or pose file of another system's export."""
+def _is_export_file(parts: tuple[str, ...]) -> bool:
+    """Return whether a name denotes a camera or pose file in another system's export."""
     *folders, name = parts
-    of_camera = name.lower().endswith(".json") and folders[-1:] in ([one] for one in CAMERAS)
+    of_camera = name.lower().endswith(".json") and folders[-1:] in ([folder] for folder in CAMERAS)
     return of_camera or name == TRANSFORMS
 
 
@@ -678,23 +676,24 @@ def _is_hidden(parts: tuple[str, ...]) -> bool:
 
 
 def _omitted_folder(parts: tuple[str, ...]) -> tuple[str, ...] | None:
-    """Return the path of a member's first folder whose name indicates colour or infrared.
+    """Return the path of a member's first folder whose name indicates colour or infrared; None if
+    none.
 
-    The topmost folder may be the packed data set, whose name is arbitrary.
+    The topmost folder is skipped: it may be the packed data set, whose name is arbitrary.
     """
     ends = (end for end in range(2, len(parts)) if is_beside_depth(parts[end - 1]))
     end = next(ends, None)
     return None if end is None else parts[:end]
 
 
-def _role_of(parts: tuple[str, ...]) -> Role | None:
-    """Return the role of a member in a sequence by its name; None if it has none."""
+def _select_role(parts: tuple[str, ...]) -> Role | None:
+    """Return the role that a member's name indicates; None for other members."""
     *folders, name = parts
     if _is_hidden(parts) or _omitted_folder(parts) is not None:
         return None
     # `find_pose_file` assigns pose files to frames
     is_pose = name.endswith(".txt") and ("pose" in name or {*folders[-1:]} & {*POSE_FOLDERS})
-    if name in _TEXTS or name in _LISTS or is_pose or _is_of_export(parts):
+    if name in _TEXTS or name in _LISTS or is_pose or _is_export_file(parts):
         return "text"
     if is_image(name) and not name.lower().endswith(".color.png"):
         return "image"

@@ -1,11 +1,11 @@
-"""Geometry artifacts: the surface that a sensor saw, quantised to 16 bits, with its patches.
+"""Geometry artifacts: an observed surface, quantised to 16 bits, with its patches.
 
     Surface  --pack_image | pack_points-->  (h, w, 3) or (N, 5) uint16
     uint16  --unpack_image | unpack_points-->  Surface
 
-Pixels of a pinhole camera are inverse depths, whose steps are far below a sensor's noise. Pixels of
-a sphere are ranges, and unordered points are offsets in a cube. A normal has 2 x 16 bits on an
-octahedron, or 2 x 8 for scans with spread points. Steps of range and offset are powers of two, so
+A pixel of a pinhole camera is an inverse depth, in steps far below a sensor's noise. A pixel of a
+sphere is a range, and an unordered point is an offset in a cube. A normal has 2 x 16 bits on an
+octahedron, or 2 x 8 for scans with spread points. Steps of ranges and offsets are powers of two, so
 packing an unpacked surface reproduces the same bytes.
 """
 
@@ -38,7 +38,7 @@ from sceneprint.types import (
 
 Packed = NDArray[np.uint16]
 MOST = 65535
-#: Smallest step that float32 resolves, relative to the largest coordinate.
+#: Smallest step, relative to the largest coordinate, that float32 resolves.
 _RESOLUTION = 2.0**-22
 
 
@@ -46,13 +46,14 @@ _RESOLUTION = 2.0**-22
 def _to_octahedron(nx: float, ny: float, nz: float, most: float) -> tuple[int, int]:
     total = abs(nx) + abs(ny) + abs(nz)
     u, v = nx / total, ny / total
-    if nz > 0:  # the middle of the square holds the normals that face the sensor (-z)
+    if nz > 0:  # normals that face the sensor (-z) lie in the middle of the square
         u, v = (
             (1.0 - abs(v)) * (1.0 if u >= 0 else -1.0),
             (1.0 - abs(u)) * (1.0 if v >= 0 else -1.0),
         )
     a, b = round((u * 0.5 + 0.5) * most), round((v * 0.5 + 0.5) * most)
-    # two positions on the edge of the square are the same direction, so one is preferred
+    # two positions on the edge of the square denote the same direction; select the larger
+    # coordinate
     a_on_edge, b_on_edge = a == 0 or a == most, b == 0 or b == most
     if a_on_edge:
         b = max(b, int(most) - b)
@@ -62,7 +63,7 @@ def _to_octahedron(nx: float, ny: float, nz: float, most: float) -> tuple[int, i
 
 
 @kernel
-def _of_octahedron(a: int, b: int, most: float) -> tuple[float, float, float]:
+def _from_octahedron(a: int, b: int, most: float) -> tuple[float, float, float]:
     u, v = a / most * 2.0 - 1.0, b / most * 2.0 - 1.0
     nz = -(1.0 - abs(u) - abs(v))
     if nz > 0:
@@ -105,7 +106,7 @@ def _unpack_line(
     inverse: Floats, across: Floats, down: Floats, most: float, xn: Floats, yn: float, area: float,
     out: Floats,
 ) -> None:  # fmt: skip
-    """Write points, normals and areas (7, w) of a row of pixels to `out`.
+    """Write the points, normals and areas of a row of pixels to `out` (7, w).
 
     Invalid pixels are computed too, so that the compiler can vectorise the loop.
     """
@@ -161,7 +162,7 @@ def _unpack_sphere(
                 continue
             away = packed[y, x, 0] * scale
             a, b, c = rays[y, x, 0], rays[y, x, 1], rays[y, x, 2]
-            nx, ny, nz = _of_octahedron(packed[y, x, 1], packed[y, x, 2], most)
+            nx, ny, nz = _from_octahedron(packed[y, x, 1], packed[y, x, 2], most)
             points[y, x, 0], points[y, x, 1], points[y, x, 2] = a * away, b * away, c * away
             normals[y, x, 0], normals[y, x, 1], normals[y, x, 2] = nx, ny, nz
             cosine = -(a * nx + b * ny + c * nz)
@@ -182,22 +183,22 @@ def _pack_normals(normals: Floats32, most: float, out: Packed) -> None:
 @kernel
 def _unpack_normals(packed: Packed, most: float, out: Floats32) -> None:
     for n in range(len(packed)):
-        nx, ny, nz = _of_octahedron(packed[n, 0], packed[n, 1], most)
+        nx, ny, nz = _from_octahedron(packed[n, 0], packed[n, 1], most)
         out[n, 0], out[n, 1], out[n, 2] = nx, ny, nz
 
 
 def _step(span: float) -> float:
-    """Return the smallest power of two of which 65535 steps cover `span`, apart from rounding."""
+    """Return the smallest power of two such that 65535 steps cover `span`, within rounding."""
     return 2.0 ** math.ceil(math.log2(span / MOST) - 1e-4) if span > 0 else 1.0
 
 
 def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
-    """Pack the surface of a camera.
+    """Pack the surface that a camera observed.
 
     Returns
     -------
-    packed : (h, w, 3) inverse depth or range, and a normal of two numbers from 0 to `most`
-    scale : inverse depth (pinhole) or range (sphere) that 1 represents
+    packed : (h, w, 3) uint16: inverse depth or range; and a normal as two numbers from 0 to `most`
+    scale : inverse depth (pinhole, 1/m) or range (sphere, m) that the number 1 represents
     """
     pinhole = isinstance(surface.camera, Intrinsics)
     if pinhole:
@@ -214,13 +215,13 @@ def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
 def unpack_image(
     packed: Packed, scale: float, camera: Intrinsics | Sphere, most: int = MOST
 ) -> Surface:
-    """Return the surface that `pack_image` has packed, within rounding. Areas are computed again.
+    """Unpack a surface from `pack_image`; areas are computed again.
 
     Parameters
     ----------
     packed : (h, w, 3) uint16; pixels whose first number is 0 are invalid
-    scale : inverse depth (pinhole) or range (sphere) that 1 represents
-    most : maximum number of a packed normal, as it was passed to `pack_image`
+    scale : result of `pack_image`
+    most : maximum number of a packed normal, as passed to `pack_image`
     """
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)
@@ -237,7 +238,7 @@ def unpack_image(
 
 
 def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, float]:
-    """Return unordered points as (N, 5) offsets and normals, with corner (3,) and step, metres."""
+    """Pack unordered points: return offsets and normals (N, 5), corner (3,) and step, metres."""
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
     packed = np.zeros((len(points), 5), np.uint16)
     if not len(points):
@@ -252,7 +253,7 @@ def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, flo
 
 
 def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST) -> Surface:
-    """Return the surface that `pack_points` has packed, as one row without areas."""
+    """Unpack a surface from `pack_points`: an image of one row, without areas."""
     points = (packed[:, :3] * step + corner).astype(np.float32)
     normals = np.zeros((len(packed), 3), np.float32)
     _unpack_normals(packed[:, 3:], float(most), normals)
@@ -262,38 +263,36 @@ def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST)
     )
 
 
-# Artifacts as bytes, which allow the validation of a frame without its upload.
+# Artifacts as bytes: with them, a frame is validated without its upload.
 #
 #     Geometry  --write_geometry-->  bytes  --read_geometry-->  Geometry
-#
-# The order is: magic, schema, CRC-32 of the rest, sizes and camera, id of the model, arrays.
-# Numbers are little-endian. Depth images have schema 1, clouds 2, and scans with spread points 3,
-# where all offsets and ranges precede the normals.
+# The order is: magic number, schema, CRC-32 of the rest, sizes and camera, id of the model, arrays.
+# Numbers are little-endian. Depth images have schema 1, clouds 2, and scans with spread points 3.
+# In schema 3, all offsets and ranges precede the normals.
 
 MAGIC = b"SPGEO"
-#: Versions of the format for depth images, clouds, and scans with spread points. Increase a version
+#: Versions of the format for depth images, clouds, and scans with spread points. Replace a version
 #: if its bytes or their meaning change.
 SCHEMA_VERSION, CLOUD_SCHEMA, SCAN_SCHEMA = 1, 2, 3
-#: Magic, schema, checksum.
+#: Magic number, schema, checksum.
 _HEAD = struct.Struct("<5sHI")
-#: Depth image: width, height, number of patches, bytes of a descriptor, fx, fy, cx, cy, inverse
-#: depth that 1 represents, model.
+#: Depth image: width, height, number of patches, bytes per descriptor, fx, fy, cx, cy, scale of
+#: `pack_image`, model.
 _DEPTH = struct.Struct("<HHHH5d32s")
-#: Cloud: width, height, number of patches, bytes of a descriptor, kind, pole, then step, left and
-#: top of a sphere or the corner of unordered points, then the range or offset that 1 represents,
-#: model.
+#: Cloud: width, height, number of patches, bytes per descriptor, kind, pole; step, left and top of
+#: a sphere, or corner of unordered points; scale of `pack_image` or step of `pack_points`; model.
 _CLOUD = struct.Struct("<HHHHBB4d32s")
 _SPHERE, _POINTS = 1, 2
 #: Scan, after the fields of a cloud: number of spread points, their corner, and their step.
 _SPREAD = struct.Struct("<H4d")
-#: Largest number of a normal in scans with spread points; the error is at most half a degree.
+#: Maximum number of a normal in scans with spread points; the error is at most half a degree.
 _COARSE = 255
-#: Maximum number of unordered points, about the number of pixels of a depth image.
+#: Maximum number of unordered points, about the number of pixels in the surface of a depth image.
 MAXIMUM_POINTS = 20_000
-#: Maximum number of patches, and of bytes of a descriptor. Validation compares all pairs of
-#: patches, and no model exceeds these numbers.
+#: Maximum number of patches, and of bytes per descriptor. Validation compares all pairs of patches;
+#: no model exceeds these numbers.
 MAXIMUM_PATCHES, MAXIMUM_DESCRIPTOR = 4096, 1024
-#: Limits of the nearest depth, metres, within which points and areas are finite in float32.
+#: Limits of the minimum depth, metres. Within them, points and areas are finite in float32.
 NEAREST = (1e-6, 1e6)
 #: Limits of a step of range or offset, metres.
 STEPS = (2.0**-40, 16.0)
@@ -309,7 +308,7 @@ _PATCH = np.dtype(
 
 
 def write_geometry(geometry: Geometry) -> bytes:
-    """Return the bytes of a geometry artifact; equal artifacts have equal bytes.
+    """Serialize a geometry artifact; equal artifacts have equal bytes.
 
     `geometry`: artifact whose model id has 64 hexadecimal digits; more than MAXIMUM_POINTS
     unordered points are thinned.
@@ -344,14 +343,14 @@ def write_geometry(geometry: Geometry) -> bytes:
 
 
 def _split(packed: Packed, places: int) -> bytes:
-    """Return the first `places` numbers of each row as 16 bits, then the normals as 8 bits."""
+    """Return the first `places` numbers of each row as 16 bits, then its normal as 2 x 8 bits."""
     return (
         packed[..., :places].astype("<u2").tobytes() + packed[..., places:].astype("u1").tobytes()
     )
 
 
-def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
-    """Return the numbers (*shape, places + 2) from the bytes of `_split`."""
+def _join(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
+    """Restore the numbers (*shape, places + 2) from the bytes of `_split`."""
     end = 2 * places * math.prod(shape)
     first = np.frombuffer(data[:end], "<u2").reshape(*shape, places)
     normals = np.frombuffer(data[end:], np.uint8).reshape(*shape, 2)
@@ -359,7 +358,7 @@ def _joined(data: memoryview, shape: tuple[int, ...], places: int) -> Packed:
 
 
 def read_geometry(data: bytes) -> Geometry:
-    """Return the geometry artifact from the bytes of `write_geometry`.
+    """Parse a geometry artifact from the bytes of `write_geometry`.
 
     Raise UnreadableGeometry if the bytes are not an artifact, are truncated or damaged, have
     another schema, or describe an impossible camera, depth or patch.
@@ -390,20 +389,20 @@ def read_geometry(data: bytes) -> Geometry:
     pixels = body[ends[0] : ends[1]]
     try:
         if spread:
-            surface = _scan(
-                _joined(pixels, (height, width), 1), body[ends[1] : ends[2]], projection, spread
+            surface = _read_scan(
+                _join(pixels, (height, width), 1), body[ends[1] : ends[2]], projection, spread
             )
         else:
             packed = np.frombuffer(pixels, "<u2").reshape(height, width, pixel // 2)
             surface = (
-                _depth(packed, *projection)
+                _read_depth(packed, *projection)
                 if schema == SCHEMA_VERSION
-                else _cloud(packed, *projection)
+                else _read_cloud(packed, *projection)
             )
     except InvalidIntrinsics as error:
         raise UnreadableGeometry(f"The geometry artifact has an invalid camera: {error}") from error
-    patches = _patches(np.frombuffer(body[ends[2] : ends[3]], _PATCH))
-    if count > MAXIMUM_PATCHES or length > MAXIMUM_DESCRIPTOR or not _sound(patches):
+    patches = _read_patches(np.frombuffer(body[ends[2] : ends[3]], _PATCH))
+    if count > MAXIMUM_PATCHES or length > MAXIMUM_DESCRIPTOR or not _are_sound(patches):
         _refuse(
             f"The geometry artifact has {count} patches with descriptors of {length} bytes, which "
             "are invalid or exceed the limits."
@@ -416,32 +415,31 @@ def _refuse(why: str) -> NoReturn:
     raise UnreadableGeometry(f"{why} Sign the frame again from its upload.")
 
 
-def _depth(
+def _read_depth(
     packed: NDArray[np.uint16], fx: float, fy: float, cx: float, cy: float, scale: float
 ) -> Surface:
     camera = Intrinsics(packed.shape[1], packed.shape[0], fx, fy, cx, cy)
-    # comparisons with NaN are false
     if not (scale > 0 and NEAREST[0] <= 1.0 / (scale * 65535.0) <= NEAREST[1]):
         _refuse(f"The geometry artifact has the invalid depth scale {scale}.")
     return unpack_image(packed, scale, camera)
 
 
-def _scan(
+def _read_scan(
     packed: Packed, points: memoryview, projection: list[Any], spread: tuple[Any, ...]
 ) -> Surface:
     """Return the surface of a range image with its spread points."""
     count, *corner, step = spread
-    near = all(abs(one) <= NEAREST[1] for one in corner)  # comparisons with NaN are false
+    near = all(abs(x) <= NEAREST[1] for x in corner)
     if not (projection[0] == _SPHERE and 0 < count <= SPREAD_POINTS and near):
         _refuse("The geometry artifact has invalid spread points.")
     if not STEPS[0] <= step <= STEPS[1]:
         _refuse(f"The geometry artifact has the invalid offset step {step}.")
-    surface = _cloud(packed, *projection, most=_COARSE)
-    spread_surface = unpack_points(_joined(points, (count,), 3), np.array(corner), step, _COARSE)
+    surface = _read_cloud(packed, *projection, most=_COARSE)
+    spread_surface = unpack_points(_join(points, (count,), 3), np.array(corner), step, _COARSE)
     return replace(surface, spread=spread_surface)
 
 
-def _cloud(
+def _read_cloud(
     packed: NDArray[np.uint16], kind: int, pole: int, a: float, b: float, c: float, step: float,
     *, most: int = MOST,
 ) -> Surface:  # fmt: skip
@@ -450,14 +448,14 @@ def _cloud(
     height, width = packed.shape[:2]
     if kind == _SPHERE:
         return unpack_image(packed, step, Sphere(width, height, a, b, c, pole), most)
-    near = all(abs(one) <= NEAREST[1] for one in (a, b, c))  # comparisons with NaN are false
+    near = all(abs(x) <= NEAREST[1] for x in (a, b, c))
     if kind != _POINTS or pole or height != 1 or width > MAXIMUM_POINTS or not near:
         _refuse("The geometry artifact has invalid unordered points.")
     return unpack_points(packed[0], np.array([a, b, c]), step)
 
 
-def _patches(rows: NDArray[np.void]) -> Patches:
-    with np.errstate(invalid="ignore"):  # for signalling NaN, which `_sound` refuses
+def _read_patches(rows: NDArray[np.void]) -> Patches:
+    with np.errstate(invalid="ignore"):  # `_are_sound` rejects NaN
         return Patches(
             means=rows["mean"].astype(float),
             normals=rows["normal"].astype(float),
@@ -467,8 +465,8 @@ def _patches(rows: NDArray[np.void]) -> Patches:
         )
 
 
-def _sound(patches: Patches) -> bool:
-    """Return whether the numbers of all patches are valid; comparisons with NaN are false."""
+def _are_sound(patches: Patches) -> bool:
+    """Return whether the numbers of all patches are valid; NaN is invalid."""
     length = np.sqrt((patches.normals**2).sum(axis=1))
     return bool(
         (np.abs(patches.means) <= FARTHEST).all()

@@ -1,4 +1,4 @@
-"""Read depth images, and combine their samples with a camera to a `DepthFrame`.
+"""Reading of depth images, and construction of a `DepthFrame` from samples and a camera.
 
 bytes  --decode_png | decode_npy-->  samples (H, W)  --make_frame-->  DepthFrame
 """
@@ -37,10 +37,10 @@ from sceneprint_client.formats import format_at, function_at, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import TRANSPORT_BYTES, inverse_depth
 
-#: Samples of a depth image: integers in stored units, or metres.
+#: Samples of a depth image: uint16 in stored units, or float32 metres.
 Samples = NDArray[np.uint16] | Floats32
 
-#: Maximum number of chunks: 16 megapixels in chunks of 1 KB. Even empty chunks take time.
+#: Maximum number of chunks, for 16 megapixels in chunks of 1 KB. Even empty chunks take time.
 _MAXIMUM_CHUNKS = 65_536
 _COLOURS = {2: "colour (RGB)", 3: "palette", 4: "greyscale with alpha", 6: "colour with alpha"}
 #: First column, first row, column step and row step of each pass of Adam7 interlacing.
@@ -50,7 +50,7 @@ _TRUNCATED = "The PNG is truncated. Copy or write the file again."
 
 
 def decode_png(data: bytes) -> NDArray[np.uint16]:
-    """Return the samples of a 16-bit greyscale PNG, in stored units.
+    """Decode the samples of a 16-bit greyscale PNG, in stored units.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
         raise UnreadableFrame("This is not a PNG. Write the depth as a 16-bit greyscale PNG.")
 
     header, pixels = b"", bytearray()
-    for kind, content in _chunks(data):
+    for kind, content in _read_chunks(data):
         if not header and kind != b"IHDR":
             raise UnreadableFrame("The PNG does not start with its header. Write it again.")
         if kind == b"IHDR":
@@ -80,7 +80,7 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
                 f"The PNG has a {kind!r} chunk, which 16-bit greyscale images do not have. "
                 "Write it as a plain PNG."
             )
-    return _samples(header, _inflate(bytes(pixels), header))
+    return _decode_rows(header, _inflate(bytes(pixels), header))
 
 
 def check_length(data: bytes) -> None:
@@ -102,7 +102,7 @@ def png_size(head: bytes) -> tuple[int, int]:
     return width, height
 
 
-def _chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
+def _read_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Verify the checksum of each chunk up to IEND, and yield its kind and content."""
     view, position = memoryview(data), len(PNG_SIGNATURE)
     for _ in range(_MAXIMUM_CHUNKS):
@@ -157,7 +157,7 @@ _DAMAGED = cast(type[Exception], isal_zlib.error)
 
 
 def _inflate(pixels: bytes, header: bytes) -> bytes:
-    """Return the filtered rows; raise UnreadableFrame if their size differs from the header's."""
+    """Decompress the filtered rows; raise UnreadableFrame if their size contradicts the header."""
     width, height, interlaced = *struct.unpack_from(">II", header), header[12]
     passes = _PASSES if interlaced else ((0, 0, 1, 1),)
     expected = 0
@@ -180,13 +180,13 @@ def _inflate(pixels: bytes, header: bytes) -> bytes:
     return rows_bytes
 
 
-def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
-    """Return the samples of filtered rows, which Pillow decodes from a minimal PNG."""
+def _decode_rows(header: bytes, rows: bytes) -> NDArray[np.uint16]:
+    """Decode filtered rows with Pillow, from a minimal PNG."""
     from PIL.PngImagePlugin import PngImageFile
 
-    plain = _png(header, zlib.compress(rows, 0))
+    plain = _build_png(header, zlib.compress(rows, 0))
     try:
-        # the pixel limit of Image.open is a setting of the whole process
+        # Image.open has a pixel limit that applies to the whole process
         with PngImageFile(io.BytesIO(plain)) as image:
             samples = np.asarray(image)
     except (OSError, ValueError, SyntaxError) as cause:
@@ -197,16 +197,16 @@ def _samples(header: bytes, rows: bytes) -> NDArray[np.uint16]:
 
 
 def encode_npy(array: NDArray[Any]) -> bytes:
-    """Return an array as the bytes of an NPY file."""
+    """Encode an array as an NPY file."""
     file = io.BytesIO()
     np.save(file, np.ascontiguousarray(array), allow_pickle=False)
     return file.getvalue()
 
 
 def encode_png(samples: NDArray[np.uint16]) -> bytes:
-    """Return a 16-bit greyscale PNG of the samples (H, W), in a sixth of Pillow's time.
+    """Encode samples (H, W) as a 16-bit greyscale PNG, in a sixth of Pillow's time.
 
-    Each row stores its differences from the previous row, and ISA-L compresses them.
+    Rows store differences from their previous rows, and ISA-L compresses them.
     """
     height, width = samples.shape
     raw = samples.astype(">u2").view(np.uint8)
@@ -215,10 +215,10 @@ def encode_png(samples: NDArray[np.uint16]) -> bytes:
     rows[1:, 1:] -= raw[:-1]
     rows[1:, 0] = 2  # filter type Up; the first row has filter type None
     header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
-    return _png(header, isal_zlib.compress(rows.tobytes(), 1))
+    return _build_png(header, isal_zlib.compress(rows.tobytes(), 1))
 
 
-def _png(header: bytes, pixels: bytes) -> bytes:
+def _build_png(header: bytes, pixels: bytes) -> bytes:
     """Return a PNG with a header and compressed rows."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
@@ -230,11 +230,11 @@ def _png(header: bytes, pixels: bytes) -> bytes:
     )  # fmt: skip
 
 
-# Images of ROS's compressed_depth_image_transport: a PNG after a header of 12 bytes.
+# Images of ROS's compressed_depth_image_transport are PNGs after a header of 12 bytes.
 
 #: Limits of the parameter a of 32FC1 images: q (q + 1) for the quantisation q, by default 100.
 _A = (1.0, 1e8)
-#: Limits of the depth that the value 1 encodes, metres: the transport's maximum, by default 10.
+#: Limits of the depth that the value 1 encodes, metres: the transport's depth_max, by default 10.
 _DEEPEST_M = (0.1, 1e3)
 
 
@@ -244,10 +244,10 @@ def transported_size(head: bytes) -> tuple[int, int]:
 
 
 def decode_transported(data: bytes) -> Samples:
-    """Return the samples of a compressedDepth message: stored units (16UC1) or metres (32FC1)."""
+    """Decode the samples of a compressedDepth message: stored units (16UC1) or metres (32FC1)."""
     samples = decode_png(data[TRANSPORT_BYTES:])
     a, b = struct.unpack_from("<ff", data, 4)
-    # for 16UC1 images, the transport leaves both numbers unset, so they are mostly zero or tiny
+    # for 16UC1 images, the transport does not set these numbers; they are mostly zero or tiny
     if not (1e-3 < a < 1e9 and 1e-3 < abs(b) < 1e9):
         return samples
     if b < 1 and _A[0] < a < _A[1] and _DEEPEST_M[0] <= a / (1 - b) <= _DEEPEST_M[1]:
@@ -259,7 +259,7 @@ def decode_transported(data: bytes) -> Samples:
     )
 
 
-# NPY files of float metres or stored units, whose headers are not trusted.
+# The headers of NPY files are not trusted.
 #
 # bytes  --decode_npy-->  samples (H, W) float32 or uint16
 
@@ -273,12 +273,12 @@ _SHAPES = (
 
 
 def decode_npy(data: bytes) -> Samples:
-    """Return the samples of an NPY file with a two-dimensional array.
+    """Decode the samples of an NPY file with a two-dimensional array.
 
     Returns
     -------
-    samples : (H, W) float32 metres for a floating-point array, with its NaN and infinities; uint16
-        stored units for a uint16 array
+    samples : (H, W); float32 metres for a floating-point array, including NaN and infinities;
+        uint16 stored units for a uint16 array
 
     Raise UnreadableFrame if the file is empty, too large or not NPY, has another type or shape,
     contains Python objects, or its size contradicts its header.
@@ -286,7 +286,7 @@ def decode_npy(data: bytes) -> Samples:
     check_length(data)
     if not data.startswith(NPY_SIGNATURE):
         raise UnreadableFrame("This is not an NPY file. Write the depth with numpy.save.")
-    header = _header(data)
+    header = _checked_npy_header(data)
     height, width = header.shape
     expected = height * width * header.dtype.itemsize
     if len(data) - header.start != expected:
@@ -299,17 +299,17 @@ def decode_npy(data: bytes) -> Samples:
     samples = numbers.reshape(header.shape, order=header.order)
     if header.dtype.kind == "u":
         return np.array(samples, dtype=np.uint16, order="C")
-    with np.errstate(all="ignore"):  # a float64 beyond float32 becomes infinite, thus missing
+    with np.errstate(all="ignore"):  # values beyond float32 become infinite, and so missing
         return np.array(samples, dtype=np.float32, order="C")
 
 
 def npy_size(head: bytes) -> tuple[int, int]:
-    """Return the width and height of an NPY file; raise UnreadableFrame if it is not an image."""
-    height, width = _header(head).shape
+    """Return the width and height of an NPY file; raise UnreadableFrame unless it is an image."""
+    height, width = _checked_npy_header(head).shape
     return width, height
 
 
-def _header(data: bytes) -> NpyHeader:
+def _checked_npy_header(data: bytes) -> NpyHeader:
     header = npy_header(data, UnreadableFrame, _TYPES, _SHAPES, whole=True)
     height, width = header.shape
     if not 1 <= height * width <= MAXIMUM_SAMPLES:
@@ -320,7 +320,7 @@ def _header(data: bytes) -> NpyHeader:
     return header
 
 
-#: Value with which some sensors mark missing samples; others use 0.
+#: Value that some sensors store for missing samples; others store 0.
 _MISSING = 65_535
 
 
@@ -333,7 +333,7 @@ def make_frame(
     name: str = "",
     pose: Floats | None = None,
 ) -> DepthFrame:
-    """Return a frame without lens distortion, in metres along the optical axis.
+    """Convert samples to a frame without lens distortion, in metres along the optical axis.
 
     Parameters
     ----------
@@ -359,7 +359,7 @@ def make_frame(
                 f"The depth scale {depth_scale} is not a positive number. "
                 "Specify the stored units per metre, such as 1000 for millimetres."
             )
-        depth = _metres(samples, depth_scale)
+        depth = _to_metres(samples, depth_scale)
         height, width = depth.shape
         if (width, height) != (intrinsics.width, intrinsics.height):
             raise InvalidIntrinsics(
@@ -367,7 +367,7 @@ def make_frame(
                 f"{intrinsics.width} x {intrinsics.height}. Specify the intrinsics of this image; "
                 "a resized image needs scaled intrinsics."
             )
-        # this precedes `undistort`, because the ray of a sample is that of the distorted pixel
+        # this precedes `undistort`, because the rays are those of the distorted pixels
         if along_ray:
             depth = ray_to_axis(depth, intrinsics)
         if intrinsics.distortion:
@@ -394,7 +394,7 @@ def read_frame(
     name: str = "",
     pose: Floats | None = None,
 ) -> DepthFrame:
-    """Return the frame of a depth image file; see `make_frame` for the other parameters.
+    """Read a depth image file as a frame; for the other parameters, see `make_frame`.
 
     Raise UnreadableFrame if the file is missing or too large, or `decode_frame` raises the error.
     The message names the file.
@@ -418,11 +418,11 @@ def decode_frame(
     samples_of: Callable[[bytes], Samples] | None = None,
     trust_depth: bool = False,
 ) -> DepthFrame:
-    """Return the frame of the bytes of a depth image; see `make_frame` for the other parameters.
+    """Decode a depth image as a frame; for the other parameters, see `make_frame`.
 
     Parameters
     ----------
-    samples_of : decoder of the file; default: `decode_samples`
+    samples_of : decoder of the file; None selects `decode_samples`
     trust_depth : whether to accept samples that do not look like depth
 
     Raise UnreadableFrame if `decode_samples`, `check_depth` or `make_frame` raises the error.
@@ -438,7 +438,7 @@ def decode_frame(
 
 
 def decode_samples(data: bytes) -> Samples:
-    """Return the samples (H, W) of a depth image: uint16 in stored units, or float32 metres.
+    """Decode the samples (H, W) of a depth image: uint16 in stored units, or float32 metres.
 
     Raise UnreadableFrame if the first bytes match no depth format, or the reader raises the error.
     """
@@ -454,8 +454,8 @@ def decode_samples(data: bytes) -> Samples:
     return samples
 
 
-def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
-    """Return (H, W) float32 metres, where 0 is missing."""
+def _to_metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
+    """Convert samples to metres (H, W), float32; 0 is missing."""
     if not isinstance(samples, np.ndarray):
         raise TypeError(f"samples must be a numpy array, not {type(samples).__name__}")
     if samples.ndim != 2 or samples.size == 0:
@@ -465,8 +465,8 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
         )
     with np.errstate(all="ignore"):  # values beyond float32 are missing
         if samples.dtype.kind == "u" and samples.dtype.itemsize == 2:
-            if samples.size > _MISSING + 1:  # a table of all values is smaller than the image
-                metres: Floats32 = np.take(_metres_of_values(depth_scale), samples)
+            if samples.size > _MISSING + 1:  # a table of all values saves time
+                metres: Floats32 = np.take(_metres_table(depth_scale), samples)
                 return metres
             depth = (samples / depth_scale).astype(np.float32)
             depth[samples == _MISSING] = 0.0
@@ -482,18 +482,13 @@ def _metres(samples: NDArray[Any], depth_scale: float) -> Floats32:
 
 
 @lru_cache(maxsize=4)
-def _metres_of_values(depth_scale: float) -> Floats32:
-    """Return the metres (65536,) of all values of a 16-bit sample."""
-    return _metres(np.arange(_MISSING + 1, dtype=np.uint16)[None], depth_scale).ravel()
-
-
-# Size of a depth image according to its header.
-#
-# first bytes  --size_of-->  width, height
+def _metres_table(depth_scale: float) -> Floats32:
+    """Return the metres (65536,) for all values of a 16-bit sample."""
+    return _to_metres(np.arange(_MISSING + 1, dtype=np.uint16)[None], depth_scale).ravel()
 
 
 def size_of(head: bytes) -> tuple[int, int] | None:
-    """Return the width and height of a depth image from its first `HEAD` bytes; None if unknown."""
+    """Return the width and height in a depth image's first `HEAD` bytes; None if unknown."""
     file_format = format_at(head, "depth")
     if file_format is None:
         return None

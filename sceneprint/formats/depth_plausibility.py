@@ -1,21 +1,20 @@
-"""Check the plausibility of depth samples by their smoothness along the rows.
+"""Check of depth samples for plausibility, by their smoothness along the rows.
 
 samples (H, W), stored units per metre  --check_depth-->  nothing, or UnreadableFrame
 
 Neighbouring samples of depth are similar, unlike those of images with swapped bytes or rotated
-bits, or of noisy infrared images. The following ranges were measured on 1,622 real depth images
-(redkitchen of 7-Scenes, fr1_rpy of TUM, studyroom2 of SUN3D, a RealSense) and 60 of synthetic
-rooms:
+bits, or of noisy infrared images. These ranges were measured on 1,622 real depth images (redkitchen
+of 7-Scenes, fr1_rpy of TUM, studyroom2 of SUN3D, a RealSense) and 60 images of synthetic rooms:
 
-    share of differing neighbours that are nearer with their bytes swapped: refused above .9
+    share of differing neighbours that are closer with their bytes swapped: rejected above .9
         depth 0 to .009, at an eighth of the size to .023; with swapped bytes .991 to 1
-    median bend (`_bend`): refused above .05
+    median bend (`_bend`): rejected above .05
         depth .0002 to .0103, at an eighth of the size to .014; with 2 % of noise .035
         rotated right by 3 bits .25 to 6.8, infrared (synthetic) .087 to .090
-    share of multiples of 8: refused above .8
+    share of multiples of 8: rejected above .8
         depth .13; rotated left by 3 bits .8 to 1
 
-An infrared image that is as smooth as depth, for example without noise, is not detected.
+Infrared images that are as smooth as depth, for example without noise, are not detected.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ _ROWS = 40  #: number of checked rows
 _PAIRS, _BENDS = 500, 4000  #: minimum numbers of pairs and of triples for a decision
 _LEAST_SHARE = 0.1  #: minimum share of samples with two valid neighbours
 _LEAST_VARYING = 0.25  #: minimum share of varying triples; with fewer, edges would dominate
-_SWAPPED = 0.9  #: maximum share of differing neighbours that are nearer with their bytes swapped
-_ROUGH, _SMOOTH = 0.05, 0.025  #: maximum median bends of depth, and after restoring the bits
-_SHIFTED = 0.8  #: maximum share of multiples of 8; depth images have one eighth
+_SWAPPED = 0.9  #: maximum share of differing neighbours that are closer with their bytes swapped
+_ROUGH, _SMOOTH = 0.05, 0.025  #: maximum median bend of depth, and of depth with restored bits
+_SHIFTED = 0.8  #: maximum share of multiples of 8; in depth images, it is about one eighth
 
 _TRUST = "If the samples are correct, use --trust-depth, or `trust_depth` in the metadata."
 
@@ -41,7 +40,7 @@ Rows = NDArray[Any]
 
 
 def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
-    """Raise an error if samples are not depth, or have swapped bytes or rotated bits.
+    """Raise UnreadableFrame if samples are not depth, or have swapped bytes or rotated bits.
 
     The check takes 0.6 ms for 640 x 480 samples. Callers skip it if the user sets `trust_depth`.
 
@@ -63,7 +62,7 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
     is_rough = _bend(rows) > _ROUGH
     if not is_rough and not (is_whole and _is_swapped(rows)):
         return
-    bits = _rotation(rows) if is_whole else None
+    bits = _find_rotation(rows) if is_whole else None
     if bits == 8 or (bits is None and not is_rough):
         raise UnreadableFrame(
             "The samples seem to have the wrong byte order, because neighbours are similar only "
@@ -81,18 +80,20 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
     )
 
 
-def _rotation(rows: Rows) -> int | None:
+def _find_rotation(rows: Rows) -> int | None:
     """Return the left rotation, in bits, that makes the samples smooth; None if there is none.
 
-    Several rotations may be smooth, since they double the depth. The smallest samples are right.
+    Further rotations double the depth, and may be smooth too: the smallest samples are right.
     """
     turned = [(bits, rows << bits | rows >> 16 - bits) for bits in range(1, 16)]
-    smooth = [(float(one.mean()), bits) for bits, one in turned if 0.0 < _bend(one) < _SMOOTH]
+    smooth = [
+        (float(turned.mean()), bits) for bits, turned in turned if 0.0 < _bend(turned) < _SMOOTH
+    ]
     return min(smooth)[1] if smooth else None
 
 
 def _is_swapped(rows: Rows) -> bool:
-    """Return whether most differing neighbours are nearer with their bytes swapped."""
+    """Return whether most differing neighbours are closer with their bytes swapped."""
     a, b = rows[:, :-1], rows[:, 1:]
     differ = _valid(a) & _valid(b) & (a != b)
     a, b = a[differ], b[differ]
@@ -111,7 +112,7 @@ def _is_shifted(rows: Rows) -> bool:
 
 
 def _bend(rows: Rows) -> float:
-    """Return the median of |a - 2 b + c| / min(a, b, c) over triples of neighbours that vary."""
+    """Return the median of |a - 2 b + c| / min(a, b, c) over triples of differing neighbours."""
     valid = _valid(rows)
     whole = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:]
     with np.errstate(all="ignore"):  # damaged floats may overflow

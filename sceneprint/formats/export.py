@@ -1,4 +1,4 @@
-"""Write points, surfaces and pose graphs as PLY, as bytes for web pages, and as g2o.
+"""Export of points and surfaces as PLY or as bytes for web pages, and of pose graphs as g2o.
 
 points, normals, colours, faces, edges  --write_ply-->  bytes of a PLY file
 points, normals, patches, residuals  --encode_points-->  bytes for web pages, 12 per point
@@ -14,22 +14,22 @@ The bytes for web pages are little-endian. The header has 48 bytes:
     16 3 x f32  origin, metres
     28 3 x f32  extent, metres
     40 u32      number of points before thinning
-    44 f32      distance that a residual of 250 represents at short range, metres (the tolerance of
+    44 f32      distance of a residual of 250 at short range, metres (the tolerance of
                 the model's validation, which grows with distance); 0 without residuals
 
-Each point follows with 12 bytes:
+12 bytes per point follow:
 
     0  3 x u16  position: origin + value / 65535 * extent
     6  u16      index of the validation patch; 65535 for none
     8  3 x i8   normal, times 127
     11 u8       residual, the distance from the surface of another frame: 1 to 250; 253 if the point
                 is outside that frame's view, or beside or behind its surface; 254 if that frame
-                saw through the point; 255 if the point was not compared
+                observed free space at the point; 255 if the point was not compared
 
 `PoseEdge` has the information matrix of the right perturbation T exp(xi), xi = (shift in metres,
-turn in radians) in the axes of the edge's second vertex. The error of g2o is the shift and the
-*vector part of the quaternion* of Z^-1 X_i^-1 X_j, which is half of a small turn. The information
-of g2o is therefore four times as large for turns, and twice as large between shift and turn.
+turn in radians) in the axes of the edge's second vertex. The error in g2o is the shift and the
+*vector part of the quaternion* of Z^-1 X_i^-1 X_j: half of a small turn. Therefore, the information
+in g2o is four times as large for turns, and twice as large between shift and turn.
 """
 
 from __future__ import annotations
@@ -54,8 +54,6 @@ from sceneprint_client.surface_encoding import (
     VERSION,
 )
 
-# PLY files.
-
 Ints = NDArray[np.int32] | NDArray[np.int64]
 
 #: PLY names of numpy types.
@@ -70,7 +68,7 @@ def write_ply(
     edges: Ints | None = None,
     comments: Sequence[str] = (),
 ) -> bytes:
-    """Return a binary little-endian PLY file; equal arrays give equal bytes.
+    """Encode points as a binary little-endian PLY file; equal arrays give equal bytes.
 
     Parameters
     ----------
@@ -79,35 +77,35 @@ def write_ply(
     colours : (N, 3) red, green, blue
     faces : (F, 3) triangles, as indices of points
     edges : (E, 2) lines, as indices of points
-    comments : lines of the header, such as the coordinate frame; escaped to printable ASCII
+    comments : header lines, such as the coordinate frame; escaped to printable ASCII
 
     Raise ValueError if an array has another shape, or an index is out of range.
     """
     n = len(points)
     kinds = [(name, "<f4") for name in "xyz"]
-    columns = [_checked(points, n, 3)]
+    columns = [_require_shape(points, n, 3)]
     if normals is not None:
         kinds += [(name, "<f4") for name in ("nx", "ny", "nz")]
-        columns.append(_checked(normals, n, 3))
+        columns.append(_require_shape(normals, n, 3))
     if colours is not None:
         kinds += [(name, "u1") for name in ("red", "green", "blue")]
-        columns.append(_checked(colours, n, 3))
+        columns.append(_require_shape(colours, n, 3))
     rows = np.empty(n, np.dtype(kinds))
     for i, (name, _) in enumerate(kinds):
         rows[name] = columns[i // 3][:, i % 3]
     lines = ["ply", "format binary_little_endian 1.0"]
-    lines += [f"comment {_one_line(comment)}" for comment in comments]
+    lines += [f"comment {_escape(comment)}" for comment in comments]
     lines += [f"element vertex {n}"]
     lines += [f"property {_WORDS[kind]} {name}" for name, kind in kinds]
     parts = [rows.tobytes()]
     if faces is not None:
         table = np.empty(len(faces), np.dtype([("count", "u1"), ("points", "<i4", 3)]))
-        table["count"], table["points"] = 3, _indices(faces, 3, n)
+        table["count"], table["points"] = 3, _require_indices(faces, 3, n)
         lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
         parts.append(table.tobytes())
     if edges is not None:
         lines += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2"]
-        parts.append(_indices(edges, 2, n).astype("<i4").tobytes())
+        parts.append(_require_indices(edges, 2, n).astype("<i4").tobytes())
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii") + b"".join(parts)
 
 
@@ -116,13 +114,15 @@ def points_of(surface: Surface) -> tuple[Floats32, Floats32]:
     return surface.points[surface.valid], surface.normals[surface.valid]
 
 
-def _checked(values: Floats | Floats32 | Bytes, n: int, width: int) -> Floats | Floats32 | Bytes:
+def _require_shape(
+    values: Floats | Floats32 | Bytes, n: int, width: int
+) -> Floats | Floats32 | Bytes:
     if values.shape != (n, width):
         raise ValueError(f"an array has the shape {values.shape}, not ({n}, {width})")
     return values
 
 
-def _indices(values: Ints, width: int, n: int) -> Ints:
+def _require_indices(values: Ints, width: int, n: int) -> Ints:
     if values.ndim != 2 or values.shape[1] != width:
         raise ValueError(f"indices have the shape {values.shape}, not (any, {width})")
     if values.size and (values.min() < 0 or values.max() >= n):
@@ -130,12 +130,10 @@ def _indices(values: Ints, width: int, n: int) -> Ints:
     return values
 
 
-def _one_line(comment: str) -> str:
-    """Return a comment as one line of ASCII, since names of frames are arbitrary."""
+def _escape(comment: str) -> str:
+    """Escape a comment to one line of ASCII: names of frames are arbitrary."""
     return comment.encode("unicode_escape").decode("ascii")
 
-
-# Points as bytes that a web page can draw directly.
 
 MEDIA_TYPE = "application/vnd.sceneprint.points"
 NOT_COMPARED = 255
@@ -154,7 +152,7 @@ def encode_points(
     total: int | None = None,
     scale: float = 0.0,
 ) -> bytes:
-    """Return points in the format of the module's docstring; equal arrays give equal bytes.
+    """Encode points in the format of the module's docstring; equal arrays give equal bytes.
 
     Parameters
     ----------
@@ -162,8 +160,8 @@ def encode_points(
     normals : (N, 3) unit vectors
     patches : (N,) indices of patches; -1 or at least NO_PATCH for none
     residuals : (N,) residuals as in the module's docstring
-    total : number of points before thinning; default: N
-    scale : distance that a residual of 250 represents, metres
+    total : number of points before thinning; None means N
+    scale : distance of a residual of 250, metres
     """
     n = len(points)
     at = np.asarray(points, np.float64)
@@ -198,19 +196,17 @@ def thinned(count: int, limit: int) -> Indices:
     return np.sort(np.argsort(keys, kind="stable")[:limit])
 
 
-# Pose graphs in the g2o format.
-
 #: Factors from (shift, vector part of the quaternion) to xi.
 _PER_QUATERNION = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
 
 @dataclass(frozen=True, eq=False)
 class PoseEdge:
-    """Relative pose of two vertices.
+    """An edge of a pose graph: the relative pose of two vertices.
 
     Parameters
     ----------
-    first, second : numbers of the vertices
+    first, second : indices of the vertices
     T : (4, 4) T_first_second
     information : (6, 6) information matrix of xi in T exp(xi): shift (metres) before turn
         (radians), in the axes of `second`
@@ -223,29 +219,29 @@ class PoseEdge:
 
 
 def g2o(poses: Sequence[Floats], edges: Sequence[PoseEdge]) -> str:
-    """Return a pose graph in the g2o format: vertices numbered from 0, then edges.
+    """Format a pose graph as g2o: vertices numbered from 0, then edges.
 
-    The text has no other lines, because some readers fail at comments and fixed vertices.
+    The text has no other lines: some readers reject comments and fixed vertices.
 
     `poses`: (4, 4) T_parent_vertex of each vertex.
     """
-    lines = [f"VERTEX_SE3:QUAT {i} {_pose(pose)}" for i, pose in enumerate(poses)]
+    lines = [f"VERTEX_SE3:QUAT {i} {_format_pose(pose)}" for i, pose in enumerate(poses)]
     upper = np.triu_indices(6)
     for edge in edges:
         information = edge.information * np.outer(_PER_QUATERNION, _PER_QUATERNION)
         numbers = " ".join(f"{value:.9g}" for value in information[upper].tolist())
-        lines.append(f"EDGE_SE3:QUAT {edge.first} {edge.second} {_pose(edge.T)} {numbers}")
+        lines.append(f"EDGE_SE3:QUAT {edge.first} {edge.second} {_format_pose(edge.T)} {numbers}")
     return "\n".join([*lines, ""])
 
 
 def information_of(covariance: Floats, T: Floats) -> Floats:
-    """Return the information matrix (6, 6) of an edge, as in `PoseEdge`.
+    """Convert a covariance to the information matrix (6, 6) of a `PoseEdge`.
 
     Parameters
     ----------
     covariance : (6, 6) covariance of T in the axes of the edge's first vertex, as in
-        `geometry.covariance`: the error is added to the translation and multiplied from the left
-        to the rotation
+        `geometry.covariance`: errors are added to the translation, and multiply the rotation from
+        the left
     T : (4, 4) T_first_second
     """
     # [exp(r) R, t + x] = T exp(xi) with x = R shift and r = R turn
@@ -254,6 +250,6 @@ def information_of(covariance: Floats, T: Floats) -> Floats:
     return (information + information.T) / 2.0
 
 
-def _pose(T: Floats) -> str:
+def _format_pose(T: Floats) -> str:
     numbers = [*T[:3, 3].tolist(), *quaternion_of(T[:3, :3]).tolist()]
     return " ".join(f"{value:.9f}" for value in numbers)

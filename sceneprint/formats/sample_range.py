@@ -1,4 +1,4 @@
-"""Range of a frame's depth, which uploads report so that users notice wrong units.
+"""The depth range of a frame. Uploads report it, so that users notice wrong units.
 
 Frame | Cloud  --sample_range-->  SampleRange
 """
@@ -10,19 +10,19 @@ import numpy as np
 from sceneprint.types import AnyFrame, Cloud, Floats32
 from sceneprint_client.api.frames import SampleRange
 
-#: Minimum number of samples for the percentiles of a larger frame; they take a millisecond.
+#: Approximate number of samples from which percentiles are computed, within a millisecond.
 _SAMPLES = 20_000
 
 
 def sample_range(frame: AnyFrame) -> SampleRange:
-    """Return percentiles of the depths or distances of a frame, from a subset of its samples."""
+    """Estimate percentiles of a frame's depths or distances from a subset of its samples."""
     if isinstance(frame, Cloud):
         points = frame.points[:: max(1, len(frame.points) // _SAMPLES)]
         return _range_of(np.linalg.norm(points, axis=1), len(frame.points), None)
     depth = frame.depth
     step = max(1, int((depth.size / _SAMPLES) ** 0.5))
-    some, count = depth[::step, ::step], int(np.count_nonzero(depth))
-    seen = some[some > 0]
+    subset, count = depth[::step, ::step], int(np.count_nonzero(depth))
+    seen = subset[subset > 0]
     return _range_of(seen if len(seen) else depth[depth > 0], count, count / depth.size)
 
 

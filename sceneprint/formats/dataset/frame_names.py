@@ -1,6 +1,6 @@
-"""Distinguish depth images from other images by the names of files and folders.
+"""Recognition of depth images by the names of files and folders.
 
-Infrared, confidence and label images may be 16-bit PNGs too, and would otherwise be read as depth.
+Infrared, confidence and label images may be 16-bit PNGs too, but are not depth.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import re
 
 from sceneprint_client.formats import format_named
 
-#: Words of colour or infrared that do not exclude depth: aligned depth, and RGB-D data sets.
+#: Names with colour or infrared that denote depth: aligned depth, and RGB-D data sets.
 _OF_DEPTH = re.compile(
     r"rgbd|rgb[-_]d(?![a-z])|(colou?r|rgb)_?aligned_?depth|depth_?(colou?r|rgb)_?aligned"
     r"|depth_?(image_?)?(aligned|registered|mapped)?_?(to|2|in|on)_?(colou?r|rgb|infra(red)?|n?ir(?![a-z]))"
@@ -18,7 +18,7 @@ _OF_DEPTH = re.compile(
 _NO_DEPTH = re.compile(
     r"rgb|colou?r|infra|confidence|(?<![a-z])(n?ir|conf|amplitude|labels?|instances?|semantics?|masks?)(?![a-z])"
 )
-#: Boundary between two words that only capitals separate, such as depthIR.
+#: Boundary between two words of a camel-case name, such as depthIR.
 _CAMEL_CASE = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 OMITTED_IMAGES = "colour, infrared, confidence or label images according to their names"

@@ -1,4 +1,4 @@
-"""References to the frames of a sequence, which read a frame on demand, and their metadata."""
+"""Sequences, references that read their frames on demand, and the metadata of frames."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from sceneprint_client.api import FrameMeta
     from sceneprint_client.api.frames import ImportOptions
 
-_TOLERANCE = 1e-2  #: maximum deviation of the length of a quaternion from 1
+_TOLERANCE = 1e-2  #: maximum deviation of a quaternion's length from 1
 _MAXIMUM_TRAJECTORY_BYTES = 2**26  #: size of an hour of poses at 200 Hz
 
 
 def read_trajectory(path: Path) -> SensorTrajectory:
-    """Return the poses of a TUM text file, with lines `t tx ty tz qx qy qz qw` and # comments.
+    """Read the poses of a TUM text file, with lines `t tx ty tz qx qy qz qw` and # comments.
 
-    The poses are sorted by time. If several lines have the same time stamp, the first one counts.
+    The poses are sorted by time. Of several lines with the same time stamp, the first is used.
 
     Raise InvalidPose if the file cannot be read or has no pose, or a line does not consist of 8
     finite numbers with a quaternion of unit length. The message names file and line.
@@ -67,7 +67,11 @@ def read_trajectory(path: Path) -> SensorTrajectory:
 def read_cloud(
     path: Path, source: CloudSource, *, name: str = "", pose: Floats | None = None
 ) -> Scan:
-    """Return the cloud of a file with the parameters used to read it.
+    """Read the cloud of a file.
+
+    Returns
+    -------
+    scan : cloud, and the parameters with which the file was read
 
     Raise UnreadableCloud if the file is missing or too large, or `decode_scan` raises the error.
     The message names the file.
@@ -89,9 +93,9 @@ Split = Literal["train", "test"]
 
 
 class Layout(Enum):
-    """Layout of the files of a sequence."""
+    """The layout of a sequence's files."""
 
-    #: Files `frame-%06d.depth.png`, each with a file `frame-%06d.pose.txt` if its pose is known.
+    #: Files `frame-%06d.depth.png`, and files `frame-%06d.pose.txt` for frames with a pose.
     SEVEN_SCENES = "7-Scenes"
     #: File `depth.txt` with time stamps and files, and `groundtruth.txt` with poses.
     TUM = "TUM RGB-D"
@@ -114,7 +118,7 @@ class Layout(Enum):
 
     @property
     def is_export(self) -> bool:
-        """Whether another system wrote the sequence; parent folders then say nothing about it."""
+        """Return whether another system wrote the sequence: its parent folders have no meaning."""
         return self in _EXPORTS
 
 
@@ -127,10 +131,10 @@ _EXPORTS = frozenset(
 
 
 class FrameReference(FrameFile):
-    """Frame of a sequence that is read on demand; `find_sequences` assigns unique names."""
+    """A frame of a sequence that is read on demand; `find_sequences` assigns unique names."""
 
     def read(self) -> AnyFrame:
-        """Read the frame; raise the errors of `read_frame`, `read_cloud` and `pose`."""
+        """Read the frame; for errors, see `read_frame`, `read_cloud` and `pose`."""
         if self.cloud is None:
             return self.read_depth()
         if self.source is None and self.row is None:
@@ -146,7 +150,7 @@ class FrameReference(FrameFile):
         return replace(scan.cloud, name=self.name)
 
     def read_depth(self) -> DepthFrame:
-        """Read a depth image; raise the errors of `read_frame` and `pose`.
+        """Read a depth image; for further errors, see `read_frame` and `pose`.
 
         Raise DatasetError if the frame is a cloud.
         """
@@ -170,19 +174,18 @@ class FrameReference(FrameFile):
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """Frames of one run of a sensor, in order.
+    """The frames of one run of a sensor, in order.
 
     Parameters
     ----------
-    name : name that is unique among the sequences of `find_sequences`
+    name : unique name among the results of `find_sequences`
     parent_frame : name of the parent frame of the poses; only poses with the same parent frame can
         be compared
-    split : use of the sequence according to the authors of the scene, or None
+    split : use of the sequence according to the authors of the scene; None if unknown
     frames : at least one frame
-    note : description of the omitted data for users; empty if all data is used
-    unposed : reason for users why frames have no pose; empty if all have one or `note` says it
-    lost : number of frames that are omitted, or used without their pose, against the user's
-        expectation
+    note : description of omitted data for users; empty if all data is used
+    unposed : reason why frames have no pose, for users; empty if all have poses or `note` gives it
+    lost : number of frames that are unexpectedly omitted, or used without their pose
     """
 
     name: str
@@ -197,13 +200,13 @@ class FrameSequence:
 
     @property
     def place(self) -> Path:
-        """Folder whose name is the parent frame: the folder of the scene or of the sequence."""
+        """Return the folder that names the parent frame: that of the scene or of the sequence."""
         if self.layout.is_export or self.parent_frame == self.name:
             return self.folder
         return self.folder.parent
 
 
-#: Reasons for omissions that lose nothing, because the frames have neither depth nor points.
+#: Reasons for omitting frames that have neither depth nor points.
 EMPTY_FRAMES = frozenset(
     {
         "frames without a depth_file_path", "cameras without a depth image", "frames without depth",
@@ -215,18 +218,15 @@ EMPTY_FRAMES = frozenset(
 def count_lost(left_out: Counter[str]) -> int:
     """Return the number of omitted frames with depth or points.
 
-    `left_out`: numbers of omitted frames by reason.
+    `left_out`: number of omitted frames by reason.
     """
     return left_out.total() - sum(left_out[reason] for reason in EMPTY_FRAMES)
-
-
-# Metadata, names and numbers of frames in uploads.
 
 
 def import_meta(
     reference: FrameReference, sequence: FrameSequence, options: ImportOptions
 ) -> FrameMeta:
-    """Return the metadata of a frame of an import; errors are those of `meta_of`."""
+    """Return the metadata of an imported frame; for errors, see `meta_of`."""
     up = options.up
     return meta_of(
         reference, robot=options.robot, session=options.session or session_of(sequence),
@@ -239,14 +239,14 @@ def import_meta(
 
 
 def session_of(sequence: FrameSequence) -> str:
-    """Return the session of a sequence, the same for a path to the sequence and to its scene."""
+    """Return the session of a sequence, whether the user specifies its folder or its scene's."""
     if sequence.layout.is_export or sequence.parent_frame == sequence.name:
         return sequence.name
     return f"{sequence.parent_frame}/{sequence.folder.name}"
 
 
 def parent_frame_of(sequence: FrameSequence, robot: str | None) -> str:
-    """Return the parent frame of the poses; the prefix keeps frames of different robots apart."""
+    """Return the parent frame of the poses; a prefix distinguishes frames of different robots."""
     own = sequence.parent_frame
     return own if robot is None else f"{robot}/{own}"
 
@@ -254,27 +254,27 @@ def parent_frame_of(sequence: FrameSequence, robot: str | None) -> str:
 def numbered_sequences(
     sequences: Iterable[FrameSequence], session: str | None
 ) -> list[FrameSequence]:
-    """Return sequences whose frames have numbers within their session.
+    """Return sequences whose frames are numbered within their sessions.
 
-    If several sequences form one session, each folder continues the numbers of the previous one.
-    Frames of one folder that the user lists one by one keep the order of their numbers in the
-    folder; a frame without a number gets the next unused one. The only sequence of a session is
+    If several sequences form a session, each folder continues the numbers of the previous folder.
+    Frames of a folder that the user lists one by one retain the order of their numbers in the
+    folder; a frame without a number gets the next unused number. A session's only sequence is
     unchanged.
 
     Parameters
     ----------
     sequences : sequences in chronological order
-    session : session of all sequences; None: that of `session_of`, which several may share
+    session : session of all sequences; None selects `session_of`, which sequences may share
     """
     numbered = list(sequences)
-    keys = [(session or session_of(one), one.folder) for one in numbered]
+    keys = [(session or session_of(sequence), sequence.folder) for sequence in numbered]
     sizes = Counter(name for name, _ in keys)
     rank = {key: place for place, key in enumerate(dict.fromkeys(keys))}
     offsets: dict[tuple[str, Path], int] = {}
     free: dict[str, int] = {}  # next unused number of each session
 
     def place_in_order(i: int) -> tuple[int, bool]:
-        # the frames of a folder may be listed in turns with those of another
+        # frames of different folders may be listed alternately
         return rank[keys[i]], numbered[i].frames[0].sequence is None
 
     for i in sorted(range(len(keys)), key=place_in_order):

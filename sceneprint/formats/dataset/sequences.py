@@ -1,8 +1,8 @@
-"""Find the sequences below a path, and write sequences whose files are complete or absent.
+"""Search for the sequences below a path, and atomic writers of their files.
 
 path  --find_sequences-->  Sequence, ...
 Camera, depth (H, W), T_parent_sensor (4, 4)  -->  intrinsics.json, *.png, *.txt
-rows of `trajectory_row`  --trajectory_text-->  what `read_trajectory` reads
+rows of `trajectory_row`  --trajectory_text-->  text for `read_trajectory`
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _MAXIMUM_LIST_BYTES = 2**26
 
 
 def list_folder(folder: Path) -> tuple[list[str], list[str]]:
-    """Return the names of the files and of the folders in a folder, except hidden ones.
+    """Return the names of the visible files and of the visible subfolders of a folder.
 
     Both lists are in natural order: frame 9 precedes frame 10.
 
@@ -86,9 +86,9 @@ def list_folder(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def natural(name: str) -> tuple[list[tuple[int, str]], str]:
-    """Return a sort key that compares digits as numbers; equal numbers are compared as text."""
+    """Return a sort key for natural order: digits are compared as numbers, ties as text."""
     parts = re.split(r"(\d+)", name, flags=re.ASCII)
-    # digits are compared by length and then as text, because a number may be arbitrarily long
+    # digits are compared by length and then as text: a number may be arbitrarily long
     key = [
         (len(part.lstrip("0")), part.lstrip("0")) if i % 2 else (0, part)
         for i, part in enumerate(parts)
@@ -97,9 +97,9 @@ def natural(name: str) -> tuple[list[tuple[int, str]], str]:
 
 
 def layout_of(files: list[str]) -> Layout | None:
-    """Return the layout of a folder with these files; None if none has depth or points.
+    """Return the layout of a folder with these files; None if no file has depth or points.
 
-    If a folder has depth images and point clouds, the images count unless there is a clouds.json.
+    If a folder has depth images and point clouds, the images count unless it has a clouds.json.
     """
     if any(SEVEN_SCENES.fullmatch(file) for file in files):
         return Layout.SEVEN_SCENES
@@ -115,13 +115,13 @@ def layout_of(files: list[str]) -> Layout | None:
 def references(
     folder: Path, files: list[str], layout: Layout, name: str, camera: Camera | None = None
 ) -> tuple[tuple[FrameReference, ...], str]:
-    """Return the frames of a folder, and the reason why some have no pose.
+    """Return the frames of a folder, and the reason why some have no pose ("" if all have poses).
 
     Parameters
     ----------
-    folder : folder; for depth images, it or a parent has an `intrinsics.json`
+    folder : folder of the frames; for depth images, it or a parent has an `intrinsics.json`
     files : names of the files in the order of `list_folder`
-    name : name of the sequence, which prefixes the names of the frames
+    name : name of the sequence, a prefix of the frames' names
     camera : camera of a 7-Scenes sequence without an intrinsics.json
 
     Raise DatasetError if intrinsics.json is missing, depth.txt or clouds.json is invalid, or two
@@ -203,14 +203,14 @@ def _tum(folder: Path, files: list[str], name: str) -> tuple[tuple[FrameReferenc
 
 
 def _least_distance(trajectory: SensorTrajectory, stamps: list[float]) -> float:
-    """Return the smallest time between a stamp and a pose, seconds."""
+    """Return the minimum time between a stamp and a pose, seconds."""
     after = np.searchsorted(trajectory.stamps, stamps)
     around = np.clip([after - 1, after], 0, len(trajectory.stamps) - 1)
     return float(np.abs(trajectory.stamps[around] - stamps).min(initial=math.inf))
 
 
 def _depth_list(path: Path) -> list[tuple[float, str]]:
-    """Return the time stamp and the file of each line of depth.txt."""
+    """Return the time stamp, seconds, and the file of each line of depth.txt."""
     listed = []
     for number, line in data_lines(read_text(path, _MAXIMUM_LIST_BYTES, DatasetError)):
         place, words = f"{path}, line {number}", line.split(maxsplit=1)
@@ -241,7 +241,7 @@ def _depth_list(path: Path) -> list[tuple[float, str]]:
 def _is_folder(entry: os.DirEntry[str]) -> bool:
     try:
         return entry.is_dir()
-    except OSError:  # a cycle of symlinks
+    except OSError:  # a cycle of symbolic links
         return False
 
 
@@ -249,10 +249,10 @@ def _may_be_cloud(file: str) -> bool:
     return format_named(file, "cloud") is not None
 
 
-_DEPTH = 4  #: maximum depth of the search below the path of the user
-_MAXIMUM_FOLDERS = 10_000  #: maximum number of searched folders; a larger tree is not a data set
+_DEPTH = 4  #: maximum depth of the search below the user's path, folders
+_MAXIMUM_FOLDERS = 10_000  #: maximum number of searched folders; larger trees are not data sets
 _MAXIMUM_SPLIT_BYTES = 65_536
-_MOST_NAMES = 5  #: maximum number of omitted files in a note
+_MOST_NAMES = 5  #: maximum number of names in a note
 _SEQUENCE_FOLDER = re.compile(r"seq-?(\d+)", re.IGNORECASE | re.ASCII)
 _SPLIT_LINE = re.compile(r"(?:sequence|seq)[\s_-]*(\d{1,9})", re.IGNORECASE | re.ASCII)
 _SPLIT_FILES: tuple[tuple[str, Split], ...] = (
@@ -264,7 +264,7 @@ _SPLIT_FILES: tuple[tuple[str, Split], ...] = (
 def find_sequences(
     path: Path | str, recording: RecordingOptions | None = None, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences at a path or up to 4 folders below it, without reading a frame.
+    """Return the sequences at a path or up to 4 folders below it, without reading frames.
 
     Supported are:
 
@@ -272,12 +272,12 @@ def find_sequences(
     * a TUM RGB-D folder,
     * a folder of depth images or point clouds (NPY files of points need a clouds.json),
     * a single depth image or cloud,
-    * ROS recordings, each of which is one sequence, or several if its stamps go back,
+    * ROS recordings: one sequence each, or several if the time stamps jump back,
     * files and folders of RTAB-Map, E57, Polycam, Record3D and nerfstudio,
     * folders of these.
 
-    Files and folders whose names indicate colour, infrared, confidence or labels are omitted, and a
-    note names them. The name of a sequence is its position below the path, or the name of the path.
+    Files and folders whose names indicate colour, infrared, confidence or labels are omitted, and
+    listed in a note. The name of a sequence is its path relative to `path`, or the name of `path`.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ def find_sequences(
     of a groundtruth.txt is not a pose. Raise MissingDependency if the path is a recording and
     rosbags is not installed.
     """
-    # the name of `..` is that of its target; a symlink keeps its own name
+    # `..` is resolved to get a name, but a symbolic link is named by itself
     path = Path(path)
     root = path.resolve() if ".." in path.parts else path.absolute()
     from sceneprint.formats import exports
@@ -304,15 +304,17 @@ def find_sequences(
     if is_recording(root) and root.exists():
         return ros.recording_sequences(root, recording or ros.RecordingOptions())
     if root.is_file():
-        return exports.file_sequences(root) if exports.is_export(root) else (_single(root),)
+        return exports.file_sequences(root) if exports.is_export(root) else (_single_frame(root),)
     if not root.is_dir():
         raise DatasetError(f"{path}: The file or folder does not exist. Check the path.")
     left_out: list[Path] = []
     walked = list(_walk(root, left_out))
     if any(layout is Layout.RECORDING for _, _, layout in walked):
         return _recordings(root, walked, recording or ros.RecordingOptions())
-    sequences = tuple(each for one in walked for each in _sequences_in(*one, root, camera))
-    note = _note_of(left_out, root)
+    sequences = tuple(
+        sequence for location in walked for sequence in _sequences_in(*location, root, camera)
+    )
+    note = _describe_omissions(left_out, root)
     if not sequences:
         raise DatasetError(
             f"{path}: There is no depth image or cloud here or up to {_DEPTH} folders below"
@@ -328,16 +330,19 @@ def find_sequences(
 
 
 def _with_note(sequences: Sequence[FrameSequence], note: str) -> tuple[FrameSequence, ...]:
-    """Return the sequences, if any, with `note` appended to the note of the first one."""
-    first = [replace(one, note="; ".join(filter(None, (one.note, note)))) for one in sequences[:1]]
+    """Return the sequences with `note` appended to the note of the first sequence, if any."""
+    first = [
+        replace(sequence, note="; ".join(filter(None, (sequence.note, note))))
+        for sequence in sequences[:1]
+    ]
     return (*first, *sequences[1:])
 
 
-def _note_of(left_out: list[Path], root: Path) -> str:
+def _describe_omissions(left_out: list[Path], root: Path) -> str:
     """Return a note on the files and folders that were omitted because of their names."""
     if not left_out:
         return ""
-    names = [one.relative_to(root.parent).as_posix() for one in left_out]
+    names = [path.relative_to(root.parent).as_posix() for path in left_out]
     more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return f"skipped: {', '.join(names[:_MOST_NAMES])}{more} ({OMITTED_IMAGES})"
 
@@ -350,7 +355,7 @@ def find_recordings(path: Path) -> list[Path]:
 
 
 def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
-    """Return the paths of the recordings among the results of `_walk`."""
+    """Return the paths of the ROS recordings in results of `_walk`."""
     return [folder / name for folder, names, layout in walked
             if layout is Layout.RECORDING for name in names]  # fmt: skip
 
@@ -358,7 +363,7 @@ def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
 def _recordings(
     root: Path, walked: list[tuple[Path, list[str], Layout]], options: RecordingOptions
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences of several recordings, named by their positions below `root`.
+    """Return the sequences of several recordings, named by their paths relative to `root`.
 
     Raise DatasetError if there are other frames too, two recordings have the same name, or
     `recording_sequences` raises the error.
@@ -366,7 +371,7 @@ def _recordings(
     from sceneprint.formats.recording.selection import recording_name, recording_sequences
 
     bags = _bags(walked)
-    other = next((one for one in walked if one[2] is not Layout.RECORDING), None)
+    other = next((result for result in walked if result[2] is not Layout.RECORDING), None)
     if other is not None:
         raise DatasetError(
             f"{root}: The folder has both ROS recordings, such as {bags[0].relative_to(root)}, and "
@@ -392,13 +397,13 @@ def _recordings(
 def find_each(
     root: Path,
 ) -> tuple[tuple[FrameSequence, ...], tuple[tuple[str, SceneprintError], ...]]:
-    """Return the readable sequences below a folder, and the errors of the unreadable ones.
+    """Return the readable sequences below a folder, and the errors of unreadable sequences.
 
     ROS recordings are skipped; see `find_sequences` for the other layouts.
 
     Returns
     -------
-    sequences : readable sequences, if any
+    sequences : readable sequences; may be empty
     refused : name and error of each unreadable sequence
 
     `root`: absolute path of a folder. Raise DatasetError if there are too many folders, or two
@@ -407,15 +412,15 @@ def find_each(
     sequences: list[FrameSequence] = []
     refused = []
     left_out: list[Path] = []
-    for one in _walk(root, left_out):
-        if one[2] is Layout.RECORDING:
+    for result in _walk(root, left_out):
+        if result[2] is Layout.RECORDING:
             continue
-        name = _name(one[0], root)
+        name = _name(result[0], root)
         try:
-            sequences += _sequences_in(*one, root)
+            sequences += _sequences_in(*result, root)
         except SceneprintError as error:
             refused.append((name, error))
-    with_note = _with_note(sequences, _note_of(left_out, root))
+    with_note = _with_note(sequences, _describe_omissions(left_out, root))
     _check_parent_frames(with_note)
     return with_note, tuple(refused)
 
@@ -425,20 +430,20 @@ def _walk(
 ) -> Iterator[tuple[Path, list[str], Layout]]:
     """Yield the path, file names and layout of each sequence, depth first in natural order.
 
-    For ROS recordings, the path is their folder, and the names are those of the recordings. For a
-    single file of another system, there are no names. Images and folders that are omitted because
-    of their names are added to `left_out`.
+    For ROS recordings, these are their folder and the names of the recordings. For a single file
+    of another system, the list of names is empty. Images and folders that are omitted because of
+    their names are added to `left_out`.
     """
     beside = [] if left_out is None else left_out
     from sceneprint.formats import exports
 
-    seen: set[Path] = set()  # resolved paths, so that cycles of symlinks end
+    seen: set[Path] = set()  # resolved paths, to end cycles of symbolic links
     waiting = [(root, 0)]
     while waiting:
         folder, depth = waiting.pop()
         try:
             resolved = folder.resolve()
-        except (OSError, RuntimeError):  # a cycle of symlinks
+        except (OSError, RuntimeError):  # a cycle of symbolic links
             continue
         if resolved in seen:
             continue
@@ -460,7 +465,7 @@ def _walk(
             yield folder, files, layout
             continue
         layout = layout_of(files)
-        # the folder of a scene may have an image or a mesh of the scene beside its sequences
+        # a scene's folder may have an image or a mesh of the scene beside its sequences
         scene = any(_SEQUENCE_FOLDER.fullmatch(name) for name in folders) or (
             layout is Layout.CLOUDS
             and ("depth" in folders or _is_above_images(folder, files, folders, depth))
@@ -496,9 +501,9 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
             if layout_of(files_below) not in (None, Layout.CLOUDS):
                 find_camera(below)
                 return True
-        except DatasetError:  # there is no camera, as for a folder of colour images
+        except DatasetError:  # no camera: they may be colour images
             continue
-        except SceneprintError:  # the camera is invalid, which the reader of the images reports
+        except SceneprintError:  # an invalid camera; the reader of the images reports it
             return True
         waiting += [(below / name, deep + 1) for name in deeper]
     return False
@@ -507,14 +512,14 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
 def _sequences_in(
     path: Path, files: list[str], layout: Layout, root: Path, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences of one result of `_walk`."""
+    """Return the sequences of a result of `_walk`; `root` is the path of the search."""
     from sceneprint.formats import exports
 
     if not layout.is_export:
         name = _name(path, root)
         frames, unposed = references(path, files, layout, name, camera)
-        sequence = _sequence_of(path, layout, name, frames, unposed)
-        if _TRAJECTORY in files and all(one.pose_source is None for one in frames):
+        sequence = _make_sequence(path, layout, name, frames, unposed)
+        if _TRAJECTORY in files and all(frame.pose_source is None for frame in frames):
             sequence = replace(sequence, lost=len(frames))  # the trajectory fits no frame
         unread = _unread_folders(path) if layout in (Layout.PLAIN, Layout.CLOUDS) else {}
         if unread:
@@ -528,39 +533,39 @@ def _sequences_in(
 
 
 def _unread_folders(folder: Path) -> dict[str, int]:
-    """Return the folders in a folder of frames that have frames too, with their numbers."""
-    found = {}
+    """Return the subfolders of a folder of frames that have frames too, and their frame counts."""
+    counts = {}
     for name in list_folder(folder)[1]:
         if is_beside_depth(name):
             continue
-        with suppress(DatasetError):  # the folder may not be read
+        with suppress(DatasetError):  # the folder is not readable
             files = list_folder(folder / name)[0]
-            found[f"{folder.name}/{name}"] = sum(is_depth(one) or is_cloud(one) for one in files)
-    return {name: count for name, count in found.items() if count}
+            counts[f"{folder.name}/{name}"] = sum(is_depth(x) or is_cloud(x) for x in files)
+    return {name: count for name, count in counts.items() if count}
 
 
-def _sequence_of(
+def _make_sequence(
     folder: Path, layout: Layout, name: str, frames: tuple[FrameReference, ...], unposed: str
 ) -> FrameSequence:
     seven, clouds = layout is Layout.SEVEN_SCENES, layout is Layout.CLOUDS
     split = _split(folder) if seven or clouds else None
-    # clouds belong to a scene only if a split file of the scene lists them
+    # clouds belong to a scene only if one of its split files lists them
     in_scene = split or (seven and _SEQUENCE_FOLDER.fullmatch(folder.name))
     parent_frame = folder.parent.name if in_scene else name
     return FrameSequence(name, folder, layout, parent_frame, split, frames, unposed=unposed)
 
 
-def _single(file: Path) -> FrameSequence:
+def _single_frame(file: Path) -> FrameSequence:
     folder, frame = file.parent, FrameReference(**vars(find_frame_file(file)))
     unposed = NO_POSE_FILE if frame.pose_source is None else ""
     if frame.camera is not None and SEVEN_SCENES.fullmatch(file.name):
-        return _sequence_of(folder, Layout.SEVEN_SCENES, folder.name, (frame,), unposed)
+        return _make_sequence(folder, Layout.SEVEN_SCENES, folder.name, (frame,), unposed)
     layout = Layout.PLAIN if frame.cloud is None else Layout.CLOUDS
     return FrameSequence(folder.name, folder, layout, folder.name, None, (frame,), unposed=unposed)
 
 
 def _split(folder: Path) -> Split | None:
-    """Return the use of a sequence according to the split files of its scene."""
+    """Return the use of a sequence according to its scene's split files; None if not listed."""
     match = _SEQUENCE_FOLDER.fullmatch(folder.name)
     number = int(match[1]) if match else -1
     uses: list[Split] = []
@@ -577,9 +582,9 @@ def _split(folder: Path) -> Split | None:
 
 
 def _split_numbers(path: Path) -> set[int]:
-    """Return the numbers of the sequences that a split file lists; raise DatasetError if one lacks.
+    """Return the sequence numbers in a split file; raise DatasetError if a sequence is missing.
 
-    An evaluation of an incomplete split would be misleading.
+    An evaluation on an incomplete split would be misleading.
     """
     _, folders = list_folder(path.parent)
     present = {int(m[1]) for name in folders if (m := _SEQUENCE_FOLDER.fullmatch(name))}
@@ -604,7 +609,7 @@ def _name(folder: Path, root: Path) -> str:
 
 
 def _check_parent_frames(sequences: tuple[FrameSequence, ...]) -> None:
-    """Raise DatasetError if two scenes share a name: their poses would seem comparable."""
+    """Raise DatasetError if two scenes have the same name: their poses would seem comparable."""
     scenes: dict[str, Path] = {}
     for sequence in sequences:
         place = sequence.place
@@ -615,13 +620,11 @@ def _check_parent_frames(sequences: tuple[FrameSequence, ...]) -> None:
             )
 
 
-# Writers of the files that `find_sequences` reads.
-
-_LARGEST = 65_534  #: largest depth, stored units; 65535 means missing
+_LARGEST = 65_534  #: maximum depth, stored units; 65535 means missing
 
 
 def write_intrinsics(folder: Path, camera: Camera) -> Path:
-    """Write `intrinsics.json` into the folder and return its path."""
+    """Write `intrinsics.json` into a folder; return its path."""
     lens = camera.intrinsics
     fields: dict[str, object] = {
         "width": lens.width, "height": lens.height, "fx": lens.fx, "fy": lens.fy, "cx": lens.cx,
@@ -681,12 +684,12 @@ def trajectory_row(stamp: float, T_parent_sensor: Floats) -> list[float]:
 
 
 def trajectory_text(rows: Iterable[Sequence[float]], comments: Iterable[str] = ()) -> str:
-    """Return a TUM trajectory as text, without loss of precision.
+    """Format a TUM trajectory as text, without loss of precision.
 
     Parameters
     ----------
     rows : rows of `trajectory_row`
-    comments : lines of the header, such as the frames of the poses; escaped to printable ASCII
+    comments : header lines, such as the names of the poses' frames; escaped to printable ASCII
     """
     lines = [f"# {comment.encode('unicode_escape').decode('ascii')}" for comment in comments]
     lines += [" ".join(repr(float(number)) for number in row) for row in rows]

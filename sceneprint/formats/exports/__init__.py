@@ -25,18 +25,18 @@ _OF_FOLDER: dict[Layout, Callable[[Path, str], FrameSequence]] = {
 
 
 def is_export(path: Path) -> bool:
-    """Return whether a path is a single file of another system that contains frames."""
+    """Return whether a path is a file in which another system stores frames."""
     file_format = format_named(path.name, "capture")
     return file_format is not None and (file_format.name != "rtabmap" or is_rtabmap(path))
 
 
 def file_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
-    """Return the sequences of a single file of another system.
+    """Return the sequences in a file of another system.
 
     Parameters
     ----------
     path : absolute path of a file for which `is_export` returns True
-    name : name of the sequences; default: name of the file
+    name : name of the sequences; None selects the name of the file
 
     Raise DatasetError if the file is damaged, has an unsupported version, or has no frames.
     """
@@ -49,18 +49,18 @@ def file_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, 
 
 
 def folder_layout(folder: Path, files: list[str], folders: list[str]) -> Layout | None:
-    """Return the layout of a folder of another system; None for other folders.
+    """Return the layout of a folder that another system wrote; None for other folders.
 
     Parameters
     ----------
     folder : path of the folder
-    files, folders : names of the files and folders in it
+    files, folders : names of its files and of its subfolders
     """
     if is_polycam(folder, folders):
         return Layout.POLYCAM
     if record3d.is_record3d(files, folders):
         return Layout.RECORD3D
-    # an intrinsics.json takes precedence, since users write it for this reader
+    # an intrinsics.json takes precedence: users write it for this reader
     if TRANSFORMS in files and INTRINSICS_FILE not in files:
         return Layout.NERFSTUDIO
     return None

@@ -1,4 +1,4 @@
-"""Read the scans of an E57 file as frames: clouds with the poses of their scanner.
+"""Reading of the scans of an E57 file as frames: clouds with the poses of their scanner.
 
 path  --e57_sequence-->  FrameSequence
 """
@@ -28,13 +28,13 @@ from sceneprint.formats.points.e57 import E57Scan, read_e57, with_viewpoint
 from sceneprint_client.files import naming
 from sceneprint_client.sidecars import CloudSource
 
-#: Maximum distance of a point from its scanner, metres; sky has larger values.
+#: Maximum distance of a point from its scanner, metres. Scanners store larger values for sky.
 _FARTHEST_M = 5_000.0
 
 
 @dataclass(frozen=True)
 class E57Source:
-    """Source of the bytes of one scan of an E57 file.
+    """The source of a frame's bytes: a scan in an E57 file.
 
     `place`: index of the scan in the file.
     """
@@ -45,11 +45,11 @@ class E57Source:
     def read_bytes(self) -> bytes:
         """Return an NPY file of points (N, 3), float32 metres in the axes of the scan.
 
-        A scan with more than 5 million points is thinned to one point per voxel, as by the service.
+        A scan with more than 5 million points is thinned like an upload.
 
         Raise UnreadableCloud if the file is damaged or cannot be read.
         """
-        with naming(f"{self.path}, scan {self.place + 1}"), _scans(self.path) as scans:
+        with naming(f"{self.path}, scan {self.place + 1}"), _open_scans(self.path) as scans:
             if self.place >= len(scans):
                 raise UnreadableCloud("The scan no longer exists in the file. Read the file again.")
             scan = scans[self.place]
@@ -66,13 +66,13 @@ class E57Source:
 
 
 @contextmanager
-def _scans(path: Path) -> Iterator[tuple[E57Scan, ...]]:
+def _open_scans(path: Path) -> Iterator[tuple[E57Scan, ...]]:
     try:
         with path.open("rb") as file:
             if file.seek(0, io.SEEK_END) == 0:
                 raise UnreadableCloud("The file is empty. Copy it again.")
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            yield read_e57(data)  # the memory is unmapped when no scan refers to it
+            yield read_e57(data)  # the memory is unmapped when the last scan is freed
     except OSError as cause:
         raise UnreadableCloud(
             f"The file cannot be read ({cause.strerror}). Copy it again."
@@ -80,7 +80,7 @@ def _scans(path: Path) -> Iterator[tuple[E57Scan, ...]]:
 
 
 def e57_sequence(path: Path, name: str) -> FrameSequence:
-    """Return the scans of a file that have a single viewpoint.
+    """Return the scans of an E57 file that have a viewpoint, as a sequence.
 
     Returns
     -------
@@ -89,7 +89,7 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
     Raise DatasetError if the file is damaged, or has only merged clouds.
     """
     try:
-        with _scans(path) as scans:
+        with _open_scans(path) as scans:
             have_viewpoint = with_viewpoint(scans)
             left_out = Counter[str]()
             frames = list[FrameReference]()
@@ -99,8 +99,8 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
                 elif not has_viewpoint:
                     left_out["clouds without a viewpoint"] += 1
                 else:
-                    frames.append(_frame(path, name, place, scan))
-            thick = sum(one.count > MOST_POINTS for one in scans)
+                    frames.append(_make_frame(path, name, place, scan))
+            thick = sum(scan.count > MOST_POINTS for scan in scans)
     except UnreadableCloud as cause:
         raise DatasetError(f"{path}: {cause}") from cause
     reasons = ", ".join(f"{count} {reason}" for reason, count in left_out.items())
@@ -116,7 +116,7 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
     return FrameSequence(name, path, Layout.E57, name, None, tuple(frames), note, lost=lost)
 
 
-def _frame(path: Path, name: str, place: int, scan: E57Scan) -> FrameReference:
+def _make_frame(path: Path, name: str, place: int, scan: E57Scan) -> FrameReference:
     label = f"scan-{place + 1:04d}"
     return FrameReference(
         f"{name}/{label}",

@@ -1,4 +1,4 @@
-"""Read folders with a `transforms.json` of nerfstudio or Instant NGP that names depth images.
+"""Reading of folders with a nerfstudio or Instant NGP `transforms.json` that lists depth images.
 
 folder  --nerfstudio_sequence-->  FrameSequence
 
@@ -6,8 +6,8 @@ The format is described at docs.nerf.studio (data conventions). fl_x, fl_y, cx, 
 p1 and p2 are fields of the file or of each frame. A frame has a `transform_matrix` from camera to
 world, with the camera in OpenGL axes (x right, y up, z backward), and a `depth_file_path` relative
 to the folder. `depth_unit_scale_factor` (default 0.001) is the number of metres per stored unit of
-PNG and NPY depth. The exporter applied `applied_transform` to the poses; the reader inverts it, so
-poses are in the frame of the original reconstruction.
+PNG and NPY depth. The exporter applied `applied_transform` to the poses. The reader inverts it, so
+that poses are in the frame of the original reconstruction.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _REMEDY = (
 
 @dataclass(frozen=True)
 class ScaledNpy:
-    """Source of an NPY depth image whose floating-point samples are not in metres.
+    """The source of a frame's bytes: an NPY depth image in units other than metres.
 
     `metres`: metres per stored unit.
     """
@@ -58,23 +58,23 @@ class ScaledNpy:
     metres: float
 
     def read_bytes(self) -> bytes:
-        """Read the file as an NPY file in metres. Raise UnreadableFrame if it is invalid."""
+        """Return the file as an NPY file in metres; raise UnreadableFrame if it is invalid."""
         return self.converted(read_bytes(self.path, MAXIMUM_IMAGE_BYTES, UnreadableFrame))
 
     def converted(self, data: bytes) -> bytes:
-        """Convert the bytes of the file to metres. Raise UnreadableFrame if they are invalid."""
+        """Convert the bytes of the file to metres; raise UnreadableFrame if they are invalid."""
         if not data.startswith(NPY_SIGNATURE):
             return data
         samples = decode_npy(data)
-        if samples.dtype == np.uint16:  # the depth scale of the camera applies to them
+        if samples.dtype == np.uint16:  # the camera's depth scale applies to these samples
             return data
-        with np.errstate(all="ignore"):  # samples that overflow are missing
+        with np.errstate(all="ignore"):  # overflows are missing samples
             metres = (samples * np.float32(self.metres)).astype(np.float32)
         return encode_npy(metres)
 
 
 def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:
-    """Return the frames of a folder with a `transforms.json`.
+    """Return the frames of a folder with a `transforms.json`, as a sequence.
 
     Returns
     -------
@@ -89,14 +89,14 @@ def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:
         raise DatasetError(
             f"{file}: The file has no list of frames. Write it in the form {_EXAMPLE}."
         )
-    T_original_saved, scale = _original(file, fields)
+    T_original_saved, scale = _original_transform(file, fields)
     frames, left_out = list[FrameReference](), Counter[str]()
-    for place, one in enumerate(listed[:_MOST_FRAMES]):
-        if not isinstance(one, dict) or _depth_name(one) is None:
+    for place, entry in enumerate(listed[:_MOST_FRAMES]):
+        if not isinstance(entry, dict) or _depth_name(entry) is None:
             left_out["frames without a depth_file_path"] += 1
             continue
         try:
-            frame = _frame(folder, fields | one, name, place)
+            frame = _make_frame(folder, fields | entry, name, place)
         except SceneprintError as error:
             left_out[f"frames that are damaged ({str(error).replace(f'{folder}/', '')})"] += 1
             continue
@@ -107,7 +107,7 @@ def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:
     return sequence_of(folder, Layout.NERFSTUDIO, name, frames, left_out, _REMEDY)
 
 
-def _original(file: Path, fields: dict[str, Any]) -> tuple[Floats, float]:
+def _original_transform(file: Path, fields: dict[str, Any]) -> tuple[Floats, float]:
     """Return T_original_saved (4, 4), and the scale of the saved poses."""
     try:
         scale = number(fields.get("applied_scale", 1.0), "applied_scale")
@@ -126,8 +126,8 @@ def _depth_name(fields: dict[str, Any]) -> str | None:
     return name if isinstance(name, str) else None
 
 
-def _frame(folder: Path, fields: dict[str, Any], name: str, place: int) -> FrameReference:
-    """Return a frame with its saved pose. Raise a SceneprintError if it is invalid."""
+def _make_frame(folder: Path, fields: dict[str, Any], name: str, place: int) -> FrameReference:
+    """Return a frame with its saved pose; raise a SceneprintError if it is invalid."""
     relative = PurePosixPath(str(_depth_name(fields)).replace("\\", "/"))
     # an untrusted file must not select arbitrary files of this machine
     if relative.is_absolute() or ".." in relative.parts:
@@ -144,7 +144,7 @@ def _frame(folder: Path, fields: dict[str, Any], name: str, place: int) -> Frame
     return FrameReference(
         f"{name}/{place:06d}-{path.stem}",
         path,
-        depth_camera(_lens(fields), depth_size(path), 1.0 / metres),
+        depth_camera(_read_lens(fields), depth_size(path), 1.0 / metres),
         None,
         optical(transform(fields.get("transform_matrix"), "transform_matrix")),
         source=source,
@@ -153,8 +153,8 @@ def _frame(folder: Path, fields: dict[str, Any], name: str, place: int) -> Frame
     )
 
 
-def _lens(fields: dict[str, Any]) -> Lens:
-    """Return the camera of a frame. Raise DatasetError if it is invalid or a fisheye camera."""
+def _read_lens(fields: dict[str, Any]) -> Lens:
+    """Return the camera of a frame; raise DatasetError if it is invalid or a fisheye camera."""
     model = fields.get("camera_model", "OPENCV")
     width, height = (pixels(fields.get(key), key) for key in ("w", "h"))
     if "fl_x" not in fields and "camera_angle_x" in fields:

@@ -1,4 +1,4 @@
-"""Convert cameras of OpenGL and ARKit to optical axes, and JSON values to checked numbers.
+"""Conversion of OpenGL and ARKit cameras to optical axes, and validation of JSON values.
 
 T_world_camera (OpenGL)  --optical-->  T_world_camera (optical)
 Lens, size of the depth image  --depth_camera-->  Camera
@@ -32,13 +32,13 @@ from sceneprint_client.formats import HEAD, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.sidecars import Camera, Position
 
-#: Transform from optical to OpenGL axes, which inverts y and z.
+#: Transform from optical to OpenGL axes: it inverts y and z.
 _T_OPENGL_OPTICAL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Pinhole camera of a colour image, whose principal point is measured from the corner.
+    """The pinhole camera of a colour image; the principal point is relative to the image's corner.
 
     Parameters
     ----------
@@ -64,14 +64,14 @@ def optical(T_world_camera: Floats) -> Floats:
 def depth_camera(
     lens: Lens, size: tuple[int, int], depth_scale: float, up: Position | None = None
 ) -> Camera:
-    """Return the camera of a depth image with the same view as a colour image.
+    """Return the camera of a depth image that has the same view as a colour image.
 
     Parameters
     ----------
     lens : camera of the colour image
     size : width and height of the depth image, which may be smaller
     depth_scale : stored units per metre
-    up : unit vector in optical axes, or None
+    up : unit vector that points up, in optical axes; None if unknown
 
     Raise DatasetError if the images have different aspect ratios. Raise InvalidIntrinsics if the
     camera is invalid.
@@ -109,11 +109,8 @@ def depth_size(path: Path) -> tuple[int, int]:
     return size
 
 
-# Values of JSON files.
-
-
 def number(value: object, what: str) -> float:
-    """Return a finite number of a JSON file. Raise DatasetError for other values."""
+    """Return a JSON value as a float; raise DatasetError unless it is a finite number."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             if math.isfinite(value):
@@ -124,7 +121,7 @@ def number(value: object, what: str) -> float:
 
 
 def pixels(value: object, what: str) -> int:
-    """Return a size in pixels of a JSON file. Raise DatasetError for other values."""
+    """Return a JSON value as an int; raise DatasetError unless it is a size in pixels."""
     size = number(value, what)
     if not 1 <= size <= 1e6 or size != int(size):
         raise DatasetError(f"{what} is {size:g}, not a size in pixels. Export the file again.")
@@ -132,7 +129,7 @@ def pixels(value: object, what: str) -> int:
 
 
 def transform(rows: object, what: str) -> Floats:
-    """Return a transform (4, 4) from 3 or 4 rows. Raise DatasetError if it is not rigid."""
+    """Return the transform (4, 4) of 3 or 4 rows; raise DatasetError unless it is rigid."""
     T = np.eye(4)
     if not isinstance(rows, list) or len(rows) not in (3, 4):
         raise DatasetError(f"{what} does not have 3 or 4 rows. Export the file again.")
@@ -146,9 +143,6 @@ def transform(rows: object, what: str) -> Floats:
         raise DatasetError(f"{what} is invalid: {cause}") from cause
 
 
-# Sequences.
-
-
 def sequence_of(
     folder: Path, layout: Layout, name: str, frames: Sequence[FrameReference],
     left_out: Counter[str], remedy: str,
@@ -158,7 +152,7 @@ def sequence_of(
     Parameters
     ----------
     frames : frames in order
-    left_out : numbers of omitted frames by reason
+    left_out : number of omitted frames by reason
     remedy : advice for users if there are no frames
 
     Raise DatasetError if there are no frames.

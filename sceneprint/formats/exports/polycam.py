@@ -1,4 +1,4 @@
-"""Read folders of Polycam's raw data: LiDAR depth images, and cameras with ARKit poses.
+"""Reading of Polycam's raw data: LiDAR depth images, and cameras with ARKit poses.
 
 folder  --polycam_sequence-->  FrameSequence
 
@@ -40,12 +40,12 @@ _REMEDY = (
 def is_polycam(folder: Path, folders: list[str]) -> bool:
     """Return whether a folder with the subfolders `folders` is an export of Polycam."""
     if folder.name == KEYFRAMES:
-        return any(one in folders for one in CAMERAS)
-    return KEYFRAMES in folders and any((folder / KEYFRAMES / one).is_dir() for one in CAMERAS)
+        return any(name in folders for name in CAMERAS)
+    return KEYFRAMES in folders and any((folder / KEYFRAMES / name).is_dir() for name in CAMERAS)
 
 
 def polycam_sequence(folder: Path, name: str) -> FrameSequence:
-    """Return the frames of a folder with `keyframes`.
+    """Return the frames of an export of Polycam, as a sequence.
 
     Returns
     -------
@@ -60,7 +60,9 @@ def polycam_sequence(folder: Path, name: str) -> FrameSequence:
         name = folder.parent.name if name == KEYFRAMES else name.removesuffix(f"/{KEYFRAMES}")
         folder = folder.parent
     keyframes = folder / KEYFRAMES
-    place = next(keyframes / one for one in CAMERAS if (keyframes / one).is_dir())
+    place = next(
+        keyframes / folder_name for folder_name in CAMERAS if (keyframes / folder_name).is_dir()
+    )
     files, left_out, frames = list_folder(place)[0], Counter[str](), list[FrameReference]()
     for file in files[:_MOST_FRAMES]:
         stem, dot, suffix = file.rpartition(".")
@@ -71,7 +73,7 @@ def polycam_sequence(folder: Path, name: str) -> FrameSequence:
             left_out["cameras without a depth image"] += 1
             continue
         try:
-            frames.append(_frame(folder, place / file, depth, name, len(frames)))
+            frames.append(_make_frame(folder, place / file, depth, name, len(frames)))
         except SceneprintError as error:
             left_out[f"frames that are damaged ({_reason(error, place)})"] += 1
     return sequence_of(folder, Layout.POLYCAM, name, frames, left_out, _REMEDY)
@@ -81,8 +83,8 @@ def _reason(error: SceneprintError, place: Path) -> str:
     return str(error).replace(f"{place}/", "")
 
 
-def _frame(folder: Path, file: Path, depth: Path, name: str, place: int) -> FrameReference:
-    """Return a frame. Raise DatasetError, InvalidIntrinsics or UnreadableFrame if it is invalid."""
+def _make_frame(folder: Path, file: Path, depth: Path, name: str, place: int) -> FrameReference:
+    """Return a frame; raise DatasetError, InvalidIntrinsics or UnreadableFrame if it is invalid."""
     fields = read_object(file, _MAXIMUM_CAMERA_BYTES, DatasetError, '{"fx": 1, "t_00": 1, ...}')
     fx, fy, cx, cy = (number(fields.get(key), key) for key in ("fx", "fy", "cx", "cy"))
     width, height = (pixels(fields.get(key), key) for key in ("width", "height"))

@@ -1,4 +1,4 @@
-"""Read captures of Record3D: .r3d files, and folders with their unpacked content.
+"""Reading of Record3D captures: .r3d files, and folders with their unpacked content.
 
 path  --record3d_sequence-->  FrameSequence
 
@@ -51,7 +51,7 @@ METADATA, FRAMES, DEPTH_SUFFIX = "metadata", "rgbd", ".depth"
 _MAXIMUM_METADATA_BYTES = 64 << 20
 _MOST_FRAMES = 100_000
 _REMEDY = "In Record3D, export the capture as .r3d (shareable internal format)."
-#: Width and height of LiDAR depth in portrait orientation, for old files that do not state them.
+#: Width and height of LiDAR depth in portrait orientation, for old files that do not specify them.
 _LIDAR = (192, 256)
 
 
@@ -64,7 +64,7 @@ def is_record3d(files: list[str], folders: list[str]) -> bool:
 
 @dataclass(frozen=True)
 class LzfseDepth:
-    """Source of a depth image of a capture.
+    """The source of a frame's bytes: a depth image in a capture.
 
     Parameters
     ----------
@@ -86,12 +86,12 @@ class LzfseDepth:
         size = 4 * self.width * self.height
         with naming(str(self.capture / self.name)):
             # content that cannot be compressed is slightly larger in LZFSE
-            samples = _decompressed(_part(self.capture, self.name, size + 65_536), size)
+            samples = _decompress(_read_part(self.capture, self.name, size + 65_536), size)
         return encode_npy(np.frombuffer(samples, "<f4").reshape(self.height, self.width))
 
 
-def _decompressed(packed: bytes, size: int) -> bytes:
-    """Return the content of a depth file. Raise UnreadableFrame unless it has `size` bytes."""
+def _decompress(packed: bytes, size: int) -> bytes:
+    """Decompress a depth file; raise UnreadableFrame unless the content has `size` bytes."""
     if len(packed) == size:
         return packed
     try:
@@ -115,14 +115,14 @@ def _decompressed(packed: bytes, size: int) -> bytes:
     return samples
 
 
-# Parts of a capture: members of the zip, or files of the folder.
+# The parts of a capture are members of the zip, or files of the folder.
 
 _LOCAL_HEADER = struct.Struct("<4s4xH16xHH")
 _STORED, _DEFLATED = 0, 8
 
 
-def _part(capture: Path, name: str, limit: int) -> bytes:
-    """Return the bytes of a part. Raise UnreadableFrame if it is missing, damaged or too large."""
+def _read_part(capture: Path, name: str, limit: int) -> bytes:
+    """Read a part of a capture; raise UnreadableFrame if it is missing, damaged or too large."""
     if capture.is_dir():
         return read_bytes(capture / name, limit, UnreadableFrame)
     try:
@@ -151,22 +151,19 @@ def _part(capture: Path, name: str, limit: int) -> bytes:
 
 @lru_cache(maxsize=4)
 def _parts_of_zip(capture: Path, _changed_ns: int, _size: int) -> dict[str, tuple[int, int, int]]:
-    """Return offset, compressed size and size of each readable member of a zip, by name."""
+    """Return the offset, compressed size and size of each readable member of a zip, by name."""
     from sceneprint.formats.archive import zip_entries
 
     with capture.open("rb") as file:
         return {
-            one.name: (one.start, one.packed, one.size)
-            for one in zip_entries(file)
-            if one.trouble is None
+            entry.name: (entry.start, entry.packed, entry.size)
+            for entry in zip_entries(file)
+            if entry.trouble is None
         }
 
 
-# Frames.
-
-
 def record3d_sequence(capture: Path, name: str) -> FrameSequence:
-    """Return the frames of a capture.
+    """Return the frames of a capture, as a sequence.
 
     Returns
     -------
@@ -181,7 +178,7 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
             f"{_REMEDY}"
         )
     try:
-        fields = json.loads(_part(capture, METADATA, _MAXIMUM_METADATA_BYTES))
+        fields = json.loads(_read_part(capture, METADATA, _MAXIMUM_METADATA_BYTES))
         if not isinstance(fields, dict) or not isinstance(fields.get("poses"), list):
             raise DatasetError("They do not contain a list of poses.")
         width, height = (pixels(fields.get(key), key) for key in ("w", "h"))
@@ -204,14 +201,14 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
             left_out["frames without depth"] += 1
             continue
         try:
-            lens = _lens(fields, place, width, height)
+            lens = _read_lens(fields, place, width, height)
             frames.append(
                 FrameReference(
                     f"{name}/{place:06d}",
                     capture / file,
                     depth_camera(lens, size, 1.0),
-                    _stamp(fields, place),
-                    optical(_pose(pose)),
+                    _read_stamp(fields, place),
+                    optical(_read_pose(pose)),
                     source=LzfseDepth(capture, file, *size),
                     original=file,
                     sequence=place,
@@ -229,8 +226,8 @@ def _has_part(capture: Path, file: str) -> bool:
     return file in _parts_of_zip(capture, status.st_mtime_ns, status.st_size)
 
 
-def _lens(fields: dict[str, Any], place: int, width: int, height: int) -> Lens:
-    """Return the camera of a frame. Raise DatasetError if it is invalid."""
+def _read_lens(fields: dict[str, Any], place: int, width: int, height: int) -> Lens:
+    """Return the camera of a frame; raise DatasetError if it is invalid."""
     rows, K = fields.get("perFrameIntrinsicCoeffs"), fields.get("K")
     if isinstance(rows, list) and place < len(rows) and isinstance(rows[place], list):
         values = rows[place][:4]
@@ -244,8 +241,8 @@ def _lens(fields: dict[str, Any], place: int, width: int, height: int) -> Lens:
     return Lens(fx, fy, cx, cy, width, height)
 
 
-def _pose(values: object) -> Floats:
-    """Return T_world_camera (4, 4) in ARKit axes. Raise DatasetError if it is invalid."""
+def _read_pose(values: object) -> Floats:
+    """Return T_world_camera (4, 4) in ARKit axes; raise DatasetError if it is invalid."""
     if not isinstance(values, list) or len(values) != 7:
         raise DatasetError("a pose does not have seven numbers")
     numbers = np.array([number(value, "a pose") for value in values])
@@ -257,7 +254,7 @@ def _pose(values: object) -> Floats:
     return transform(T.tolist(), "a pose")
 
 
-def _stamp(fields: dict[str, Any], place: int) -> float | None:
+def _read_stamp(fields: dict[str, Any], place: int) -> float | None:
     stamps = fields.get("frameTimestamps")
     if isinstance(stamps, list) and place < len(stamps):
         return number(stamps[place], "a time stamp")

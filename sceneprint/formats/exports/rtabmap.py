@@ -1,8 +1,8 @@
-"""Read RTAB-Map databases: depth images or laser scans of their nodes, with optimised poses.
+"""Reading of RTAB-Map databases: depth images or laser scans of nodes, with optimised poses.
 
 path  --rtabmap_sequences-->  FrameSequence, ...
 
-The reader uses the tables Node, Data and Admin of rtabmap 0.10 to 0.23. The file is not trusted: it
+The reader supports rtabmap 0.10 to 0.23 (tables Node, Data and Admin). The file is not trusted: it
 is opened read-only, code in its schema is not run, and queries are limited.
 """
 
@@ -49,8 +49,8 @@ from sceneprint_client.errors import printable
 from sceneprint_client.sidecars import Camera, CloudSource
 
 _SIGNATURE = b"SQLite format 3\0"
-#: Maximum size of a value, bytes; maximum number of instructions of a query, in units of 100,000;
-#: and maximum number of nodes.
+#: Maximum size of a value, bytes; maximum number of SQLite instructions, in units of 100,000; and
+#: maximum number of nodes.
 _MAXIMUM_VALUE, _MOST_STEPS, _MOST_NODES = 256 << 20, 20_000, 1_000_000
 _COLUMNS = {
     "Node": {"id", "map_id", "stamp", "pose"},
@@ -69,30 +69,29 @@ def is_rtabmap(path: Path) -> bool:
     try:
         with path.open("rb") as file:
             return path.is_file() and file.read(len(_SIGNATURE)) == _SIGNATURE
-    except OSError:  # a later reader reports the error
+    except OSError:  # the reader reports the error
         return False
 
 
-_NodeCamera = tuple[
-    Intrinsics, Floats
-]  #: intrinsics of a camera's part of the image, T_base_camera
+#: Intrinsics of a camera's part of the depth image, and T_base_camera.
+_NodeCamera = tuple[Intrinsics, Floats]
 
 
 @dataclass(eq=False)
 class _Node:
-    """Node of the graph without its images."""
+    """A node of the graph, without its images."""
 
     id: int
     session: int
     stamp: float
     pose: Floats | None
     cameras: tuple[_NodeCamera, ...] = ()  #: cameras with depth
-    scan: tuple[int, Floats] | None = None  #: format and T_base_scan of its laser scan
+    scan: tuple[int, Floats] | None = None  #: format and T_base_scan of the laser scan
 
 
 @dataclass(frozen=True)
 class RtabmapDepth:
-    """Source of the depth image of one camera of a node.
+    """The source of a frame's bytes: the depth image of a node's camera.
 
     Parameters
     ----------
@@ -111,7 +110,7 @@ class RtabmapDepth:
         Raise DatasetError if the database cannot be read. Raise UnreadableFrame if the image is
         damaged or missing.
         """
-        blob = _value(self.path, "depth", self.node)
+        blob = _read_value(self.path, "depth", self.node)
         kind = depth_size(blob[:DEPTH_HEAD])
         if self.cameras == 1 and kind is not None and kind[0] == "millimetres":
             return blob
@@ -125,12 +124,12 @@ class RtabmapDepth:
 
 @dataclass(frozen=True)
 class RtabmapScan:
-    """Source of the laser scan of a node.
+    """The source of a frame's bytes: the laser scan of a node.
 
     Parameters
     ----------
     node : id of the node
-    form : format number of rtabmap for the points; 0 if not stored
+    form : rtabmap's format number of the points; 0 if not stored
     """
 
     path: Path
@@ -143,30 +142,30 @@ class RtabmapScan:
         Raise DatasetError if the database cannot be read. Raise UnreadableCloud if the scan is
         damaged or two-dimensional.
         """
-        return encode_npy(scan_points(_value(self.path, "scan", self.node), self.form))
+        return encode_npy(scan_points(_read_value(self.path, "scan", self.node), self.form))
 
 
 def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
     """Return the frames of a database: one sequence per camera, or the laser scans.
 
-    The poses are the optimised ones that rtabmap stores when it closes a database. If they are
-    missing, odometry provides the poses, and each session has its own parent frame.
+    The poses are the optimised poses that rtabmap stores when it closes a database. If they are
+    missing, odometry provides the poses, and each session has a separate parent frame.
 
     Returns
     -------
-    sequences : at least one sequence; the `note` lists the omitted nodes
+    sequences : at least one sequence; the `note` of each lists the omitted nodes
 
     `name`: name of the sequences; default: name of the file. Raise DatasetError if the file is not
     a database of RTAB-Map, has an unsupported version, is in use or damaged, or no node has depth
     or a three-dimensional laser scan.
     """
     name = name or path.stem
-    with _opened(path) as database:
-        version = _version(path, database)
-        optimised = _optimised_poses(database)
+    with _open_database(path) as database:
+        version = _read_version(path, database)
+        optimised = _read_optimised_poses(database)
         left_out: Counter[str] = Counter()
         nodes = [
-            node for node in _nodes(path, database, version, optimised, left_out)
+            node for node in _read_nodes(path, database, version, optimised, left_out)
             if node.cameras or node.scan is not None
         ]  # fmt: skip
     if any(node.cameras for node in nodes):
@@ -175,23 +174,20 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
     if not nodes:
         raise DatasetError(
             f"{path}: No node has a depth image or a three-dimensional laser scan"
-            f"{_listed(left_out, ' (', ')')}. Record with a depth camera or a 3D LiDAR and with "
-            f"`Mem/BinDataKept` set to true, or {_EXPORT_CLOUD}."
+            f"{_list_counts(left_out, ' (', ')')}. Record with a depth camera or a 3D LiDAR and "
+            f"with `Mem/BinDataKept` set to true, or {_EXPORT_CLOUD}."
         )
     sequences: list[FrameSequence] = []
-    for world, of_world in _worlds(name, nodes, optimised is not None):
-        sequences += _sequences(path, name, world, of_world)
-    note = _note(sequences, optimised is not None, left_out)
+    for world, of_world in _group_by_parent(name, nodes, optimised is not None):
+        sequences += _make_sequences(path, name, world, of_world)
+    note = _describe(sequences, optimised is not None, left_out)
     sequences[0] = replace(sequences[0], lost=count_lost(left_out))
-    return tuple(replace(one, note=note) for one in sequences)
-
-
-# The database.
+    return tuple(replace(sequence, note=note) for sequence in sequences)
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open an untrusted database with restrictions. Raise DatasetError for errors of SQLite."""
+def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open an untrusted database with restrictions; raise DatasetError for errors of SQLite."""
     for suffix in ("-wal", "-journal"):
         beside = path.with_name(path.name + suffix)
         if beside.is_file() and beside.stat().st_size:
@@ -211,7 +207,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
             steps = iter(range(_MOST_STEPS))
             database.set_progress_handler(lambda: next(steps, None) is None, 100_000)
             yield database
-    # messages of SQLite may quote bytes of the file that are not valid UTF-8
+    # messages of SQLite may quote invalid UTF-8 from the file
     except (sqlite3.Error, UnicodeDecodeError, OverflowError, MemoryError) as cause:
         reason = printable(f"{cause!s:.120}")
         raise DatasetError(
@@ -220,7 +216,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         ) from cause
 
 
-def _version(path: Path, database: sqlite3.Connection) -> Version:
+def _read_version(path: Path, database: sqlite3.Connection) -> Version:
     """Return the RTAB-Map version of a database.
 
     Raise DatasetError if tables or columns are missing, or the version is not supported.
@@ -256,8 +252,8 @@ def _version(path: Path, database: sqlite3.Connection) -> Version:
     return version
 
 
-def _optimised_poses(database: sqlite3.Connection) -> dict[int, Floats] | None:
-    """Return the optimised poses by node; None if the database has none."""
+def _read_optimised_poses(database: sqlite3.Connection) -> dict[int, Floats] | None:
+    """Return the optimised poses (4, 4) by node; None if the database has none."""
     columns = {str(row[1]) for row in database.execute("PRAGMA table_info(Admin)").fetchmany(500)}
     if not {"opt_ids", "opt_poses"} <= columns:
         return None
@@ -281,11 +277,11 @@ def _optimised_poses(database: sqlite3.Connection) -> dict[int, Floats] | None:
     return by_node or None
 
 
-def _nodes(
+def _read_nodes(
     path: Path, database: sqlite3.Connection, version: Version,
     optimised: dict[int, Floats] | None, left_out: Counter[str],
 ) -> Iterator[_Node]:  # fmt: skip
-    """Yield the nodes with data and a pose, in order, and count the others in `left_out`."""
+    """Yield the nodes with a pose, in order; count other nodes by reason in `left_out`."""
     columns = {str(row[1]) for row in database.execute("PRAGMA table_info(Data)").fetchmany(500)}
     scan = "substr(d.scan, -12)" if "scan" in columns else "NULL"
     scan += ", d.scan_info" if "scan_info" in columns else ", NULL"
@@ -299,7 +295,7 @@ def _nodes(
                 f"{path}: The database has more than {_MOST_NODES} nodes. Split it by sessions."
             )
         try:
-            node = _node(row, version, left_out)
+            node = _parse_node(row, version, left_out)
         except (BrokenBlob, TypeError, ValueError, OverflowError) as cause:
             left_out[f"damaged nodes ({printable(str(cause))})"] += 1
             continue
@@ -311,8 +307,8 @@ def _nodes(
         yield node
 
 
-def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _Node:
-    """Return the node of a row with its odometry pose.
+def _parse_node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _Node:
+    """Convert a row to a node with its odometry pose; count missing data in `left_out`.
 
     Raises
     ------
@@ -324,7 +320,9 @@ def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _No
     depth = depth_size(head) if isinstance(head, bytes) else None
     if depth is not None and isinstance(calibration, bytes):
         lenses = cameras(calibration, version)
-        node.cameras = tuple(_scaled(lens, depth[1] // len(lenses), depth[2]) for lens in lenses)
+        node.cameras = tuple(
+            _scale_camera(lens, depth[1] // len(lenses), depth[2]) for lens in lenses
+        )
     elif depth is not None:
         left_out["depth images without a calibration"] += 1
     elif isinstance(head, bytes) and len(head) > 4:
@@ -338,8 +336,8 @@ def _node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _No
     return node
 
 
-def _scaled(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
-    """Scale the camera of a colour image to a depth image of this size, pixels.
+def _scale_camera(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
+    """Scale the camera of a colour image to a depth image of `width` x `height` pixels.
 
     Raise BrokenBlob if the images have different aspect ratios, or the camera is invalid.
     """
@@ -360,9 +358,9 @@ def _scaled(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
     return intrinsics, lens.T_base_camera
 
 
-def _value(path: Path, column: str, node: int) -> bytes:
-    """Return a binary value of a node. Raise DatasetError if it is missing."""
-    with _opened(path) as database:
+def _read_value(path: Path, column: str, node: int) -> bytes:
+    """Return a binary value of a node; raise DatasetError if it is missing."""
+    with _open_database(path) as database:
         row = database.execute(f"SELECT {column} FROM Data WHERE id = ?", (node,)).fetchone()
     if row is None or not isinstance(row[0], bytes):
         raise DatasetError(
@@ -371,11 +369,10 @@ def _value(path: Path, column: str, node: int) -> bytes:
     return row[0]
 
 
-# Sequences.
-
-
-def _worlds(name: str, nodes: list[_Node], is_optimised: bool) -> Iterator[tuple[str, list[_Node]]]:
-    """Yield each parent frame with the nodes whose poses lead to it."""
+def _group_by_parent(
+    name: str, nodes: list[_Node], is_optimised: bool
+) -> Iterator[tuple[str, list[_Node]]]:
+    """Group nodes by parent frame; yield each parent frame with its nodes."""
     sessions = sorted({node.session for node in nodes})
     if is_optimised or len(sessions) == 1:
         yield name, nodes
@@ -384,7 +381,9 @@ def _worlds(name: str, nodes: list[_Node], is_optimised: bool) -> Iterator[tuple
         yield f"{name}/map-{session}", [node for node in nodes if node.session == session]
 
 
-def _sequences(path: Path, name: str, world: str, nodes: list[_Node]) -> Iterator[FrameSequence]:
+def _make_sequences(
+    path: Path, name: str, world: str, nodes: list[_Node]
+) -> Iterator[FrameSequence]:
     count = max(len(node.cameras) for node in nodes)
     if not count:
         frames = tuple(_scan_frame(path, name, node) for node in nodes)
@@ -432,18 +431,18 @@ def _scan_frame(path: Path, name: str, node: _Node) -> FrameReference:
     )
 
 
-def _note(sequences: list[FrameSequence], is_optimised: bool, left_out: Counter[str]) -> str:
-    """Return a note for users on the frames, their poses and the omitted nodes."""
-    frames = sum(len(one.frames) for one in sequences)
+def _describe(sequences: list[FrameSequence], is_optimised: bool, left_out: Counter[str]) -> str:
+    """Describe the frames, the source of their poses, and the omitted nodes for users."""
+    frames = sum(len(sequence.frames) for sequence in sequences)
     poses = "optimised poses"
     if not is_optimised:
         poses = (
             "odometry poses, because the database has no optimised poses: "
             "open and close it in RTAB-Map to store them"
         )
-    return f"{frames} frames taken, {poses}{_listed(left_out, '; skipped: ', '')}"
+    return f"{frames} frames taken, {poses}{_list_counts(left_out, '; skipped: ', '')}"
 
 
-def _listed(counts: Counter[str], before: str, after: str) -> str:
+def _list_counts(counts: Counter[str], before: str, after: str) -> str:
     parts = [f"{count} {reason}" for reason, count in counts.most_common(6) if count]
     return f"{before}{', '.join(parts)}{after}" if parts else ""

@@ -1,4 +1,4 @@
-"""Decode binary columns of RTAB-Map databases: transforms, calibrations, depth, laser scans.
+"""Decoding of binary columns of RTAB-Map databases: transforms, calibrations, depth, laser scans.
 
 bytes  --transform-->  (4, 4)          bytes  --matrix-->  array
 bytes, version  --cameras-->  RtabmapCamera, ...          bytes  --depth_samples-->  (H, W)
@@ -32,14 +32,14 @@ Version = tuple[int, int, int]
 
 #: Maximum size of a decompressed matrix, bytes.
 _MAXIMUM_MATRIX_BYTES = 256 << 20
-#: Element types of OpenCV matrices, by type code.
+#: Element types of OpenCV matrices; the index is the type code.
 _ELEMENTS = ("u1", "i1", "<u2", "<i2", "<i4", "<f4", "<f8")
 _RVL = b"DEPTHRVL"
 _RVL_HEADER = len(_RVL) + 8
 #: Number of first bytes of a depth image that determine its kind and size.
 DEPTH_HEAD = 32
 _AGAIN = "Copy the database again, or export it with rtabmap-reprocess."
-#: Rotation from optical axes to the base, which rtabmap assumes if none is stored.
+#: Default of rtabmap for the transform from optical axes to the base.
 _OPTICAL = (
     (0.0, 0.0, 1.0, 0.0),
     (-1.0, 0.0, 0.0, 0.0),
@@ -50,7 +50,7 @@ _OPTICAL = (
 
 @dataclass(frozen=True, eq=False)
 class RtabmapCamera:
-    """Camera of a node.
+    """A camera of a node.
 
     Parameters
     ----------
@@ -69,11 +69,11 @@ class RtabmapCamera:
 
 
 class BrokenBlob(ValueError):
-    """Error for a column with an invalid value; the message says why."""
+    """A column has an invalid value. The message is the reason."""
 
 
 def transform(blob: bytes) -> Floats | None:
-    """Return the transform (4, 4) from 3 x 4 float32, row by row; None for the null transform.
+    """Decode a transform (4, 4) from 3 x 4 float32, row by row; return None for the null transform.
 
     Raise BrokenBlob if the length is wrong, or the transform is not rigid.
     """
@@ -90,9 +90,9 @@ def transform(blob: bytes) -> Floats | None:
 
 
 def matrix(blob: bytes) -> NDArray[Any]:
-    """Return the array (rows, columns, channels) of a compressed matrix.
+    """Decompress a matrix (rows, columns, channels).
 
-    Three 32-bit integers after the compressed bytes are rows, columns and the OpenCV type.
+    Three 32-bit integers follow the compressed bytes: rows, columns and the OpenCV type.
 
     Raise BrokenBlob if the matrix is damaged, or larger than 256 MiB.
     """
@@ -116,29 +116,26 @@ def matrix(blob: bytes) -> NDArray[Any]:
     return np.frombuffer(content, dtype).reshape(rows, columns, channels)
 
 
-# Calibrations.
-
-
 def cameras(blob: bytes, version: Version) -> tuple[RtabmapCamera, ...]:
-    """Return the cameras of a node, from left to right in its images; empty for a stereo camera.
+    """Decode the cameras of a node, from left to right in its images; empty for a stereo camera.
 
     `blob`: calibration. Since 0.18, it has one record per camera. Before, it had the float32
     numbers fx, fy, cx, cy, (since 0.11.2) width, height, and the local transform of each camera.
     Raise BrokenBlob if the calibration is damaged.
     """
     if version >= (0, 18, 0):
-        return _serialized_cameras(blob)
+        return _read_records(blob)
     numbers = np.frombuffer(blob, "<f4") if len(blob) % 4 == 0 else np.empty(0, "<f4")
     of_camera = 18 if version >= (0, 11, 2) else 16
     if len(numbers) % of_camera == 0 and len(numbers):
         rows = numbers.reshape(-1, of_camera)
-        return tuple(_camera_of(*row[:-12].tolist(), local=row[-12:].tobytes()) for row in rows)
-    if len(numbers) in (17, 19):  # a stereo camera has a baseline, and since 0.11.2 a size
+        return tuple(_make_camera(*row[:-12].tolist(), local=row[-12:].tobytes()) for row in rows)
+    if len(numbers) in (17, 19):  # a stereo camera, which also has a baseline
         return ()
     raise BrokenBlob(f"a calibration has the invalid size of {len(blob)} bytes")
 
 
-def _camera_of(
+def _make_camera(
     fx: float, fy: float, cx: float, cy: float, width: float = 0, height: float = 0, *, local: bytes
 ) -> RtabmapCamera:
     if not np.isfinite((fx, fy, cx, cy, width, height)).all():
@@ -149,8 +146,8 @@ def _camera_of(
     return RtabmapCamera(fx, fy, cx, cy, int(width), int(height), T)
 
 
-def _serialized_cameras(blob: bytes) -> tuple[RtabmapCamera, ...]:
-    """Return the cameras of records of 11 integers, K, D, R and P as float64, and a transform."""
+def _read_records(blob: bytes) -> tuple[RtabmapCamera, ...]:
+    """Decode camera records of 11 integers, K, D, R and P as float64, and a transform."""
     cameras, at = [], 0
     while at < len(blob):
         if len(blob) - at < 44:
@@ -164,21 +161,21 @@ def _serialized_cameras(blob: bytes) -> tuple[RtabmapCamera, ...]:
         if kind != 0 or not sizes_fit or local not in (0, 12) or end > len(blob):
             raise BrokenBlob("a calibration has an unknown format")
         numbers = np.frombuffer(blob, "<f8", k + d + r + p, at + 44)
-        # P is the camera of the rectified images, which the database stores
+        # the database stores rectified images; P is their camera
         P, K = numbers[k + d + r :].reshape(-1, 4), numbers[:k].reshape(-1, 3)
         lens = P if len(P) and P[0, 0] > 0 else K
         if not len(lens):
             raise BrokenBlob("a calibration has no camera matrix")
         fx, fy, cx, cy = (float(lens[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
         part = blob[end - 4 * local : end]
-        cameras.append(_camera_of(fx, fy, cx, cy, width, height, local=part))
+        cameras.append(_make_camera(fx, fy, cx, cy, width, height, local=part))
         at = end
     if not cameras:
         raise BrokenBlob("a calibration is empty")
     return tuple(cameras)
 
 
-# Depth images: PNG of 16-bit millimetres, PNG of float metres in four colour channels, or RVL.
+# Depth images are PNGs of 16-bit millimetres or of float metres in four colour channels, or RVL.
 
 DepthKind = Literal["millimetres", "metres", "rvl"]
 
@@ -201,7 +198,7 @@ def depth_size(head: bytes) -> tuple[DepthKind, int, int] | None:
 
 
 def depth_samples(blob: bytes) -> Samples:
-    """Return the samples (H, W) of a depth image: uint16 millimetres, or float32 metres.
+    """Decode the samples (H, W) of a depth image: uint16 millimetres, or float32 metres.
 
     Raise UnreadableFrame if the image is damaged, too large, or not a depth image.
     """
@@ -216,25 +213,24 @@ def depth_samples(blob: bytes) -> Samples:
         )
     if kind == "millimetres":
         return decode_png(blob)
-    return _float_samples(blob) if kind == "metres" else rvl_samples(blob[len(_RVL) :])
+    return _decode_metres(blob) if kind == "metres" else rvl_samples(blob[len(_RVL) :])
 
 
-def _float_samples(blob: bytes) -> Floats32:
+def _decode_metres(blob: bytes) -> Floats32:
     from PIL.PngImagePlugin import PngImageFile
 
     try:
-        # the pixel limit of Image.open is a setting of the whole process
+        # Image.open has a pixel limit that applies to the whole process
         with PngImageFile(io.BytesIO(blob)) as image:
             colours = np.asarray(image)
     except (OSError, ValueError, SyntaxError) as cause:
         raise UnreadableFrame(f"The depth image is damaged ({cause}). {_AGAIN}") from cause
-    # in the channel order of OpenCV (blue, green, red, alpha), the bytes are a float32
+    # the bytes in OpenCV's channel order (blue, green, red, alpha) form a float32
     return np.ascontiguousarray(colours[:, :, [2, 1, 0, 3]]).view("<f4")[:, :, 0]
 
 
-# Laser scans.
-
-#: Formats of three-dimensional scans, and their numbers of values per point before 0.16.1.
+#: Formats of three-dimensional scans, and numbers of values per point that denote them before
+#: 0.16.1.
 _SOLID_FORMATS, _SOLID_CHANNELS = range(5, 12), (3, 4, 6, 7)
 
 
@@ -270,7 +266,7 @@ def is_solid(tail: bytes, form: int) -> bool:
 
 
 def scan_points(blob: bytes, form: int) -> Floats32:
-    """Return the points (N, 3) of a laser scan, metres in the axes of the scan.
+    """Decode the points (N, 3) of a laser scan, metres in the axes of the scan.
 
     Raise UnreadableCloud if the scan is damaged or two-dimensional.
     """

@@ -1,10 +1,10 @@
-"""Read point clouds from the bytes of a file.
+"""Decoding of point clouds from the bytes of a file.
 
 bytes  --decode_scan-->  Scan: the cloud, and the parameters used to read it
 bytes  --read_kitti | read_npy | read_pointcloud2-->  FilePoints
 
-This module reads plain arrays: KITTI's .bin, NPY, and serialised ROS 2 messages of the type
-sensor_msgs/PointCloud2. Other modules read the other formats.
+This module contains the readers of plain arrays: KITTI's .bin, NPY, and serialised ROS 2 messages
+of the type sensor_msgs/PointCloud2.
 """
 
 from __future__ import annotations
@@ -40,13 +40,11 @@ from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import cloud_blocks, cloud_table
 from sceneprint_client.sidecars import UNSAID, Position, Unsaid
 
-# Plain arrays: KITTI's .bin, and NPY.
-
 _KITTI_ROW = 16  #: bytes: x, y, z, intensity
 
 
 def read_kitti(data: bytes) -> FilePoints:
-    """Return the points of a KITTI scan: rows of x, y, z, intensity as little-endian float32.
+    """Read the points of a KITTI scan: rows of x, y, z, intensity as little-endian float32.
 
     Raise UnreadableCloud if the size is not a multiple of a row, or the rows have another length.
     """
@@ -68,19 +66,19 @@ def read_kitti(data: bytes) -> FilePoints:
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
 
 
-#: Row lengths that can be recognised, and minimum number of rows for a decision.
+#: Recognised row lengths, and minimum number of rows for a decision.
 _LENGTHS, _FEWEST_ROWS = range(3, 9), 500
 _LEAST_SPREAD = 0.02  #: minimum column spread for a decision
 _LEAST_OF_BEST = 0.93  #: minimum column spread at length four, relative to the largest spread
 
 
 def _row_length(data: bytes) -> int | None:
-    """Return the number of float32 in a row if it is clearly not four, else None.
+    """Estimate the number of float32 per row; return None unless it clearly differs from four.
 
-    With a wrong length, columns mix all fields and have similar means. The variance of the column
-    means, relative to the variance of all values, is therefore largest for the correct length. In
+    With a wrong length, columns mix all fields and have similar means. Therefore, the variance of
+    the column means, relative to the variance of all values, is maximal for the correct length. In
     57 scans of three sensors, written in rows of 3 to 8, the value for length four was at least .99
-    of the largest value if four was correct, and at most .87 otherwise.
+    of the maximum if four was correct, and at most .87 otherwise.
     """
     values = np.frombuffer(data, "<f4", len(data) // 4)
     if len(values) < _FEWEST_ROWS * _KITTI_ROW // 4:
@@ -93,7 +91,7 @@ def _row_length(data: bytes) -> int | None:
 
 
 def _column_spread(values: Floats32, length: int) -> float:
-    """Return the variance of the column means relative to that of all values, after compression."""
+    """Return the ratio of variances, of column means to all values, after range compression."""
     rows = len(values) // length
     chosen = np.linspace(0, rows - 1, min(rows, 20_000 // length)).astype(np.int64)
     table = values[: rows * length].reshape(rows, length)[chosen].astype(np.float64)
@@ -104,9 +102,9 @@ def _column_spread(values: Floats32, length: int) -> float:
 
 
 def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """Return the points, metres, of a float16, float32 or float64 NPY file, (N, 3) or (N, 4).
+    """Read the points, metres, of a float16, float32 or float64 NPY file, (N, 3) or (N, 4).
 
-    The fourth column is omitted. The blocks are read when they are iterated, once.
+    The fourth column is omitted. The blocks can be iterated once.
 
     Raise UnreadableCloud if the file is not NPY, has another type or shape or more than `most`
     points, or its size contradicts its header.
@@ -134,11 +132,8 @@ def read_npy(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     return FilePoints(count, (rows[i : i + n, :3].astype(np.float64) for i, n in steps(count)))
 
 
-# ROS 2 messages.
-
-
 def read_pointcloud2(data: bytes) -> FilePoints:
-    """Return the points of a serialised PointCloud2; points at the origin count as missing.
+    """Read the points of a serialised PointCloud2; points at the origin count as missing.
 
     Raise UnreadableCloud if the bytes are not such a message, are damaged, lack x, y or z, or their
     sizes contradict each other.
@@ -147,24 +142,22 @@ def read_pointcloud2(data: bytes) -> FilePoints:
     return FilePoints(table.size, cloud_blocks(table))
 
 
-# Thinning and decoding of clouds.
-
-#: Smallest edge of a voxel, metres. 2^21 such voxels extend over 20 km.
+#: Minimum edge of a voxel, metres. 2^21 such voxels extend over 20 km.
 _FINEST = 0.01
 
 Keys = NDArray[np.int64]
 
 
 def thinned(points: Floats32, most: int, finest: float = _FINEST) -> tuple[Floats32, float]:
-    """Return the first point of each voxel, at most `most` points, in their order.
+    """Thin points to the first point of each voxel; their order is preserved.
 
-    The edge of the voxels is the smallest of 1, 1.4, 2, ... times `finest` that suffices.
+    The edge of the voxels is the smallest of `finest` times 1, 1.4, 2, ... that suffices.
 
     Parameters
     ----------
     points : (N, 3) points with coordinates up to a million times `finest`
-    most : maximum number; at least 8, because eight voxels of any size meet at the origin
-    finest : smallest edge of a voxel
+    most : maximum number of points; at least 8, because eight voxels of any size meet at the origin
+    finest : minimum edge of a voxel
 
     Returns
     -------
@@ -173,8 +166,8 @@ def thinned(points: Floats32, most: int, finest: float = _FINEST) -> tuple[Float
     """
     slots = 1 << max(4, math.ceil(math.log2(1.5 * most)))
     table, indices = np.empty(slots, np.int64), np.empty(most, np.int32)
-    # the secret prevents files whose voxels all collide in the hash table; it does not affect the
-    # selection of points
+    # without a secret, a file could make all voxels collide in the hash table; the selected points
+    # do not depend on it
     secret, step = secrets.randbits(62), 0
     while True:
         edge = finest * math.sqrt(2.0) ** step
@@ -190,7 +183,7 @@ def _first_points(
 ) -> int:
     """Write the index of the first point of each voxel to `indices`.
 
-    Return the number of indices, or -1 if there are too many.
+    Return the number of indices; -1 if `indices` is too short.
     """
     table[:] = -1
     mask, n = len(table) - 1, 0
@@ -213,10 +206,10 @@ def _first_points(
     return n
 
 
-#: Minimum and maximum number of points of a cloud; larger clouds are thinned.
+#: Minimum and maximum number of points in a cloud; larger clouds are thinned.
 FEWEST_POINTS, MOST_POINTS = 10, 5_000_000
 
-#: Maximum distance of a point from the viewpoint, metres.
+#: Maximum distance of a point from the viewpoint along an axis, metres.
 FARTHEST_M = 10_000.0
 
 #: Maximum distance of a viewpoint from the origin of its file, metres: half of Earth's perimeter.
@@ -227,11 +220,11 @@ _READERS = {one.name: one.reader for one in formats_of("cloud")}
 
 @dataclass(frozen=True, eq=False)
 class ReadPoints:
-    """Content of a file of points.
+    """The content of a point cloud file.
 
     Parameters
     ----------
-    points : (n, 3) float32, metres relative to the viewpoint; finite and at most `FARTHEST_M` away
+    points : (n, 3) float32, metres relative to the viewpoint; finite, at most `FARTHEST_M` per axis
     viewpoint : position of the sensor, metres in the file's axes; None without a viewpoint
     file_points : number of points in the file, including missing points
     """
@@ -247,7 +240,7 @@ PointsOf = Callable[[bytes, CloudFormat, Position | Unsaid | None, float], ReadP
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Cloud with the parameters used to read it.
+    """A cloud, and the parameters with which its file was read.
 
     Parameters
     ----------
@@ -272,7 +265,7 @@ def decode_cloud(
     pose: Floats | None = None,
     points_of: PointsOf | None = None,
 ) -> Cloud:
-    """Return the cloud of a file's bytes; see `decode_scan`."""
+    """Decode a point cloud file; see `decode_scan`."""
     return decode_scan(
         data,
         file_format=file_format,
@@ -294,18 +287,17 @@ def decode_scan(
     pose: Floats | None = None,
     points_of: PointsOf | None = None,
 ) -> Scan:
-    """Return the cloud of a file's bytes with the parameters used to read it.
+    """Decode a point cloud file; return its cloud, and the parameters with which it was read.
 
     Parameters
     ----------
     data : the whole file
-    file_format : format of the file; None recognises all formats except KITTI scans by their first
-        bytes
-    viewpoint : position of the sensor, metres in the file's axes; None for points of many views;
-        default: the VIEWPOINT of a PCD file, else the origin
+    file_format : format of the file; None recognises all formats except KITTI by the first bytes
+    viewpoint : position of the sensor, metres in the file's axes; None for points from several
+        viewpoints; by default, the VIEWPOINT of a PCD file or the origin
     units_per_metre : units of the file's coordinates per metre, such as 1000 for millimetres
     pose : (4, 4) T_parent_sensor, or None if unknown
-    points_of : reader of the file; default: `read_points`
+    points_of : reader of the file; None selects `read_points`
 
     Returns
     -------
@@ -324,7 +316,7 @@ def decode_scan(
                 f"The file has {len(data)} bytes; the limit is {MAXIMUM_CLOUD_BYTES}. "
                 "Downsample the cloud, or send it in parts."
             )
-        recognised = _format(data, file_format)
+        recognised = _select_format(data, file_format)
         raw = (points_of or read_points)(data, recognised, viewpoint, units_per_metre)
         points, missing = raw.points, raw.file_points - len(raw.points)
         if len(points) < FEWEST_POINTS:
@@ -359,15 +351,15 @@ def read_points(
     viewpoint: Position | Unsaid | None,
     units_per_metre: float,
 ) -> ReadPoints:
-    """Return the points of a file of a known format; see `decode_scan`."""
+    """Read the points of a file in a known format; for the parameters, see `decode_scan`."""
     raw: FilePoints = function_at(_READERS[file_format])(data)
-    place = _viewpoint(viewpoint, raw, units_per_metre)
+    place = _select_viewpoint(viewpoint, raw, units_per_metre)
     # the reader has already compared the number of points with the size of the file
-    points = _points_from(raw, place or (0.0, 0.0, 0.0), units_per_metre)
+    points = _relative_points(raw, place or (0.0, 0.0, 0.0), units_per_metre)
     return ReadPoints(points, place, raw.count)
 
 
-def _format(data: bytes, stated: CloudFormat | None) -> CloudFormat:
+def _select_format(data: bytes, stated: CloudFormat | None) -> CloudFormat:
     recognised = format_of(data)
     if stated == "kitti" and recognised is not None:
         raise UnreadableCloud(
@@ -398,10 +390,10 @@ def _check_units(units: float) -> None:
         )
 
 
-def _viewpoint(
+def _select_viewpoint(
     viewpoint: Position | Unsaid | None, raw: FilePoints, units: float
 ) -> Position | None:
-    """Return the position of the sensor, metres; None for points of many views."""
+    """Return the position of the sensor, metres; None for points from several viewpoints."""
     if isinstance(viewpoint, Unsaid):
         x, y, z = raw.viewpoint or (0.0, 0.0, 0.0)
         viewpoint = (x / units, y / units, z / units)
@@ -415,10 +407,10 @@ def _viewpoint(
     return viewpoint
 
 
-def _points_from(raw: FilePoints, place: Position, units: float) -> Floats32:
-    """Return the valid points (n, 3) relative to a position, metres."""
+def _relative_points(raw: FilePoints, place: Position, units: float) -> Floats32:
+    """Return the valid points (n, 3) relative to the position `place`, metres."""
     points, n = np.empty((raw.count, 3), np.float32), 0
-    with np.errstate(all="ignore"):  # points that overflow are missing
+    with np.errstate(all="ignore"):  # overflows are missing points
         for block in raw.blocks:
             block /= units
             block -= place

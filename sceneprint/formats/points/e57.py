@@ -1,11 +1,11 @@
-"""Read E57 files (ASTM E2807): scans of laser scanners with their poses.
+"""Reading of E57 files (ASTM E2807): scans of laser scanners with their poses.
 
 bytes  --read_e57-->  E57Scan, ...  --points-->  FilePoints
 
 A file is a sequence of pages that each end with a checksum. Their payload consists of sections with
-packed points, and of an XML text that describes them. Points are decoded in blocks, so a scan needs
-a few megabytes of memory besides its file. The reference implementation (libE57) opens files by
-name, which a confined decoder may not do. This module therefore reads the format itself.
+packed points, and of an XML text that describes the sections. Points are decoded in blocks, so a
+scan needs a few megabytes of memory besides its file. The reference implementation (libE57) opens
+files by name, but confined decoders cannot. Therefore, this module parses the format.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sceneprint.types import Bytes, Floats
 from sceneprint_client.errors import printable
 from sceneprint_client.poses import rigid_transform, rotation_of
 
-#: Types that can hold the bytes of an E57 file.
+#: Types for the bytes of an E57 file.
 Buffer = bytes | bytearray | memoryview | mmap
 
 E57_SIGNATURE = b"ASTM-E57"
@@ -36,10 +36,10 @@ _HEADER = struct.Struct("<8sIIQQQQ")
 _SECTION = struct.Struct("<B7xQQQ")
 _CHECKSUM_BYTES = 4
 _PAGE_BYTES = (256, 1 << 16)  #: smallest and largest page; the standard requires 1024
-_WINDOW_BYTES = 4 << 20  #: size of the window of pages that is verified at once, bytes
+_WINDOW_BYTES = 4 << 20  #: size of the window of pages whose checksums are verified at once, bytes
 _MAXIMUM_XML_BYTES = 64 << 20
 _MAXIMUM_SCANS = 10_000
-#: Maximum number of points of a scan. Points of few bits take time even in a small file.
+#: Maximum number of points of a scan. Points with few bits take time even in a small file.
 MAXIMUM_SCAN_POINTS = 200_000_000
 _NAMESPACE = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"
 _AGAIN = "Copy the file again, or export it again as E57."
@@ -52,14 +52,14 @@ _INDEX, _DATA, _EMPTY = 0, 1, 2  #: kinds of packets
 
 @dataclass(frozen=True)
 class _Field:
-    """Field of a point, and its packing.
+    """A field of a point, and its packing.
 
     Parameters
     ----------
     name : name such as "cartesianX"; empty for a field of an extension
     bits : number of bits of a value
     dtype : type of a floating-point field; None for integers
-    minimum : smallest integer, which is stored as 0
+    minimum : smallest integer; it is stored as 0
     scale, offset : parameters of value = scale * integer + offset
     """
 
@@ -73,14 +73,14 @@ class _Field:
 
 @dataclass(frozen=True, eq=False)
 class E57Scan:
-    """Scan of an E57 file, whose points `points` decodes.
+    """A scan of an E57 file.
 
     Parameters
     ----------
     name : name in the file; may be empty
     count : number of points, including invalid points
     T_world_scan : (4, 4) float64 pose of the scan in the file's frame, metres
-    has_pose : whether the file states the pose; otherwise it is the identity
+    has_pose : whether the file states the pose; otherwise, T_world_scan is the identity
     is_structured : whether the points have rows and columns, as seen from a single viewpoint
     is_spherical : whether the points are ranges and angles from the scanner
     """
@@ -98,8 +98,8 @@ class E57Scan:
     def points(self) -> FilePoints:
         """Return the points in the axes of the scan, metres; invalid points are NaN.
 
-        The blocks are decoded during iteration, which raises UnreadableCloud if the packed points
-        are damaged or truncated.
+        The blocks are decoded during iteration. The iteration raises UnreadableCloud if the packed
+        points are damaged or truncated.
         """
         return FilePoints(self.count, self._blocks())
 
@@ -109,7 +109,7 @@ class E57Scan:
         by_name = {one.name: place for place, one in enumerate(self._fields)}
         columns = [by_name[name] for name in (*names, state) if name in by_name]
         streams = [_Stream(self._fields[place]) for place in columns]
-        packets = _packets(self._pages, self._start, len(self._fields))
+        packets = _read_packets(self._pages, self._start, len(self._fields))
         for first, n in steps(self.count):
             while not all(one.holds(n) for one in streams):
                 packet = next(packets, None)
@@ -128,7 +128,7 @@ class E57Scan:
 
 
 def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats:
-    """Return positions (n, 3) from spherical coordinates (n,); elevation is relative to x and y."""
+    """Convert spherical coordinates (n,) to positions (n, 3); the xy plane has elevation 0."""
     with np.errstate(all="ignore"):
         level = distance * np.cos(elevation)
         return np.stack(
@@ -137,7 +137,7 @@ def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats
 
 
 def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
-    """Return the scans of an E57 file in their order, without decoding their points.
+    """Return the scans of an E57 file in order, without decoding their points.
 
     Returns
     -------
@@ -165,7 +165,7 @@ def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
             f"The description of the scans has {xml_bytes} bytes, too many to read. {_AS_PLY}"
         )
     pages = _Pages(memoryview(data)[:length], page)
-    root = _description(pages.read(pages.logical(xml_start), xml_bytes))
+    root = _parse_description(pages.read(pages.logical(xml_start), xml_bytes))
     scans = root.findall(f"{_NAMESPACE}data3D/{_NAMESPACE}vectorChild")
     if not scans:
         raise UnreadableCloud(f"The file has no scan. {_AGAIN}")
@@ -173,28 +173,27 @@ def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
         raise UnreadableCloud(
             f"The file has {len(scans)} scans; the limit is {_MAXIMUM_SCANS}. Split the file."
         )
-    return tuple(_scan(pages, node, number) for number, node in enumerate(scans, start=1))
+    return tuple(_parse_scan(pages, node, number) for number, node in enumerate(scans, start=1))
 
 
 def with_viewpoint(scans: tuple[E57Scan, ...]) -> list[bool]:
     """Return, for each scan of a file, whether the scan's origin is the viewpoint of its points.
 
-    This is true for structured scans and for ranges and angles. It is also true for scans with a
-    pose if the poses of the file differ or contain a rotation: merged clouds have no pose, or one
-    that shifts them to map coordinates.
+    This is true for structured scans, and for points that are ranges and angles. It is also true
+    for scans with a pose if the file's poses differ or contain a rotation. Merged clouds have no
+    pose, or a pose that shifts them to map coordinates.
     """
-    poses = [one.T_world_scan for one in scans if one.has_pose]
+    poses = [scan.T_world_scan for scan in scans if scan.has_pose]
     turned = any(not np.allclose(T[:3, :3], np.eye(3), atol=1e-9) for T in poses)
     registered = turned or any(not np.array_equal(T, poses[0]) for T in poses)
-    return [one.is_structured or one.is_spherical or (one.has_pose and registered) for one in scans]
-
-
-# Pages: payload with a checksum.
+    return [
+        scan.is_structured or scan.is_spherical or (scan.has_pose and registered) for scan in scans
+    ]
 
 
 @lru_cache(maxsize=1)
 def _crc_table() -> NDArray[np.uint32]:
-    """Return the table of CRC-32C for two bytes at a time."""
+    """Return the table (65536,) of CRC-32C for two bytes at a time."""
     table = np.arange(1 << 16, dtype=np.uint32)
     for _ in range(16):
         odd = (table & np.uint32(1)) * np.uint32(0x82F63B78)
@@ -203,7 +202,7 @@ def _crc_table() -> NDArray[np.uint32]:
 
 
 def _checksums(payloads: Bytes) -> NDArray[np.uint32]:
-    """Return CRC-32C of each row of (n, even) bytes."""
+    """Return the CRC-32C of each row of bytes (n, m); m is even."""
     table = _crc_table()
     words = np.ascontiguousarray(payloads.view("<u2").T)
     crc = np.full(len(payloads), 0xFFFFFFFF, np.uint32)
@@ -213,7 +212,7 @@ def _checksums(payloads: Bytes) -> NDArray[np.uint32]:
 
 
 class _Pages:
-    """Payload of a file's pages as one sequence of bytes, with verified checksums.
+    """The payload of a file's pages as one sequence of bytes, with verified checksums.
 
     Parameters
     ----------
@@ -225,7 +224,7 @@ class _Pages:
         self._data, self._page = data, page
         self._payload = page - _CHECKSUM_BYTES
         self._group = max(1, _WINDOW_BYTES // page)  # number of pages in a window
-        self._window, self._number = b"", -1
+        self._window, self._parse_number = b"", -1
 
     def logical(self, physical: int) -> int:
         """Convert an offset in the file to an offset in the payload."""
@@ -251,7 +250,7 @@ class _Pages:
         return b"".join(pieces)
 
     def _in_window(self, number: int) -> bytes:
-        if number != self._number:
+        if number != self._parse_number:
             first = number * self._group * self._page
             window = self._data[first : first + self._group * self._page]
             rows = np.frombuffer(window, np.uint8).reshape(-1, self._page)
@@ -263,14 +262,14 @@ class _Pages:
                     f"The file is damaged: the checksum of its page "
                     f"{number * self._group + int(wrong[0])} is wrong. {_AGAIN}"
                 )
-            self._window, self._number = payloads.tobytes(), number
+            self._window, self._parse_number = payloads.tobytes(), number
         return self._window
 
 
-# XML text that describes the scans and the packing of their points.
+# An XML text describes the scans and the packing of their points.
 
 
-def _description(text: bytes) -> Element:
+def _parse_description(text: bytes) -> Element:
     try:
         content = text.decode("utf-8-sig")
         # entities could expand without limit, and E57 does not use them
@@ -283,7 +282,7 @@ def _description(text: bytes) -> Element:
         ) from cause
 
 
-def _scan(pages: _Pages, node: Element, number: int) -> E57Scan:
+def _parse_scan(pages: _Pages, node: Element, number: int) -> E57Scan:
     name = (node.findtext(f"{_NAMESPACE}name") or "").strip()
     place = printable(f"Scan {number} ({name:.60})" if name else f"Scan {number}")
     points = node.find(f"{_NAMESPACE}points")
@@ -293,13 +292,13 @@ def _scan(pages: _Pages, node: Element, number: int) -> E57Scan:
     for codec in points.iterfind(f"{_NAMESPACE}codecs/{_NAMESPACE}vectorChild/*"):
         if codec.tag not in (f"{_NAMESPACE}inputs", f"{_NAMESPACE}bitPackCodec"):
             raise UnreadableCloud(f"{place} uses an unknown codec. {_AS_PLY}")
-    count = _whole(points.get("recordCount"), place)
+    count = _parse_integer(points.get("recordCount"), place)
     if not 0 <= count <= MAXIMUM_SCAN_POINTS:
         raise UnreadableCloud(
             f"{place} declares {count} points; the limit is {MAXIMUM_SCAN_POINTS}. Downsample the "
             "scan, or export it in parts."
         )
-    fields = tuple(_fields(prototype, place))
+    fields = tuple(_parse_fields(prototype, place))
     bits = {one.name: one.bits for one in fields}
     spherical = not all(name in bits for name in _CARTESIAN)
     coordinates = _SPHERICAL if spherical else _CARTESIAN
@@ -311,48 +310,48 @@ def _scan(pages: _Pages, node: Element, number: int) -> E57Scan:
     return E57Scan(
         name=name,
         count=count,
-        T_world_scan=np.eye(4) if pose is None else _pose(pose, place),
+        T_world_scan=np.eye(4) if pose is None else _parse_pose(pose, place),
         has_pose=pose is not None,
         is_structured=all(bits.get(name, 0) for name in ("rowIndex", "columnIndex")),
         is_spherical=spherical,
         _pages=pages,
-        _start=pages.logical(_whole(points.get("fileOffset"), place)) if count else 0,
+        _start=pages.logical(_parse_integer(points.get("fileOffset"), place)) if count else 0,
         _fields=fields,
     )
 
 
-def _fields(prototype: Element, place: str, *, nested: bool = False) -> Iterator[_Field]:
-    """Yield the fields in the order of their packed values."""
+def _parse_fields(prototype: Element, place: str, *, nested: bool = False) -> Iterator[_Field]:
+    """Yield the fields of a prototype in the order of their packed values."""
     for node in prototype:
         kind = node.get("type")
         name = "" if nested else node.tag.removeprefix(_NAMESPACE)
         if kind in ("Structure", "Vector"):
-            yield from _fields(node, place, nested=True)
+            yield from _parse_fields(node, place, nested=True)
         elif kind == "Float":
             single = node.get("precision") == "single"
             yield _Field(name, 32 if single else 64, "<f4" if single else "<f8")
         elif kind in ("Integer", "ScaledInteger"):
-            low = _whole(node.get("minimum", str(-(2**63))), place)
-            high = _whole(node.get("maximum", str(2**63 - 1)), place)
+            low = _parse_integer(node.get("minimum", str(-(2**63))), place)
+            high = _parse_integer(node.get("maximum", str(2**63 - 1)), place)
             if not -(2**63) <= low <= high < 2**63:
                 raise UnreadableCloud(f"The bounds of a field of {place} are wrong. {_AGAIN}")
             scale, offset = (
-                _number(node.get(key, default), place)
+                _parse_number(node.get(key, default), place)
                 for key, default in (("scale", "1"), ("offset", "0"))
             )
             if kind == "Integer":
                 scale, offset = 1.0, 0.0
             yield _Field(name, (high - low).bit_length(), None, low, scale, offset)
-        else:  # a text field, whose length varies
+        else:  # a text field of varying length
             yield _Field("", 0)
 
 
-def _pose(node: Element, place: str) -> Floats:
-    """Return T_world_scan (4, 4) of a pose; missing parts are the identity."""
+def _parse_pose(node: Element, place: str) -> Floats:
+    """Parse T_world_scan (4, 4) from a pose element; missing parts are the identity."""
 
     def numbers(part: str, names: str) -> Floats:
         texts = (node.findtext(f"{_NAMESPACE}{part}/{_NAMESPACE}{name}") for name in names)
-        return np.array([_number(text or "0", place) for text in texts])
+        return np.array([_parse_number(text or "0", place) for text in texts])
 
     T = np.eye(4)
     T[:3, 3] = numbers("translation", "xyz")
@@ -368,7 +367,7 @@ def _pose(node: Element, place: str) -> Floats:
         raise UnreadableCloud(f"{place}: {cause}") from cause
 
 
-def _whole(text: str | None, place: str) -> int:
+def _parse_integer(text: str | None, place: str) -> int:
     try:
         if text is None or len(text) > 20:
             raise ValueError
@@ -377,7 +376,7 @@ def _whole(text: str | None, place: str) -> int:
         raise UnreadableCloud(f"A number of {place} is missing or damaged. {_AGAIN}") from cause
 
 
-def _number(text: str, place: str) -> float:
+def _parse_number(text: str, place: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -387,10 +386,10 @@ def _number(text: str, place: str) -> float:
     return value
 
 
-# Packets, each of which has the next bytes of every field.
+# A packet has the next bytes of every field.
 
 
-def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
+def _read_packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
     """Yield the bytes of every field, packet by packet.
 
     Parameters
@@ -407,19 +406,19 @@ def _packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes]]:
         size = last + 1
         if packet == _DATA:
             content = pages.read(place, min(size, end - place))
-            sizes = _sizes(content, size, fields)
+            sizes = _field_sizes(content, size, fields)
             pieces, at = [], 6 + 2 * fields
-            for one in sizes:
-                pieces.append(content[at : at + one])
-                at += one
+            for n in sizes:
+                pieces.append(content[at : at + n])
+                at += n
             yield pieces
         elif packet not in (_INDEX, _EMPTY) or size < 4:
             raise UnreadableCloud(f"The packed points of the file are damaged. {_AGAIN}")
         place += size
 
 
-def _sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
-    """Return the size of each field in a packet, bytes; the sum is compared with the packet."""
+def _field_sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
+    """Return the size of each field in a packet, bytes; raise UnreadableCloud if they exceed it."""
     head = 6 + 2 * fields
     if len(content) == size >= head and struct.unpack_from("<H", content, 4)[0] == fields:
         sizes: tuple[int, ...] = struct.unpack_from(f"<{fields}H", content, 6)
@@ -429,7 +428,7 @@ def _sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
 
 
 class _Stream:
-    """Values of one field, whose bytes arrive in packets."""
+    """The values of a field; its bytes arrive in packets."""
 
     def __init__(self, packing: _Field) -> None:
         self._field, self._bytes = packing, bytearray()
@@ -438,23 +437,23 @@ class _Stream:
         self._bytes += piece
 
     def holds(self, n: int) -> bool:
-        """Return whether the bytes of n values have arrived."""
+        """Return whether the bytes of n values are available."""
         return 8 * len(self._bytes) >= n * self._field.bits
 
     def take(self, n: int) -> Floats:
-        """Return the next n values; except at the end, n must be a multiple of 8."""
-        one = self._field
-        size = -(-n * one.bits // 8)
+        """Remove and return the next n values; n must be a multiple of 8 except at the end."""
+        packing = self._field
+        size = -(-n * packing.bits // 8)
         content = bytes(self._bytes[:size])
         del self._bytes[:size]
-        if one.dtype is not None:
-            return np.frombuffer(content, one.dtype, n).astype(np.float64)
-        whole = unpacked(content, one.bits, n) + np.uint64(one.minimum % 2**64)
-        return whole.view(np.int64).astype(np.float64) * one.scale + one.offset
+        if packing.dtype is not None:
+            return np.frombuffer(content, packing.dtype, n).astype(np.float64)
+        whole = unpacked(content, packing.bits, n) + np.uint64(packing.minimum % 2**64)
+        return whole.view(np.int64).astype(np.float64) * packing.scale + packing.offset
 
 
 def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
-    """Return n integers of 0 to 64 bits, packed without gaps and least significant bit first."""
+    """Unpack n integers of `bits` (0 to 64) bits; the least significant bit is stored first."""
     if bits == 0:
         return np.zeros(n, np.uint64)
     source = np.frombuffer(content + bytes(9), np.uint8)
@@ -464,7 +463,7 @@ def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
     for k in range(min(8, (bits + 14) // 8)):
         values |= source[first + k].astype(np.uint64) << np.uint64(8 * k)
     values >>= shift
-    if bits > 57:  # a number that does not start at a byte boundary may extend into a ninth byte
+    if bits > 57:  # a number may extend into a ninth byte unless it starts at a byte boundary
         ninth = source[first + 8].astype(np.uint64)
         values |= np.where(shift > 0, ninth << ((np.uint64(64) - shift) & np.uint64(63)), 0)
     return values & np.uint64(2**bits - 1)

@@ -1,9 +1,8 @@
-"""Read LAS files (ASPRS LAS 1.0 to 1.4), and LAZ files with the package lazrs.
+"""Reading of LAS files (ASPRS LAS 1.0 to 1.4), and of LAZ files with the package lazrs.
 
 bytes  --read_las-->  FilePoints
 
-Each point format starts with X, Y, Z as integers, to which the scale and offset of the header
-apply.
+Records of all point formats start with X, Y, Z as integers. The header has their scale and offset.
 """
 
 from __future__ import annotations
@@ -23,20 +22,18 @@ from sceneprint.formats.points.rows import MAXIMUM_POINTS, FileBytes, FilePoints
 from sceneprint.types import Floats
 from sceneprint_client.files import LAS_SIGNATURE
 
-# Compressed points of LAZ files, which the optional package lazrs (Rust) decompresses.
+# The optional package lazrs (Rust) decompresses the points of LAZ files.
 #
-# bytes  --inflated_records-->  blocks of records
-#
-# lazrs allocates memory according to the file, and Rust aborts if an allocation fails. All numbers
-# that determine allocations are therefore compared with the length of the file first (M. Isenburg,
-# LASzip 1.3 and 1.4): the kinds of values in a record, the number of chunks, and, from format 6 on,
-# the lengths of the layers of each chunk.
+# bytes  --inflated_records-->  blocks of records lazrs allocates memory according to the file, and
+# Rust aborts if an allocation fails. Therefore, all numbers that determine allocations are compared
+# with the file's length first (M. Isenburg, LASzip 1.3 and 1.4): the kinds of values in a record,
+# the number of chunks, and, from format 6 on, the lengths of the layers of each chunk.
 
 _VLR = 54  #: size of the header of a variable-length record, bytes
 _MAXIMUM_VLRS = 10_000
-_VARIABLE = 0xFFFFFFFF  #: chunk size in the header if the chunks have different sizes
+_VARIABLE = 0xFFFFFFFF  #: chunk size in the header if chunks have different sizes
 _MOST = 2 << 30  #: maximum size of all records, bytes; they are decompressed in blocks
-#: Maximum compression ratio, and size of records that are exempt from it, bytes.
+#: Maximum compression ratio, and total size of records that is exempt from it, bytes.
 _MOST_RATIO, _FREE = 250, 64 << 20
 
 #: Size of a value by kind, bytes.
@@ -48,7 +45,7 @@ _BYTES, _LAYERED_BYTES = 0, 14
 def inflated_records(
     data: FileBytes, start: int, form: int, length: int, count: int, row: np.dtype[np.void]
 ) -> Iterator[NDArray[np.void]]:
-    """Yield the records of a LAZ file.
+    """Yield the records of a LAZ file, in blocks.
 
     Parameters
     ----------
@@ -62,12 +59,12 @@ def inflated_records(
     Raise MissingDependency if lazrs is not installed. Raise UnreadableCloud if the compressed
     points are damaged or contradict the header.
     """
-    lazrs = _lazrs()
+    lazrs = _import_lazrs()
     vlr = _laszip_vlr(data)
-    compressor, coder, chunk, kinds = _described(vlr)
+    compressor, coder, chunk, kinds = _parse_vlr(vlr)
     layered = compressor == 3
     is_supported = layered == (form >= 6) and coder == 0 and compressor in (2, 3)
-    if not is_supported or not _fits(kinds, layered, length):
+    if not is_supported or not _form_record(kinds, layered, length):
         raise UnreadableCloud(
             f"The LAZ file stores records of {length} bytes of format {form} as {kinds[:20]} with "
             f"compressor {compressor}, which is contradictory or not supported. {_AGAIN}"
@@ -78,28 +75,28 @@ def inflated_records(
             f"{_MOST_RATIO} times the size of the file, {len(data)} bytes. {_AGAIN}"
         )
     _check_chunks(data, start, length, kinds, count, chunk)
-    return _records(lazrs, data, start, vlr, count, row)
+    return _decompress_records(lazrs, data, start, vlr, count, row)
 
 
-def _records(
+def _decompress_records(
     lazrs: ModuleType, data: FileBytes, start: int, vlr: bytes, count: int, row: np.dtype[np.void]
 ) -> Iterator[NDArray[np.void]]:
     source = io.BytesIO(data) if isinstance(data, bytes) else data
     source.seek(start)
     fields = lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z
     selection = lazrs.DecompressionSelection(fields)
-    reader: Any = _guarded(lazrs.LasZipDecompressor, source, vlr, selection)
+    reader: Any = _call_lazrs(lazrs.LasZipDecompressor, source, vlr, selection)
     most = max(1, (4 << 20) // row.itemsize)
     for _, n in steps(count):
         table = np.empty(n, row)
         for i in range(0, n, most):
             part = bytearray(min(most, n - i) * row.itemsize)
-            _guarded(reader.decompress_many, part)
+            _call_lazrs(reader.decompress_many, part)
             table[i : i + most] = np.frombuffer(part, row)
         yield table
 
 
-def _guarded(function: Any, *arguments: Any) -> Any:
+def _call_lazrs(function: Any, *arguments: Any) -> Any:
     try:
         return function(*arguments)
     except (KeyboardInterrupt, SystemExit):
@@ -110,7 +107,7 @@ def _guarded(function: Any, *arguments: Any) -> Any:
         ) from cause
 
 
-def _lazrs() -> ModuleType:
+def _import_lazrs() -> ModuleType:
     try:
         import lazrs
     except ImportError as cause:
@@ -123,7 +120,7 @@ def _lazrs() -> ModuleType:
 
 
 def las_records(data: FileBytes) -> Iterator[tuple[bytes, int, bytes]]:
-    """Yield the user id, record id and content of each variable-length record of the header."""
+    """Yield the user id, record id and content of each variable-length record in the header."""
     at, end, count = struct.unpack_from("<HII", data, 94)
     for _ in range(min(count, _MAXIMUM_VLRS)):
         if at + _VLR > end:
@@ -141,8 +138,8 @@ def _laszip_vlr(data: FileBytes) -> bytes:
     raise UnreadableCloud(f"The LAZ file does not say how its points are packed. {_AGAIN}")
 
 
-def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
-    """Return the compressor, the coder, the points per chunk, and kind and size of each value."""
+def _parse_vlr(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
+    """Parse the compressor, coder, points per chunk, and the kind and size of each value."""
     if len(vlr) >= 34:
         compressor, coder = struct.unpack_from("<HH", vlr, 0)
         (chunk,) = struct.unpack_from("<I", vlr, 12)
@@ -153,8 +150,11 @@ def _described(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
     raise UnreadableCloud(f"The LAZ file does not say how its points are packed. {_AGAIN}")
 
 
-def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
-    """Return whether these kinds form a record: the point first, then each kind at most once."""
+def _form_record(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
+    """Return whether values of these kinds and sizes form a record of `length` bytes.
+
+    The point must come first, and each kind may occur once.
+    """
     names = [kind for kind, _ in kinds]
     free = _LAYERED_BYTES if layered else _BYTES
     return (
@@ -169,17 +169,17 @@ def _fits(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
 def _check_chunks(
     data: FileBytes, start: int, length: int, kinds: list[tuple[int, int]], count: int, chunk: int
 ) -> None:
-    """Raise UnreadableCloud if the chunks are longer than the file, or too many or too few."""
+    """Raise UnreadableCloud if the chunk table contradicts the file's length or the header."""
     error = UnreadableCloud(f"The chunk table of the LAZ file contradicts its points. {_AGAIN}")
     if len(data) - start < 8:
         raise error
     (table,) = struct.unpack_from("<q", data, start)
-    if table == -1:  # a file that was written to a pipe has the offset at its end
+    if table == -1:  # files that were written to a pipe have the offset at their end
         (table,) = struct.unpack_from("<q", data, len(data) - 8)
     if not start + 8 <= table <= len(data) - 8:
         raise error
     version, chunks = struct.unpack_from("<II", data, table)
-    # the first point of each chunk is uncompressed, which limits the number of chunks
+    # the first point of each chunk is uncompressed; this limits the number of chunks
     if version != 0 or chunks * length > len(data) or chunks > count:
         raise error
     if chunk != _VARIABLE and chunks != -(-count // chunk):
@@ -209,7 +209,7 @@ Records = NDArray[np.void]
 
 
 def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """Return the points of a LAS or LAZ file.
+    """Read the points of a LAS or LAZ file.
 
     Raise UnreadableCloud if the file is not LAS, has an unknown point format or more than `most`
     points, or its size contradicts its header. Raise MissingDependency if the file is LAZ and lazrs
@@ -251,10 +251,10 @@ def read_las(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
             )
         table = np.frombuffer(data, row, count, start)
         records = (table[i : i + n] for i, n in steps(count))
-    return FilePoints(count, _lengths(records, transform))
+    return FilePoints(count, _scale_records(records, transform))
 
 
-def _lengths(records: Iterator[Records], transform: tuple[float, ...]) -> Iterator[Floats]:
+def _scale_records(records: Iterator[Records], transform: tuple[float, ...]) -> Iterator[Floats]:
     for rows in records:
         block = np.empty((len(rows), 3))
         for k, name in enumerate("xyz"):

@@ -1,4 +1,4 @@
-"""Read PCD files of the Point Cloud Library (ascii, binary and binary_compressed).
+"""Reading of PCD files of the Point Cloud Library (ascii, binary and binary_compressed).
 
 bytes  --read_pcd-->  FilePoints
 """
@@ -33,8 +33,7 @@ from sceneprint_client.sidecars import Position
 # LZF, the compression of binary_compressed PCD files (M. Lehmann's liblzf 3.6).
 #
 # packed, size  --inflate-->  bytes
-#
-# A control byte c below 32 is followed by c + 1 literal bytes. Other control bytes are back
+# After a control byte c below 32, c + 1 literal bytes follow. Other control bytes are back
 # references: the upper three bits are the number of bytes to repeat minus two (for 7, the next byte
 # is added), and the lower five bits are the upper part of the distance.
 
@@ -43,12 +42,12 @@ MOST_RATIO = 88
 
 
 def inflate(packed: Bytes, size: int) -> Bytes:
-    """Return the decompressed bytes.
+    """Decompress LZF data.
 
     Parameters
     ----------
     packed : (n,) compressed bytes
-    size : exact size of the result, which the caller has limited, bytes
+    size : exact size of the result, bytes; the caller has limited it
 
     Raise UnreadableCloud if the result has another size, or the compressed bytes are damaged.
     """
@@ -68,7 +67,7 @@ def inflate(packed: Bytes, size: int) -> Bytes:
 
 @kernel
 def _inflate(packed: Bytes, out: Bytes) -> int:
-    """Fill `out` and return the number of bytes, or -1 if they do not fit or are damaged."""
+    """Fill `out`; return the number of bytes, or -1 if they do not fit or are damaged."""
     i, o, size, room = 0, 0, len(packed), len(out)
     while i < size:
         control = int(packed[i])
@@ -94,7 +93,7 @@ def _inflate(packed: Bytes, out: Bytes) -> int:
             i += 1
             if back < 0 or o + length > room:
                 return -1
-            for k in range(length):  # source and target may overlap, so bytes are copied singly
+            for k in range(length):  # source and target may overlap
                 out[o + k] = out[back + k]
         o += length
     return o
@@ -117,7 +116,7 @@ _ENTRIES = (
 
 @dataclass(frozen=True)
 class Field:
-    """Field of each row, with a number of values of one type."""
+    """A field of a row: one or more values of the same type."""
 
     name: str
     kind: str  #: numpy type
@@ -125,18 +124,18 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Size of the field in a row, bytes."""
+        """Return the size of the field in a row, bytes."""
         return self.count * np.dtype(self.kind).itemsize
 
 
 def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """Return the points of a PCD file, and its VIEWPOINT unless it is the origin.
+    """Read the points of a PCD file, and its VIEWPOINT unless it is the origin.
 
     Raise UnreadableCloud if the file is not PCD, its points lack x, y or z, there are more than
     `most` points, or the header contradicts the rest of the file.
     """
-    entries, start = _header(data)
-    fields, count = _fields(entries), _points(entries)
+    entries, start = _read_header(data)
+    fields, count = _parse_fields(entries), _count_points(entries)
     names = [field.name for field in fields]
     wrong = [k for k in _XYZ if names.count(k) != 1 or fields[names.index(k)].count != 1]
     if wrong:
@@ -150,9 +149,7 @@ def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     if form == "ascii":
         blocks = _ascii_blocks(data, start, count, fields)
     elif form == "binary":
-        if (
-            len(data) - start < count * width
-        ):  # more bytes are accepted, since some files are padded
+        if len(data) - start < count * width:  # some files are padded, so more bytes are accepted
             raise UnreadableCloud(
                 f"The PCD header declares {count} points of {width} bytes, but "
                 f"{len(data) - start} of {count * width} bytes follow. {_AGAIN}"
@@ -166,7 +163,7 @@ def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
             f"The PCD file has DATA {form!r:.40}; ascii, binary and binary_compressed are "
             f"supported. {_AGAIN}"
         )
-    return FilePoints(count, blocks, _viewpoint(entries.get("VIEWPOINT")))
+    return FilePoints(count, blocks, _parse_viewpoint(entries.get("VIEWPOINT")))
 
 
 def _ascii_blocks(data: FileBytes, start: int, count: int, fields: list[Field]) -> Iterator[Floats]:
@@ -183,7 +180,7 @@ def _ascii_blocks(data: FileBytes, start: int, count: int, fields: list[Field]) 
 def _compressed_blocks(
     data: FileBytes, start: int, count: int, fields: list[Field], most: int
 ) -> Iterator[Floats]:
-    """Yield the blocks of a compressed body, which stores the fields one after the other."""
+    """Yield the blocks of a compressed body; it stores one field after the other."""
     size = count * sum(field.size for field in fields)
     if len(data) - start < 8:
         raise UnreadableCloud(f"The PCD file ends before its compressed points. {_AGAIN}")
@@ -209,7 +206,7 @@ def _compressed_blocks(
             for i, n in steps(count))  # fmt: skip
 
 
-def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
+def _read_header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
     """Return the entries of the header by name, and the offset of the points."""
     head = data[:_MAXIMUM_HEADER]
     if format_of(head[:HEAD]) != "pcd":
@@ -234,7 +231,7 @@ def _header(data: FileBytes) -> tuple[dict[str, list[str]], int]:
     return entries, start
 
 
-def _fields(entries: dict[str, list[str]]) -> list[Field]:
+def _parse_fields(entries: dict[str, list[str]]) -> list[Field]:
     names = axis_names(entries.get("FIELDS", entries.get("COLUMNS", [])))
     kinds, sizes = entries.get("TYPE", []), entries.get("SIZE", [])
     counts = entries.get("COUNT", ["1"] * len(names))
@@ -247,7 +244,7 @@ def _fields(entries: dict[str, list[str]]) -> list[Field]:
         )
     fields = []
     for name, kind, size, count in zip(names, kinds, sizes, counts, strict=True):
-        dtype, values = _TYPES.get(f"{kind}{size}"), _whole("COUNT", count)
+        dtype, values = _TYPES.get(f"{kind}{size}"), _parse_integer("COUNT", count)
         if dtype is None or values > _MAXIMUM_COUNT:
             raise UnreadableCloud(
                 f"The PCD field {name!r:.40} has COUNT {count}, TYPE {kind!r:.20} and SIZE "
@@ -257,14 +254,14 @@ def _fields(entries: dict[str, list[str]]) -> list[Field]:
     return fields
 
 
-def _points(entries: dict[str, list[str]]) -> int:
+def _count_points(entries: dict[str, list[str]]) -> int:
     """Return the number of points according to POINTS, or to WIDTH and HEIGHT."""
     counts = []
     if "POINTS" in entries:
-        counts.append(_whole("POINTS", " ".join(entries["POINTS"])))
+        counts.append(_parse_integer("POINTS", " ".join(entries["POINTS"])))
     if "WIDTH" in entries:
-        rows = _whole("HEIGHT", " ".join(entries.get("HEIGHT", ["1"])))
-        counts.append(_whole("WIDTH", " ".join(entries["WIDTH"])) * rows)
+        rows = _parse_integer("HEIGHT", " ".join(entries.get("HEIGHT", ["1"])))
+        counts.append(_parse_integer("WIDTH", " ".join(entries["WIDTH"])) * rows)
     if not counts or counts[0] != counts[-1]:
         raise UnreadableCloud(
             "The PCD header must state the number of points in POINTS or in WIDTH and HEIGHT, but "
@@ -273,14 +270,14 @@ def _points(entries: dict[str, list[str]]) -> int:
     return counts[0]
 
 
-def _whole(name: str, word: str) -> int:
+def _parse_integer(name: str, word: str) -> int:
     if not (word.isascii() and word.isdigit() and len(word) <= 18):
         raise UnreadableCloud(f"The PCD header has the invalid {name} {word!r:.40}. {_AGAIN}")
     return int(word)
 
 
-def _viewpoint(words: list[str] | None) -> Position | None:
-    """Return the translation of VIEWPOINT."""
+def _parse_viewpoint(words: list[str] | None) -> Position | None:
+    """Parse the translation of VIEWPOINT; return None for the origin."""
     if words is None:
         return None
     try:

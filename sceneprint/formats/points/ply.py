@@ -1,9 +1,8 @@
-"""Read the elements of PLY files, and the points among them.
+"""Reading of the elements of PLY files, including their points.
 
 bytes  --read_ply-->  FilePoints
 
-Memory is allocated only for elements that fit into the rest of the file, since headers are not
-trusted.
+Headers are not trusted: memory is allocated only for elements that fit into the rest of the file.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ from sceneprint.formats.points.rows import (
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
 
-# Binary rows with lists, whose lengths vary.
+# Binary rows with lists have different lengths.
 #
 # bytes, start, count, kinds  --skip_rows-->  offset after the rows
 #                             --list_blocks-->  three of their values (n, 3)
 
 Places = NDArray[np.int64]
 
-#: Type in numpy of each value, and of the length of a list.
+#: numpy type of each value or list element, and of the list's length; None for a single value.
 Kinds = Sequence[tuple[str, str | None]]
 
 
 def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> int:
-    """Return the offset after `count` rows.
+    """Return the offset after `count` rows with lists.
 
     Raise UnreadableCloud if the file ends before the last row.
     """
@@ -55,7 +54,7 @@ def skip_rows(view: Bytes, start: int, count: int, kinds: Kinds, order: str) -> 
 def list_blocks(
     view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
 ) -> Iterator[Floats]:
-    """Yield three values of each row in blocks (n, 3); raise the errors of `skip_rows`."""
+    """Yield `picked` values of rows with lists in blocks (n, 3); for errors, see `skip_rows`."""
     for places, _ in value_offsets(view, start, count, kinds, picked, order):
         block = np.empty((len(places), 3))
         for k, value in enumerate(picked):
@@ -68,9 +67,9 @@ def list_blocks(
 def value_offsets(
     view: Bytes, start: int, count: int, kinds: Kinds, picked: tuple[int, int, int], order: str
 ) -> Iterator[tuple[Places, int]]:
-    """Yield the offsets (n, 3) of the `picked` values of a block of rows, and the offset after it.
+    """Yield the offsets (n, 3) of `picked` values in each block of rows, and the block's end.
 
-    Errors are those of `skip_rows`.
+    For errors, see `skip_rows`.
     """
     sizes = np.array([np.dtype(kind).itemsize for kind, _ in kinds])
     lengths = np.array([np.dtype(length).itemsize if length else 0 for _, length in kinds])
@@ -78,7 +77,9 @@ def value_offsets(
     values = np.array(picked)
     for first, n in steps(count):
         places = np.zeros((n, 3), np.int64)
-        start, rows = _walk(view, start, places, sizes, lengths, signed, values, order == "<")
+        start, rows = _fill_offsets(
+            view, start, places, sizes, lengths, signed, values, order == "<"
+        )
         if rows < n:
             raise UnreadableCloud(
                 f"The file ends in row {first + rows + 1} of {count}, whose lists declare more "
@@ -88,11 +89,11 @@ def value_offsets(
 
 
 @kernel
-def _walk(
+def _fill_offsets(
     view: Bytes, start: int, places: Places, sizes: Places, lengths: Places,
     signed: NDArray[np.bool_], values: Places, little: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Fill `places`, and return the offset after the last complete row and the number of rows."""
+    """Fill `places` with offsets; return the offset after the last complete row, and its number."""
     at, end = start, len(view)
     for row in range(len(places)):
         for p in range(len(sizes)):
@@ -130,7 +131,7 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 @dataclass(frozen=True)
 class Property:
-    """Property of an element: a value, or a list of values after its length."""
+    """A property of an element: a value, or a list of values after its length."""
 
     name: str
     kind: str  #: numpy type without byte order
@@ -139,7 +140,7 @@ class Property:
 
 @dataclass(frozen=True)
 class Element:
-    """Element of a file: a number of rows with the same properties."""
+    """An element of a file: rows with the same properties."""
 
     name: str
     count: int
@@ -147,17 +148,17 @@ class Element:
 
     @property
     def least(self) -> int:
-        """Minimum size of a binary row, bytes; the exact size if it has no lists."""
+        """Return the minimum size of a binary row, bytes; the exact size if it has no lists."""
         return sum(np.dtype(p.length or p.kind).itemsize for p in self.properties)
 
     @property
     def has_lists(self) -> bool:
-        """Whether rows have lists, so that their sizes vary."""
+        """Return whether rows have lists, so that their sizes vary."""
         return any(p.length for p in self.properties)
 
 
 def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
-    """Return the vertices of a PLY file.
+    """Read the vertices of a PLY file.
 
     Raise UnreadableCloud if the file is not PLY, its vertices lack x, y or z, there are more than
     `most`, or the header contradicts the rest of the file.
@@ -186,9 +187,8 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
         begins = start if i == at else begins
         start = element_end(data, start, element, order)
     rest = len(data) - start
-    if rest > _MAXIMUM_HEADER or data[start:].strip(
-        b"\r\n"
-    ):  # the header states a wrong type or count
+    # a header with a wrong type or count leaves bytes
+    if rest > _MAXIMUM_HEADER or data[start:].strip(b"\r\n"):
         raise UnreadableCloud(f"{rest} bytes follow after the elements of the PLY header. {_AGAIN}")
     if vertex.has_lists:
         kinds = [(p.kind, p.length) for p in vertex.properties]
@@ -215,7 +215,7 @@ def element_end(data: FileBytes, start: int, element: Element, order: str) -> in
 
 
 def _ascii_blocks(data: FileBytes, start: int, elements: list[Element]) -> Iterator[Floats]:
-    """Return the blocks of the last element of `elements` in an ascii file."""
+    """Return the coordinates of the last element of `elements` in an ascii file, in blocks."""
     *before, vertex = elements
     text = np.frombuffer(data, np.uint8)
     for element in before:
@@ -229,7 +229,7 @@ def _ascii_blocks(data: FileBytes, start: int, elements: list[Element]) -> Itera
 
 
 def ply_header(data: FileBytes) -> tuple[str, list[Element], int]:
-    """Return the byte order ("" for ascii), the elements, and the offset of the rows."""
+    """Parse the byte order ("" for ascii), the elements, and the offset of the rows."""
     head = data[:_MAXIMUM_HEADER]
     old = head[3:4] == b"\r" and head[4:5] != b"\n"  # line endings of classic Mac OS
     ending = b"\r" if old else b"\n"
@@ -259,14 +259,14 @@ def _parse_header(lines: list[str]) -> tuple[str, list[Element]]:
         if word == "format" and len(rest) == 2 and rest[0] in _ORDERS and order is None:
             order = _ORDERS[rest[0]]
         elif word == "element" and len(rest) == 2 and len(elements) < _MAXIMUM_PROPERTIES:
-            elements.append(Element(rest[0], _count(rest[1]), ()))
+            elements.append(Element(rest[0], _parse_count(rest[1]), ()))
         elif word == "property" and elements:
             last = elements[-1]
             if len(last.properties) == _MAXIMUM_PROPERTIES:
                 raise UnreadableCloud(
                     f"{last.name!r:.40} has more than {_MAXIMUM_PROPERTIES} properties. {_AGAIN}"
                 )
-            elements[-1] = Element(last.name, last.count, (*last.properties, _property(rest)))
+            elements[-1] = Element(last.name, last.count, (*last.properties, _parse_property(rest)))
         else:
             raise UnreadableCloud(f"The PLY header has the invalid line {line!r:.60}. {_AGAIN}")
     if order is None:
@@ -281,12 +281,12 @@ def _parse_header(lines: list[str]) -> tuple[str, list[Element]]:
 
 
 def _with_axis_names(element: Element) -> Element:
-    names = axis_names([one.name for one in element.properties])
+    names = axis_names([item.name for item in element.properties])
     named = zip(element.properties, names, strict=True)
-    return replace(element, properties=tuple(replace(one, name=name) for one, name in named))
+    return replace(element, properties=tuple(replace(item, name=name) for item, name in named))
 
 
-def _property(words: list[str]) -> Property:
+def _parse_property(words: list[str]) -> Property:
     if len(words) == 2 and words[0] in _TYPES:
         return Property(words[1], _TYPES[words[0]])
     if len(words) == 4 and words[0] == "list" and words[1] in _TYPES and words[2] in _TYPES:
@@ -299,7 +299,7 @@ def _property(words: list[str]) -> Property:
     )
 
 
-def _count(word: str) -> int:
+def _parse_count(word: str) -> int:
     if not (word.isascii() and word.isdigit() and len(word) <= 18):
         raise UnreadableCloud(f"The PLY header has the invalid count {word!r:.40}. {_AGAIN}")
     return int(word)

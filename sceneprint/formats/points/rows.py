@@ -1,8 +1,8 @@
-"""Points in the form that all readers return, their limits, and a parser for rows of text.
+"""Points as readers return them, their limits, and a parser for rows of text.
 
 text, start  --parse_rows-->  coordinates (n, 3), offset after the rows, status
 
-Each line of text is a point; the parser reads three of its columns. Python's `float` would take a
+A line of text is a point; the parser reads three of its columns. Python's `float` would take a
 minute for the largest file.
 """
 
@@ -20,31 +20,31 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Bytes, Floats
 from sceneprint_client.sidecars import Position
 
-#: Maximum number of points of a file. Larger files are refused according to their header.
+#: Maximum number of points of a file. Files whose headers declare more are rejected.
 MAXIMUM_POINTS = 20_000_000
 
-#: Maximum size of data that is decompressed at once, bytes. It suffices for 20 million points of
-#: four values, and several uploads may need it at the same time.
+#: Maximum size of data that is decompressed at once, bytes: sufficient for 20 million points of
+#: four values. Several uploads may need this memory at the same time.
 MAXIMUM_INFLATED = 400 << 20
 
-#: Number of points in a block, which fits into the processor's cache.
+#: Number of points in a block that fits into the processor's cache.
 BLOCK = 1 << 16
 
 
-#: Bytes of a file, in memory or mapped from the disk.
+#: Bytes of a file, in memory or mapped from a disk.
 FileBytes = bytes | mmap.mmap
 
 
 @dataclass(frozen=True, eq=False)
 class FilePoints:
-    """Points in the units and axes of their file.
+    """The points of a file, in its units and axes.
 
     Parameters
     ----------
-    count : number of points, which has been compared with the length of the file
+    count : number of points; it does not exceed what the length of the file allows
     blocks : coordinates in order, in blocks (n, 3) of float64; missing points are NaN or infinite,
         and may cause numpy warnings
-    viewpoint : viewpoint that the file states, or None
+    viewpoint : viewpoint that the file states; None if it states none
     """
 
     count: int
@@ -67,7 +67,7 @@ def steps(count: int) -> Iterator[tuple[int, int]]:
 
 
 def axis_names(names: list[str]) -> list[str]:
-    """Return the names of fields with X, Y, Z, which PDAL writes, replaced by x, y, z."""
+    """Return the names of fields, with X, Y, Z (written by PDAL) replaced by x, y, z."""
     if {"x", "y", "z"}.isdisjoint(names):
         return [name.lower() if name in ("X", "Y", "Z") else name for name in names]
     return names
@@ -80,7 +80,7 @@ def record_blocks(
 
     Parameters
     ----------
-    data, start, count : the file, and offset and number of its records, which must fit into it
+    data, start, count : the file, and the offset and number of its records; they must fit into it
     fields : name, numpy type and number of values of each field, including x, y and z
     """
     packed = [(name if name in ("x", "y", "z") else f"{place}", kind, (n,) * (n != 1))
@@ -90,8 +90,6 @@ def record_blocks(
         rows = table[first : first + n]
         yield np.stack([rows[name] for name in "xyz"], axis=1, dtype=np.float64)
 
-
-# Rows of text, one per line.
 
 #: Status of a row: readable, or the reason why it is unreadable.
 GOOD, ENDS, FEW, MANY, NO_NUMBER, CORNERS = 0, 1, 2, 3, 4, 5
@@ -111,7 +109,7 @@ _TENS = np.array([float(f"1e{k}") for k in range(23)])
 def parse_blocks(
     text: Bytes, start: int, count: int, axes: NDArray[np.int8], lists: NDArray[np.bool_]
 ) -> Iterator[Floats]:
-    """Yield the coordinates of `count` rows in blocks (n, 3); see `parse_rows`.
+    """Yield the coordinates of `count` rows of text in blocks (n, 3); see `parse_rows`.
 
     Raise UnreadableCloud if a row is missing or malformed. The message states its number.
     """
@@ -127,11 +125,11 @@ def parse_blocks(
 
 
 def skip_lines(text: Bytes, start: int, count: int) -> int:
-    """Return the offset after `count` lines that are not empty.
+    """Return the offset after `count` lines, not counting empty lines.
 
     Raise UnreadableCloud if there are fewer lines.
     """
-    place, lines = _skip(text, start, count)
+    place, lines = _skip_lines(text, start, count)
     if lines < count:
         raise UnreadableCloud(
             f"The file ends after {lines} of the {count} rows that precede its points. "
@@ -142,7 +140,7 @@ def skip_lines(text: Bytes, start: int, count: int) -> int:
 
 def check_room(text: Bytes, start: int, count: int, columns: int) -> None:
     """Raise UnreadableCloud if a header declares more rows than fit into the rest of the file."""
-    if count * columns * 2 - 1 > len(text) - start:  # each value has at least a digit and a space
+    if count * columns * 2 - 1 > len(text) - start:  # a value has at least a digit and a space
         raise UnreadableCloud(
             f"The header declares {count} rows of {columns} values, but only "
             f"{len(text) - start} bytes follow. Copy or write the file again."
@@ -160,7 +158,7 @@ def parse_rows(
     text : (N,) bytes
     start : offset of the first row
     out : (n, 3) output
-    axes : (c,) column of `out` for each value, or -1
+    axes : (c,) column of `out` for each value of a row; -1 for skipped values
     lists : (c,) whether a value is the length of a list that follows on the same line
 
     Returns
@@ -199,7 +197,7 @@ def parse_rows(
 
 
 @kernel
-def _skip(text: Bytes, start: int, count: int) -> tuple[int, int]:
+def _skip_lines(text: Bytes, start: int, count: int) -> tuple[int, int]:
     i, size = start, len(text)
     for line in range(count):
         while i < size and (text[i] == 10 or text[i] == 13):
@@ -213,7 +211,7 @@ def _skip(text: Bytes, start: int, count: int) -> tuple[int, int]:
 
 @kernel
 def word(text: Bytes, start: int) -> tuple[int, int]:
-    """Return the start and end of the next word on this line, which are equal if there is none."""
+    """Return the start and end of the next word on this line; they are equal if there is none."""
     first = start
     while first < len(text) and (text[first] == 32 or text[first] == 9):
         first += 1
@@ -225,7 +223,7 @@ def word(text: Bytes, start: int) -> tuple[int, int]:
 
 @kernel
 def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
-    """Return the value of a word, exact except for the last bit, and whether it is a number.
+    """Parse a word; return its value, exact except for the last bit, and whether it is a number.
 
     All spellings of NaN and infinity by printf give NaN.
     """

@@ -1,9 +1,9 @@
-"""Read ROS files through rosbags: MCAP, rosbag2 folders and databases, ROS 1 bags.
+"""Reading of ROS files with rosbags: MCAP, rosbag2 folders and databases, ROS 1 bags.
 
 path  --Bag-->  topics, raw messages; raw message  --Bag.decode-->  its fields
 
-rosbags raises arbitrary exceptions for damaged files, so each call is made within
-`_dataset_errors`, and decompression is limited.
+rosbags raises arbitrary exceptions for damaged files, so all calls run within `_dataset_errors`.
+Decompression is limited.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader as Ros2Reader
     from rosbags.typesys.store import Typestore
 
-#: File of a rosbag2 folder with its metadata.
+#: Metadata file of a rosbag2 folder.
 _METADATA = "metadata.yaml"
 #: Maximum size of a decompressed chunk, bytes; recorders write 1 to 4 MB.
 MAXIMUM_CHUNK_BYTES = 256 << 20
@@ -41,22 +41,23 @@ MAXIMUM_MESSAGE_BYTES = 256 << 20
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 POINTS = "sensor_msgs/msg/PointCloud2"
-#: Own messages of the drivers of Livox, and all messages with points.
+#: Message types of the Livox drivers.
 LIVOX = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+#: All message types with points.
 CLOUDS = (POINTS, *LIVOX)
 CAMERA = "sensor_msgs/msg/CameraInfo"
 IMU = "sensor_msgs/msg/Imu"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-#: Type of transforms in ROS 1 before tf2, with the same fields.
+#: Type of transforms in ROS 1 before tf2; it has the same fields.
 OLD_TRANSFORMS = "tf/msg/tfMessage"
 _TRANSFORMS_FIELDS = "geometry_msgs/TransformStamped[] transforms"
-#: Types of messages that `Bag.decode` supports.
+#: Message types that `Bag.decode` supports.
 TYPES = (IMAGE, COMPRESSED, *CLOUDS, CAMERA, IMU, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a path is a ROS recording by its suffix, or a folder with rosbag2 metadata."""
+    """Return whether a path is a ROS recording: by its suffix, or as a folder with metadata."""
     if path.is_dir():
         return (path / _METADATA).is_file() and not (path / "intrinsics.json").is_file()
     return format_named(path.name, "recording") is not None
@@ -64,7 +65,7 @@ def is_recording(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class BagTopic:
-    """Topic of a bag.
+    """A topic of a bag.
 
     Parameters
     ----------
@@ -80,13 +81,13 @@ class BagTopic:
 
 @dataclass(frozen=True)
 class RawMessage:
-    """Serialised message of a bag.
+    """A serialised message of a bag.
 
     Parameters
     ----------
     topic : name of the topic
     log_ns : time of recording, nanoseconds
-    data : bytes that ROS serialised
+    data : serialised content
     """
 
     topic: str
@@ -95,7 +96,7 @@ class RawMessage:
 
 
 class Bag:
-    """Open ROS recording, which threads may share.
+    """An open ROS recording that threads may share.
 
     `path`: .mcap, .db3 or .bag file, or rosbag2 folder. Raise DatasetError if the file does not
     exist, is damaged, or has an unsupported format. Raise MissingDependency if rosbags is not
@@ -114,9 +115,11 @@ class Bag:
         self._closes = weakref.finalize(self, _close, self._reader)
         with _dataset_errors(path):
             self._connections: list[Connection] = [
-                one for one in self._reader.connections if _serialization(one) in ("cdr", "ros1")
+                connection
+                for connection in self._reader.connections
+                if _serialization(connection) in ("cdr", "ros1")
             ]
-            self.is_ros1 = any(_serialization(one) == "ros1" for one in self._connections)
+            self.is_ros1 = any(_serialization(entry) == "ros1" for entry in self._connections)
             self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time
             self.topics = _topics(self._connections)
         self._types = _types(ros1=self.is_ros1)
@@ -127,21 +130,21 @@ class Bag:
 
     def of_type(self, *types: str) -> list[BagTopic]:
         """Return the topics of these types that have messages, sorted by name."""
-        return [one for one in self.topics if one.type in types and one.count]
+        return [topic for topic in self.topics if topic.type in types and topic.count]
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """Yield the messages of topics in the order of recording.
+        """Yield the messages of topics in recording order.
 
         Parameters
         ----------
         topics : names of the topics
-        start_ns, stop_ns : first time of recording, and time after the last, nanoseconds
+        start_ns, stop_ns : bounds, start <= time of recording < stop, nanoseconds; None for none
 
         Raise DatasetError if the file is damaged.
         """
-        connections = [one for one in self._connections if one.topic in topics]
+        connections = [connection for connection in self._connections if connection.topic in topics]
         if not connections:
             return
         with self._lock, _dataset_errors(self.path):
@@ -160,10 +163,10 @@ class Bag:
             try:
                 return next(messages, None)
             finally:
-                messages.close()  # type: ignore[attr-defined]  # a generator, which holds the lock
+                messages.close()  # type: ignore[attr-defined]  # the generator holds the lock
 
     def at(self, topic: str, log_ns: int, occurrence: int) -> RawMessage:
-        """Return the message of a topic with this time of recording.
+        """Return the message of a topic that was recorded at `log_ns` nanoseconds.
 
         `occurrence`: index among the messages with the same time. Raise DatasetError if the message
         no longer exists, or the file is damaged.
@@ -178,7 +181,7 @@ class Bag:
         return messages[occurrence]
 
     def decode(self, message: RawMessage, kind: str) -> Any:
-        """Return the fields of a message, as attributes.
+        """Decode a message to an object with its fields as attributes.
 
         `kind`: type of the message, one of TYPES. Raise DatasetError if the bytes are not a message
         of this type.
@@ -195,9 +198,9 @@ class Bag:
             return self._types.deserialize_cdr(message.data, type_name)
 
     def stamp_ns(self, message: RawMessage) -> int:
-        """Return the time of measurement of a message with a header, nanoseconds.
+        """Return the measurement time of a message with a header, nanoseconds.
 
-        If the header has no time, return the time of recording. Only the header is decoded.
+        If the header has no time, return the recording time. Only the header is decoded.
         """
         head = message.data[:12]
         if len(head) < 12:
@@ -214,22 +217,22 @@ class Bag:
 
 @lru_cache(maxsize=4)
 def shared_bag(path: Path) -> Bag:
-    """Return a bag that this process shares among the frame references from other processes."""
+    """Return an open bag from a cache, for frame references that come from other processes."""
     return Bag(path)
 
 
 def _serialization(connection: Connection) -> str:
-    """Return the serialisation format of a topic; ROS 1 bags do not state it."""
+    """Return the serialisation format of a topic; "ros1" for ROS 1 bags, which do not state it."""
     return str(getattr(connection.ext, "serialization_format", "ros1"))
 
 
 def _topics(connections: list[Connection]) -> tuple[BagTopic, ...]:
-    """Return the topics sorted by name; a topic with several types has an entry for each type."""
+    """Return the topics, sorted by name; a topic with several types has an entry per type."""
     counts: dict[tuple[str, str], int] = {}
-    for one in connections:
-        package, _, name = one.msgtype.partition("/")  # ROS 1 in MCAP has sensor_msgs/Image
-        key = (str(one.topic), f"{package}/msg/{name.removeprefix('msg/')}")
-        counts[key] = counts.get(key, 0) + int(one.msgcount)
+    for connection in connections:
+        package, _, name = connection.msgtype.partition("/")  # ROS 1 in MCAP has sensor_msgs/Image
+        key = (str(connection.topic), f"{package}/msg/{name.removeprefix('msg/')}")
+        counts[key] = counts.get(key, 0) + int(connection.msgcount)
     return tuple(BagTopic(name, kind, n) for (name, kind), n in sorted(counts.items()))
 
 
@@ -253,7 +256,7 @@ def _close(reader: Ros1Reader | Ros2Reader) -> None:
 
 @contextmanager
 def _dataset_errors(path: Path, what: str = "The recording cannot be read") -> Iterator[None]:
-    """Raise DatasetError for any exception of rosbags."""
+    """Convert exceptions of rosbags to DatasetError within a `with` block."""
     try:
         yield
     except (SceneprintError, GeneratorExit):
@@ -275,9 +278,6 @@ def _advice(path: Path) -> str:
     )
 
 
-# Message types and decompression limits of rosbags.
-
-
 def require_rosbags() -> None:
     """Raise MissingDependency if rosbags is not installed."""
     if find_spec("rosbags") is None:
@@ -289,7 +289,7 @@ def require_rosbags() -> None:
 
 @lru_cache(maxsize=2)
 def _types(*, ros1: bool) -> Typestore:
-    """Return the standard message definitions. Those in the bag are not trusted.
+    """Return the standard message definitions; the definitions in a bag are not trusted.
 
     Raise MissingDependency if rosbags is not installed.
     """
@@ -305,7 +305,7 @@ def _types(*, ros1: bool) -> Typestore:
 
 
 def load_readers() -> None:
-    """Load rosbags and its decompressors, which a confined process cannot do later."""
+    """Load rosbags and its decompressors before a process is confined."""
     for ros1 in (False, True):
         _types(ros1=ros1)
     import rosbags.serde.primitives  # noqa: F401  (rosbags generates code that imports it)
@@ -317,8 +317,8 @@ def load_readers() -> None:
 def _limit_decompression() -> None:
     """Limit decompressed chunks to their declared size and to MAXIMUM_CHUNK_BYTES.
 
-    rosbags decompresses a chunk completely before it checks the size, so a damaged or hostile chunk
-    could fill the memory. Its tables of decompressors are replaced by limited functions.
+    rosbags decompresses a chunk completely before it checks the size, so a damaged or malicious
+    chunk could exhaust memory. Therefore, limited functions replace its decompressors.
     """
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import storage_mcap as mcap
@@ -332,7 +332,7 @@ def _limit_decompression() -> None:
 
 
 def _read_any_profile() -> None:
-    """Make rosbags accept MCAP files with another profile than ROS 2, such as none or ROS 1.
+    """Make rosbags accept MCAP files without the ROS 2 profile, such as those of ROS 1.
 
     Their channels state the serialisation, and the message definitions in the file are not needed.
     """
@@ -341,7 +341,7 @@ def _read_any_profile() -> None:
     from rosbags.rosbag2 import storage_mcap as mcap
 
     class ProfiledReader(mcap.McapReader):
-        """MCAP file whose profile reads as "ros2"."""
+        """A reader of MCAP files that assumes the profile "ros2"."""
 
         def _open(self) -> None:
             opened, self.bio = self.bio, _Profiled(self.bio)  # type: ignore[assignment]
@@ -360,7 +360,7 @@ _PROFILE = struct.pack("<I4s", 4, b"ros2")
 
 
 class _Profiled:
-    """MCAP file whose header, after its length at byte 9, starts with the profile of ROS 2."""
+    """An MCAP file whose profile reads as "ros2": the start of the header, after its length."""
 
     def __init__(self, file: Any) -> None:
         self._file = file
@@ -369,7 +369,7 @@ class _Profiled:
         return getattr(self._file, name)
 
     def read(self, size: int = -1) -> bytes:
-        """Return the next bytes, with the profile replaced."""
+        """Return the next bytes, with the length and the profile replaced."""
         place = self._file.tell()
         if place == 17:
             return _PROFILE + bytes(self._file.read(size - len(_PROFILE)))
@@ -396,7 +396,7 @@ def _lz4() -> Any:
 
 
 def _inflate(stream: Any, data: bytes, most: int) -> bytes:
-    """Decompress a chunk of at most `most` bytes."""
+    """Decompress a chunk; raise ValueError if its content exceeds `most` bytes."""
     if most > MAXIMUM_CHUNK_BYTES:
         raise ValueError(f"a chunk declares {most} bytes, more than {MAXIMUM_CHUNK_BYTES}")
     content: bytes = stream.decompress(data, most + 1)

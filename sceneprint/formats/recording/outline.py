@@ -1,6 +1,6 @@
-"""Outline of a recording for users: its topics, and what an upload would select.
+"""Outline of a recording for users: its topics, and the frames that an upload would select.
 
-path, RecordingOptions  --bag_outline-->  BagOutline, with `findings` in sentences
+path, RecordingOptions  --bag_outline-->  BagOutline, with `findings` as text
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ from sceneprint_client.api.frames import SampleRange, pooled_range
 from sceneprint_client.errors import printable
 from sceneprint_client.frame_files import meta_of
 
-#: Number of frames of a recording that are read to determine its range.
+#: Number of frames that are read to determine the depth range of a recording.
 _SAMPLED = 9
 
 
 @dataclass(frozen=True)
 class BagOutline:
-    """Content of a bag, and the frames that an upload would select.
+    """The content of a bag, and the frames that an upload would select.
 
     Parameters
     ----------
     kind : format of the files
-    start_ns, end_ns : times of recording of the first and the last message, nanoseconds
+    start_ns, end_ns : recording times of the first and of the last message, nanoseconds
     frames : topics with frames
-    chosen : selected topic, or None
-    camera : topic of its camera, or None
+    chosen : selected topic of frames; None if there is none
+    camera : name of the camera topic of `chosen`; None if there is none
     sequences : sequences of the selected frames; may be empty
     problem : reason why no frames are selected; empty if there are some
     """
@@ -54,12 +54,12 @@ class BagOutline:
 
     @property
     def seconds(self) -> float:
-        """Duration of the recording."""
+        """Return the duration of the recording, seconds."""
         return max(self.end_ns - self.start_ns, 0) * 1e-9
 
     @property
     def span(self) -> str:
-        """Duration and start of the recording."""
+        """Return the duration and start of the recording as text."""
         if self.end_ns < self.start_ns:
             return "no messages"
         try:
@@ -69,10 +69,10 @@ class BagOutline:
         return f"{self.seconds:.1f} s from {start:%Y-%m-%dT%H:%M:%SZ}"
 
     def use_of(self, topic: BagTopic) -> str:
-        """Return how an upload can use a topic; empty if it cannot."""
+        """Return how an upload can use a topic, as text; empty if it cannot."""
         if topic.name == self.camera:
             return "camera"
-        frames = next((one for one in self.frames if one.topic == topic), None)
+        frames = next((entry for entry in self.frames if entry.topic == topic), None)
         if frames is None:
             return ""
         use = "not depth by its name" if frames.is_beside_depth else frames.encoding or "points"
@@ -81,13 +81,13 @@ class BagOutline:
 
     @property
     def findings(self) -> list[str]:
-        """Findings on the selected frames: omissions, camera, poses, mounting, up and range."""
-        lines = [line for one in self.sequences for line in _findings_of(one)]
+        """Return lines on the selected frames: omissions, camera, poses, mounting, up and range."""
+        lines = [line for sequence in self.sequences for line in _describe_frames(sequence)]
         return lines if self.range is None else [*lines, str(self.range)]
 
 
 def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
-    """Return the content of a bag, and the frames that an upload with these options would select.
+    """Read the content of a bag, and the frames that an upload with these options would select.
 
     Raise DatasetError if the bag cannot be read. Raise MissingDependency if rosbags is not
     installed.
@@ -120,8 +120,8 @@ def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
 def sampled_range(
     sequences: Sequence[FrameSequence],
 ) -> tuple[SampleRange | None, SceneprintError | None]:
-    """Return the range of a sample of the frames, and the error if none can be read."""
-    frames = [one for sequence in sequences for one in sequence.frames]
+    """Return the depth range of a sample of the frames, or an error if none can be read."""
+    frames = [frame for sequence in sequences for frame in sequence.frames]
     ranges, error = list[SampleRange](), None
     for place in sorted(set(np.linspace(0, len(frames) - 1, _SAMPLED).round().astype(int))):
         try:
@@ -131,7 +131,7 @@ def sampled_range(
     return pooled_range(ranges), None if ranges else error
 
 
-def _findings_of(sequence: FrameSequence) -> list[str]:
+def _describe_frames(sequence: FrameSequence) -> list[str]:
     first = sequence.frames[0]
     lines = [sequence.note] if sequence.note else []
     if first.camera is not None:
@@ -146,7 +146,7 @@ def _findings_of(sequence: FrameSequence) -> list[str]:
     if base is not None and base.matrix is not None:
         x, y, z = (round(row[3], 3) + 0.0 for row in base.matrix[:3])
         lines.append(f"mounting: at {x:.3f} {y:.3f} {z:.3f} m in {printable(str(base.base_frame))}")
-    sensors = (one.camera or one.cloud for one in sequence.frames)
+    sensors = (frame.camera or frame.cloud for frame in sequence.frames)
     ups = sum(sensor is not None and sensor.up is not None for sensor in sensors)
     lines.append(f"up: known for {ups} of {len(sequence.frames)} frames")
     return lines

@@ -1,7 +1,7 @@
-"""Read transforms, odometry, cameras and time stamps of a bag in one pass.
+"""Reading of a bag's transforms, odometry, cameras and time stamps in one pass.
 
 Bag, topics  --scan_bag-->  BagScan
-stamps in the order of recording  -->  BagPart, ...: a new part starts when the clock was set back
+stamps in recording order  -->  BagPart, ...: a part ends where the clock was set back
 """
 
 from __future__ import annotations
@@ -41,35 +41,35 @@ from sceneprint_client.transforms import (
     motion,
 )
 
-#: Function that takes the number of messages that have been read, and the number of all messages.
+#: Callback with the number of messages that have been read, and the number of all messages.
 Progress = Callable[[int, int], None]
 #: Maximum number of messages of a topic of frames.
 MOST_FRAMES = 2_000_000
 
 
-#: Maximum decrease of the stamps of a source, seconds. A larger decrease means a clock that was set
-#: back.
+#: Maximum decrease between stamps of a source, seconds. After a larger decrease, the clock counts
+#: as set back.
 _OUT_OF_ORDER_S = 0.1
-#: Number of decreases, each followed by an increase, after which the stamps of a source are
-#: ignored: it has several publishers with different delays.
+#: Number of decreases with a following increase after which a source's stamps are ignored: it has
+#: several publishers with different delays.
 _MOST_FLIPS = 8
-#: Maximum number of parts of a recording, and of different contents of its CameraInfo.
+#: Maximum number of parts of a recording, and of distinct CameraInfo messages.
 MOST_PARTS, MOST_INFOS = 1000, 100_000
-#: Maximum difference between values of a fixed transform, metres and radians, and maximum number of
-#: stored values.
+#: Maximum difference between values of a static transform, metres and radians, and maximum number
+#: of stored values.
 _FIXED, _MOST_FIXED = 0.1, 100
 
 
 @dataclass(eq=False)
 class BagPart:
-    """Part of a recording in which stamps do not go back.
+    """A part of a recording within which stamps do not jump back.
 
     Parameters
     ----------
-    first : number of the first frame
-    tree : transforms, and odometry that no transform duplicates
-    imus : measurements by frame of the IMU
-    info_stamps_ns, infos : time of each calibrated CameraInfo, and its index in the scan
+    first : index of the first frame
+    tree : transforms, and odometry without duplicate transforms
+    imus : measurements by coordinate frame of the IMU
+    info_stamps_ns, infos : stamp of each calibrated CameraInfo, ns, and index in `BagScan.infos`
     """
 
     first: int
@@ -82,8 +82,8 @@ class BagPart:
     def info_at(self, stamps_ns: Sequence[int]) -> list[int]:
         """Return the index of the CameraInfo for each stamp.
 
-        The order of preference is: the same stamp, the nearest within 20 ms, the last before the
-        stamp, the first.
+        In order of preference, it has the same stamp, is the nearest within 20 ms, the last before
+        the stamp, or the first.
         """
         times = np.frombuffer(self.info_stamps_ns, np.int64)
         order = np.argsort(times, kind="stable")
@@ -99,16 +99,16 @@ class BagPart:
 
 @dataclass(eq=False)
 class BagScan:
-    """Result of one pass over a bag.
+    """The result of a pass over a bag.
 
     Parameters
     ----------
     parts : at least one part, in order
-    infos : calibrated CameraInfo messages with different contents
-    stamps_ns : time of measurement of each frame, in the order of recording
-    places : time of recording of each frame, and its index among messages with the same time
+    infos : distinct calibrated CameraInfo messages
+    stamps_ns : measurement time of each frame, nanoseconds, in recording order
+    places : recording time of each frame, nanoseconds, and its index among messages with that time
     damaged : number of messages that were skipped because they do not decode
-    fixed : values of the static transforms; the last value counts
+    fixed : values of each static transform, by parent and child; the last value counts
     """
 
     parts: list[BagPart] = field(default_factory=lambda: [BagPart(0)])
@@ -120,13 +120,13 @@ class BagScan:
 
     @property
     def ends(self) -> list[int]:
-        """Return the number after that of the last frame of each part."""
+        """Return the end of each part: the index after its last frame."""
         return [*(part.first for part in self.parts[1:]), len(self.stamps_ns)]
 
 
 @dataclass(frozen=True)
 class _Odometry:
-    """Pose of a robot in its odometry frame."""
+    """The pose of a robot in its odometry frame."""
 
     parent: str
     child: str
@@ -135,7 +135,7 @@ class _Odometry:
 
 
 class _SeveralClocks(Exception):
-    """Error for a source whose stamps go back and forth."""
+    """The stamps of a source jump back and forth."""
 
     def __init__(self, source: str) -> None:
         super().__init__(source)
@@ -144,7 +144,7 @@ class _SeveralClocks(Exception):
 
 @dataclass(eq=False)
 class _Clocks:
-    """Latest stamps of the sources within a part: topics, and transforms of tf.
+    """The latest stamps of the sources within a part; sources are topics, and transforms of tf.
 
     `ignored`: sources whose stamps do not determine the clock.
     """
@@ -156,9 +156,9 @@ class _Clocks:
     _flips: dict[str, int] = field(default_factory=dict)
 
     def goes_back(self, source: str, stamp_ns: int) -> bool:
-        """Record a stamp, and return whether it shows that the clock was set back.
+        """Record a stamp; return whether the clock was set back.
 
-        Raise _SeveralClocks if the stamps of the source go back and forth.
+        Raise _SeveralClocks if the stamps of the source jump back and forth.
         """
         if stamp_ns <= 0 or source in self.ignored:
             return False
@@ -181,14 +181,14 @@ class _Clocks:
 def scan_bag(
     bag: Bag, frames: BagTopic | None, camera: BagTopic | None, progress: Progress | None
 ) -> BagScan:
-    """Read transforms, odometry, cameras and the times of the frames, without decoding samples.
+    """Read the transforms, odometry, cameras and frame times of a bag, without decoding samples.
 
     Parameters
     ----------
     bag : open recording
-    frames : topic of the frames, or None
-    camera : topic of the CameraInfo of the frames, or None
-    progress : function that is called from time to time, or None
+    frames : topic of the frames; None reads no frames
+    camera : topic of the frames' CameraInfo; None reads no cameras
+    progress : callback every 64 messages; None for no callback
 
     Raise DatasetError if the bag is damaged or too long.
     """
@@ -202,24 +202,25 @@ def scan_bag(
 
 
 class _Scanner:
-    """State of one pass over a bag; see `scan_bag` for the parameters."""
+    """The state of a pass over a bag; for the parameters, see `scan_bag`."""
 
     def __init__(
         self, bag: Bag, frames: BagTopic | None, camera: BagTopic | None, clocks: _Clocks
     ) -> None:
         self._bag, self._frames, self._clocks = bag, frames, clocks
         self._kinds = {
-            one.name: one.type for one in bag.of_type(TRANSFORMS, OLD_TRANSFORMS, ODOMETRY, IMU)
+            topic.name: topic.type
+            for topic in bag.of_type(TRANSFORMS, OLD_TRANSFORMS, ODOMETRY, IMU)
         } | ({} if camera is None else {camera.name: camera.type})
         self._scan = BagScan()
-        # by the bytes after the stamp; -1 if uncalibrated
+        # index of each CameraInfo by its bytes after the stamp; -1 if uncalibrated
         self._info_numbers: dict[bytes, int] = {}
 
     def scan(self, progress: Progress | None) -> BagScan:
-        """Read all messages. Raise the errors of `scan_bag`, and _SeveralClocks."""
+        """Read all messages; for errors, see `scan_bag`. Raise _SeveralClocks if `_Clocks` does."""
         scan, frames = self._scan, self._frames
         names = [*self._kinds, *([] if frames is None else [frames.name])]
-        total = sum(one.count for one in self._bag.topics if one.name in names)
+        total = sum(topic.count for topic in self._bag.topics if topic.name in names)
         for done, message in enumerate(self._bag.messages(names)):
             if progress is not None and done % 64 == 0:
                 progress(done, total)
@@ -227,7 +228,7 @@ class _Scanner:
                 if frames is not None and message.topic == frames.name:
                     self._count_frame(message)
                 else:
-                    self._take(message, self._kinds[message.topic])
+                    self._record_message(message, self._kinds[message.topic])
         if progress is not None:
             progress(total, total)
         for part in scan.parts:
@@ -236,7 +237,7 @@ class _Scanner:
         return scan
 
     def _part_at(self, source: str, stamp_ns: int) -> BagPart:
-        """Return the part of a stamp, which is a new one if the clock was set back."""
+        """Return the part for a stamp; start a part if the clock was set back."""
         parts = self._scan.parts
         if self._clocks.goes_back(source, stamp_ns):
             if len(parts) == MOST_PARTS:
@@ -257,11 +258,11 @@ class _Scanner:
         if len(scan.places) > MOST_FRAMES:
             raise DatasetError(f"There are more than {MOST_FRAMES} frames. Split the bag.")
 
-    def _take(self, message: RawMessage, kind: str) -> None:
-        """Record the content of a message that is not a frame."""
+    def _record_message(self, message: RawMessage, kind: str) -> None:
+        """Record the content of a message other than a frame."""
         scan, bag = self._scan, self._bag
         if kind == CAMERA and message.data[12:] in self._info_numbers:
-            self._take_info(message, self._info_numbers[message.data[12:]])
+            self._record_info(message, self._info_numbers[message.data[12:]])
             return
         try:
             fields = bag.decode(message, kind)
@@ -277,7 +278,7 @@ class _Scanner:
             number = len(scan.infos) if is_calibrated(fields) else -1
             scan.infos.extend([] if number < 0 else [fields])
             self._info_numbers[message.data[12:]] = number
-            self._take_info(message, number)
+            self._record_info(message, number)
         elif kind == IMU:
             if float(fields.linear_acceleration_covariance[0]) < 0:  # the IMU has no accelerometer
                 return
@@ -294,20 +295,20 @@ class _Scanner:
             if parent and child and len(known) < MOST_SAMPLES:
                 known.append(_Odometry(parent, child, stamp, pose_row(fields.pose.pose)))
         else:
-            self._take_transforms(message, fields)
+            self._record_transforms(message, fields)
 
-    def _take_info(self, message: RawMessage, number: int) -> None:
+    def _record_info(self, message: RawMessage, number: int) -> None:
         stamp = self._bag.stamp_ns(message)
         part = self._part_at(message.topic, stamp)
         if number >= 0:
             part.info_stamps_ns.append(stamp)
             part.infos.append(number)
 
-    def _take_transforms(self, message: RawMessage, fields: Any) -> None:
+    def _record_transforms(self, message: RawMessage, fields: Any) -> None:
         fixed = message.topic.rpartition("/")[2] == "tf_static"
-        for one in fields.transforms:
-            parent, child = str(one.header.frame_id), str(one.child_frame_id)
-            row, stamp = transform_row(one.transform), stamp_of(one.header)
+        for transform in fields.transforms:
+            parent, child = str(transform.header.frame_id), str(transform.child_frame_id)
+            row, stamp = transform_row(transform.transform), stamp_of(transform.header)
             if not fixed:
                 part = self._part_at(f"{message.topic} ({parent} -> {child})", stamp)
                 part.tree.add(parent, child, stamp, row, fixed=False)
@@ -318,7 +319,7 @@ class _Scanner:
 
 
 def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float]]]) -> None:
-    """Add static transforms, except those that contradict themselves or tf."""
+    """Add the static transforms, except transforms with contradictory values."""
     for (parent, child), rows in fixed.items():
         moving = tree.samples(parent, child)
         accepted = [
@@ -336,14 +337,14 @@ def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float
 
 
 def _add_odometry(tree: TransformTree, odometry: dict[str, list[_Odometry]]) -> None:
-    """Add odometry that tf does not duplicate, from the topic of each edge with most messages."""
+    """Add odometry for edges without transforms, from the topic with the most messages."""
     edges: dict[tuple[str, str], list[_Odometry]] = {}
     for topic in sorted(odometry, key=lambda name: len(odometry[name])):
-        for one in odometry[topic][:1]:
-            edges[one.parent, one.child] = odometry[topic]
+        for pose in odometry[topic][:1]:
+            edges[pose.parent, pose.child] = odometry[topic]
     for (parent, child), samples in edges.items():
         if tree.has_edge(parent, child):
             continue
-        for one in samples:
-            if (one.parent, one.child) == (parent, child):
-                tree.add(parent, child, one.stamp_ns, one.sample, fixed=False)
+        for pose in samples:
+            if (pose.parent, pose.child) == (parent, child):
+                tree.add(parent, child, pose.stamp_ns, pose.sample, fixed=False)

@@ -1,4 +1,4 @@
-"""Join the scans of a bag that precede a frame.
+"""Joining of a frame with the preceding scans of a bag.
 
 poses of all scans, keyframes  --scan_windows-->  ScanWindow of each keyframe
 Bag  --ScanWindow.cloud-->  joined points (N, 3)
@@ -22,20 +22,20 @@ from sceneprint_client.joiner import MOST_SCANS, Joiner, window_start
 from sceneprint_client.ros_messages import timed_points
 from sceneprint_client.transforms import TransformTree
 
-#: Number of messages of which the first with points determines the duration of a scan.
+#: Maximum number of messages that are read to determine the duration of a scan.
 _MOST_SKIPPED = 50
 
 
 @dataclass(frozen=True, eq=False)
 class ScanWindow:
-    """Scans of a bag that are joined to one frame.
+    """The scans of a bag that are joined to a frame.
 
     Parameters
     ----------
-    scans : stamp of each scan in order, nanoseconds, with the `places` of its BagScan
-    metres : length of the way whose scans are joined
-    tree : transforms with sorted samples, which the windows of a recording share
-    world, sensor, frame : parent frame of the odometry, sensor, and frame of the points
+    scans : stamp of each scan in order, nanoseconds, and its entry of `BagScan.places`
+    metres : length of the path whose scans are joined
+    tree : transforms with sorted samples; the windows of a recording share them
+    world, sensor, frame : parent frame of the odometry, sensor's frame, and points' frame
     """
 
     scans: Sequence[tuple[int, tuple[int, int]]]
@@ -49,11 +49,11 @@ class ScanWindow:
         return {**self.__dict__, "tree": self._near_tree()}
 
     def _near_tree(self) -> TransformTree:
-        """Return the transforms around the scans."""
+        """Return the transforms within the time of the scans."""
         return self.tree.excerpt(self.scans[0][0], self.scans[-1][0])
 
     def cloud(self, bag: Bag, topic: BagTopic) -> Floats32:
-        """Return the joined points (N, 3) in the axes of the newest scan.
+        """Join the scans; return points (N, 3), metres, in the axes of the newest scan.
 
         Raise UnreadableCloud if the newest scan is damaged, or the odometry does not cover it.
         Raise DatasetError if the bag is damaged.
@@ -63,7 +63,7 @@ class ScanWindow:
         is_newest_joined = False
         for stamp_ns, place in self.scans:
             message = bag.at(topic.name, *place)
-            is_newest_joined = self._add(joiner, tree, stamp_ns, bag, topic, message)
+            is_newest_joined = self._add_scan(joiner, tree, stamp_ns, bag, topic, message)
         if not is_newest_joined:
             raise UnreadableCloud(
                 "The scan is damaged, or its odometry has a gap or a jump. Upload it without "
@@ -71,11 +71,11 @@ class ScanWindow:
             )
         return joiner.cloud()
 
-    def _add(
+    def _add_scan(
         self, joiner: Joiner, tree: TransformTree, stamp_ns: int, bag: Bag, topic: BagTopic,
         message: RawMessage,
     ) -> bool:  # fmt: skip
-        """Add a scan to a joiner; return False if it is left out."""
+        """Add a scan to a joiner; return False if the scan is omitted."""
         try:
             points, seconds = timed_points(bag.decode(message, topic.type))
         except SceneprintError:
@@ -84,7 +84,7 @@ class ScanWindow:
             (T,) = tree.poses(self.frame, self.sensor, [stamp_ns])
             if T is None:
                 return False
-            # points in a world frame have already been corrected for motion
+            # the publisher has corrected points in a world frame for motion
             points, seconds = (points - T[:3, 3]) @ T[:3, :3], None
         return joiner.add(stamp_ns, points, seconds)
 
@@ -93,16 +93,16 @@ def scan_windows(
     scan: BagScan, tree: TransformTree, poses: Mapping[int, Floats], keyframes: Iterable[int],
     names: tuple[str, str, str], metres: float,
 ) -> dict[int, ScanWindow]:  # fmt: skip
-    """Return the scans that are joined to each keyframe, by the index of the keyframe.
+    """Return the scans that are joined to each keyframe, by index of the keyframe.
 
     Parameters
     ----------
     scan : stamps and places of all scans
     tree : transforms of the part of the bag
-    poses : T_world_sensor (4, 4) of the scans with a pose, by their index
-    keyframes : indices of the keyframes, which have poses
-    names : frames of the odometry, of the sensor, and of the points
-    metres : length of the way whose scans are joined
+    poses : T_world_sensor (4, 4) of the scans with a pose, by index
+    keyframes : indices of the keyframes; they have poses
+    names : parent frame of the odometry, frame of the sensor, and frame of the points
+    metres : length of the path whose scans are joined
     """
     stamps = scan.stamps_ns
     order = sorted(poses, key=lambda place: stamps[place])
@@ -115,13 +115,13 @@ def scan_windows(
         end = rank[place] + 1
         first = max(0, end - MOST_SCANS)
         first += window_start(positions[first:end], metres)
-        scans = [(stamps[one], scan.places[one]) for one in order[first:end]]
+        scans = [(stamps[index], scan.places[index]) for index in order[first:end]]
         windows[place] = ScanWindow(scans, metres, paths, *names)
     return windows
 
 
 def scan_seconds(bag: Bag, topic: BagTopic, scan: BagScan) -> float | None:
-    """Return the time from the stamp of a scan to its last point, or None if unknown.
+    """Return the seconds from the stamp of a scan to its last point; None if unknown.
 
     Empty and damaged messages at the start of a recording are skipped.
     """

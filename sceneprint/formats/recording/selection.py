@@ -1,4 +1,4 @@
-"""Select the frames of a bag, and compute their poses.
+"""Selection of a bag's frames, and computation of their poses.
 
 path, RecordingOptions  --recording_sequences-->  FrameSequence of each part
 stamps, poses  --keyframes-->  indices of frames far enough from the previous keyframe
@@ -42,21 +42,19 @@ from sceneprint_client.transforms import (
     frame_name,
 )
 
-# Keyframes.
-
 
 def keyframes(
     stamps_ns: Sequence[int], poses: Sequence[Floats] | None, metres: float, radians: float,
     seconds: float,
 ) -> list[int]:  # fmt: skip
-    """Return the indices of the keyframes; the first frame is always a keyframe.
+    """Select keyframes; return their indices. The first frame is always a keyframe.
 
     Parameters
     ----------
     stamps_ns : time of each frame in order, nanoseconds
     poses : T_parent_sensor (4, 4) of each frame; None if unknown
-    metres, radians : minimum distance or angle from the previous keyframe; 0 selects every frame
-    seconds : minimum time after the previous keyframe, if there are no poses
+    metres, radians : minimum distance or angle from the previous keyframe; 0 selects all frames
+    seconds : minimum time after the previous keyframe, for frames without poses
     """
     places: list[int] = []
     for place, stamp in enumerate(stamps_ns):
@@ -80,9 +78,6 @@ def _relative_motion(a: Floats, b: Floats) -> tuple[float, float]:
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), math.atan2(sine, cosine)
 
 
-# The keyframes.
-
-
 @dataclass(frozen=True)
 class RecordingOptions:
     """Options for the frames of a bag; None selects a value from the content of the bag.
@@ -91,14 +86,14 @@ class RecordingOptions:
     ----------
     camera_info : topic of the CameraInfo of the depth images
     pose_frame : parent frame of the poses, such as "map" or "odom"
-    keyframe_m, keyframe_deg : minimum distance or angle from the previous keyframe; 0 selects every
-        frame
-    keyframe_s : minimum time after the previous keyframe, if there are no poses
+    keyframe_m, keyframe_deg : minimum distance or angle from the previous keyframe; 0 selects all
+        frames
+    keyframe_s : minimum time after the previous keyframe, for frames without poses, seconds
     sensor_frame : frame of the sensor, if points are in another frame
-    depth_scale : stored units per metre of 16-bit depth; default: that of an intrinsics.json, or
-        1000
-    join_m : length of the way whose scans are joined to one frame, metres; 0 takes each scan alone
-    progress : function that is called while the bag is read
+    depth_scale : stored units per metre of 16-bit depth; None selects the value of an
+        intrinsics.json, or 1000
+    join_m : length of the path whose scans are joined to a frame, metres; 0 joins no scans
+    progress : callback while the bag is read; see Progress
     """
 
     topic: str | None = None
@@ -113,24 +108,21 @@ class RecordingOptions:
     progress: Progress | None = None
 
 
-# Frames.
-
-
 def recording_sequences(
     path: Path, options: RecordingOptions, name: str | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the keyframes of a recording, whose samples are read on demand.
+    """Return the keyframes of a recording; their samples are read on demand.
 
     Parameters
     ----------
     path : .mcap, .db3 or .bag file, or rosbag2 folder
     options : topics and keyframes to select
-    name : name of the sequence; default: name of the file
+    name : name of the sequence; None selects the name of the file
 
     Returns
     -------
-    sequences : one sequence, or several if stamps go back; the `note` of the first one lists the
-        selected and the omitted frames, with reasons
+    sequences : one sequence, or several if stamps jump back; the `note` of the first sequence
+        describes the selected frames, and the omitted frames with reasons
 
     Raise DatasetError if the recording cannot be read, has no suitable topic, or has several. Raise
     InvalidIntrinsics if the camera is invalid, or its lens is not supported. Raise
@@ -159,14 +151,16 @@ def sequences_of(
     info = None if frames.encoding is None else camera_topic(bag, frames, options.camera_info)
     scan = scan_bag(bag, frames.topic, info, options.progress)
     cameras = (
-        {} if frames.encoding is None else _cameras(bag, frames, info, scan, options.depth_scale)
+        {}
+        if frames.encoding is None
+        else _select_cameras(bag, frames, info, scan, options.depth_scale)
     )
-    sensor = _sensor(bag, scan, frames, options)
+    sensor = _select_sensor(bag, scan, frames, options)
     is_timed = options.join_m and sensor == frames.frame
     seconds = scan_seconds(bag, frames.topic, scan) if is_timed else None
-    motions = _motions(bag, scan, frames, sensor, options, seconds or 0.0)
-    note = _note(frames, scan, motions)
-    counts = [len(one.scans) for motion in motions for one in motion.windows.values()]
+    motions = _compute_motions(bag, scan, frames, sensor, options, seconds or 0.0)
+    note = _describe_selection(frames, scan, motions)
+    counts = [len(window.scans) for motion in motions for window in motion.windows.values()]
     if counts:
         note += f"; each frame joins the scans of {options.join_m:g} m ({np.median(counts):g} "
         note += "of them in the median), "
@@ -188,7 +182,7 @@ def sequences_of(
     for number, motion in enumerate(motions, 1):
         part = name if len(motions) == 1 else f"{name}.part{number}"
         references = [
-            _reference(bag, frames, scan, cameras.get(place), motion, part, place)
+            _make_reference(bag, frames, scan, cameras.get(place), motion, part, place)
             for place in motion.keyframes
         ]
         if references:
@@ -197,7 +191,7 @@ def sequences_of(
                 FrameSequence(
                     part, bag.path, Layout.RECORDING, parent, None, tuple(references),
                     note="" if sequences else note,
-                    lost=0 if sequences else _lost(scan, motions),
+                    lost=0 if sequences else _count_lost(scan, motions),
                 )
             )  # fmt: skip
     return sequences
@@ -208,8 +202,8 @@ def recording_name(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
-def _sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions) -> str:
-    """Return the frame of the sensor.
+def _select_sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptions) -> str:
+    """Return the coordinate frame of the sensor.
 
     It is the frame of the messages, unless the user specifies another frame or the points are in a
     world frame, such as the registered points of FAST-LIO.
@@ -236,9 +230,10 @@ def _sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: RecordingOptio
 
 
 def _is_world(frame: str, trees: Sequence[TransformTree]) -> bool:
-    """Return whether a frame is a world frame, so that points in it are not in sensor axes.
+    """Return whether a coordinate frame is a world frame, so that its points are not in sensor
+    axes.
 
-    A world frame has a usual name, or sensors move in it while it moves in no other frame.
+    World frames have usual names, or sensors move in them and they move in no other frame.
     """
     name = frame.rpartition("/")[2]
     if name in WORLDS or name == _WORLD_OF_LOAM:
@@ -254,7 +249,7 @@ _WORLD_OF_LOAM = "camera_init"
 
 @dataclass(eq=False)
 class _Motion:
-    """Motion of the sensor in one part of a recording, by the index of each frame.
+    """The motion of the sensor in a part of a recording; dictionaries have the indices of frames.
 
     Parameters
     ----------
@@ -262,7 +257,7 @@ class _Motion:
     base : frame of the robot; None if unknown
     poses, mountings : known T_world_sensor and T_base_sensor
     ups : known up directions in the sensor's axes
-    cloud_poses : T_cloud_sensor of frames whose points are not in the axes of the sensor
+    cloud_poses : T_cloud_sensor of frames whose points are in other axes than the sensor's
     keyframes : indices of the keyframes
     unknown : reasons why frames have no pose
     windows : scans that are joined to the keyframes
@@ -288,11 +283,11 @@ class _Motion:
         return any(why.nearest_s is None for why in self.unknown.values())
 
 
-def _motions(
+def _compute_motions(
     bag: Bag, scan: BagScan, frames: FrameTopic, sensor: str, options: RecordingOptions,
     scan_s: float,
 ) -> list[_Motion]:  # fmt: skip
-    """Return the motion in each part with frames; `scan_s` is the duration of a scan."""
+    """Return the motion in each part with frames; `scan_s` is the duration of a scan, seconds."""
     parts = [
         (part, range(part.first, end))
         for part, end in zip(scan.parts, scan.ends, strict=True)
@@ -301,25 +296,26 @@ def _motions(
     world = options.pose_frame
     trees = [part.tree for part, _ in parts]
     if world is not None and all(tree.path(world, sensor) is None for tree in trees):
-        above = dict.fromkeys(one for tree in trees for one in tree.ancestors(sensor)[1:])
+        above = dict.fromkeys(frame for tree in trees for frame in tree.ancestors(sensor)[1:])
         raise DatasetError(
             f"{bag.path}: There are no transforms from {sensor or 'the sensor'} to "
             f"{world!r:.100}. Frames above it are {', '.join(above) or 'none'}."
         )
     motions = [
-        _motion(part, places, scan, (sensor, frames.frame), world, scan_s) for part, places in parts
+        _compute_motion(part, places, scan, (sensor, frames.frame), world, scan_s)
+        for part, places in parts
     ]
     with_poses = any(motion.poses for motion in motions)
     if options.join_m and not with_poses:
         raise DatasetError(
-            f"{bag.path}: {_note(frames, scan, motions)}. Scans are joined by odometry: omit "
-            "--join-m, or record /tf or odometry."
+            f"{bag.path}: {_describe_selection(frames, scan, motions)}. Scans are joined by "
+            "odometry: omit --join-m, or record /tf or odometry."
         )
     is_elsewhere = sensor != frames.frame
     if not with_poses and (is_elsewhere or any(motion.is_disputed for motion in motions)):
         return motions  # the caller reports the contradictory transforms
     for (part, places), motion in zip(parts, motions, strict=True):
-        _choose(motion, part, places, scan, sensor, options, with_poses=with_poses)
+        _select_keyframes(motion, part, places, scan, sensor, options, with_poses=with_poses)
         if options.join_m:
             names = motion.world or "", sensor, frames.frame
             motion.windows = scan_windows(
@@ -328,11 +324,11 @@ def _motions(
     return motions
 
 
-def _motion(
+def _compute_motion(
     part: BagPart, places: range, scan: BagScan, names: tuple[str, str], pose_frame: str | None,
     scan_s: float,
 ) -> _Motion:  # fmt: skip
-    """Return the poses and mountings of a sensor in one part, without keyframes."""
+    """Compute the poses and mountings of a sensor in a part; keyframes are not selected yet."""
     tree, (sensor, frame) = part.tree, names
     stamps = [scan.stamps_ns[place] for place in places]
     world = frame_name(pose_frame or "") or tree.world_of(sensor)
@@ -376,11 +372,11 @@ def _motion(
     return motion
 
 
-def _choose(
+def _select_keyframes(
     motion: _Motion, part: BagPart, places: range, scan: BagScan, sensor: str,
     options: RecordingOptions, *, with_poses: bool,
 ) -> None:  # fmt: skip
-    """Select the keyframes of one part by pose if the recording has poses, else by time."""
+    """Select the keyframes of a part: by pose if the recording has poses, otherwise by time."""
     stamps, poses = scan.stamps_ns, motion.poses
     if not with_poses:
         motion.world = None
@@ -393,15 +389,15 @@ def _choose(
         options.keyframe_s,
     )
     motion.keyframes = [order[place] for place in chosen]
-    motion.ups = _ups(part, sensor, motion.keyframes, stamps)
+    motion.ups = _compute_ups(part, sensor, motion.keyframes, stamps)
 
 
-def _ups(
+def _compute_ups(
     part: BagPart, sensor: str, keyframes: list[int], stamps_ns: Sequence[int]
 ) -> dict[int, Floats]:
-    """Return the up direction of keyframes in the sensor's axes.
+    """Return the up directions (3,) of keyframes in the sensor's axes, by index.
 
-    The source is the IMU with most measurements among those with a fixed position on the sensor.
+    Of the IMUs that are fixed to the sensor, the one with the most measurements determines them.
     """
     for imu in sorted(part.imus, key=lambda name: (-len(part.imus[name]), name)):
         T_sensor_imu = part.tree.fixed_transform(sensor, imu)
@@ -416,7 +412,7 @@ def _ups(
     return {}
 
 
-def _reference(
+def _make_reference(
     bag: Bag, frames: FrameTopic, scan: BagScan, camera: Camera | None, motion: _Motion, name: str,
     place: int,
 ) -> FrameReference:  # fmt: skip
@@ -442,22 +438,22 @@ def _reference(
             motion.windows.get(place),
         ),
         base=base,
-        original=f"{frames.topic.name}/{_seconds(scan.stamps_ns[place])}",
+        original=f"{frames.topic.name}/{_format_stamp(scan.stamps_ns[place])}",
         sequence=place,
     )
 
 
-def _seconds(stamp_ns: int) -> str:
-    """Return a stamp in seconds as text, since a float cannot represent nanoseconds."""
+def _format_stamp(stamp_ns: int) -> str:
+    """Format a stamp in seconds; a float cannot represent nanoseconds."""
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
-def _cameras(
+def _select_cameras(
     bag: Bag, frames: FrameTopic, topic: BagTopic | None, scan: BagScan, scale: float | None
 ) -> dict[int, Camera]:
-    """Return the camera of each depth image from CameraInfo, or from an intrinsics.json."""
+    """Return the camera of each depth image, by index, from CameraInfo or an intrinsics.json."""
     if topic is None or not scan.infos:
-        beside = _camera_beside(bag, frames, topic)
+        beside = _find_camera(bag, frames, topic)
         beside = replace(beside, depth_scale=scale or beside.depth_scale)
         return dict.fromkeys(range(len(scan.stamps_ns)), beside)
     with naming(f"{bag.path}, {topic.name}"):
@@ -472,11 +468,13 @@ def _cameras(
         if part.infos:
             numbers = part.info_at([scan.stamps_ns[place] for place in places])
             last = part.infos[-1]
-        by_place.update((place, cameras[one]) for place, one in zip(places, numbers, strict=True))
+        by_place.update(
+            (place, cameras[number]) for place, number in zip(places, numbers, strict=True)
+        )
     return by_place
 
 
-def _camera_beside(bag: Bag, frames: FrameTopic, topic: BagTopic | None) -> Camera:
+def _find_camera(bag: Bag, frames: FrameTopic, topic: BagTopic | None) -> Camera:
     try:
         return find_camera(bag.path.parent)
     except DatasetError as cause:
@@ -489,8 +487,8 @@ def _camera_beside(bag: Bag, frames: FrameTopic, topic: BagTopic | None) -> Came
         ) from cause
 
 
-def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
-    """Return a note for users on the selected and the omitted frames."""
+def _describe_selection(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
+    """Describe the selected and the omitted frames for users."""
     total, selected = len(scan.stamps_ns), sum(len(motion.keyframes) for motion in motions)
     poses = sum(len(motion.poses) for motion in motions)
     worlds = sorted({motion.world for motion in motions if motion.poses and motion.world})
@@ -499,8 +497,8 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
         f"of {total} frames{' in ' if worlds else ''}{', '.join(worlds)}"
     )
     if poses < total:
-        text += f"; {total - poses} without: {_reasons(frames, motions)}"
-    without = _without_pose(scan, motions)
+        text += f"; {total - poses} without: {_describe_unknown(frames, motions)}"
+    without = _count_without_pose(scan, motions)
     left = [
         f"{count} {reason}"
         for count, reason in (
@@ -514,27 +512,27 @@ def _note(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
         text += f"; skipped: {', '.join(left)}"
     if len(motions) > 1:
         text += f"; split into {len(motions)} parts, because stamps go back"
-    remarks = dict.fromkeys(one for motion in motions for one in motion.remarks)
+    remarks = dict.fromkeys(remark for motion in motions for remark in motion.remarks)
     return printable("; ".join([text, *list(remarks)[:5]]))
 
 
-def _lost(scan: BagScan, motions: list[_Motion]) -> int:
-    """Return the number of omitted frames, omitted poses and damaged messages."""
+def _count_lost(scan: BagScan, motions: list[_Motion]) -> int:
+    """Return the number of unexpectedly omitted frames or poses, and of damaged messages."""
     has_poses = any(motion.poses for motion in motions)
     if not has_poses and any(motion.is_broken for motion in motions):
         return len(scan.stamps_ns)
-    return _without_pose(scan, motions) + scan.damaged
+    return _count_without_pose(scan, motions) + scan.damaged
 
 
-def _without_pose(scan: BagScan, motions: list[_Motion]) -> int:
-    """Return the number of frames that are omitted because only other frames have a pose."""
+def _count_without_pose(scan: BagScan, motions: list[_Motion]) -> int:
+    """Return the number of frames that are omitted because only other frames have poses."""
     poses = sum(len(motion.poses) for motion in motions)
     is_left_out = poses or not any(motion.keyframes for motion in motions)
     return len(scan.stamps_ns) - poses if is_left_out else 0
 
 
-def _reasons(frames: FrameTopic, motions: list[_Motion]) -> str:
-    """Return the reasons why frames have no poses, the most frequent first."""
+def _describe_unknown(frames: FrameTopic, motions: list[_Motion]) -> str:
+    """Describe why frames have no poses, most frequent reason first."""
     whys = [why for motion in motions for why in motion.unknown.values()]
     reasons = []
     for (transform, disputed), count in Counter(

@@ -1,4 +1,4 @@
-"""Select the topics of a bag with frames, and convert their messages to the bytes of frames.
+"""Selection of a bag's topics with frames, and conversion of their messages to frames.
 
 Bag  --choose_topic-->  FrameTopic  --camera_topic-->  topic of its camera
 Image | CompressedImage  --depth_file-->  bytes of a PNG or NPY file
@@ -43,15 +43,13 @@ from sceneprint_client.ros_messages import (
 )
 from sceneprint_client.transforms import frame_name
 
-# Conversion of ROS messages to the bytes of a frame.
-
 
 def depth_file(message: Any, *, compressed: bool) -> bytes:
-    """Return the bytes of a PNG or NPY file with the samples of a depth image.
+    """Convert a depth image message to the bytes of a PNG or NPY file.
 
     Parameters
     ----------
-    message : sensor_msgs Image, or CompressedImage of depth
+    message : sensor_msgs Image or CompressedImage with depth
     compressed : whether the message is a CompressedImage
 
     Returns
@@ -71,13 +69,13 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
 
 
 def cloud_file(message: Any, T_cloud_sensor: Floats | None = None) -> bytes:
-    """Return the bytes of an NPY file with the points of a PointCloud2; see `cloud_points`.
+    """Convert a PointCloud2 to the bytes of an NPY file of points; see `cloud_points`.
 
     Parameters
     ----------
     message : sensor_msgs PointCloud2
-    T_cloud_sensor : (4, 4) transform with which the points are converted to the sensor's axes, or
-        None
+    T_cloud_sensor : (4, 4) pose of the sensor in the cloud's frame, to convert the points to the
+        sensor's axes; None leaves them unchanged
     """
     if T_cloud_sensor is None:
         return encode_npy(cloud_points(message))
@@ -88,7 +86,7 @@ def cloud_file(message: Any, T_cloud_sensor: Floats | None = None) -> bytes:
 
 @dataclass(frozen=True)
 class FrameTopic:
-    """Topic whose messages are frames.
+    """A topic whose messages are frames.
 
     Parameters
     ----------
@@ -102,19 +100,19 @@ class FrameTopic:
 
     @property
     def is_compressed(self) -> bool:
-        """Whether the messages are compressed images."""
+        """Return whether the messages are compressed images."""
         return self.topic.type == COMPRESSED
 
     @property
     def is_rectified(self) -> bool:
-        """Whether the images are rectified according to the ROS naming convention."""
+        """Return whether the images are rectified, by the ROS naming convention."""
         return is_rectified(self.topic.name)
 
     @property
     def is_beside_depth(self) -> bool:
-        """Whether the topic is named after colour, infrared, confidence or labels.
+        """Return whether the topic's name indicates colour, infrared, confidence or labels.
 
-        Of `/depth/confidence` and `/ir_camera/depth/image`, only the first does.
+        `/depth/confidence` does; `/ir_camera/depth/image` does not.
         """
         parts = topic_without_transport(self.topic.name).split("/")
         last = max((i for i, part in enumerate(parts) if "depth" in part.lower()), default=0)
@@ -123,13 +121,13 @@ class FrameTopic:
 
 @dataclass(frozen=True, eq=False)
 class BagSource:
-    """Source of the bytes of a frame: one message of a bag.
+    """The source of a frame's bytes: a message of a bag.
 
     Parameters
     ----------
-    log_ns, occurrence : time of recording, and index among the messages with the same time
-    T_cloud_sensor : (4, 4) transform with which points are converted to the sensor's axes, or None
-    window : scans that are joined to the frame, or None
+    log_ns, occurrence : recording time, nanoseconds, and index among the messages with that time
+    T_cloud_sensor : see `cloud_file`
+    window : scans that are joined to the frame; None if none are
     """
 
     bag: Bag
@@ -155,7 +153,7 @@ class BagSource:
         with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
             try:
                 fields = self.bag.decode(message, self.topic.type)
-            except DatasetError as cause:  # only this message is damaged
+            except DatasetError as cause:  # the message, not the bag, is damaged
                 error: type[FrameError] = UnreadableCloud if is_cloud else UnreadableFrame
                 raise error("The message is damaged. Record it again.") from cause
             if is_cloud:
@@ -164,37 +162,34 @@ class BagSource:
 
     def __reduce__(self) -> tuple[Any, ...]:
         place = self.log_ns, self.occurrence, self.T_cloud_sensor, self.window
-        return _source_in, (self.bag.path, self.topic, *place)
+        return _restore_source, (self.bag.path, self.topic, *place)
 
 
-def _source_in(path: Path, topic: BagTopic, *place: Any) -> BagSource:
-    """Return a source from another process; its bag is opened in this process."""
+def _restore_source(path: Path, topic: BagTopic, *place: Any) -> BagSource:
+    """Rebuild a source that was pickled in another process; open its bag in this process."""
     return BagSource(shared_bag(path), topic, *place)
-
-
-# Selection of topics.
 
 
 def frame_topics(bag: Bag) -> list[FrameTopic]:
     """Return the topics of depth images and points, according to their first messages.
 
-    If an image topic exists both raw and compressed, the raw one is returned.
+    If an image topic exists both raw and compressed, the raw topic is returned.
     """
     topics = []
     for topic in bag.of_type(IMAGE, COMPRESSED, *CLOUDS):
-        one = _frame_topic(bag, topic)
-        if one is not None:
-            topics.append(one)
-    raw = {one.topic.name for one in topics if not one.is_compressed}
+        described = _describe_topic(bag, topic)
+        if described is not None:
+            topics.append(described)
+    raw = {described.topic.name for described in topics if not described.is_compressed}
     return [
-        one
-        for one in topics
-        if not (one.is_compressed and topic_without_transport(one.topic.name) in raw)
+        described
+        for described in topics
+        if not (described.is_compressed and topic_without_transport(described.topic.name) in raw)
     ]
 
 
-def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
-    """Return the description of a topic from its first message; None if it has no depth."""
+def _describe_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
+    """Return a topic with the encoding and frame of its first message; None if it has no depth."""
     try:
         message = bag.first(topic.name)
         fields = None if message is None else bag.decode(message, topic.type)
@@ -211,50 +206,50 @@ def _frame_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
 
 
 def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
-    """Return the topic of the frames.
+    """Select the topic of the frames.
 
     `name`: name that the user specifies, or None. Raise DatasetError if no topic fits, or several
     topics fit and `name` is None. Infrared and the like must be named.
     """
     candidates = frame_topics(bag)
     if name is not None:
-        named = [one for one in bag.topics if one.name == name]
+        named = [topic for topic in bag.topics if topic.name == name]
         if not named:
             raise DatasetError(
                 f"{bag.path}: There is no topic {name!r:.100}. Select one of "
-                f"{listed(one.topic for one in candidates)}. `sceneprint bag` lists all topics."
+                f"{listed(topic.topic for topic in candidates)}. `sceneprint bag` lists all topics."
             )
-        frames = next((one for one in candidates if one.topic.name == name), None)
+        frames = next((topic for topic in candidates if topic.topic.name == name), None)
         if frames is None and named[0].type in (IMAGE, COMPRESSED, *CLOUDS):
-            frames = _frame_topic(bag, named[0])
+            frames = _describe_topic(bag, named[0])
         if frames is None:
             raise DatasetError(
                 f"{bag.path}: The topic {printable(name)} ({printable(named[0].type)}, "
                 f"{named[0].count} messages) has no depth images ({_SUPPORTED}) and no points. "
-                f"Select one of {listed(one.topic for one in candidates)}."
+                f"Select one of {listed(topic.topic for topic in candidates)}."
             )
         return frames
-    candidates = [one for one in candidates if not one.is_beside_depth]
+    candidates = [topic for topic in candidates if not topic.is_beside_depth]
     if not candidates:
         raise DatasetError(
             f"{bag.path}: There is no topic of depth images ({_SUPPORTED}; not {OMITTED_IMAGES}) "
-            f"or of points (PointCloud2, CustomMsg). Images are {_encodings(bag)}. "
+            f"or of points (PointCloud2, CustomMsg). Images are {_list_encodings(bag)}. "
             "Select one with --topic. `sceneprint bag` lists all topics."
         )
     if len(candidates) > 1:
         raise DatasetError(
             f"{bag.path}: {len(candidates)} topics have frames: "
-            f"{listed(one.topic for one in candidates)}. Select one with --topic."
+            f"{listed(topic.topic for topic in candidates)}. Select one with --topic."
         )
     return candidates[0]
 
 
-#: Supported encodings of images, for messages.
+#: Supported encodings of images, for error messages.
 _SUPPORTED = "16UC1, mono16, 32FC1, compressedDepth, or 16-bit PNG"
 
 
-def _encodings(bag: Bag) -> str:
-    """Return the encodings of the images of a bag, for messages."""
+def _list_encodings(bag: Bag) -> str:
+    """List the encodings of a bag's images, for error messages."""
     encodings = []
     for topic in bag.of_type(IMAGE, COMPRESSED)[:20]:
         try:
@@ -268,21 +263,21 @@ def _encodings(bag: Bag) -> str:
 
 
 def camera_topic(bag: Bag, frames: FrameTopic, name: str | None) -> BagTopic | None:
-    """Return the CameraInfo topic of depth images; None if none fits.
+    """Select the CameraInfo topic of depth images; return None if none fits.
 
     It is `name`; otherwise `camera_info` in the namespace of the images; otherwise the only topic
-    whose first message has the frame of the images.
+    whose first message has the coordinate frame of the images.
 
     Parameters
     ----------
     frames : topic of depth images
-    name : name that the user specifies, or None
+    name : name that the user specifies; None selects automatically
 
     Raise DatasetError if `name` is not a topic of CameraInfo, or several topics have the frame.
     """
     topics = bag.of_type(CAMERA)
     if name is not None:
-        topic = next((one for one in topics if one.name == name), None)
+        topic = next((candidate for candidate in topics if candidate.name == name), None)
         if topic is None:
             raise DatasetError(
                 f"{bag.path}: There is no topic {name!r:.100} of CameraInfo. Select one of "
@@ -290,10 +285,10 @@ def camera_topic(bag: Bag, frames: FrameTopic, name: str | None) -> BagTopic | N
             )
         return topic
     beside = topic_without_transport(frames.topic.name).rpartition("/")[0] + "/camera_info"
-    for one in topics:
-        if one.name == beside:
-            return one
-    fitting = [one for one in topics if _frame_of(bag, one) == frames.frame]
+    for candidate in topics:
+        if candidate.name == beside:
+            return candidate
+    fitting = [candidate for candidate in topics if _frame_of(bag, candidate) == frames.frame]
     if len(fitting) > 1:
         raise DatasetError(
             f"{bag.path}: Several cameras fit {frames.topic.name}: {listed(fitting)}. "
@@ -303,7 +298,7 @@ def camera_topic(bag: Bag, frames: FrameTopic, name: str | None) -> BagTopic | N
 
 
 def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
-    """Return the frame of a topic's first message."""
+    """Return the coordinate frame of a topic's first message; None if it cannot be decoded."""
     try:
         message = bag.first(topic.name)
         fields = None if message is None else bag.decode(message, topic.type)
@@ -313,6 +308,9 @@ def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
 
 
 def listed(topics: Iterable[BagTopic]) -> str:
-    """Return names, types and message counts of topics, for messages."""
-    names = [f"{one.name} ({one.type.rpartition('/')[2]}, {one.count} messages)" for one in topics]
+    """List the names, types and message counts of topics, for error messages."""
+    names = [
+        f"{topic.name} ({topic.type.rpartition('/')[2]}, {topic.count} messages)"
+        for topic in topics
+    ]
     return printable(", ".join(names[:20])) or "none"

@@ -1,4 +1,4 @@
-"""Determine the units of the coordinates of a LAS file from its header.
+"""Units of the coordinates of a LAS file, according to its header.
 
 bytes  --las_units_per_metre-->  1 for metres, 3.28 for feet, or None
 """
@@ -20,21 +20,21 @@ _WKT_UNIT = re.compile(r'UNIT\s*\[\s*"([^"]{1,60})"\s*,\s*([0-9.eE+-]{1,30})')
 
 
 def las_units_per_metre(data: FileBytes) -> float | None:
-    """Return the units per metre of the file's coordinates; None if the file does not state them.
+    """Read the units per metre of the file's coordinates; return None if the file states none.
 
     Raise UnreadableCloud if the coordinates are degrees.
     """
     for user, number, content in las_records(data):
         if user == b"LASF_Projection" and number in (_GEO_KEYS, _WKT):
             is_wkt = number == _WKT
-            units = _of_wkt(content.decode("latin-1")) if is_wkt else _of_keys(content)
+            units = _read_wkt(content.decode("latin-1")) if is_wkt else _read_geo_keys(content)
             if units is not None:
                 return units
     return None
 
 
-def _of_keys(body: bytes) -> float | None:
-    """Return the units per metre from a directory of GeoTIFF keys."""
+def _read_geo_keys(body: bytes) -> float | None:
+    """Read the units per metre from a directory of GeoTIFF keys; return None if it has none."""
     numbers = struct.unpack_from(f"<{len(body) // 2}H", body)
     keys = {
         key: value
@@ -42,15 +42,15 @@ def _of_keys(body: bytes) -> float | None:
         if location == 0
     }
     if keys.get(_MODEL) == _GEOGRAPHIC:
-        raise _degrees()
+        raise _degrees_error()
     return _UNITS.get(keys.get(_LINEAR_UNIT, 0))
 
 
-def _of_wkt(text: str) -> float | None:
-    """Return the units per metre from the first length unit in well-known text."""
+def _read_wkt(text: str) -> float | None:
+    """Read the units per metre from the first length unit in well-known text, if any."""
     head = text.lstrip()[:8].upper()
     if head.startswith(("GEOGCS", "GEOGCRS")):
-        raise _degrees()
+        raise _degrees_error()
     for name, value in _WKT_UNIT.findall(text):
         if "degree" not in name.lower() and "radian" not in name.lower():
             try:
@@ -61,7 +61,7 @@ def _of_wkt(text: str) -> float | None:
     return None
 
 
-def _degrees() -> UnreadableCloud:
+def _degrees_error() -> UnreadableCloud:
     return UnreadableCloud(
         "The coordinates of the LAS file are longitude and latitude in degrees. Convert them to "
         "metres, for example to UTM with `pdal translate` and filters.reprojection, and upload "

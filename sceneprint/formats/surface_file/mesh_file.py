@@ -1,8 +1,8 @@
-"""Read OBJ, STL and glTF files with trimesh, which no other module imports.
+"""Reading of OBJ, STL and glTF files with trimesh; only this module imports trimesh.
 
 bytes, format  --read_mesh-->  vertices, triangles
 
-The reader uses only the bytes: it refuses files whose geometry is in other files, and ignores
+The reader uses only the bytes: it rejects files whose geometry is in other files, and ignores
 materials and textures.
 """
 
@@ -38,12 +38,12 @@ _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_", "E
 
 @dataclass(frozen=True, eq=False)
 class FileMesh:
-    """Geometry of a file in the axes of its scene.
+    """The geometry of a file, in the axes of its scene.
 
     Parameters
     ----------
     vertices : (N, 3) float64, units of the file
-    triangles : (M, 3) int32 indices, -1 if beyond int32; None if the file has no triangles
+    triangles : (M, 3) int32 indices, -1 for invalid indices; None if the file has no triangles
     notes : sentences for users on omitted parts
     """
 
@@ -52,31 +52,31 @@ class FileMesh:
     notes: tuple[str, ...] = ()
 
     def blocks(self) -> Iterator[Floats]:
-        """Yield the vertices in blocks."""
+        """Yield the vertices in blocks (n, 3)."""
         for first in range(0, len(self.vertices), BLOCK):
             yield self.vertices[first : first + BLOCK]
 
 
 def read_mesh(data: FileBytes, file_format: MeshFormat) -> FileMesh:
-    """Return the vertices and triangles of all parts of a file.
+    """Read the vertices and triangles of all parts of a file.
 
     Raise UnreadableCloud if the file is damaged, has no geometry or too much, or needs other files
     or unsupported extensions. Raise MissingDependency if trimesh is not installed.
     """
-    trimesh = _trimesh()
+    trimesh = _import_trimesh()
     name = {"glb": "glTF", "gltf": "glTF"}.get(file_format, file_format.upper())
     if file_format in ("glb", "gltf"):
-        _check_gltf(_gltf_json(data, file_format))
+        _check_gltf(_read_gltf_json(data, file_format))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            # numpy only issues a warning if text ends within its numbers
+            # numpy issues only a warning if text ends within an array
             warnings.simplefilter("error", DeprecationWarning)
             scene = trimesh.load_scene(
                 io.BytesIO(data), file_type=file_format, process=False, validate=False,
                 skip_materials=True, maintain_order=True,
             )  # fmt: skip
-            return _joined(trimesh, scene, name)
+            return _join_parts(trimesh, scene, name)
     except (MemoryError, UnreadableCloud):
         raise
     except Exception as cause:  # trimesh raises arbitrary exceptions for damaged files
@@ -85,7 +85,7 @@ def read_mesh(data: FileBytes, file_format: MeshFormat) -> FileMesh:
         ) from cause
 
 
-def _trimesh() -> ModuleType:
+def _import_trimesh() -> ModuleType:
     try:
         import trimesh
     except ImportError as cause:
@@ -98,17 +98,19 @@ def _trimesh() -> ModuleType:
     return module
 
 
-def _joined(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
-    """Return all triangles of a scene, or all points if it has no triangles."""
+def _join_parts(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
+    """Join all triangles of a scene; join all points if it has no triangles."""
     parts = []
     for node in scene.graph.nodes_geometry:
         T, key = scene.graph[node]
         parts.append((scene.geometry[key], np.asarray(T, np.float64)))
-    meshes = [(one, T) for one, T in parts if isinstance(one, trimesh.Trimesh) and len(one.faces)]
-    clouds = [(one, T) for one, T in parts if isinstance(one, trimesh.PointCloud)]
-    clouds += [(one, T) for one, T in parts if isinstance(one, trimesh.Trimesh)]
+    meshes = [
+        (part, T) for part, T in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)
+    ]
+    clouds = [(part, T) for part, T in parts if isinstance(part, trimesh.PointCloud)]
+    clouds += [(part, T) for part, T in parts if isinstance(part, trimesh.Trimesh)]
     chosen = meshes or clouds
-    count = sum(len(one.vertices) for one, _ in chosen)
+    count = sum(len(part.vertices) for part, _ in chosen)
     if not count:
         raise UnreadableCloud(
             f"The {name} file has neither triangles nor points. Export the geometry again, and "
@@ -120,18 +122,18 @@ def _joined(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
             f"The {name} file has {count} vertices; the limit is {most}. Simplify the mesh, or "
             "write only its vertices, as a cloud."
         )
-    check_triangles(sum(len(one.faces) for one, _ in meshes))
+    check_triangles(sum(len(part.faces) for part, _ in meshes))
     vertices = np.concatenate(
-        [np.asarray(one.vertices, np.float64) @ T[:3, :3].T + T[:3, 3] for one, T in chosen]
+        [np.asarray(part.vertices, np.float64) @ T[:3, :3].T + T[:3, 3] for part, T in chosen]
     )
     omitted = len(parts) - len(chosen)
     notes = (f"{omitted} parts without triangles were skipped.",) if omitted else ()
     if not meshes:
         return FileMesh(vertices, None, notes)
     triangles, first = list[Ints32](), 0
-    for one, T in meshes:
-        faces = np.asarray(one.faces, np.int64)
-        n = len(one.vertices)
+    for part, T in meshes:
+        faces = np.asarray(part.faces, np.int64)
+        n = len(part.vertices)
         if np.linalg.det(T[:3, :3]) < 0:  # a reflection reverses the orientation of triangles
             faces = faces[:, ::-1]
         triangles.append(np.where((faces < 0) | (faces >= n), -1, faces + first).astype(np.int32))
@@ -139,7 +141,7 @@ def _joined(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
     return FileMesh(vertices, np.concatenate(triangles), notes)
 
 
-def _gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
+def _read_gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
     length = 0
     if file_format == "glb":
         if len(data) < _GLB_HEADER:
@@ -164,8 +166,8 @@ def _gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
 
 
 def _check_gltf(fields: dict[str, Any]) -> None:
-    """Raise UnreadableCloud for geometry in other files, compression, and arrays without bytes."""
-    for buffer in _objects(fields, "buffers"):
+    """Raise UnreadableCloud for geometry in other files, compression, or arrays without bytes."""
+    for buffer in _list_objects(fields, "buffers"):
         uri = buffer.get("uri")
         if uri is not None and not str(uri)[:100].startswith("data:"):
             raise UnreadableCloud(
@@ -173,13 +175,13 @@ def _check_gltf(fields: dict[str, Any]) -> None:
                 "single GLB file."
             )
     required = fields.get("extensionsRequired", [])
-    unknown = [str(one) for one in required if not str(one).startswith(_HARMLESS)]
+    unknown = [str(extension) for extension in required if not str(extension).startswith(_HARMLESS)]
     if unknown:
         raise UnreadableCloud(
             f"The glTF file needs the extension {unknown[0]!r:.60}, which is not supported. Export "
             "it without compression or quantisation."
         )
-    for accessor in _objects(fields, "accessors"):
+    for accessor in _list_objects(fields, "accessors"):
         if "sparse" in accessor or "bufferView" not in accessor:
             raise UnreadableCloud(
                 "The glTF file has sparse arrays, or arrays without bytes, which are not "
@@ -187,8 +189,8 @@ def _check_gltf(fields: dict[str, Any]) -> None:
             )
 
 
-def _objects(fields: dict[str, Any], key: str) -> list[dict[str, Any]]:
+def _list_objects(fields: dict[str, Any], key: str) -> list[dict[str, Any]]:
     objects = fields.get(key, [])
-    if not isinstance(objects, list) or not all(isinstance(one, dict) for one in objects):
+    if not isinstance(objects, list) or not all(isinstance(item, dict) for item in objects):
         raise UnreadableCloud(f"The glTF file has no list of objects as its {key}. {_AGAIN}")
     return objects

@@ -1,4 +1,4 @@
-"""Read the triangles of a PLY file, and convert polygons to fans of triangles.
+"""Reading of a PLY file's faces, and conversion of polygons to fans of triangles.
 
 bytes  --read_faces-->  triangles (M, 3)
 """
@@ -39,9 +39,9 @@ _AGAIN = "Copy or write the file again."
 
 
 def read_faces(data: FileBytes) -> Ints32 | None:
-    """Return the triangles (M, 3) of the element `face`; None if the file has no such element.
+    """Read the triangles (M, 3) of the element `face`; return None if the file has no faces.
 
-    Indices are not compared with the number of vertices. Indices beyond int32 are -1.
+    Indices are not compared with the number of vertices; negative and beyond int32, they become -1.
 
     Raise UnreadableCloud if the faces have no list of vertices, or fewer or more bytes than
     declared, a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.
@@ -51,7 +51,7 @@ def read_faces(data: FileBytes) -> Ints32 | None:
     if "face" not in names or elements[names.index("face")].count == 0:
         return None
     before, face = elements[: names.index("face")], elements[names.index("face")]
-    lists = [k for k, one in enumerate(face.properties) if one.name in _NAMES and one.length]
+    lists = [k for k, prop in enumerate(face.properties) if prop.name in _NAMES and prop.length]
     if len(lists) != 1 or face.properties[lists[0]].kind[0] == "f":
         raise UnreadableCloud(
             "The faces of the PLY file do not have exactly one list of integers called "
@@ -63,7 +63,7 @@ def read_faces(data: FileBytes) -> Ints32 | None:
     else:
         for element in before:
             start = element_end(data, start, element, order)
-        blocks = _binary(data, start, face, lists[0], order)
+        blocks = _binary_fans(data, start, face, lists[0], order)
     triangles, count = list[Ints32](), 0
     for block in blocks:
         count += len(block)
@@ -81,29 +81,31 @@ def check_triangles(count: int) -> None:
         )
 
 
-def _binary(data: FileBytes, start: int, face: Element, at: int, order: str) -> Iterator[Indices]:
+def _binary_fans(
+    data: FileBytes, start: int, face: Element, at: int, order: str
+) -> Iterator[Indices]:
     element_end(data, start, face, order)  # checks that the rows fit into the file
     view = np.frombuffer(data, np.uint8)
-    kinds = [(one.kind, one.length) for one in face.properties]
+    kinds = [(prop.kind, prop.length) for prop in face.properties]
     chosen = face.properties[at]
     index, length = np.dtype(order + chosen.kind), np.dtype(order + (chosen.length or ""))
     for places, _ in value_offsets(view, start, face.count, kinds, (at, at, at), order):
         begins = places[:, 0]
-        sizes = _gathered(view, begins, length, 1)[:, 0]
+        sizes = _numbers(view, begins, length, 1)[:, 0]
         _check_corners(int(sizes.min()), int(sizes.max()))
         for corners in np.unique(sizes):
-            polygons = _gathered(view, begins[sizes == corners] + length.itemsize, index, corners)
-            yield _fans(polygons)
+            first = begins[sizes == corners] + length.itemsize
+            yield _fans(_numbers(view, first, index, corners))
 
 
-def _gathered(view: Bytes, begins: Indices, kind: np.dtype[np.integer], count: int) -> Indices:
-    """Return `count` numbers from each offset (n,), as (n, count)."""
+def _numbers(view: Bytes, begins: Indices, kind: np.dtype[np.integer], count: int) -> Indices:
+    """Read `count` numbers at each offset (n,); return them as (n, count)."""
     picked = view[begins[:, None] + np.arange(count * kind.itemsize)]
     return np.ascontiguousarray(picked).view(kind).astype(np.int64)
 
 
 def _fans(polygons: Indices) -> Indices:
-    """Return the triangles (n (c - 2), 3) of polygons (n, c)."""
+    """Split polygons (n, c) into triangles (n (c - 2), 3)."""
     c = polygons.shape[1]
     fan = np.array([(0, k, k + 1) for k in range(1, c - 1)])
     return polygons[:, fan].reshape(-1, 3)
@@ -124,11 +126,13 @@ def _ascii_triangles(
     for element in before:
         start = skip_lines(text, start, element.count)
     check_room(text, start, face.count, len(face.properties))
-    lists = np.array([one.length is not None for one in face.properties])
+    lists = np.array([prop.length is not None for prop in face.properties])
     room = np.empty((1 << 16, 3), np.int64)
     done = 0
     while done < face.count:
-        start, rows, triangles, state = _fill(text, start, face.count - done, lists, at, room)
+        start, rows, triangles, state = _parse_faces(
+            text, start, face.count - done, lists, at, room
+        )
         if state != GOOD:
             raise UnreadableCloud(
                 f"Row {done + rows + 1} of {face.count} faces cannot be read: "
@@ -139,15 +143,15 @@ def _ascii_triangles(
 
 
 @kernel
-def _fill(
+def _parse_faces(
     text: Bytes, start: int, most: int, lists: NDArray[np.bool_], at: int, out: Indices
 ) -> tuple[int, int, int, int]:
-    """Fill `out` with triangles while it has space for the largest polygon.
+    """Parse faces into triangles while `out` has space for the largest polygon.
 
     Returns
     -------
-    end, rows, triangles, status : offset after the last row, numbers of rows and of triangles, and
-        status of the next row
+    end, rows, triangles, status : offset after the last row, number of rows, number of triangles,
+        and status of the next row
     """
     i, size, n, row = start, len(text), 0, 0
     while row < most and n + _MOST_CORNERS <= len(out):

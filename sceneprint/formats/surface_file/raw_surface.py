@@ -1,8 +1,8 @@
-"""Surface in the units and axes of its file, which all readers return.
+"""The result of all readers of surfaces, in the units and axes of the file.
 
 blocks of points  --gather-->  RawSurface
 
-Points are float32 relative to a float64 origin, so map coordinates (UTM) keep a precision of
+Points are float32 relative to a float64 origin, so that map coordinates (UTM) have a precision of
 millimetres. Large clouds are thinned while they are read.
 """
 
@@ -17,13 +17,13 @@ from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.cloud import thinned
 from sceneprint.types import Floats, Floats32, Ints32
 
-#: Maximum number of points of a file, of points of a thinned cloud, and of vertices and triangles
-#: of a mesh.
+#: Maximum number of points in a file and in a thinned cloud, and of vertices and triangles in a
+#: mesh.
 MOST_FILE_POINTS, MOST_POINTS = 60_000_000, 10_000_000
 MOST_VERTICES, MOST_TRIANGLES = 15_000_000, 20_000_000
 #: Minimum voxel edge length of a thinned cloud, metres.
 FINEST_M = 0.01
-#: Largest coordinate without subtraction of an origin, units of the file.
+#: Maximum coordinate for which no origin is subtracted, units of the file.
 _NEAR_UNITS = 1000.0
 TOO_LARGE = (
     "A coordinate is larger than any coordinate on Earth. Remove isolated distant points, and "
@@ -35,17 +35,17 @@ _MOST_VOXELS = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class RawSurface:
-    """Surface in the units and axes of its file.
+    """A surface in the units and axes of its file.
 
     Parameters
     ----------
-    points : (N, 3) float32, relative to `origin`; only those of a mesh may be NaN or infinite
+    points : (N, 3) float32, relative to `origin`; vertices of a mesh may be NaN or infinite
     origin : (3,) float64
     triangles : (M, 3) int64 or int32 indices that have not been checked; None for a cloud
     file_points : number of points of the file, including missing points
     voxel : voxel edge length of a thinned cloud, units of the file; None if it is not thinned
-    units_per_metre : units that the file states, or None
-    up : (3,) up direction that the file states, or None
+    units_per_metre : units that the file states; None if it states none
+    up : (3,) up direction that the file states; None if it states none
     usual_up : (3,) up direction of most files of this format
     notes : sentences for users on omitted parts
     """
@@ -67,7 +67,7 @@ def gather(
     units_of: Callable[[Floats32], float] | None,
     most: int = MOST_POINTS,
 ) -> tuple[Floats32, Floats, float | None]:
-    """Return the points of all blocks, and thin a large cloud.
+    """Concatenate the points of all blocks; thin large clouds.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ def gather(
     cloud = _Cloud(count, units_of, most)
     for block in blocks:
         cloud.add(block)
-    return cloud.finished()
+    return cloud.finish()
 
 
 class _Cloud:
-    """Points that are added in blocks, and thinned when there are too many."""
+    """A cloud to which points are added in blocks, and which is thinned when it is too large."""
 
     def __init__(self, count: int, units_of: Callable[[Floats32], float] | None, most: int) -> None:
         room = count if units_of is None else min(count, 2 * most)
@@ -104,7 +104,7 @@ class _Cloud:
         self._voxel: float | None = None
 
     def add(self, block: Floats) -> None:
-        """Add points, except those of a cloud that are not finite."""
+        """Add points; for clouds, omit points that are not finite."""
         present = np.asarray(np.isfinite(block).all(axis=1))
         if self._units_of is not None and not present.all():
             block, present = block[present], present[present]
@@ -117,14 +117,14 @@ class _Cloud:
             if self._n == len(self._points):
                 self._thin()
             piece = block[first : first + len(self._points) - self._n]
-            with np.errstate(all="ignore"):  # points that overflow are missing
+            with np.errstate(all="ignore"):  # overflows are missing points
                 shifted = piece if self._origin is None else piece - self._origin
                 self._points[self._n : self._n + len(piece)] = shifted
             self._n += len(piece)
             first += len(piece)
 
-    def finished(self) -> tuple[Floats32, Floats, float | None]:
-        """Return points, origin and voxel; see `gather`."""
+    def finish(self) -> tuple[Floats32, Floats, float | None]:
+        """Return the points, origin and voxel; see `gather`."""
         if self._units_of is not None and (self._n > self._most or self._voxel is not None):
             self._thin()
         points = self._points[: self._n]

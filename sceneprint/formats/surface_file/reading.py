@@ -1,9 +1,9 @@
-"""Read a file of a whole map as a `ReferenceSurface` in metres.
+"""Reading of a whole map file as a `ReferenceSurface` in metres.
 
 bytes, name, options  --read_surface-->  ReadSurface
 
-If neither the file nor the options state the units or the up direction, they are estimated from the
-surface, and the result says so. The axes remain those of the file.
+Units and an up direction that neither the file nor the options state are estimated from the
+surface, and a note says so. The axes are those of the file.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ AXES: dict[str, Floats] = {
 FAR_M = 1000.0
 _STL_HEADER, _STL_TRIANGLE = 84, 50  #: bytes
 _BLOCK = 1 << 18
-#: Coordinate larger than that of any place on Earth in any supported unit; its products are finite.
+#: Coordinate beyond all places on Earth, in all supported units; its products are finite.
 _MOST_UNITS = 1e15
-#: Usual range of the extent of a place, metres; other extents cause a note.
+#: Minimum and maximum usual extent of a place, metres; other extents cause a note.
 _SMALL_M, _LARGE_M = 1.0, 5000.0
 
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Properties of a surface that the user states; None uses the file, or an estimate.
+    """Properties of a surface that the user states; None uses the file's value, or an estimate.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class SurfaceOptions:
 
 @dataclass(frozen=True, eq=False)
 class ReadSurface:
-    """Surface with the parameters used to read it.
+    """A surface, and the parameters with which its file was read.
 
     Parameters
     ----------
@@ -108,11 +108,11 @@ class ReadSurface:
 
 
 def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
-    """Return the format of a file of a whole map, from its first bytes or its name.
+    """Recognise the format of a whole map file, from its first bytes or its name.
 
     Parameters
     ----------
-    head : first 10,016 bytes of the file, or all of a smaller file
+    head : first `HEAD` bytes of the file
     name : name of the file; its suffix identifies OBJ and ascii STL
     size : size of the file, bytes
 
@@ -142,19 +142,19 @@ def read_surface(
     data: FileBytes, name: str, options: SurfaceOptions | None = None,
     file_format: SurfaceFormat | None = None,
 ) -> ReadSurface:  # fmt: skip
-    """Return the surface from a whole-map file.
+    """Read the surface in a whole map file.
 
     Parameters
     ----------
     data : the whole file, in memory or mapped
-    name : name of the file for errors; its suffix identifies formats without a signature
+    name : name of the file for errors; its suffix identifies formats without a magic number
     options : properties that the user states
-    file_format : format of the file if known
+    file_format : format of the file; None recognises it
 
     Returns
     -------
-    read : surface without missing points, and without triangles that have no area or lack a vertex;
-        a cloud of more than 10 million points is thinned to the first point of each voxel
+    read : surface without missing points, and without triangles that lack an area or a vertex; a
+        cloud of more than 10 million points is thinned to the first point of each voxel
 
     Raise UnreadableCloud if the bytes have an unknown format, are damaged, have coordinates in
     degrees or exceed a limit, a triangle refers to a missing vertex, or the surface exceeds 20 km.
@@ -164,35 +164,35 @@ def read_surface(
     stated = options or SurfaceOptions()
     with naming(name):
         form = file_format or surface_format(data[:HEAD], name, len(data))
-        return _in_metres(_raw(data, form, stated), stated)
+        return _convert(_read_raw(data, form, stated), stated)
 
 
-def _raw(data: FileBytes, form: SurfaceFormat, options: SurfaceOptions) -> RawSurface:
+def _read_raw(data: FileBytes, form: SurfaceFormat, options: SurfaceOptions) -> RawSurface:
     if form in ("obj", "stl", "glb", "gltf"):
         mesh = read_mesh(data, form)
         is_gltf = form in ("glb", "gltf")
         points = FilePoints(len(mesh.vertices), mesh.blocks())
-        raw = _gathered(points, mesh.triangles, AXES["z" if form == "stl" else "y"], options)
+        raw = _gather_points(points, mesh.triangles, AXES["z" if form == "stl" else "y"], options)
         stated = (1.0, AXES["y"]) if is_gltf else (None, None)
         return replace(raw, units_per_metre=stated[0], up=stated[1], notes=mesh.notes)
     if form == "ply":
         faces = read_faces(data)
         points = read_ply(data, MOST_FILE_POINTS if faces is None else MOST_VERTICES)
-        return _gathered(points, faces, AXES["z"], options)
+        return _gather_points(points, faces, AXES["z"], options)
     if form == "las":
         points = read_las(data, MOST_FILE_POINTS)  # this checks the header
         units = options.units_per_metre or las_units_per_metre(data)
-        raw = _gathered(points, None, AXES["z"], replace(options, units_per_metre=units))
+        raw = _gather_points(points, None, AXES["z"], replace(options, units_per_metre=units))
         return replace(raw, units_per_metre=units, up=AXES["z"])
     if form == "e57":
         in_metres = replace(options, units_per_metre=options.units_per_metre or 1.0)
-        raw = _gathered(_of_scans(read_e57(data)), None, AXES["z"], in_metres)
+        raw = _gather_points(_join_scans(read_e57(data)), None, AXES["z"], in_metres)
         return replace(raw, units_per_metre=1.0)
     points = (read_pcd if form == "pcd" else read_npy)(data, MOST_FILE_POINTS)
-    return _gathered(points, None, AXES["z"], options)
+    return _gather_points(points, None, AXES["z"], options)
 
 
-def _of_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
+def _join_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
     """Return the points of all scans in the frame of the file."""
     count = sum(scan.count for scan in scans)
     check_count(count, MOST_FILE_POINTS)
@@ -201,13 +201,13 @@ def _of_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
         for scan in scans:
             T = scan.T_world_scan
             for block in scan.points().blocks:
-                with np.errstate(all="ignore"):  # points that overflow are missing
+                with np.errstate(all="ignore"):  # overflows are missing points
                     yield block @ T[:3, :3].T + T[:3, 3]
 
     return FilePoints(count, blocks())
 
 
-def _gathered(
+def _gather_points(
     points: FilePoints, triangles: Ints32 | None, usual_up: Floats, options: SurfaceOptions
 ) -> RawSurface:
     if triangles is not None and not len(triangles):
@@ -216,24 +216,24 @@ def _gathered(
     if triangles is None:
 
         def thin(so_far: Floats32) -> float:
-            return options.units_per_metre or _estimated_units(so_far, None, usual_up)
+            return options.units_per_metre or _estimate_units(so_far, None, usual_up)
 
     gathered, origin, voxel = gather(points.blocks, points.count, thin)
     return RawSurface(gathered, origin, triangles, points.count, voxel, None, None, usual_up)
 
 
-def _estimated_units(points: Floats32, triangles: Ints32 | None, usual_up: Floats) -> float:
+def _estimate_units(points: Floats32, triangles: Ints32 | None, usual_up: Floats) -> float:
     return estimate_units(points, estimate_up(points, triangles, usual_up).up)
 
 
-def _in_metres(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
-    """Remove missing points and triangles, and convert the units to metres."""
+def _convert(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
+    """Remove missing points and triangles, and convert a surface to metres."""
     notes = list(raw.notes)
-    points, triangles = _cleaned(raw, notes)
+    points, triangles = _clean(raw, notes)
     if not max(float(points.max()), -float(points.min())) < _MOST_UNITS:
         raise UnreadableCloud(TOO_LARGE)
-    up, up_from = _up(raw, options, points, triangles, notes)
-    units, units_from = _units(raw, options, points, up, notes)
+    up, up_from = _select_up(raw, options, points, triangles, notes)
+    units, units_from = _select_units(raw, options, points, up, notes)
     offset = _to_metres(points, raw.origin, units)
     extent = float((points.max(axis=0) - points.min(axis=0)).max())
     if units_from != "stated" and not _SMALL_M <= extent <= _LARGE_M:
@@ -248,11 +248,11 @@ def _in_metres(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
     return ReadSurface(surface, units_from, up_from, tuple(notes), units, raw.file_points, voxel)
 
 
-def _up(
+def _select_up(
     raw: RawSurface, options: SurfaceOptions, points: Floats32, triangles: Ints32 | None,
     notes: list[str],
 ) -> tuple[Floats, Source]:  # fmt: skip
-    """Return the up direction and its source."""
+    """Return the up direction (3,) and its source; add a note on an estimate to `notes`."""
     if options.up is not None:
         return AXES[options.up], "stated"
     if raw.up is not None:
@@ -267,10 +267,10 @@ def _up(
     return estimate.up, "estimated"
 
 
-def _units(
+def _select_units(
     raw: RawSurface, options: SurfaceOptions, points: Floats32, up: Floats, notes: list[str]
 ) -> tuple[float, Source]:
-    """Return the units per metre and their source."""
+    """Return the units per metre and their source; add a note on an estimate to `notes`."""
     if options.units_per_metre is not None:
         return options.units_per_metre, "stated"
     if raw.units_per_metre is not None:
@@ -285,8 +285,8 @@ def _units(
     return units, "estimated"
 
 
-def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
-    """Return the points and triangles without missing points and vertices."""
+def _clean(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
+    """Remove missing points, and invalid triangles; add notes on them to `notes`."""
     if raw.triangles is None:
         missing = raw.file_points - len(raw.points)
         if missing and raw.voxel is None:
@@ -304,7 +304,7 @@ def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None
             f"Triangle {first + 1} of {len(raw.triangles)} refers to a vertex that is not among "
             f"the {len(raw.points)} vertices of the file. Copy or write the file again."
         )
-    points, triangles = _proper(raw.points, raw.triangles)
+    points, triangles = _remove_flat(raw.points, raw.triangles)
     omitted = len(raw.triangles) - len(triangles)
     if not len(triangles):
         raise UselessFrame(
@@ -316,8 +316,8 @@ def _cleaned(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None
     return points, triangles
 
 
-def _proper(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
-    """Return the vertices of triangles with an area, and these triangles."""
+def _remove_flat(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
+    """Return the triangles that have an area, and their vertices."""
     proper = np.ones(len(triangles), np.bool_)
     present = np.asarray(np.isfinite(points).all(axis=1))
     for first in range(0, len(triangles), _BLOCK):
@@ -337,9 +337,9 @@ def _proper(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
 
 
 def _to_metres(points: Floats32, origin: Floats, units: float) -> Floats:
-    """Convert points in place to metres relative to an offset, and return the offset (3,), metres.
+    """Convert points in place to metres relative to an offset; return the offset (3,), metres.
 
-    The offset is the middle of the points in whole metres if it is farther than `FAR_M`, else 0.
+    The offset is the middle of the points in whole metres if it is farther away than `FAR_M`, or 0.
 
     Parameters
     ----------
