@@ -1,8 +1,8 @@
-"""FAISS indexes of signatures, which compare all signatures by squared Euclidean distance.
+"""FAISS indexes that compare all signatures by squared Euclidean distance.
 
-Tests showed that this type of FAISS index is correct, while some types return wrong results or
-abort the process. Its codes are the signatures, so its distances equal those of
-`geometry.retrieval` up to the integers that single precision represents exactly.
+Tests show that this type of FAISS index is correct; some other types return wrong results or abort
+the process. Its codes are the signatures, so its distances equal those of `geometry.retrieval` as
+long as single precision represents them exactly.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from sceneprint.types import Bytes
 if TYPE_CHECKING:
     from faiss import IndexBinaryFlat, IndexScalarQuantizer
 
-#: Distances from this one on may be rounded in single precision.
+#: Minimum distance that single precision may round.
 ROUNDED = 1 << 24
 
 
 def library() -> Any:
-    """Return the module FAISS, set to one thread, since requests run concurrently."""
+    """Return the module faiss, limited to one thread: requests run concurrently."""
     import faiss  # late, as it takes 0.3 s
 
-    faiss.omp_set_num_threads(1)  # of this thread
+    faiss.omp_set_num_threads(1)  # the setting applies to the calling thread
     return faiss
 
 
 def allocate(n: int, dimension: int) -> tuple[IndexScalarQuantizer, Bytes]:
-    """Return an index of n unset signatures, and a view of its memory (n, d) uint8 to set them."""
+    """Return an index of n uninitialised signatures, and a writable view (n, d) uint8 of them."""
     faiss = library()
     index = faiss.IndexScalarQuantizer(
         dimension, faiss.ScalarQuantizer.QT_8bit_direct, faiss.METRIC_L2
@@ -49,7 +49,7 @@ def codes_of(index: IndexScalarQuantizer) -> Bytes:
 
 
 class _Codes:
-    """The memory of an index for NumPy, with a reference that keeps the index alive."""
+    """The memory of an index for NumPy; the reference prevents the deletion of the index."""
 
     def __init__(self, index: Any, read_only: bool) -> None:
         self._index = index
@@ -66,7 +66,7 @@ def _view(index: Any, *, read_only: bool) -> Bytes:
 def write_index(
     index: IndexScalarQuantizer | IndexBinaryFlat, take: Callable[[bytes], None]
 ) -> None:
-    """Pass the bytes of an index to `take`, block by block; raise the errors of `take`."""
+    """Pass the bytes of an index to `take`, block by block."""
     faiss = library()
     binary = isinstance(index, faiss.IndexBinaryFlat)
     write = faiss.write_index_binary if binary else faiss.write_index
@@ -74,11 +74,11 @@ def write_index(
 
 
 def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
-    """Map an index into shared memory, which remains valid after its file is unlinked.
+    """Map an index file into shared memory; the memory remains valid after the file is unlinked.
 
     Parameters
     ----------
-    path : file whose checksum the caller has verified, since FAISS crashes on malicious bytes
+    path : file whose checksum the caller has verified: FAISS crashes on malicious bytes
     n, dimension : expected number and length of the signatures
 
     Raises
@@ -100,7 +100,7 @@ def map_index(path: Path, n: int, dimension: int) -> IndexScalarQuantizer:
 
 
 def map_binary(path: Path, n: int, bits: int) -> IndexBinaryFlat:
-    """Map an index of bits into memory, as `map_index` does."""
+    """Map a file with an index of bits into memory; see `map_index`."""
     faiss = library()
     index = _map_file(path, faiss.read_index_binary)
     if not isinstance(index, faiss.IndexBinaryFlat) or (index.d, index.ntotal) != (bits, n):
@@ -117,7 +117,7 @@ def _map_file(path: Path, read: Callable[[str, int], Any]) -> Any:
 
 
 def selection(free: NDArray[np.bool_] | None) -> Any:
-    """Return the parameters of a search of the rows where `free` (n,) is True; None selects all."""
+    """Return the parameters of a search in the rows where `free` (n,) is True; None selects all."""
     if free is None:
         return None
     faiss = library()
@@ -132,12 +132,12 @@ def nearest(
     Parameters
     ----------
     query : (d,) uint8
-    count : number of rows, of which at least as many must be searchable
-    free : (n,) which rows are searchable; None selects all
+    count : number of rows, at most the number of searchable rows
+    free : (n,) mask of the searchable rows; None selects all
 
     Returns
     -------
-    (count,) rows, those with lower numbers if distances are equal, and (count,) distances; None if
+    (count,) rows, with the lowest numbers among equal distances, and (count,) distances; None if
     FAISS may have rounded a distance
     """
     if count == 0:

@@ -1,4 +1,4 @@
-"""Manifests of indexes, which list the segments of a version and their parts.
+"""Manifests of indexes: lists of the segments of a version and of their parts.
 
     NUMBER.json    manifest of a version, written after all of its parts
 
@@ -39,8 +39,8 @@ class Recall(StrictRecord):
     ----------
     share : share of the `near` exact nearest neighbours that a search finds
     near : number of neighbours
-    sample : number of measured queries, each by a frame without itself; 0 if a search compares
-        every frame
+    sample : number of measured queries by frames of the map, excluding the frame; 0 if searches
+        compare all frames
     probes : minimum number of frames that sketches select for a search; 0 without sketches
     frames : number of frames at the time of the measurement
     """
@@ -73,13 +73,13 @@ class SegmentFiles(StrictRecord):
 
     @property
     def frames(self) -> int:
-        """Number of frames in the segment that were not removed."""
+        """Return the number of frames in the segment that were not removed."""
         keys, gone = self.file("keys"), self.file("gone")
         return ((0 if keys is None else keys[1]) - (0 if gone is None else gone[1])) // 8
 
     def file(self, kind: str) -> PartOfIndex | None:
         """Return the part of a kind; None if there is none."""
-        return next((one for one in self.files if one[0].endswith(f".{kind}")), None)
+        return next((part for part in self.files if part[0].endswith(f".{kind}")), None)
 
 
 class IndexManifest(StrictRecord):
@@ -91,8 +91,8 @@ class IndexManifest(StrictRecord):
     revision : revision of the map up to which the index contains its frames
     model_id : id of the model that signed the frames
     dimension : D, length of a signature in bytes
-    anchor : anchor by which the publisher recognises the state of the database
-    segments : segments, which together contain each frame once
+    anchor : text by which the publisher recognises the state of the database
+    segments : segments that together contain each frame once
     """
 
     schema_version: Annotated[int, Field(ge=SCHEMA_VERSION, le=SCHEMA_VERSION)] = SCHEMA_VERSION
@@ -105,39 +105,41 @@ class IndexManifest(StrictRecord):
 
     @property
     def name(self) -> str:
-        """Name of the manifest in a folder or an object store."""
+        """Return the name of the manifest in a folder or an object store."""
         return f"{self.number:010d}.json"
 
     @property
     def files(self) -> tuple[PartOfIndex, ...]:
-        """All distinct parts."""
-        return tuple(dict.fromkeys(each for one in self.segments for each in one.files))
+        """Return all distinct parts."""
+        return tuple(dict.fromkeys(part for segment in self.segments for part in segment.files))
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
-        return sum(one.frames for one in self.segments)
+        """Return the number of frames."""
+        return sum(segment.frames for segment in self.segments)
 
     @property
     def keys(self) -> tuple[str, ...]:
-        """Names of the parts with keys."""
+        """Return the names of the parts with keys."""
         return tuple(name for name, _ in self.files if name.endswith(".keys"))
 
     @property
     def worn_keys(self) -> tuple[str, ...]:
-        """Names of the parts with the keys of segments from which frames were removed."""
-        return tuple(one.files[0][0] for one in self.segments if one.file("gone") is not None)
+        """Return the names of the parts with keys, for segments with removed frames."""
+        return tuple(
+            segment.files[0][0] for segment in self.segments if segment.file("gone") is not None
+        )
 
     @property
     def recall(self) -> Recall:
-        """Recall of a search, which is the minimum over the segments."""
-        each = [one.recall for one in self.segments]
+        """Return the recall of a search: the minimum over the segments."""
+        recalls = [segment.recall for segment in self.segments]
         return Recall(
-            share=min((one.share for one in each), default=1.0),
-            near=max((one.near for one in each), default=0),
-            sample=sum(one.sample for one in each),
-            probes=sum(one.probes for one in each),
-            frames=sum(one.frames for one in each),
+            share=min((segment.share for segment in recalls), default=1.0),
+            near=max((segment.near for segment in recalls), default=0),
+            sample=sum(segment.sample for segment in recalls),
+            probes=sum(segment.probes for segment in recalls),
+            frames=sum(segment.frames for segment in recalls),
         )
 
 
@@ -148,7 +150,7 @@ def manifest_number(name: str) -> int | None:
 
 
 def manifests(folder: Path) -> list[tuple[int, Path]]:
-    """Return numbers and paths of all manifests in a folder, sound or damaged, newest first."""
+    """Return the numbers and paths of all manifests in a folder, even if damaged, newest first."""
     try:
         numbered = [(manifest_number(path.name), path) for path in folder.iterdir()]
     except OSError:  # an unreadable cache counts as empty
@@ -157,12 +159,12 @@ def manifests(folder: Path) -> list[tuple[int, Path]]:
 
 
 def newest_number(folder: Path) -> int | None:
-    """Return the number of the newest manifest, sound or damaged; None if there is none."""
+    """Return the number of the newest manifest, even if damaged; None if there is none."""
     return next((number for number, _ in manifests(folder)), None)
 
 
 def write_manifest(folder: Path, manifest: IndexManifest) -> Path:
-    """Write a manifest durably, after all of its parts."""
+    """Write a manifest durably; all of its parts must exist."""
     path = folder / manifest.name
     write_durable(path, seal(manifest))
     return path
@@ -178,7 +180,7 @@ def read_manifest(path: Path) -> IndexManifest:
 
 
 def decode_manifest(name: str, data: bytes, place: str) -> IndexManifest:
-    """Return a manifest from its bytes.
+    """Parse a manifest.
 
     Parameters
     ----------
@@ -204,8 +206,8 @@ def scrub(folder: Path) -> Iterator[Path | None]:
 
     Yields
     ------
-    path : None after each block, so that the caller may pause; the path of each damaged or missing
-        file, once
+    path : None after each block, so that the caller may pause; once the path of each damaged or
+        missing file
     """
     for _, path in manifests(folder):
         try:
@@ -224,6 +226,6 @@ def scrub(folder: Path) -> Iterator[Path | None]:
 
 
 def _is_lasting(error: DamagedIndex) -> bool:
-    """Return whether an error persists, unlike that of a temporarily unreadable file."""
+    """Return whether an error persists, unlike the error of a temporarily unreadable file."""
     cause = error.__cause__
     return not isinstance(cause, OSError) or cause.errno in (errno.ENOENT, errno.EIO)

@@ -1,8 +1,8 @@
 """Versions of an index: their publication, opening, and search together with newer frames.
 
 A version is a list of segments. The next version adds a segment of new frames and merges some of
-the others; most parts remain. All parts are durable before their manifest is written. A builder
-that is killed leaves the former version intact, and parts that the next builder removes.
+the others; most parts remain. All parts are durable before their manifest is written. A killed
+builder leaves the former version intact; the next builder removes its parts.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class IndexVersion:
-    """A published version of an index; immutable, and safe to share between threads.
+    """A published, immutable version of an index. Threads may share an instance.
 
-    It remains usable after its parts were removed, since they are mapped into memory.
+    It remains usable after its parts are removed, because they are mapped into memory.
 
     Parameters
     ----------
     segments : segments that together contain each frame once
-    inodes : inodes of the parts by name, since a part may be written again under its name
+    inodes : inodes of the parts by name: a part may be written again with the same name
     """
 
     manifest: IndexManifest
@@ -62,49 +62,49 @@ class IndexVersion:
     inodes: Mapping[str, int]
 
     def __len__(self) -> int:
-        return sum(len(one) for one in self.segments)
+        return sum(len(segment) for segment in self.segments)
 
     @property
     def number(self) -> int:
-        """Number of the version."""
+        """Return the number of the version."""
         return self.manifest.number
 
     @property
     def revision(self) -> int:
-        """Revision of the map up to which the index contains its frames."""
+        """Return the revision of the map up to which the index contains its frames."""
         return self.manifest.revision
 
     @property
     def anchor(self) -> str:
-        """Anchor by which the publisher recognises the state of the database."""
+        """Return the text by which the publisher recognises the state of the database."""
         return self.manifest.anchor
 
     @property
     def model_id(self) -> str:
-        """Id of the model that signed the frames."""
+        """Return the id of the model that signed the frames."""
         return self.manifest.model_id
 
     @cached_property
     def keys(self) -> Keys:
-        """Keys (N,) of the frames in ascending order."""
+        """Return the keys (N,) of the frames in ascending order."""
         standing = [one.keys[one.standing_rows(one.gone)] for one in self.segments]
         return np.sort(np.concatenate([np.empty(0, np.int64), *standing]))
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
-        """Return which frames (n,) the index contains."""
+        """Return a mask (n,) of the frames that the index contains."""
         contained = np.zeros(len(keys), np.bool_)
-        for one in self.segments:
-            contained |= one.rows_of(keys) >= 0
+        for segment in self.segments:
+            contained |= segment.rows_of(keys) >= 0
         return contained
 
     def vectors_of(self, keys: Keys) -> Bytes:
         """Return a copy of the signatures (r, D) of frames; raise ValueError if one is missing."""
         result = np.empty((len(keys), self.manifest.dimension), np.uint8)
         missing = np.ones(len(keys), np.bool_)
-        for one in self.segments:
-            rows = one.rows_of(keys)
+        for segment in self.segments:
+            rows = segment.rows_of(keys)
             at = np.flatnonzero(rows >= 0)
-            result[at] = one.vectors[rows[at]]
+            result[at] = segment.vectors[rows[at]]
             missing[at] = False
         if missing.any():
             raise ValueError(f"no frames {keys[missing][:5].tolist()} in this index")
@@ -121,16 +121,15 @@ def newest(
 ) -> IndexVersion | None:
     """Open the newest sound version in a folder; return None if there is none.
 
-    All parts are verified before use. A version with a damaged part is logged and skipped, and an
-    older one is used.
+    All parts are verified before use. A version with a damaged part is logged and skipped.
 
     Parameters
     ----------
-    folder : folder of the map's index, which need not exist
+    folder : folder of the map's index; it may be missing
     model_id, dimension : model and length of the signatures; versions of other models are skipped
-    known : open version of this folder, whose parts are not verified again, and which is returned
-        itself if it is the newest
-    sound : inodes by name of parts that this process has verified
+    known : open version of this folder: it is returned if it is the newest, and its parts are not
+        verified again
+    sound : inodes, by name, of parts that this process has verified
     """
     while True:
         listed, version, errors = manifests(folder), None, []
@@ -142,10 +141,10 @@ def newest(
                     break
             except DamagedIndex as error:
                 errors.append(error)
-        # a part may be missing because a builder has just removed it; then there is a newer version
+        # a part is also missing if a builder has just removed it, after writing a newer version
         if not errors or manifests(folder) == listed:
-            for each in errors:
-                log.warning("Damaged index skipped; it will be rebuilt: %s", each)
+            for damage in errors:
+                log.warning("Damaged index skipped; it will be rebuilt: %s", damage)
             return version
 
 
@@ -167,8 +166,8 @@ def open_version(
         if inodes[name] != verified.get(name, -1):
             for _ in verify(folder, name, size):
                 pass
-    # open segments are reused with their caches, unless a damaged part was written again
-    open_ones = {} if known is None else {one.record: one for one in known.segments}
+    # reuse open segments with their caches, unless a damaged part was written again
+    open_ones = {} if known is None else {segment.record: segment for segment in known.segments}
     segments = tuple(
         open_ones[record]
         if record in open_ones
@@ -181,22 +180,21 @@ def open_version(
 
 
 def _inode(path: Path) -> int:
-    """Return the inode of a file, 0 if it does not exist."""
+    """Return the inode of a file; 0 if it does not exist."""
     try:
         return path.stat().st_ino
     except OSError:
         return 0
 
 
-# Search: the nearest frames of a map by exact distance of signatures, Sec. III-C.
-#
-# All frames of the tail and of segments without sketches are compared. Of a segment with sketches,
-# only the frames with the nearest sketches are compared; their recall is measured at publication.
+# A search returns the nearest frames of a map by exact distance of signatures: Sec. III-C. It
+# compares all frames of the tail and of segments without sketches. In segments with sketches, it
+# compares the frames with the nearest sketches; publication measures the recall.
 
 
 @dataclass(frozen=True, eq=False)
 class Tail:
-    """Frames that are newer than an index, and replace frames of the index with the same keys.
+    """Frames that are newer than an index. They replace frames of the index with the same keys.
 
     Parameters
     ----------
@@ -225,11 +223,11 @@ class Tail:
 
     @cached_property
     def places(self) -> Places:
-        """Rows of the frames by their keys."""
+        """Return the rows of the frames by key."""
         return Places(self.keys)
 
     def rows_among(self, gone: Keys, among: Keys | None) -> NDArray[np.int64]:
-        """Return the rows of frames in `among` (None: all) and not in `gone`; both ascending."""
+        """Return the rows of frames in `among` (None: all) but not in `gone`; both ascend."""
         free = np.full(len(self), among is None)
         if among is not None:
             free[self.places.found(among)] = True
@@ -238,7 +236,7 @@ class Tail:
 
 
 def signatures_of(keys: Keys, version: IndexVersion | None, tail: Tail) -> Bytes:
-    """Return the signatures (r, D) of frames (r,) in their order, preferably from the tail.
+    """Return the signatures (r, D) of frames (r,), from the tail or from the index.
 
     Raises
     ------
@@ -267,11 +265,11 @@ def check_lengths(dimension: int, version: IndexVersion | None, tail: Tail) -> N
 
 @dataclass(frozen=True, eq=False)
 class SearchHits:
-    """The results of a search: keys (r,) and distances (r,) of the nearest frames, ascending.
+    """The results of a search: keys (r,) and distances (r,) of the nearest frames, nearest first.
 
     Parameters
     ----------
-    exact : whether every searchable frame was compared
+    exact : whether all searchable frames were compared
     compared : number of frames whose distance was computed
     """
 
@@ -295,18 +293,18 @@ def search(
     among: Keys | None = None,
     exact: bool = False,
 ) -> SearchHits:
-    """Return the nearest frames of a map; any number of threads may search an index.
+    """Return the nearest frames of a map. Any number of threads may search an index.
 
     Parameters
     ----------
     query : (D,) uint8, signature of the map's model
     version : version of the index; None without an index
-    tail : newer frames, which replace frames of the index with the same keys
+    tail : newer frames
     size : maximum number of results
     metric : metric of the map's model
     dead : keys of deleted frames
     among : keys of the searchable frames; None selects all
-    exact : whether to compare every searchable frame
+    exact : whether to compare all searchable frames
 
     Raises
     ------
@@ -322,8 +320,8 @@ def search(
     parts = [distances(query, tail.signatures, metric, alive)]
     if version is not None and len(version):
         gone = np.sort(np.concatenate([gone, tail.keys]))
-        for one in version.segments:
-            (own, distant), all_of_it, count = one.nearest(
+        for segment in version.segments:
+            (own, distant), all_of_it, count = segment.nearest(
                 query, size, gone, among, metric=metric, exact=exact
             )
             keys.append(own)
@@ -335,7 +333,7 @@ def search(
 
 
 def _nearest(keys: Keys, values: NDArray[np.int64], size: int) -> NDArray[np.intp]:
-    """Return the positions of the `size` smallest distances in ascending order, ties by key."""
+    """Return the positions of the `size` smallest distances, in ascending order; ties by key."""
     size = min(size, len(keys))
     if size == 0:
         return np.empty(0, np.intp)
@@ -361,30 +359,30 @@ def publish(
 ) -> IndexVersion | None:
     """Publish the version that follows `previous`.
 
-    Only one process builds in a folder at a time. The two newest versions remain; parts of older
-    ones are removed, while readers may still use them. Only new frames, and the segments with which
-    they are merged, are written. Memory holds the signatures of one written segment at a time.
+    A single process builds in a folder at a time. The two newest versions remain; parts of older
+    versions are removed, while readers may still use them. Only new frames, and the segments with
+    which they are merged, are written. Memory holds the signatures of one segment at a time.
 
     Parameters
     ----------
-    folder : folder of the map's index, which is created if it is missing
+    folder : folder of the map's index; created if missing
     model_id : id of the model that signed the frames
     revision : revision of the map up to which `blocks` and `previous` contain its frames
-    blocks : keys (n,) int64 and signatures (n, D) uint8 of the frames that are not in `previous`,
-        or whose signatures replace those in `previous`; it is read once, block by block
+    blocks : keys (n,) int64 and signatures (n, D) uint8 of new and replaced frames, in blocks;
+        iterated once
     previous : newest version in the folder; None builds an index without reuse
     drop : keys of deleted frames
-    anchor : function that returns the anchor; it is called after `blocks` were read
+    anchor : function that returns the anchor; called after `blocks` are read
     clean : whether to remove all bytes of deleted frames, and therefore the previous version
-    flat_bytes : size of signatures in bytes above which there are sketches
+    flat_bytes : size of signatures in bytes above which sketches are written
     after : number that the new version's number must exceed
-    share : function that is called with the manifest before it is written; it returns False, which
-        cancels the publication, if another host published a version with this number
+    share : function that is called with the manifest before it is written; it returns False to
+        cancel the publication, if another host published a version with this number
 
     Returns
     -------
-    version : open version; None if another process is building, or `previous` is not the newest
-        version any more, so that the caller must open the newest and try again
+    version : open version; None if another process is building, or if `previous` is no longer the
+        newest version: open the newest version, and try again
 
     Raises
     ------
@@ -411,7 +409,7 @@ def publish(
             remove_unneeded(folder)
             return None
         write_manifest(folder, manifest)
-        # the previous version is known to be sound, unlike versions after it
+        # the previous version is sound; versions after it may be damaged
         before = last if previous is None else previous.number
         keep_only(folder, {manifest.number} if clean else {manifest.number, before})
         known = {} if previous is None else previous.inodes
@@ -423,7 +421,7 @@ def _write_segments(
     folder: Path, previous: IndexVersion | None, blocks: Iterable[Block], drop: frozenset[int],
     clean: bool, flat_bytes: int,
 ) -> tuple[tuple[SegmentFiles, ...], int]:  # fmt: skip
-    """Write new and merged segments; return all segments, and the length of signatures."""
+    """Write new and merged segments; return all segments, and the length of signatures in bytes."""
     dimension = None if previous is None else previous.manifest.dimension
     new_keys, stored = spool_blocks(folder, blocks, dimension)
     if previous is None and len(new_keys) == 0:
@@ -440,14 +438,15 @@ def _write_segments(
 
 
 def _is_overtaken(folder: Path, previous: IndexVersion) -> bool:
-    """Return whether the newest version in a folder is not `previous` any more."""
+    """Return whether the newest version in a folder is no longer `previous`."""
     version = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
     return version is None or version.number != previous.number
 
 
 def clear(folder: Path, but: int | None = None) -> bool:
-    """Remove all versions of an index, except number `but`, while readers may still use them;
-    return False if another process is building.
+    """Remove all versions of an index except number `but`; return False if a process is building.
+
+    Readers may still use the removed versions.
     """
     with folder_turn(folder) as mine:
         if mine:
@@ -464,7 +463,7 @@ def keep_only(folder: Path, numbers: Collection[int]) -> None:
     """Remove all versions except some numbers; the caller holds the lock of the folder."""
     needed: set[str] = set()
     for number, path in manifests(folder):
-        if number not in numbers:  # before its parts, so that manifests list only existing ones
+        if number not in numbers:  # remove a manifest before its parts
             path.unlink(missing_ok=True)
             continue
         with suppress(DamagedIndex):  # a damaged manifest needs no parts

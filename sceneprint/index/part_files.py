@@ -1,7 +1,7 @@
-"""Parts of indexes: files that are named by the SHA-256 of their bytes.
+"""The parts of indexes: files that are named by the SHA-256 of their bytes.
 
-The names in a manifest are thus checksums, manifests with the same part share one file, and files
-never change.
+Therefore, the names in a manifest are checksums, manifests with the same part share a file, and
+files never change.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def put(
             write(take)
             size = file.tell()
             file.flush()
-            os.fsync(file.fileno())  # before the rename, so that named files are complete
+            os.fsync(file.fileno())  # the content must be durable before its name
         name = f"{digest.hexdigest()}.{kind}"
         os.replace(part, folder / name)  # noqa: PTH105  (the one call that is atomic by contract)
         sync_folder(folder)
@@ -83,7 +83,7 @@ def put(
 
 
 def verify(folder: Path, name: str, size: int) -> Iterator[None]:
-    """Verify a part, and yield after each block, so that the caller may stop.
+    """Verify the checksum of a part; yield after each block, so that the caller may stop.
 
     Raises
     ------
@@ -105,7 +105,7 @@ def verify(folder: Path, name: str, size: int) -> Iterator[None]:
 
 
 def mapped(path: Path) -> mmap.mmap | bytes:
-    """Map a file into shared memory, which remains valid after the file is unlinked.
+    """Map a file into shared memory; the memory remains valid after the file is unlinked.
 
     Raises
     ------

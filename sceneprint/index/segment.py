@@ -1,11 +1,11 @@
-"""Segments of a version of an index, which are searched separately and merged when there are many.
+"""Segments of an index version. They are searched separately, and merged when there are many.
 
     new frames  --\\
     segments of the previous version  --merge_plan-->  sources  --write_segment-->  segments
 
-A publication writes new frames as one segment, and merges segments that are not at least `RATIO`
-times as large as the next smaller one. Each time a frame is written again, its segment has grown by
-at least a third, so the total cost is O(n log n) (the logarithmic method of Bentley and Saxe).
+A publication writes new frames as one segment, and merges segments that are less than `RATIO` times
+as large as the next smaller segment. Whenever a frame is written again, its segment has grown by at
+least a third, so the total cost is O(n log n) (the logarithmic method of Bentley and Saxe).
 Removed frames remain in the files of a segment, and are listed in another file, until the segment
 is written again.
 """
@@ -57,14 +57,14 @@ RATIO = 3
 MOST_SEGMENTS = 8
 #: Share of removed frames above which a segment is written again without them.
 GONE_SHARE = 0.25
-#: Size of signatures in bytes up to which a map has no sketches; comparing all of them takes 3 ms.
+#: Size of signatures in bytes up to which a map has no sketches; comparing them takes 3 ms.
 FLAT_BYTES = 1 << 24
 #: Size of segments without sketches in a larger map, as a share of FLAT_BYTES.
 FLAT_SHARE = 1 / 8
-#: If fewer than one in this many frames is searchable, only these are compared, not by FAISS, since
-#: it would read all frames.
+#: If fewer than one in FEW frames is searchable, these are compared without FAISS: it would read
+#: all frames.
 FEW = 8
-#: Maximum size of a search by FAISS; for larger ones, sorting costs more than comparing.
+#: Maximum size of a search by FAISS; for larger searches, sorting takes longer than comparing.
 LONGEST = 2048
 
 #: Rows or keys of frames, and their distances.
@@ -102,10 +102,10 @@ class Places:
         return np.where(self._rising[at] == keys, places, -1)
 
     def found(self, keys: Keys) -> NDArray[np.int64]:
-        """Return the positions of the existing ones of ascending keys."""
+        """Return the positions of those of ascending keys that are in the list."""
         if len(self._rising) == 0 or len(keys) == 0:
             return np.empty(0, np.int64)
-        # most keys of a long list belong to other segments, which have frames of other times
+        # most keys of a long list belong to other segments, with frames of other times
         first = keys.searchsorted(self._rising[0])
         last = keys.searchsorted(self._rising[-1], "right")
         if first == last:
@@ -116,15 +116,15 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Signatures of some frames in mapped parts.
+    """A segment: signatures of some frames, in mapped parts.
 
     Parameters
     ----------
     keys : (N,) int64, ascending keys of all frames in the parts
     index : FAISS index of the signatures in the same order
     sketches : sketches of the frames; None if all frames are compared
-    gone : (g,) int64, ascending keys of removed frames: deleted, or signed again and in another
-        segment
+    gone : (g,) int64, ascending keys of removed frames: deleted, or signed again and stored in
+        another segment
     """
 
     record: SegmentFiles
@@ -138,17 +138,17 @@ class Segment:
 
     @cached_property
     def vectors(self) -> Bytes:
-        """Read-only signatures (N, D) uint8 in the order of the keys."""
+        """Return the read-only signatures (N, D) uint8 in the order of the keys."""
         return codes_of(self.index)
 
     @cached_property
     def places(self) -> Places:
-        """Rows of all frames by their keys, including removed ones."""
+        """Return the rows of all frames by key, including removed frames."""
         return Places(self.keys)
 
     @cached_property
     def gone_rows(self) -> NDArray[np.int64]:
-        """Rows (g,) of removed frames."""
+        """Return the rows (g,) of removed frames."""
         return self.places.of(self.gone)
 
     @cached_property
@@ -156,7 +156,7 @@ class Segment:
         return Places(self.gone)
 
     def rows_of(self, keys: Keys) -> NDArray[np.int64]:
-        """Return the rows (n,) of frames; -1 for missing or removed ones."""
+        """Return the rows (n,) of frames; -1 for missing and removed frames."""
         rows = self.places.of(keys)
         if len(self.gone):
             rows[self._gone_places.of(keys) >= 0] = -1
@@ -170,23 +170,23 @@ class Segment:
         self, query: Bytes, size: int, gone: Keys, among: Keys | None, *, metric: Metric,
         exact: bool,
     ) -> tuple[Found, bool, int]:  # fmt: skip
-        """Return candidates that include the nearest searchable frames.
+        """Compare frames with a query; return candidates that include the nearest frames.
 
         Parameters
         ----------
         query : (D,) uint8
         gone : (g,) ascending keys of excluded frames
         among : (a,) ascending keys of searchable frames; None selects all others
-        exact : whether to compare every searchable frame
+        exact : whether to compare all searchable frames
 
         Returns
         -------
-        keys and distances of the candidates; whether every searchable frame was compared; number of
-        compared frames
+        keys and distances of the candidates; whether all searchable frames were compared; and the
+        number of compared frames
         """
         free = self._free_rows(gone, among)
         count = len(self.keys) if free is None else int(np.count_nonzero(free))
-        rows: NDArray[np.int64] | None = None  # None: all searchable rows
+        rows: NDArray[np.int64] | None = None  # None selects all searchable rows
         if free is not None and count < len(free) // FEW:
             rows = np.flatnonzero(free)
         elif self.sketches is not None and not exact:
@@ -201,7 +201,7 @@ class Segment:
         return (self.keys[rows], distant), len(rows) == count, len(rows)
 
     def _free_rows(self, gone: Keys, among: Keys | None) -> NDArray[np.bool_] | None:
-        """Return which rows (N,) are searchable; None if all are."""
+        """Return a mask (N,) of the searchable rows; None if all are searchable."""
         rows = self.places.found(gone)
         if among is None and len(rows) == len(self.gone) == 0:
             return None
@@ -213,7 +213,7 @@ class Segment:
 
 
 def open_segment(folder: Path, record: SegmentFiles, dimension: int) -> Segment:
-    """Map the parts of a segment, which the caller has verified.
+    """Map the parts of a segment; the caller has verified them.
 
     Raises
     ------
@@ -243,10 +243,10 @@ def _rising_keys(path: Path) -> Keys:
 
 
 def merge_plan(sizes: Sequence[int]) -> list[list[int]]:
-    """Return the groups of indexes of `sizes` that become one segment each, smallest first."""
+    """Return groups of indices of `sizes`; each group becomes a segment. Smallest group first."""
     groups: list[list[int]] = []
     total = 0
-    for at in sorted(range(len(sizes)), key=lambda each: sizes[each]):
+    for at in sorted(range(len(sizes)), key=lambda index: sizes[index]):
         if groups and sizes[at] < RATIO * total:
             groups[-1].append(at)
             total += sizes[at]
@@ -281,22 +281,24 @@ class SegmentSource:
 def segment_sources(
     segments: Sequence[Segment], new_keys: Keys, stored: Bytes, drop: frozenset[int]
 ) -> list[SegmentSource]:
-    """Return the remaining frames of segments, and the new frames, without empty sources."""
+    """Return the sources of the next version: the remaining frames of segments, and new frames."""
     none, dropped = np.empty(0, np.int64), np.fromiter(drop, np.int64, len(drop))
     changed = np.union1d(dropped, new_keys)
     sources = []
-    for one in segments:
-        gone = np.union1d(one.gone, one.keys[one.places.found(changed)])
-        sources.append(SegmentSource(one.keys, one.vectors, one.standing_rows(gone), one, gone))
+    for segment in segments:
+        gone = np.union1d(segment.gone, segment.keys[segment.places.found(changed)])
+        sources.append(
+            SegmentSource(segment.keys, segment.vectors, segment.standing_rows(gone), segment, gone)
+        )
     new = np.flatnonzero(~np.isin(new_keys, dropped))
     sources.append(SegmentSource(new_keys, stored, new, None, none))
-    return [each for each in sources if len(each)]
+    return [source for source in sources if len(source)]
 
 
 def spool_blocks(
     folder: Path, blocks: Iterable[Block], dimension: int | None
 ) -> tuple[Keys, Bytes]:
-    """Return keys (n,) and signatures (n, D) of blocks; the signatures are in an unnamed file.
+    """Write blocks to an unnamed file; return their keys (n,) and mapped signatures (n, D).
 
     Raises
     ------
@@ -325,32 +327,32 @@ def spool_blocks(
 def write_segment(
     folder: Path, sources: Sequence[SegmentSource], *, clean: bool, flat_bytes: float
 ) -> SegmentFiles:
-    """Write the frames of sources as one segment in the order of their keys.
+    """Write the frames of sources as a segment, in the order of their keys.
 
-    The parts of a single segment are reused without reading them, unless more than GONE_SHARE of
-    its frames are removed.
+    If the only source is a segment, its parts are reused, unless more than GONE_SHARE of its frames
+    are removed.
 
     Parameters
     ----------
     clean : whether to write a single segment again if any of its frames is removed
-    flat_bytes : size of signatures in bytes above which there are sketches
+    flat_bytes : size of signatures in bytes above which sketches are written
     """
     only = sources[0]
     may_be_gone = 0 if clean else GONE_SHARE * len(only.keys)
     if len(sources) == 1 and only.segment is not None and len(only.gone) <= may_be_gone:
-        return _keep_segment(folder, only.segment, only.gone, flat_bytes)
-    keys = np.concatenate([each.keys[each.rows] for each in sources])
+        return _reuse_segment(folder, only.segment, only.gone, flat_bytes)
+    keys = np.concatenate([source.keys[source.rows] for source in sources])
     by_key = np.argsort(keys)
     keys, order = keys[by_key], np.empty(len(keys), np.int64)
     order[by_key] = np.arange(len(keys))
     index, vectors = faiss_index.allocate(len(keys), only.vectors.shape[1])
     step, start = max(BLOCK_BYTES // vectors.shape[1], 1), 0
-    for each in sources:
-        places = order[start : start + len(each)]
-        start += len(each)
-        for first in range(0, len(each), step):
+    for source in sources:
+        places = order[start : start + len(source)]
+        start += len(source)
+        for first in range(0, len(source), step):
             block = slice(first, first + step)
-            vectors[places[block]] = each.vectors[each.rows[block]]
+            vectors[places[block]] = source.vectors[source.rows[block]]
     recall = _flat_recall(len(keys))
     files = [
         put(folder, "keys", lambda take: take(keys.astype("<i8").tobytes())),
@@ -375,10 +377,10 @@ def _flat_recall(frames: int) -> Recall:
     return Recall(share=1.0, near=NEAR, sample=0, probes=0, frames=frames)
 
 
-def _keep_segment(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> SegmentFiles:
-    """Return the parts of a remaining segment, with updated removed keys.
+def _reuse_segment(folder: Path, segment: Segment, gone: Keys, flat_bytes: float) -> SegmentFiles:
+    """Return the parts of a reused segment, with updated removed keys.
 
-    An older segment of a map that has grown gets sketches.
+    The segment gets sketches if it now exceeds `flat_bytes`.
     """
     kinds, recall, more = ["keys", "faiss"], segment.record.recall, list[PartOfIndex]()
     if segment.vectors.nbytes <= flat_bytes:
@@ -391,5 +393,5 @@ def _keep_segment(folder: Path, segment: Segment, gone: Keys, flat_bytes: float)
         kinds.append("gone")
     else:
         more.append(put(folder, "gone", lambda take: take(gone.astype("<i8").tobytes())))
-    files = [one for one in segment.record.files if one[0].rpartition(".")[2] in kinds]
+    files = [part for part in segment.record.files if part[0].rpartition(".")[2] in kinds]
     return SegmentFiles(files=(*files, *more), recall=recall)

@@ -1,11 +1,11 @@
-"""Sketches of signatures, with one bit per byte, which select the frames that a search compares.
+"""Sketches of signatures, with one bit per byte. They select the frames that a search compares.
 
     signatures (N, d) uint8  --write_segment-->  FAISS's IndexBinaryFlat in a file
     query (d,)  --Sketches.candidates-->  rows with the most similar sketches
 
 A bit is set if the byte is above its mean in the segment. A sketch has an eighth of the size of its
-signature, and comparing two takes an xor and a count of bits. A search compares all sketches of a
-segment with the query, and then the exact distances of the selected rows. The number of rows to
+signature, and comparing sketches takes an xor and a count of bits. A search compares all sketches
+of a segment with the query, and then the signatures of the selected rows. The number of rows to
 select is measured when the segment is written.
 """
 
@@ -29,13 +29,13 @@ from sceneprint.types import Bytes, Floats32
 if TYPE_CHECKING:
     from faiss import IndexBinaryFlat
 
-#: Maximum number of frames to compute means.
+#: Maximum number of frames from which means are computed.
 MEASURED = 1 << 16
-#: Minimum number of selected frames of a search, and minimum multiple of its size.
+#: Minimum number of frames that a search selects, absolute and as a multiple of its size.
 LEAST_SELECTED, TIMES_WANTED = 256, 4
-#: Number of neighbours to measure recall, and the required recall.
+#: Number of neighbours for which recall is measured, and the required recall.
 NEAR, ENOUGH = 10, 0.995
-#: Maximum and minimum number of measured queries, and maximum number of bytes to compare.
+#: Maximum and minimum number of measured queries, and maximum number of bytes that they compare.
 MOST, LEAST, COMPARED_BYTES = 100, 10, 1 << 36
 
 
@@ -65,8 +65,8 @@ class Sketches:
         Parameters
         ----------
         query : (d,) uint8
-        count : number of rows, of which at least as many must be searchable
-        free : (N,) which rows are searchable; None selects all
+        count : number of rows, at most the number of searchable rows
+        free : (N,) mask of the searchable rows; None selects all
         """
         if count == 0:
             return np.empty(0, np.int64)
@@ -83,17 +83,17 @@ class Sketches:
         ----------
         query : (d,) uint8
         size : number of nearest rows to find
-        free : (N,) which rows are searchable; None selects all
+        free : (N,) mask of the searchable rows; None selects all
         """
         n = len(self) if free is None else int(np.count_nonzero(free))
         return np.sort(self.nearest(query, min(max(self.probes, TIMES_WANTED * size), n), free))
 
 
 def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
-    """Return at most `limit` of n rows, a random one from each of `limit` equal intervals.
+    """Select at most `limit` of n rows: a random row from each of `limit` equal intervals.
 
-    Intervals represent all places of a map equally; random choice avoids aliasing with periodic
-    orders of frames, such as of alternating robots.
+    Intervals represent all places of a map equally. Random selection avoids aliasing with periodic
+    orders of frames, such as those of alternating robots.
     """
     if n <= limit:
         return np.arange(n)
@@ -107,7 +107,7 @@ def sketch(signatures: Bytes, means: Bytes) -> Bytes:
 
 
 def make_sketches(vectors: Bytes) -> Sketches:
-    """Return the sketches of signatures (N, d), N >= 1; the result is deterministic."""
+    """Compute the sketches of signatures (N, d), N >= 1, deterministically."""
     n, d = vectors.shape
     means = vectors[draw(n, MEASURED, 0)].mean(axis=0, dtype=np.float64).astype(np.uint8)
     index = library().IndexBinaryFlat(8 * -(-d // 8))
@@ -153,10 +153,10 @@ def _share_found(
 def neighbours(
     vectors: Bytes, chosen: NDArray[np.int64], most: int
 ) -> Iterator[tuple[int, NDArray[np.int64]]]:
-    """Return each of some rows (c,) with its nearest other rows, at most `most`, in any order.
+    """Yield each of the rows `chosen` (c,) with its nearest other rows, at most `most`, unordered.
 
-    Rows are compared with all signatures (N, d), N > 1, by matrix products, which take a third of
-    the time of `distances`. Rounding may affect the order of almost equal distances.
+    Rows are compared with all signatures (N, d), N > 1, by matrix products: they take a third of
+    the time of `distances`, but rounding may affect the order of almost equal distances.
     """
     n, d = vectors.shape
     most, step = min(most, n - 1), max(BLOCK_BYTES // d, 1)

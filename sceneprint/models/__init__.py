@@ -1,4 +1,4 @@
-"""Models, their files and their pair tables."""
+"""Models, model files and pair tables."""
 
 from sceneprint.models.model import SCHEMA_VERSION, Model, ModelParameters
 from sceneprint.models.model_file import (

@@ -1,8 +1,8 @@
-"""A model: all data that determine signatures and artifacts, identified by their content.
+"""A model: all data that determine signatures and artifacts. A digest identifies it.
 
-`scale_lengths` returns the parameters for a larger or smaller world. If a cloud and the lengths of
-the parameters are multiplied by s, the signature is unchanged, and translations are multiplied by
-s. This holds for depth images approximately: the gate of their plane fit
+`scale_lengths` returns parameters for a larger or smaller world. If a cloud and the lengths of the
+parameters are multiplied by s, the signature is unchanged, and translations are multiplied by s.
+For depth images, this holds approximately: the gate of their plane fit
 (`NormalParameters.plane_gate`) is both a share of 1/z and a value in 1/metres.
 """
 
@@ -45,12 +45,12 @@ from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
-#: Versions of the file and its semantics, for models with and without a whitening. They are part of
-#: a model's id. A version must be raised if code changes the signatures of its models.
+#: Versions of the file and its semantics, for models with and without a whitening. A model's id
+#: depends on its version. Raise a version if code changes the signatures of its models.
 SCHEMA_VERSION, PSI_SCHEMA_VERSION = 3, 2
 
-#: Groups whose default parameters are omitted from files and ids. New parameters therefore preserve
-#: the ids of existing models, but defaults must not change.
+#: Groups whose default parameters are omitted from files and ids. Therefore, new parameters
+#: preserve the ids of existing models, but defaults must not change.
 SPARSE = ("cloud", "validation")
 
 T = TypeVar("T")
@@ -77,7 +77,7 @@ class ModelParameters:
 
 @dataclass(frozen=True)
 class AnswerParameters:
-    """The parameters that evaluate poses on a map; signatures and artifacts do not use them."""
+    """The parameters for evaluating poses on a map; they do not affect signatures and artifacts."""
 
     map: MapParameters = field(default_factory=MapParameters)
     confidence: ConfidenceModel = field(default_factory=ConfidenceModel)
@@ -88,17 +88,16 @@ class Model:
     """Projection, mixture, quantiser, compression, whitening, and the parameters of each stage.
 
     A whitened signature has a few hundred bytes and is compared by L2. Without a whitening,
-    signatures are psi, compared by L1 as in Sec. III-C.
+    signatures are psi and are compared by L1, as in Sec. III-C.
 
     Parameters
     ----------
     name : display name; not part of the id
-    quantiser_step : step of psi per unit of a byte
-    psi_unrelated_distance : median L1 distance between psi of unrelated training frames, in units
-        of a byte
+    quantiser_step : difference of psi per unit of a quantised byte
+    psi_unrelated_distance : median L1 distance between quantised psi of unrelated training frames
     provenance : data and settings of the training; not part of the id
     whitening : see Whitening; None if signatures are psi
-    answer : see AnswerParameters; not part of the id, so that it can change without new signatures
+    answer : see AnswerParameters; not part of the id, so that changes need no new signatures
     """
 
     name: str
@@ -119,7 +118,7 @@ class Model:
 
     @property
     def unrelated_distance(self) -> float:
-        """Return d0, the median distance of unrelated training frames, in the stored metric."""
+        """Return d0, the median distance of unrelated training frames, in `metric`."""
         if self.whitening is None:
             return self.psi_unrelated_distance
         return self.whitening.unrelated_distance
@@ -133,7 +132,7 @@ class Model:
 
     @property
     def tensors(self) -> dict[str, NDArray[np.float64] | Floats32 | Ints8]:
-        """Return the fitted arrays by their names in the file."""
+        """Return the fitted arrays by name, as in the file."""
         arrays = {
             "projection.mean": self.projection.mean,
             "projection.matrix": self.projection.matrix,
@@ -159,7 +158,7 @@ class Model:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Return all values, besides arrays, on which signatures, artifacts or answers depend."""
+        """Return all values, except arrays, on which signatures or artifacts depend."""
         header = {
             "schema_version": PSI_SCHEMA_VERSION,
             "parameters": to_mapping(self.parameters),
@@ -190,24 +189,24 @@ class Model:
 
     @property
     def level_length(self) -> int:
-        """Return the length of one level's Fisher vector, 25 G."""
+        """Return the length of a level's Fisher vector, 25 G."""
         return int(2 * self.mixture.means.shape[1] + 1) * len(self.mixture)
 
     @property
     def signature_bytes(self) -> int:
-        """Return the number of bytes of a stored signature: d of the whitening, or 25 G H."""
+        """Return the number of bytes of a signature: d of the whitening, or 25 G H."""
         if self.whitening is None:
             return self.level_length * len(self.levels)
         return self.whitening.dimension
 
     @property
     def without_whitening(self) -> Model:
-        """Return the model without its whitening, whose signatures are psi of all levels."""
+        """Return the model without its whitening; its signatures are psi of all levels."""
         return replace(self, whitening=None)
 
 
 def to_mapping(parameters: ModelParameters) -> dict[str, Any]:
-    """Return parameters as JSON; `SPARSE` groups contain only values that are not the default."""
+    """Convert parameters to JSON values; `SPARSE` groups omit values that equal the default."""
     whole = {name: group for name, group in asdict(parameters).items() if name not in SPARSE}
     for name in SPARSE:
         group = getattr(parameters, name)
@@ -239,17 +238,17 @@ def parse_parameters(values: Any) -> ModelParameters:
 
 
 def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
-    """Return a parameter record from parsed JSON with exactly its fields.
+    """Convert parsed JSON with exactly the fields of a parameter record to the record.
 
     Parameters
     ----------
     kind : class of the record
     where : path of the record, for errors
-    groups : further fields, which are not in `values`
+    groups : further fields of the record, not in `values`
 
     Raises
     ------
-    UnreadableModel : If `values` has other fields than `kind`
+    UnreadableModel : If `values` has other fields than `kind`, or a value is not a number
     """
     hints = get_type_hints(kind)
     names = {field.name for field in fields(kind)} - set(groups)  # type: ignore[arg-type]
@@ -262,7 +261,7 @@ def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
     parsed = {
         name: from_mapping(hints[name], value, f"{where}.{name}")
         if is_dataclass(hints[name])
-        else _number(hints[name], value, f"{where}.{name}")
+        else _convert_number(hints[name], value, f"{where}.{name}")
         for name, value in values.items()
     }
     return kind(**parsed, **groups)
@@ -278,17 +277,17 @@ def differences(record: Any, default: Any = None) -> dict[str, Any]:
     """
     default = type(record)() if default is None else default
     different: dict[str, Any] = {}
-    for each in fields(record):
-        value, usual = getattr(record, each.name), getattr(default, each.name)
+    for parameter in fields(record):
+        value, usual = getattr(record, parameter.name), getattr(default, parameter.name)
         if is_dataclass(value):
             value, usual = differences(value, usual), {}
         if value != usual:
-            different[each.name] = value
+            different[parameter.name] = value
     return different
 
 
 def apply_changes(default: T, values: Any, where: str) -> T:
-    """Return a record with some of its values replaced.
+    """Return a copy of a record with some of its values replaced.
 
     Parameters
     ----------
@@ -310,14 +309,14 @@ def apply_changes(default: T, values: Any, where: str) -> T:
     parsed = {
         name: apply_changes(getattr(default, name), value, f"{where}.{name}")
         if is_dataclass(hints[name])
-        else _number(hints[name], value, f"{where}.{name}")
+        else _convert_number(hints[name], value, f"{where}.{name}")
         for name, value in values.items()
     }
     return replace(default, **parsed)  # type: ignore[type-var]
 
 
-def _number(kind: Any, value: Any, where: str) -> Any:
-    """Return a number or truth value that is converted to the type of its field."""
+def _convert_number(kind: Any, value: Any, where: str) -> Any:
+    """Convert a number or Boolean to the type of its field; raise UnreadableModel for others."""
     if isinstance(value, bool) is not (kind is bool) or not isinstance(value, bool | int | float):
         raise UnreadableModel(
             f"The model's {where} is {value!r}, not a number: the file is damaged. Download the "
@@ -386,7 +385,7 @@ POWERS: dict[type, dict[str, int]] = {
 
 
 def scale_lengths(parameters: T, factor: float) -> T:
-    """Return a record of parameters with all lengths in it and in its groups scaled.
+    """Return a copy of a parameter record with all lengths scaled, including those in its groups.
 
     Parameters
     ----------
@@ -395,10 +394,10 @@ def scale_lengths(parameters: T, factor: float) -> T:
     """
     powers = POWERS.get(type(parameters), {})
     changes: dict[str, Any] = {}
-    for each in fields(parameters):  # type: ignore[arg-type]
-        value = getattr(parameters, each.name)
+    for parameter in fields(parameters):  # type: ignore[arg-type]
+        value = getattr(parameters, parameter.name)
         if is_dataclass(value):
-            changes[each.name] = scale_lengths(value, factor)
-        elif each.name in powers:
-            changes[each.name] = value * factor ** powers[each.name]
+            changes[parameter.name] = scale_lengths(value, factor)
+        elif parameter.name in powers:
+            changes[parameter.name] = value * factor ** powers[parameter.name]
     return replace(parameters, **changes)  # type: ignore[type-var]

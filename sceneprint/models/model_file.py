@@ -1,7 +1,7 @@
 """Model files, and the cache of the pair tables that are computed from models.
 
 A model's file is safetensors with a JSON header, without pickle or code. Its pair table is built
-once per machine, and then memory-mapped by all processes.
+once per machine; all processes then map it into memory.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from sceneprint_client.api.maps import PRESETS
 
 #: Maximum number of components, because the pair table stores 16-bit indices.
 MAXIMUM_COMPONENTS = 2**15 - 1
-#: Minimum and maximum of the numbers that determine the memory and time per frame.
+#: Minimum and maximum of the parameters that determine the memory and time per frame.
 BOUNDS = {
     "bins of the table": (1, 4_000_000),
     "levels": (1, 16),
@@ -89,7 +89,7 @@ MAXIMUM_DIMENSION = 1024
 
 
 def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -> None:
-    """Check the levels of a whitening and the length of its signatures.
+    """Validate the levels of a whitening and the length of its signatures.
 
     Raises
     ------
@@ -107,11 +107,11 @@ def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -
 
 
 def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> None:
-    """Check that parameters from a file bound the memory and time per frame.
+    """Validate that parameters from a file bound the memory and time per frame.
 
     Parameters
     ----------
-    n_compressed : number of bytes of a descriptor
+    n_compressed : number of bytes per descriptor
 
     Raises
     ------
@@ -128,7 +128,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
     alignment, rivals = p.validation.alignment, p.validation.rivals
     sequence = alignment.sequence
     refinements = (alignment.coarse, alignment.fine, rivals.first, rivals.then)
-    strides = [p.validation.agreement.stride, *(one.stride for one in refinements)]
+    strides = [p.validation.agreement.stride, *(refinement.stride for refinement in refinements)]
     strides += [alignment.fine_stride, alignment.score_stride]
     plan = alignment.plan
     if not (plan.cell > 0 and plan.voxel > 0 and 0 < plan.height_step <= plan.height_range < 1e6):
@@ -154,7 +154,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         "hypotheses": max(alignment.n_refined, alignment.n_fine, alignment.consensus.n_seeds),
         "correspondences": alignment.matching.n_sources * alignment.matching.n_nearest,
         "rivals": max(rivals.n_axes, rivals.n_planes, rivals.n_shifts, rivals.n_proposed),
-        "iterations of a refinement": max(one.iterations for one in refinements),
+        "iterations of a refinement": max(refinement.iterations for refinement in refinements),
         "stride": min(strides),
         "pixels about an edge": p.validation.agreement.edge_px,
         "rounds of a hypothesis": alignment.consensus.rounds,
@@ -180,7 +180,7 @@ def _check_cloud(p: CloudParameters) -> None:
         raise ValueError("voxels and pixels of a cloud are too large, or their angles too small")
     if not min(p.seed_px, p.validation_seed_px) >= 1:
         raise ValueError("the distance between seeds of a cloud must be at least one voxel")
-    if not 0 < p.range_gate <= 1:  # a gate of 1 allows neighbours at e times the range
+    if not 0 < p.range_gate <= 1:  # a gate of 1 admits neighbours at e times the range
         raise ValueError("the range gate of a cloud must be above 0 and at most 1")
 
 
@@ -189,7 +189,7 @@ MAXIMUM_BYTES = 16 << 20
 
 
 def write_model(model: Model) -> bytes:
-    """Return the bytes of a model's file."""
+    """Serialize a model as the bytes of its file."""
     from safetensors.numpy import save
 
     header = model.header | {
@@ -204,7 +204,7 @@ def write_model(model: Model) -> bytes:
 def save_model(model: Model, path: Path) -> None:
     """Write a model to a file atomically; the folder must exist."""
     data = write_model(model)
-    parse_model(data, str(path))  # an unreadable file must not be written
+    parse_model(data, str(path))  # raise before an unreadable file is written
     write_whole(path, data)
 
 
@@ -236,7 +236,7 @@ def read_model(model: str | Path) -> Model:
 
 
 def parse_model(data: bytes, name: str) -> Model:
-    """Return the model in the bytes of its file.
+    """Parse a model from the bytes of its file.
 
     Parameters
     ----------
@@ -266,7 +266,7 @@ def parse_model(data: bytes, name: str) -> Model:
             "wrote it."
         )
     try:
-        model, expected = _assemble(header, tensors), str(header["id"])
+        model, expected = _assemble_model(header, tensors), str(header["id"])
     except UnreadableModel as error:
         raise UnreadableModel(f"{name}: {error}") from error
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -282,7 +282,7 @@ def parse_model(data: bytes, name: str) -> Model:
     return model
 
 
-def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
+def _assemble_model(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
     g = len(tensors["mixture.weights"])
     shapes = {
         "projection.mean": (PROPERTY_DIMENSION,),
@@ -322,13 +322,13 @@ def _assemble(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Model:
         quantiser_step=step,
         psi_unrelated_distance=d0,
         provenance=dict(header["provenance"]),
-        whitening=_whitening(header, tensors, 25 * g, parameters.hierarchy.n_levels),
-        answer=_answer(header.get("answer", {})),
+        whitening=_parse_whitening(header, tensors, 25 * g, parameters.hierarchy.n_levels),
+        answer=_parse_answer(header.get("answer", {})),
     )
 
 
-def _answer(values: Any) -> AnswerParameters:
-    """Return the parsed parameters of the answer; raise an error if they are invalid."""
+def _parse_answer(values: Any) -> AnswerParameters:
+    """Parse the answer parameters; raise an error if they are invalid."""
     answer = apply_changes(AnswerParameters(), values, "answer")
     refinement, views = answer.map.refinement, answer.map
     counts = {
@@ -351,10 +351,10 @@ def _check_counts(counts: dict[str, int]) -> None:
             raise ValueError(f"{name}: {count} is not in the range {least} to {most}")
 
 
-def _whitening(
+def _parse_whitening(
     header: dict[str, Any], tensors: dict[str, np.ndarray], level_length: int, n_levels: int
 ) -> Whitening | None:
-    """Return the whitening of a file; None if the file has no whitening."""
+    """Parse the whitening of a file; return None if the file has no whitening."""
     if "whitening" not in header:
         return None
     values, basis = header["whitening"], tensors["whitening.basis"]
@@ -382,27 +382,27 @@ HEAD = 64
 #: Number of bins between two reports of progress.
 CHUNK = 16_384
 
-#: Callback for the number of finished bins and the total number of bins.
+#: Callback with the number of finished bins and the number of all bins.
 Progress = Callable[[int, int], None]
 
 
 def default_cache_dir() -> Path:
-    """Return the default folder of derived files, the user's cache folder."""
+    """Return the default folder of cached tables, in the user's cache folder."""
     return Path(platformdirs.user_cache_dir("sceneprint", appauthor=False))
 
 
 def open_table(
     model: Model, cache_dir: Path | None = None, progress: Progress | None = None
 ) -> PairTable:
-    """Return the table of a model, from the cache if possible.
+    """Open the pair table of a model from the cache, or build and cache it.
 
-    If several processes build it simultaneously, each publishes a complete file with the same
-    bytes. If the cache folder is not writable, the table stays in memory.
+    If several processes build it simultaneously, each writes a complete file with the same bytes.
+    If the cache folder is not writable, the table is only in memory.
 
     Parameters
     ----------
-    cache_dir : folder of derived files; created if missing
-    progress : callback for the progress of building the table
+    cache_dir : folder of cached tables, created if missing; None selects the default
+    progress : callback while the table is built; see Progress
     """
     folder = default_cache_dir() if cache_dir is None else cache_dir
     path = folder / f"table-v{CACHE_VERSION}-{model.id}.bin"
@@ -412,7 +412,7 @@ def open_table(
     table = build_table(model, progress)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, _head(table.packed) + table.packed.tobytes())
+        write_whole(path, _file_head(table.packed) + table.packed.tobytes())
     except OSError:  # the cache is optional
         return table
     return _map_table(path, model) or table
@@ -428,12 +428,12 @@ def _map_table(path: Path, model: Model) -> PairTable | None:
         packed = np.memmap(path, np.float32, "r", offset=HEAD, shape=shape)
     except (OSError, ValueError):
         return None
-    # slices of a memmap are slow, so use an ndarray of the same memory
-    return PairTable(np.asarray(packed)) if head == _head(packed) else None
+    # slices of a memmap are slow, so use an ndarray with the same memory
+    return PairTable(np.asarray(packed)) if head == _file_head(packed) else None
 
 
-def _head(packed: Floats32) -> bytes:
-    """Return the first bytes of the file: kind, version, and a checksum (verified in 20 ms)."""
+def _file_head(packed: Floats32) -> bytes:
+    """Return the head of the cached file: kind, version, and a checksum (verified in 20 ms)."""
     checksum = zlib.crc32(packed.view(np.uint8).data)
     return f"sceneprint table {CACHE_VERSION} {checksum:08x}".encode().ljust(HEAD)
 
