@@ -1,1 +1,1 @@
-"""Pure functions of arrays, with one file per section of the paper."""
+"""Pure functions of arrays; the folders follow the sections of the paper."""

@@ -1,18 +1,17 @@
-"""Fuse views to the cells of a grid, and compare the cells of two sessions.
+"""Fusion of views to the cells of a grid, and comparison of the cells of two sessions.
 
     points of a view  --view_cells-->  CELL_SUM by tile
     CELL_SUM of views  --fuse_cells-->  CELL_SUM
     CELL_SUM  --encode_cells-->  CELL  --coarsen_cells-->  part of a tile of the next level
 
     points of a session's frames  --merge_views-->  SessionCells
-    cells, a frame of the other session  --frame_verdicts-->  one verdict per cell
+    cells, a frame of the other session  --frame_verdicts-->  a verdict per cell
     counts of the verdicts of all these frames  --cell_states-->  same, changed or unseen
 
 A tile has 64 x 64 x 64 cells. Fusion is exact and independent of order: it sums integers, and the
-last view is the view with the latest time; views of equal time are ordered by number. A changed
-cell of the earlier session has disappeared; a changed cell of the later session is new. Verdicts
-use the tolerances of validation in the map, but accept both sides of a surface, since cells have no
-normals.
+last view has the latest time, then the greatest number. A changed cell of the earlier session has
+disappeared; a changed cell of the later session is new. Verdicts use the tolerances of validation,
+but accept both sides of a surface: cells have no normals.
 """
 
 from __future__ import annotations
@@ -39,8 +38,9 @@ from sceneprint_client.surface_encoding import CELL, NO_SESSION, NO_TIME, SEEN_S
 
 #: Integer coordinates (x, y, z) of a tile.
 TilePlace = tuple[int, int, int]
-#: Sums over the views of a cell: its position in the tile as z, y, x of 6 bits each; the number of
-#: views; sums of the observed positions in 256ths of a cell; the last view's time, number, session.
+#: A cell with sums over its views: its position in the tile as z, y, x of 6 bits each; the number
+#: of views; sums of the observed positions in 256ths of a cell; the last view's time, number,
+#: session.
 CELL_SUM = np.dtype(
     [
         ("key", "<u4"), ("views", "<u4"), ("sums", "<u4", 3), ("taken", "<f8"),
@@ -51,7 +51,7 @@ CellSums = NDArray[Any]
 Cells = NDArray[Any]
 #: Ratio of the cell widths of successive levels.
 FACTOR = 4
-#: Number of steps in which a position within a cell is encoded, per axis.
+#: Number of steps per axis that encode a position within a cell.
 _FINE = 256
 #: Maximum coordinate of a point, in cells: tile numbers are exact up to this value.
 _FARTHEST = 2.0**40
@@ -95,10 +95,10 @@ def time_scale(first: float, last: float) -> TimeScale:
 
 
 def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlace, CellSums]:
-    """Return the cells of one view by tile, as CELL_SUM sorted by key.
+    """Return the cells of a view by tile, as CELL_SUM sorted by key.
 
-    Each holds the mean position of its points within the cell, as the sum of one view. At most
-    MOST_TILES tiles remain, those with the most cells. NaN and very distant points are omitted.
+    A cell has the mean position of its points, as the sum of a single view. The MOST_TILES tiles
+    with the most cells remain. NaN and very distant points are omitted.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlac
 
 
 def fuse_cells(parts: Sequence[CellSums]) -> CellSums:
-    """Return the fused cells of one tile from several views or groups of views, sorted by key."""
+    """Fuse the cells of a tile from several views or groups of views; sort them by key."""
     rows = np.concatenate(parts) if parts else np.zeros(0, CELL_SUM)
     if len(rows) == 0:
         return rows
@@ -175,7 +175,7 @@ def encode_cells(rows: CellSums, scale: TimeScale | None) -> Cells:
 
 
 def coarsen_cells(parts: Mapping[TilePlace, Cells]) -> Cells:
-    """Return the cells (CELL) of a tile of the next level.
+    """Combine finer tiles to the cells (CELL) of a tile of the next, coarser level.
 
     A coarse cell has the mean position of its finer cells, their maximum `seen`, and the session
     and time of the finer cell that was last seen.
@@ -217,7 +217,7 @@ def remove_tile(cells: Cells, place: TilePlace) -> Cells:
 
 
 def merge_cells(cells: Cells, others: Cells) -> Cells:
-    """Return the cells of two disjoint parts of one tile, sorted."""
+    """Merge the cells of two disjoint parts of a tile; sort them by z, y and x."""
     merged = np.concatenate([cells, others])
     return merged[np.argsort(_cell_keys(merged["at"].astype(np.int64)), kind="stable")]
 
@@ -231,25 +231,25 @@ def _cell_keys(at: NDArray[np.int64]) -> NDArray[np.int64]:
 SessionCells = dict[TilePlace, CellSums]
 #: States of a cell: not observed by the other session, confirmed by it, or contradicted by it.
 UNSEEN, SAME, CHANGED = 0, 1, 2
-#: Number of frames that must see through a changed cell; all frames if there are fewer.
+#: Number of frames that must see through a cell for it to be changed; all if there are fewer.
 LEAST_THROUGH = 2
 
 
 @dataclass(frozen=True, eq=False)
 class VerdictCounts:
-    """Counts of the verdicts of another session's frames on cells.
+    """Counts of verdicts on cells by the frames of another session.
 
     Parameters
     ----------
-    agreeing : (N,) uint16 number of frames that saw a surface in the cell
-    through : (N,) uint16 number of frames that saw through the cell
+    agreeing : (N,) uint16 number of frames that observed a surface in the cell
+    through : (N,) uint16 number of frames that observed free space in the cell
     """
 
     agreeing: NDArray[np.uint16]
     through: NDArray[np.uint16]
 
     def add(self, verdicts: Bytes) -> None:
-        """Count the verdicts (N,) that `frame_verdicts` returned for another frame."""
+        """Add the verdicts (N,) of a frame, from `frame_verdicts`."""
         self.agreeing[verdicts == AGREES] += 1
         self.through[verdicts == VIOLATES] += 1
 
@@ -260,7 +260,7 @@ def empty_counts(count: int) -> VerdictCounts:
 
 
 def merge_views(cells: SessionCells, views: Sequence[SessionCells]) -> SessionCells:
-    """Return the cells of a session, fused with the cells of more views from `view_cells`."""
+    """Fuse the cells of a session with the cells of further views from `view_cells`."""
     parts: dict[TilePlace, list[CellSums]] = {place: [rows] for place, rows in cells.items()}
     for view in views:
         for place, rows in view.items():
@@ -274,7 +274,7 @@ def count_cells(cells: SessionCells) -> int:
 
 
 def cell_positions(cells: SessionCells, cell_m: float) -> Floats:
-    """Return the mean position observed in each cell, (N, 3) metres, by tile and row."""
+    """Return the mean observed position (N, 3) in each cell, metres, in the stored order."""
     positions = [np.zeros((0, 3))]
     for place in sorted(cells):
         rows = cells[place]
@@ -288,11 +288,11 @@ def cell_positions(cells: SessionCells, cell_m: float) -> Floats:
 def frame_verdicts(
     positions: Floats, surface: Surface, T_parent_sensor: Floats, p: OverlapParameters
 ) -> Bytes:
-    """Return one frame's verdicts on cells, (N,) uint8.
+    """Return a frame's verdicts on cells, (N,) uint8.
 
-    AGREES: the cell is on the surface, whatever its normal. VIOLATES: the frame saw through the
-    cell; unordered points never do. UNKNOWN: the cell is outside the view, behind the surface, near
-    an edge, or not measured.
+    AGREES: the cell is on the surface, regardless of its normal. VIOLATES: the frame sees through
+    the cell; unordered points never do. UNKNOWN: the cell is outside the view, behind the surface,
+    near an edge, or not measured.
 
     Parameters
     ----------
@@ -305,7 +305,7 @@ def frame_verdicts(
     ranges = np.linalg.norm(surface.points[surface.valid].astype(np.float64), axis=1)
     if not len(ranges):
         return verdicts
-    # float32 resolves millimetres near the sensor, but not at a distant origin
+    # float32 resolves millimetres near the sensor, but not far from the origin
     offsets = positions - T_parent_sensor[:3, 3]
     reach = 1.1 * float(ranges.max()) + p.point_tolerance
     near = np.flatnonzero(np.einsum("ij,ij->i", offsets, offsets) < reach * reach)

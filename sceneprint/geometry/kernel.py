@@ -1,15 +1,15 @@
-"""Compilation of loops to machine code, caches per frame, and parallel halves of a computation.
+"""Compilation of loops to machine code, per-frame caches, and parallel halves of computations.
 
 Kernels release the interpreter's lock (`nogil`) and are compiled once per installation (`cache`).
 They never use `parallel`, because a forked child dies in OpenMP, or `fastmath`, so the compiler
 neither reorders sums nor fuses products, and a frame gives the same bytes on every processor.
-Divisions have no check for zero, which would prevent vectorization: kernels check their divisors
-themselves. For the same reason an inner loop writes one array, unless the kernel is disjoint.
+Divisions do not check for zero, because the check prevents vectorization: kernels check their
+divisors. For the same reason, an inner loop writes a single array, unless the kernel is disjoint.
 
     with cores.shared():  run_both(first, second)  -->  both results
 
-Validation refines two independent directions, and a frame's signature and artifact come from one
-surface: `run_both` computes such halves on two cores if one is free. Results are equal to the bit.
+Validation refines two independent directions, and a frame's signature and artifact share a surface:
+`run_both` computes such halves on two cores if a core is free. The results are bit-identical.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ import numpy as np
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: LLVM's name and features of the processor for which wheels and images contain machine code:
-#: x86-64 processors since 2013.
+#: LLVM's name and features of the processors for which wheels and images contain machine code:
+#: x86-64 since 2013.
 TARGET = "x86-64-v3"
 TARGET_FEATURES = (
     "+avx,+avx2,+bmi,+bmi2,+cx16,+f16c,+fma,+lzcnt,+movbe,+popcnt,+sahf,+sse3,+sse4.1,+sse4.2,"
     "+ssse3"
 )
 
-#: Guards the creation of compilers. Reentrant: a kernel creates the compilers of its callees.
+#: Lock for creating compilers; reentrant, because a kernel creates the compilers of its callees.
 _compiler_lock = threading.RLock()
 
 
 class Kernel:
-    """A loop over arrays that imports numba and compiles, or loads its code, on its first call.
+    """A loop over arrays that is compiled, or whose code is loaded, on its first call.
 
     Parameters
     ----------
@@ -60,14 +60,14 @@ class Kernel:
         self._call: Callable[..., Any] = self._first_call
         self._stamp = ""
 
-    #: A property that resolves to the machine code: a method would slow the 1,000 calls per query.
+    #: A property that returns the machine code: a method would slow down the 1,000 calls per query.
     __call__ = property(attrgetter("_call"))
 
     def _first_call(self, *arguments: Any) -> Any:
         return self.compiler(*arguments)
 
     def __reduce__(self) -> str:
-        """Return the name of the kernel, by which pickle restores it."""
+        """Return the name of the kernel, from which pickle restores it."""
         return self.function.__qualname__
 
     def __getattr__(self, name: str) -> Any:
@@ -78,7 +78,7 @@ class Kernel:
 
     @property
     def _numba_type_(self) -> Any:
-        """Return the type that numba uses when another kernel calls this one."""
+        """Return the type that numba uses when another kernel calls this kernel."""
         return self.compiler._numba_type_
 
     @property
@@ -92,7 +92,7 @@ class Kernel:
 
     @property
     def stamp(self) -> str:
-        """Return the stamp that valid code on disk has; "" if numba compiles no code."""
+        """Return the stamp of valid code on disk; "" if numba does not compile."""
         _ = self.compiler
         return self._stamp
 
@@ -119,15 +119,15 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 def disjoint_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop whose output arrays share no memory with other arguments; see `kernel`.
 
-    The compiler can then vectorize reads of scattered numbers, since no write changes them.
+    Since writes cannot change the inputs, the compiler can vectorize reads of scattered numbers.
     """
     return cast(Callable[P, R], Kernel(function, disjoint=True))
 
 
 class _Prefetch:
-    """A call in a kernel that loads a row of a table into the processor's caches.
+    """A function for kernels that loads a row of a table into the processor's caches.
 
-    It hides the latency of scattered rows and changes no result.
+    It hides the latency of scattered rows. Results do not change.
     """
 
     def __call__(self, table: Any, row: Any) -> None:
@@ -135,7 +135,7 @@ class _Prefetch:
 
     @property
     def _defn(self) -> Any:
-        """Return the function that generates the code, for the stamps of kernels that use it."""
+        """Return the function that generates the code, for the stamps of kernels that call it."""
         from sceneprint.geometry.kernel_cache import prefetch_row
 
         return prefetch_row._defn
@@ -154,7 +154,7 @@ prefetch = _Prefetch()
 
 
 def code_folder(function: Any) -> tuple[str, bool]:
-    """Return the folder of a kernel's code, and whether it contains code for this processor."""
+    """Return the folder of a kernel's code, and whether it has code for this processor."""
     cache = getattr(function, "_cache", None)
     folder: tuple[str, bool] = ("", False) if cache is None else cache.folder()
     return folder
@@ -170,10 +170,10 @@ def runs_here() -> bool:
 
 
 def _hash_dependencies(function: Callable[..., Any], names: dict[str, Any]) -> str:
-    """Return a digest of the kernels and constants of other files that a kernel may contain.
+    """Return a digest of the kernels and constants of other files that a kernel may use.
 
     The stamp of numba covers the kernel's file only. Imports precede definitions in our modules,
-    so `names` contains every dependency on another file.
+    so `names` contains all dependencies on other files.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ _DEPENDENCIES: dict[tuple[str, str, int], str] = {}
 
 
 def _dependency_text(name: str, value: object, module: str) -> str:
-    """Return the content of a global name that a kernel can use; "" if its own file defines it."""
+    """Return the content of a global name of a kernel; "" if the kernel's file defines it."""
     if name.startswith("__"):
         return ""
     if isinstance(value, ModuleType):  # a kernel may use any of its attributes
@@ -209,7 +209,7 @@ def _dependency_text(name: str, value: object, module: str) -> str:
 
 
 def _constant_text(value: Any, module: str) -> str:
-    """Return the content of a value that a kernel can use; "" if its own file defines it."""
+    """Return the content of a value that a kernel can use; "" if the kernel's file defines it."""
     if isinstance(value, tuple):
         return f"({','.join(_constant_text(item, module) for item in value)})"
     if isinstance(value, bool | int | float | complex | str):
@@ -241,10 +241,10 @@ F = TypeVar("F")
 def cached_per_frame(
     function: Callable[Concatenate[F, P], R],
 ) -> Callable[Concatenate[F, P], R]:
-    """Cache results of a function of a surface, patches or a geometry for the argument's lifetime.
+    """Cache the results of a function as long as its first argument (such as a surface) exists.
 
     The first argument is compared by identity and must not change. Other arguments are hashable.
-    Results are shared, so callers must not write into them.
+    Callers share results, and must not change them.
     """
     results: WeakKeyDictionary[F, dict[Hashable, R]] = WeakKeyDictionary()
 
@@ -270,7 +270,7 @@ class Cores:
 
     Parameters
     ----------
-    count : number of cores; with 1 nothing runs in parallel
+    count : number of cores; 1 disables parallel computation
     """
 
     def __init__(self, count: int) -> None:
@@ -281,7 +281,7 @@ class Cores:
 
     @contextmanager
     def shared(self) -> Iterator[None]:
-        """Occupy a core, and allow `run_both` within the context to use a second core."""
+        """Occupy a core, and allow `run_both` within the `with` block to use a second core."""
         with self._lock:
             self._busy += 1
         token = _cores.set(self)
@@ -305,7 +305,7 @@ class Cores:
                 return first(), later.result()
             finally:
                 if not later.cancel():
-                    later.exception()  # wait, because it may still use the caller's arguments
+                    later.exception()  # wait: it may still use the caller's arguments
         finally:
             with self._lock:
                 self._busy -= 1
@@ -319,7 +319,7 @@ _cores: ContextVar[Cores | None] = ContextVar("cores", default=None)
 
 
 def run_both(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
-    """Return the results of two computations that write no common memory.
+    """Run two computations that write no common memory; return their results.
 
     They run in parallel within `Cores.shared` if a core is free, otherwise sequentially. If both
     raise an exception, the exception of `first` is raised.

@@ -1,9 +1,8 @@
-"""The cache of kernels' machine code, in numba's folders or in those of a wheel or an image.
+"""The cache of kernels' machine code, in numba's folders or in folders of a wheel or an image.
 
 numba stores code under the name of the processor that compiled it. Code that is shipped with an
-installation was compiled for `TARGET`. It lies in numba's folder or beside the sources, which may
-be read-only.
-This module imports numba, which takes long, so `kernel` imports it on the first call.
+installation is compiled for `TARGET`, and lies in numba's folder or beside the sources. The folder
+may be read-only. Importing numba takes long, so `kernel` imports this module on the first call.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ class DisjointCompiler(Compiler):
 def _prefetch_row(_context: Any, table: Any, row: Any) -> Any:
     """Prefetch the first 128 bytes (two cache lines) of a row of a C-contiguous table.
 
-    The arguments are numba types. The result is the signature and the generator of a call's code.
+    The arguments are numba types. The result is the signature, and the code generator of a call.
     """
     signature = types.void(table, row)
 
@@ -69,7 +68,7 @@ class _BesideTheSource(InTreeCacheLocator):
     """A locator of code beside the sources, for installations without a writable folder."""
 
     def ensure_cache_path(self) -> None:
-        """Accept a read-only folder: nothing is written to it."""
+        """Accept read-only folders: nothing is written to them."""
 
 
 class _Locations(CompileResultCacheImpl):
@@ -77,7 +76,7 @@ class _Locations(CompileResultCacheImpl):
 
 
 class KernelCache(FunctionCache):
-    """The machine code of one kernel on disk."""
+    """The machine code of a kernel on disk."""
 
     _impl_class = _Locations
 
@@ -91,7 +90,7 @@ class KernelCache(FunctionCache):
         self._read_only = isinstance(locator, _BesideTheSource)
 
     def stamp(self, dependencies: str) -> object:
-        """Return the stamp that code on disk must have, including this digest of dependencies."""
+        """Return the stamp that code on disk must have; it includes a digest of dependencies."""
         stamp = (self._cache_file._source_stamp, dependencies)
         self._cache_file._source_stamp = self._shipped._source_stamp = stamp
         return stamp

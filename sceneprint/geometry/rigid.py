@@ -25,7 +25,7 @@ def inverse(T: Floats) -> Floats:
 
 
 def inverses(transforms: Floats) -> Floats:
-    """Return the inverses of (n, 4, 4) rigid transforms."""
+    """Return the inverses (n, 4, 4) of rigid transforms (n, 4, 4)."""
     result = np.zeros((len(transforms), 4, 4))
     _write_inverses(np.array(transforms, float), result)
     return result
@@ -42,7 +42,7 @@ def _write_inverses(transforms: Floats, result: Floats) -> None:
 
 
 def transform_points(T: Floats, points: Floats) -> Floats:
-    """Return points (n, 3) of frame a in the coordinates of frame b; T is T_b_a."""
+    """Transform points (n, 3) from frame a to frame b; T is T_b_a."""
     result: Floats = points @ T[:3, :3].T + T[:3, 3]
     return result
 
@@ -55,7 +55,7 @@ def rotation_angle(R: Floats) -> float:
 
 
 def pose_difference(a: Floats, b: Floats) -> tuple[float, float]:
-    """Return the differences of two transforms in translation (metres) and rotation (radians)."""
+    """Return the difference of two transforms in translation (metres) and rotation (radians)."""
     metres, radians = _pose_differences(a[None], b[None])[0, 0].tolist()
     return metres, radians
 
@@ -89,7 +89,7 @@ def are_near(transforms: Floats, T: Floats, metres: float, radians: float) -> ND
     """Return a mask (n,) of the transforms (n, 4, 4) within `metres` and `radians` of T."""
     near = np.empty(len(transforms), np.bool_)
     cosine = math.cos(radians)
-    # copies, because a kernel is compiled again for arrays that are read-only
+    # copies, because numba would compile the kernel again for read-only arrays
     _mark_near(np.array(transforms, float), np.array(T, float), metres, cosine, near)
     return near
 
@@ -116,7 +116,7 @@ def _mark_near(
 def select_distinct(
     transforms: Floats, scores: Floats, metres: float, radians: float, most: int
 ) -> list[int]:
-    """Return the indices of the best transforms that differ from each other, best first.
+    """Select the best transforms that differ from each other; return their indices, best first.
 
     Parameters
     ----------
@@ -126,16 +126,18 @@ def select_distinct(
     """
     order = np.argsort(-scores, kind="stable")
     chosen = np.empty(min(most, len(order)), np.int64)
-    count = _select(np.ascontiguousarray(transforms), order, metres, math.cos(radians), chosen)
+    count = _select_first(
+        np.ascontiguousarray(transforms), order, metres, math.cos(radians), chosen
+    )
     indices: list[int] = chosen[:count].tolist()
     return indices
 
 
 @kernel
-def _select(
+def _select_first(
     transforms: Floats, order: Ints64, metres: float, cosine: float, chosen: Ints64
 ) -> int:  # fmt: skip
-    """Write the indices of distinct transforms to `chosen`, and return their number."""
+    """Write the indices of distinct transforms to `chosen`; return their number."""
     count = 0
     for i in order:
         if count == len(chosen):
@@ -276,7 +278,7 @@ def solve_positive(A: Floats, b: Floats, x: Floats) -> bool:
 
 @dataclass(frozen=True)
 class AveragingParameters:
-    """The tolerances within which a vote agrees with the medoid."""
+    """Tolerances within which a vote agrees with the medoid."""
 
     agree_m: float = 0.15  #: maximum distance, metres
     agree_rad: float = math.radians(10.0)  #: maximum angle, radians
@@ -308,7 +310,7 @@ def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAv
     """Return the mean of the votes near their medoid.
 
     The medoid is the vote with the most other votes near it. Ties are resolved by the distance to
-    the other votes, then by rank.
+    these votes, then by rank.
 
     Parameters
     ----------
@@ -343,9 +345,9 @@ def pose_spread(T: Floats, poses: Floats) -> tuple[float, float]:
 
 
 def mean_direction(directions: Floats, within: float) -> Floats | None:
-    """Return the mean direction (3,), a unit vector, of the largest group of unit vectors.
+    """Return the mean (3,), a unit vector, of the largest group of unit vectors that agree.
 
-    The result is None unless more than half of the vectors agree.
+    The result is None unless more than half of all vectors are in the group.
 
     Parameters
     ----------
@@ -361,14 +363,14 @@ def mean_direction(directions: Floats, within: float) -> Floats | None:
     return result
 
 
-#: The up directions, unit vectors (3,), in the coordinates of source and target; None if unknown.
+#: Unit vectors (3,) that point up in the coordinates of source and target; None if unknown.
 Ups = tuple[Floats | None, Floats | None]
 NO_UPS: Ups = (None, None)
 
 
 @dataclass(frozen=True)
 class GravityParameters:
-    """The maximum tilts of transforms against `up`, in radians, with a margin for its noise."""
+    """Maximum tilts of transforms against `up`, in radians, with a margin for the noise of `up`."""
 
     gate: float = math.radians(15.0)  #: maximum difference of two corresponding patches' slopes
     proposed_tilt: float = math.radians(20.0)  #: maximum tilt of an unrefined hypothesis
@@ -400,16 +402,16 @@ def tilts(transforms: Floats, ups: Ups) -> Floats:
 
 
 def tilt_of(T: Floats | None, ups: Ups) -> float | None:
-    """Return the tilt of a transform in radians; None if the transform or an `up` is unknown."""
+    """Return the tilt of a transform, radians; None if the transform or one of `ups` is unknown."""
     if T is None or ups[0] is None or ups[1] is None:
         return None
     return float(tilts(T[None], ups)[0])
 
 
 def are_level(transforms: Floats, ups: Ups, most: float) -> NDArray[np.bool_]:
-    """Return a mask of the transforms that tilt by at most `most` radians.
+    """Return a mask (n,) of the transforms that tilt by at most `most` radians.
 
-    The mask selects all transforms if an `up` is unknown.
+    The mask selects all transforms if one of `ups` is unknown.
     """
     level: NDArray[np.bool_] = tilts(transforms, ups) <= most
     return level

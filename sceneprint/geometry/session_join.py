@@ -1,4 +1,4 @@
-"""Verification of associations between two runs by loops, and the transform between the runs.
+"""Verification of associations between two runs by loops, and estimation of their transform.
 
 edges, paths of both runs  --judge_edges-->  EdgeVerdicts
 votes T_a_b with positions  --join_sessions-->  SessionJoin
@@ -8,14 +8,14 @@ odometry between their frames; if the loop does not close, one of the edges is w
 odometry over short distances only, so drift is negligible and the runs need no common origin
 (pairwise consistency: Mangelson et al., ICRA 2018, with the odometry's uncertainty as a tolerance).
 
-Edges of one viewpoint share their errors. Therefore an edge is supported only if it closes a loop
-with an edge of another viewpoint on either run. Loops cannot distinguish the sides of a symmetric
-object, because all edges are wrong by the same rotation. Within one run, an edge is therefore
-unsupported if it deviates from the odometry by more than the maximum drift.
+Edges of the same viewpoint share their errors. Therefore, an edge is supported only if it closes a
+loop with an edge of another viewpoint on either run. Loops cannot distinguish the sides of a
+symmetric object, because all edges are wrong by the same rotation. Therefore, within a run, an edge
+is unsupported if it deviates from the odometry by more than the maximum drift.
 
-Each association of a frame of run b with a frame of run a is a vote for the transform between
-their parent frames. Votes are compared at the positions of their frames, because one degree moves
-a distant origin by metres.
+An association of a frame of run b with a frame of run a is a vote for the transform between their
+parent frames. Votes are compared at the positions of their frames: a degree moves a distant origin
+by metres.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sceneprint.types import Floats
 
 @dataclass(frozen=True, eq=False)
 class Votes:
-    """Transforms between two parent frames, one for each association.
+    """Votes for the transform between two parent frames, one per association.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def association_votes(
     transforms: Floats, source_poses: Floats, target_poses: Floats,
     source: NDArray[np.int64], target: NDArray[np.int64], weights: Floats,
 ) -> Votes:  # fmt: skip
-    """Return the votes of associations.
+    """Convert associations to votes.
 
     Parameters
     ----------
@@ -81,13 +81,13 @@ def association_votes(
 
 Ints64 = NDArray[np.int64]
 
-#: Path length that stands for a gap in odometry, metres: longer than any loop.
+#: Path length that represents a gap in odometry, metres: longer than any loop.
 _GAP_M = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class RobotPath:
-    """The poses of a robot frame by frame.
+    """The path of a robot, with a pose per frame.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class RobotPath:
 
 
 def robot_path(poses: Floats, parents: Ints64) -> RobotPath:
-    """Return the path of a run.
+    """Compute the path of a run.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def robot_path(poses: Floats, parents: Ints64) -> RobotPath:
 
 @dataclass(frozen=True)
 class CycleParameters:
-    """The tolerances within which a loop of two edges closes."""
+    """Tolerances within which a loop of two edges closes."""
 
     close_m: float = 0.07  #: maximum residual of a loop of length zero, metres
     close_rad: float = math.radians(4.0)  #: maximum residual of a loop of length zero, radians
@@ -133,9 +133,9 @@ class CycleParameters:
     most_drift: float = 0.2  #: maximum plausible drift between any two frames of a run
     reach_m: float = 1.0  #: maximum path length between the edges of a loop, metres
     reach_rad: float = math.radians(60.0)  #: maximum rotation between the edges of a loop, radians
-    view_m: float = 0.1  #: maximum distance between two frames of one viewpoint, metres
-    view_rad: float = math.radians(6.0)  #: maximum angle of frames of one viewpoint, radians
-    most_loops: int = 4_000_000  #: maximum number of loops; the reach is halved until it holds
+    view_m: float = 0.1  #: maximum distance between two frames of a viewpoint, metres
+    view_rad: float = math.radians(6.0)  #: maximum angle between two frames of a viewpoint, radians
+    most_loops: int = 4_000_000  #: maximum number of loops; the reach is halved if there are more
 
     def scaled(self, scale: float) -> CycleParameters:
         """Return these parameters with all lengths multiplied by `scale`."""
@@ -170,7 +170,7 @@ class EdgeVerdicts:
     Parameters
     ----------
     accepted : (n,) mask of the edges that other edges do not outvote
-    loops : (n,) number of loops with accepted edges; 0 if the edge is unchecked
+    loops : (n,) number of loops with accepted edges; 0 for unchecked edges
     closed : (n,) number of these loops that close
     supported : (n,) mask of the accepted edges that close a loop with an edge of another viewpoint
         and agree with the odometry of their run
@@ -213,7 +213,7 @@ def judge_edges(
 
 
 def _match_odometry(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDArray[np.bool_]:
-    """Return a mask of the edges of a run that its odometry does not contradict."""
+    """Return a mask (n,) of the edges that the odometry of their run does not contradict."""
     here, there = run.poses[edges.source], run.poses[edges.target]
     predicted = there @ edges.transforms  # pose of the source frame that the edge implies
     metres = np.linalg.norm(predicted[:, :3, 3] - here[:, :3, 3], axis=1)
@@ -229,8 +229,8 @@ def _match_odometry(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDA
 def _loops(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters
 ) -> tuple[Ints64, Ints64, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return pairs (i, j) of edges that form loops, and masks of the pairs whose loop closes and
-    of the pairs whose viewpoints differ on either run.
+    """Return pairs (i, j) of edges that form loops, a mask of the pairs whose loop closes, and a
+    mask of the pairs whose viewpoints differ on either run.
     """
     ways = np.stack(
         [
@@ -272,7 +272,7 @@ def _are_elsewhere(
 
 @kernel
 def _are_near(ways: Floats, i: int, j: int, limits: Floats) -> bool:
-    # comparisons with NaN are false, so frames without a pose form no loops
+    # NaN fails these comparisons, so frames without a pose form no loops
     near: bool = (
         abs(ways[i, 0] - ways[j, 0]) <= limits[0]
         and abs(ways[i, 1] - ways[j, 1]) <= limits[1]
@@ -357,7 +357,7 @@ def _outvote(
     starts: Ints64, others: Ints64, closing: NDArray[np.bool_], weights: Floats,
     accepted: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Reject the worst edge while the votes against it outweigh those for it."""
+    """Reject the worst edge as long as the votes against it outweigh the votes for it."""
     n = len(accepted)
     against = np.zeros(n)
     for i in range(n):
@@ -380,23 +380,23 @@ Strength = Literal["strong", "weak"]
 
 @dataclass(frozen=True)
 class JoiningParameters:
-    """The tolerances within which votes agree, and the agreement that a join requires."""
+    """Tolerances within which votes agree, and the agreement that a join requires."""
 
     agree_m: float = 0.2  #: maximum difference at a vote's position, metres
     agree_rad: float = math.radians(6.0)  #: maximum difference in rotation, radians
     sigma_m: float = 0.04  #: standard deviation of a vote's position, metres
     sigma_rad: float = math.radians(1.2)  #: standard deviation of a vote's rotation, radians
     hypotheses: int = 300  #: maximum number of votes that are tested as the transform
-    rounds: int = 8  #: iterations of the fit
+    rounds: int = 8  #: number of iterations of the fit
     least_votes: int = 3  #: minimum number of agreeing votes
     least_frames: int = 2  #: minimum number of frames of the agreeing votes in either run
-    view_m: float = 0.1  #: maximum distance between two frames of one viewpoint, metres
-    view_rad: float = math.radians(6.0)  #: maximum angle of frames of one viewpoint, radians
+    view_m: float = 0.1  #: maximum distance between two frames of a viewpoint, metres
+    view_rad: float = math.radians(6.0)  #: maximum angle between two frames of a viewpoint, radians
     rival: float = 0.5  #: share of the support at which another transform prevents a join
     strong_votes: int = 10  #: minimum number of agreeing votes of a strong join
     strong_frames: int = 5  #: minimum number of their frames in either run
     strong_share: float = 0.5  #: minimum share of agreeing votes among all votes
-    strong_extent_m: float = 1.0  #: minimum extent of their frames: one place can be mistaken
+    strong_extent_m: float = 1.0  #: minimum extent of their frames: a single place may mislead
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,8 +406,9 @@ class SessionJoin:
     Parameters
     ----------
     T : (4, 4) T_a_b; None if too few votes agree or another transform has enough support
-    agree : (n,) mask of the votes that agree with the best transform, even if it was refused
-    spread_m, spread_rad : root mean square difference of these votes from it, at their frames
+    agree : (n,) mask of the votes that agree with the best transform, even if it is rejected
+    spread_m, spread_rad : root mean square difference of these votes from it, at their frames,
+        metres and radians
     rival : number of the other votes that agree on the second-best transform
     strength : strong, or weak if few votes agree; None without a transform
     reason : short explanation of the result
@@ -428,11 +429,11 @@ class SessionJoin:
 
 
 def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = None) -> SessionJoin:
-    """Return the transform with the largest support, fitted to the votes that agree with it.
+    """Estimate the transform with the largest support, fitted to the votes that agree with it.
 
     Each vote (a random sample of `hypotheses` votes if there are more) is tested as the transform,
-    and the best is refitted to the votes that agree. The weights of the votes of one frame are
-    normalized to 1, so that a frame with many matches does not outweigh other frames.
+    and the best vote is refitted to the votes that agree. The weights of a frame's votes are
+    normalized, so that a frame with many matches does not outweigh other frames.
 
     Parameters
     ----------
@@ -448,13 +449,13 @@ def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = Non
     if n == 0:
         raise ValueError("There are no votes. Pass at least one vote.")
     weights = votes.weights / np.bincount(votes.source)[votes.source]
-    every = np.ones(n, np.bool_)
-    best = _best(votes, weights, _sample(np.arange(n), seed, p), every, p)
-    T, agree = _fit(votes, weights, votes.transforms[best], p)
+    everything = np.ones(n, np.bool_)
+    best = _best_vote(votes, weights, _sample(np.arange(n), seed, p), everything, p)
+    T, agree = _fit_transform(votes, weights, votes.transforms[best], p)
     others, rivals = ~agree, np.zeros(n, np.bool_)
     if others.any():
-        second = _best(votes, weights, _sample(np.flatnonzero(others), seed, p), others, p)
-        rivals = _agreeing(votes, votes.transforms[second], p) & others
+        second = _best_vote(votes, weights, _sample(np.flatnonzero(others), seed, p), others, p)
+        rivals = _agreement_mask(votes, votes.transforms[second], p) & others
     strength, reason = _join_strength(votes, weights, agree, rivals, p)
     metres, radians = _differences(votes, T)
     return SessionJoin(
@@ -472,9 +473,9 @@ def _join_strength(
     votes: Votes, weights: Floats, agree: NDArray[np.bool_], rivals: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> tuple[Strength | None, str]:  # fmt: skip
-    """Return the strength of a join, or None if it is refused, and the reason."""
+    """Return the strength of a join, None if it is rejected, and the reason."""
     n, support = len(agree), int(agree.sum())
-    frames = min(len(np.unique(each[agree])) for each in (votes.source, votes.target))
+    frames = min(len(np.unique(identifiers[agree])) for identifiers in (votes.source, votes.target))
     reason = f"{support} of {n} associations agree"
     if support < p.least_votes or frames < p.least_frames:
         return None, (
@@ -521,39 +522,39 @@ def _rotation_vectors(votes: Votes, T: Floats) -> Floats:
     return turns
 
 
-def _agreeing(votes: Votes, T: Floats, p: JoiningParameters) -> NDArray[np.bool_]:
+def _agreement_mask(votes: Votes, T: Floats, p: JoiningParameters) -> NDArray[np.bool_]:
     metres, radians = _differences(votes, T)
     agree: NDArray[np.bool_] = (metres <= p.agree_m) & (radians <= p.agree_rad)
     return agree
 
 
-def _best(
+def _best_vote(
     votes: Votes, weights: Floats, chosen: NDArray[np.intp], among: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> int:  # fmt: skip
-    """Return the vote of `chosen` with the largest support by votes of `among`; ties by order."""
+    """Return the index in `chosen` of the vote that most of `among` support; ties by order."""
     support = [
-        float(weights[_agreeing(votes, votes.transforms[i], p) & among].sum()) for i in chosen
+        float(weights[_agreement_mask(votes, votes.transforms[i], p) & among].sum()) for i in chosen
     ]
     return int(chosen[int(np.argmax(np.round(support, 9)))])
 
 
-def _fit(
+def _fit_transform(
     votes: Votes, weights: Floats, T: Floats, p: JoiningParameters
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Fit a transform to the votes that agree with it; return the result and their mask."""
-    agree = _agreeing(votes, T, p)
+    agree = _agreement_mask(votes, T, p)
     for _ in range(p.rounds):
-        step = _step(votes, weights * agree, T, p)
-        now = _agreeing(votes, step, p)
+        step = _improve(votes, weights * agree, T, p)
+        now = _agreement_mask(votes, step, p)
         if not now.any():  # the mean of two distant votes may agree with none
             break
         T, agree = step, now
     return T, agree
 
 
-def _step(votes: Votes, weights: Floats, T: Floats, p: JoiningParameters) -> Floats:
-    """Return T after a Gauss-Newton step on positions and rotations, with Cauchy weights."""
+def _improve(votes: Votes, weights: Floats, T: Floats, p: JoiningParameters) -> Floats:
+    """Improve T by a Gauss-Newton step on positions and rotations, with Cauchy weights."""
     voted = np.einsum("nij,nj->ni", votes.transforms[:, :3, :3], votes.places)
     voted += votes.transforms[:, :3, 3]
     places = votes.places @ T[:3, :3].T + T[:3, 3]

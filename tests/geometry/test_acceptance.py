@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.registration.alignment import AlignmentParameters, FrameSamples, _scores
+from sceneprint.geometry.registration.alignment import AlignmentParameters, FrameSamples, _score
 from sceneprint.geometry.registration.overlap import OverlapParameters, PlaneView, agreements
 from sceneprint.geometry.validation.acceptance import (
     AcceptanceParameters,
@@ -242,5 +242,5 @@ def test_a_violation_costs_three_inliers() -> None:
         for surface, points in ((seen, source), (seen, wall_points))
     ]
     every = AlignmentParameters(score_stride=1)
-    scores = _scores(frames[0], frames[1], np.eye(4)[None], every, p)
+    scores = _score(frames[0], frames[1], np.eye(4)[None], every, p)
     assert scores == pytest.approx([(5 - 3 * 2) / 7 + 4 / 4])

@@ -54,7 +54,7 @@ def graph(a: Patches, b: Patches, pairs: Ints32) -> tuple[NDArray[np.uint64], ND
     i, j = pairs.T
     bits = np.zeros((len(pairs), (len(pairs) + 63) // 64), np.uint64)
     rows = (a.means[i], a.normals[i], b.means[j], b.normals[j])
-    module._graph(
+    module._build_graph(
         *(np.ascontiguousarray(one.T) for one in rows),
         P.distance_tolerance, P.angle_tolerance, P.minimum_distance, bits,
     )  # fmt: skip
@@ -109,7 +109,7 @@ def test_common_neighbours_equal_the_product_of_the_matrix(n: int) -> None:
     bits[:, :n] = matrix
     packed = np.packbits(bits, axis=1, bitorder="little").view(np.uint64)
     common = np.zeros((n, n), np.int32)
-    module._second_order(packed, common)
+    module._count_common(packed, common)
     np.testing.assert_array_equal(common, np.where(matrix, matrix.astype(int) @ matrix, 0))
 
 
@@ -119,7 +119,7 @@ def test_largest_are_in_the_order_of_a_stable_sort(most: int) -> None:
     for _ in range(50):
         row = rng.integers(0, 12, 40).astype(np.int32)
         order = np.empty(most, np.int32)
-        module._largest(row, order)
+        module._write_largest(row, order)
         np.testing.assert_array_equal(order, np.argsort(-row, kind="stable")[:most])
 
 
@@ -132,7 +132,7 @@ def test_fit_equals_scipys() -> None:
         weights = rng.uniform(0.1, 1.0, n)
         T = np.zeros((4, 4))
         columns = [np.ascontiguousarray(one.T) for one in (p, normals, q, others)]
-        assert module._fit(*columns, weights, 0.3, np.empty(n, np.int32), T)
+        assert module._fit_transform(*columns, weights, 0.3, np.empty(n, np.int32), T)
         a, b = np.average(p, axis=0, weights=weights), np.average(q, axis=0, weights=weights)
         R = Rotation.align_vectors(
             np.concatenate([q - b, others]),

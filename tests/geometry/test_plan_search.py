@@ -13,7 +13,7 @@ from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
     _draw_slices,
     _height_offsets,
-    _slice,
+    _slice_heights,
     _slice_spectrum,
     dominant_up,
     draw_plan,
@@ -132,7 +132,7 @@ def test_slices_are_heights_above_the_lowest_point_of_the_neighbourhood() -> Non
     ground = [(1.0, 1.0, -1.5)]
     above = [(5.0, 5.0, z - 1.5) for z in (0.3, 0.5, 1.1, 1.3, 2.7, 11.9, 12.1)]
     apart = [(13.0, 1.0, 0.0)]  # two squares from the others, so it is its own ground
-    slices = _slice(np.array(ground + above + apart), P)
+    slices = _slice_heights(np.array(ground + above + apart), P)
     assert slices.tolist() == [0, 0, 1, 1, 2, 3, 3, 0, 0]
 
 

@@ -464,7 +464,7 @@ def test_wrong_calls(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
         validate(query, match, mode="other")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="lengths, 128 and 127 bytes"):
         validate(query, replace(match, descriptors=match.descriptors[:, :127]))
-    with pytest.raises(ModelMismatch, match="Frames of two models cannot be compared"):
+    with pytest.raises(ModelMismatch, match="Frames of different models cannot be compared"):
         pipeline.validate(query, replace(match, model_id="0" * 64))
 
 

@@ -557,7 +557,7 @@ def compatible(module: ModuleType, a: Patches, b: Patches) -> bool:
     """Whether two correspondences, of patch 0 and of patch 1, are compatible."""
     bits = np.zeros((2, 1), np.uint64)
     columns = (np.ascontiguousarray(x.T) for x in (a.means, a.normals, b.means, b.normals))
-    module._graph(*columns, 0.12, 0.5, 0.15, bits)
+    module._build_graph(*columns, 0.12, 0.5, 0.15, bits)
     assert bits[0, 0] in (0, 2)
     assert bits[1, 0] == bits[0, 0] // 2
     return bool(bits[0, 0])
@@ -614,10 +614,10 @@ def check_consensus(module: ModuleType) -> None:
         return [np.ascontiguousarray(one.T) for one in arrays]
 
     of_source = columns(source.means, source.normals)
-    assert module._fit(*of_source, *columns(q, m), weights, 0.05, room, found)
+    assert module._fit_transform(*of_source, *columns(q, m), weights, 0.05, room, found)
     np.testing.assert_allclose(found, T, atol=1e-12)
     few = np.array([1.0, 0, 0, 1])
-    assert not module._fit(*of_source, *columns(q, m), few, 0.05, room, found)
+    assert not module._fit_transform(*of_source, *columns(q, m), few, 0.05, room, found)
     # what it explains: off by 0, 6 cm, 16 cm, and by 0 but facing elsewhere; (1 - .16)^2
     off = q.copy()
     off[1, 0] += 0.06

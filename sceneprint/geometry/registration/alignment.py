@@ -1,4 +1,4 @@
-"""The search for the transform that best explains two frames, and for alternatives (Sec. III-E).
+"""Search for the transform that best explains two frames, and for alternatives (Sec. III-E).
 
     correspondences (M)  --consensus-->  transforms (S, 4, 4), by descending support
     Geometry, Geometry  --align-->  Alignment               for one direction
@@ -11,12 +11,12 @@ seed correspondence and compatible correspondences that are also compatible with
 (second-order compatibility: Chen et al., SC2-PCR, CVPR 2022) determine one transform, which is
 refined over all correspondences that it explains.
 
-The directions of depth images are searched independently: the agreement of their results is
-evidence, which a common search would destroy. Scans contain much more surface, so one search is
-sufficient; their directions are refined separately.
+The directions of depth images are searched independently, because the agreement of independent
+results is evidence. Scans contain much more surface, so a single search is sufficient; their
+directions are refined separately.
 
 If `up` is known in both frames, gravity excludes transforms that tilt (an IMU measures `up` to half
-a degree). `up` may be wrong, so the gates have a margin, and if no transform fits, the search is
+a degree). Since `up` may be wrong, the gates have a margin, and if no transform fits, the search is
 repeated without `up`. The paper does not use gravity.
 """
 
@@ -107,7 +107,7 @@ class ConsensusParameters:
 
 @kernel
 def _alike_angles(a: float, b: float, most: float) -> bool:
-    """Return whether two angles, specified by their cosines, differ by at most `most` radians."""
+    """Return whether two angles with these cosines differ by at most `most` radians."""
     a, b = min(max(a, -1.0), 1.0), min(max(b, -1.0), 1.0)
     return not abs(np.arccos(a) - np.arccos(b)) > most
 
@@ -121,7 +121,7 @@ def _compare(
     p: Floats, n: Floats, q: Floats, m: Floats, i: int,
     tolerance: float, angle: float, minimum: float, verdicts: Bytes, cosines: Floats,
 ) -> None:  # fmt: skip
-    """Compare correspondence i with each later one; all arrays are (3, M), cosines (2, M).
+    """Compare correspondence i with all later correspondences; arrays are (3, M), cosines (2, M).
 
     They are compatible if lengths, heights above each other's planes, angles between normals and
     the signed triple product, which excludes mirror images, agree. The cosines bound the difference
@@ -169,7 +169,7 @@ def _compare(
 
 
 @kernel
-def _graph(
+def _build_graph(
     p: Floats, n: Floats, q: Floats, m: Floats,
     tolerance: float, angle: float, minimum: float, bits: NDArray[np.uint64],
 ) -> None:  # fmt: skip
@@ -187,8 +187,8 @@ def _graph(
 
 
 @kernel
-def _second_order(bits: NDArray[np.uint64], common: Ints32) -> None:
-    """Write the number of correspondences compatible with both i and j; 0 if i and j are not."""
+def _count_common(bits: NDArray[np.uint64], common: Ints32) -> None:
+    """Write the number of correspondences compatible with both i and j; 0 for incompatible i, j."""
     count, words = bits.shape
     m1, m2 = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
     m4, h = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
@@ -218,7 +218,7 @@ def _select_weighted(weights: Floats, places: Ints32) -> int:
 
 
 @kernel
-def _fit(
+def _fit_transform(
     p: Floats, n: Floats, q: Floats, m: Floats, weights: Floats, normal_weight: float,
     places: Ints32, T: Floats,
 ) -> bool:  # fmt: skip
@@ -281,7 +281,7 @@ def _weigh_inliers(
 
 
 @kernel
-def _largest(row: Ints32, order: Ints32) -> None:
+def _write_largest(row: Ints32, order: Ints32) -> None:
     """Write the indices of the largest values of a row, in descending order; ties by index."""
     count = 0
     for j in range(len(row)):
@@ -296,7 +296,7 @@ def _largest(row: Ints32, order: Ints32) -> None:
 
 
 @kernel
-def _hypotheses(
+def _fit_hypotheses(
     p: Floats, n: Floats, q: Floats, m: Floats, common: Ints32, n_seeds: int, n_support: int,
     normal_weight: float, rounds: int, distance: float, cosine: float, T: Floats,
 ) -> int:  # fmt: skip
@@ -314,7 +314,7 @@ def _hypotheses(
         if support[seed] <= 0:
             break
         row = common[seed]
-        _largest(row, order)
+        _write_largest(row, order)
         weights[:] = 0.0
         weights[seed] = max(row[order[0]], 1)
         for k in order:
@@ -323,18 +323,18 @@ def _hypotheses(
             if row[j] > 0:
                 support[j] *= 1.0 - 0.5 * row[j] / row[order[0]]
         support[seed] = 0.0
-        if not _fit(p, n, q, m, weights, normal_weight, places, T[found]):
+        if not _fit_transform(p, n, q, m, weights, normal_weight, places, T[found]):
             continue
         for _ in range(rounds):
             _weigh_inliers(p, n, q, m, T[found], distance, cosine, weights)
-            if not _fit(p, n, q, m, weights, normal_weight, places, T[found]):
+            if not _fit_transform(p, n, q, m, weights, normal_weight, places, T[found]):
                 break
         found += 1
     return found
 
 
 def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParameters) -> Floats:
-    """Return transforms from source to target on which correspondences agree.
+    """Compute transforms from source to target on which correspondences agree.
 
     Parameters
     ----------
@@ -343,7 +343,8 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
 
     Returns
     -------
-    (S, 4, 4) T_target_source, at most `n_seeds`; none if fewer than three correspondences agree
+    (S, 4, 4) T_target_source; S is at most `n_seeds`, and 0 if fewer than three correspondences
+    agree
     """
     if len(pairs) < 3:
         return np.empty((0, 4, 4))
@@ -352,11 +353,11 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
     b = np.ascontiguousarray(target.means[pairs[:, 1]].T)
     m = np.ascontiguousarray(target.normals[pairs[:, 1]].T)
     bits = np.zeros((len(pairs), (len(pairs) + 63) // 64), np.uint64)
-    _graph(a, n, b, m, p.distance_tolerance, p.angle_tolerance, p.minimum_distance, bits)
+    _build_graph(a, n, b, m, p.distance_tolerance, p.angle_tolerance, p.minimum_distance, bits)
     common = np.zeros((len(pairs), len(pairs)), np.int32)
-    _second_order(bits, common)
+    _count_common(bits, common)
     T = np.zeros((p.n_seeds, 4, 4))
-    count = _hypotheses(
+    count = _fit_hypotheses(
         a, n, b, m, common, p.n_seeds, p.n_support, p.normal_weight, p.rounds,
         p.inlier_distance, p.inlier_cosine, T,
     )  # fmt: skip
@@ -366,8 +367,8 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
 def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
     """Return the angle between `up` (3,) and the nearest dominant direction of the surface, rad.
 
-    Visible floors and tables show the up direction as precisely as an IMU, but a ramp misleads and
-    the floor may be out of view. Therefore the angle is a hint, not evidence.
+    Visible floors and tables determine the up direction as precisely as an IMU, but ramps mislead,
+    and the floor may be out of view. Therefore, the angle is a hint, not evidence.
     """
     facing = frame.surface.normals[frame.surface.valid][:: p.floor_stride].astype(float)
     if not len(facing):
@@ -379,7 +380,7 @@ def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
 def contradiction(
     tilt: float, query: Geometry, match: Geometry, ups: Ups, p: GravityParameters
 ) -> str:
-    """Return the reason for refusing a transform that fits, but tilts against `up`.
+    """Explain the rejection of a transform that fits, but tilts against `up`.
 
     Parameters
     ----------
@@ -411,7 +412,7 @@ class AlignmentParameters:
     matching: MatchingParameters = field(default_factory=MatchingParameters)
     consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
     n_refined: int = 16  #: number of hypotheses that are refined
-    n_sliced: int = 4  #: number of hypotheses of slices among them, whatever their scores
+    n_sliced: int = 4  #: number of hypotheses of slices among them, regardless of their scores
     score_stride: int = 2  #: stride of the points that score hypotheses
     n_fine: int = 6  #: number of hypotheses of scans that are refined finely before ranking
     fine_stride: int = 4  #: stride of the pixels in this refinement
@@ -429,7 +430,7 @@ class AlignmentParameters:
 
 @dataclass(frozen=True, eq=False)
 class FrameSamples:
-    """A frame that is prepared for the scoring of hypotheses.
+    """A frame with precomputed samples for scoring hypotheses.
 
     Parameters
     ----------
@@ -443,7 +444,7 @@ class FrameSamples:
     up: Floats | None = None
 
     def plan(self, p: PlanParameters) -> ScanPlan:
-        """Return the plan of a scan."""
+        """Return the plan of a scan, as seen from above."""
         if self.up is not None:
             return draw_plan(self.geometry.surface, p, up=self.up)
         return _upright_plan(self.geometry.surface, p)
@@ -457,7 +458,7 @@ def _upright_plan(surface: Surface, p: PlanParameters) -> ScanPlan:
 def frame_samples(
     geometry: Geometry, stride: int, p: PlaneParameters, up: Floats | None = None
 ) -> FrameSamples:
-    """Return a frame that is prepared for `align`; the stride is in pixels."""
+    """Prepare a frame for `align`; the stride is in pixels."""
     return FrameSamples(
         geometry, sample_points(geometry.surface, stride), plane_view(geometry, p), up
     )
@@ -473,7 +474,7 @@ class Alignment:
     others : (n, 4, 4) other refined hypotheses, best first
     stiffness : ratio of the smallest to the largest eigenvalue of the information; 0 if a direction
         is unconstrained
-    refined : last refinement, with its information; None if it failed
+    refined : last refinement; None if it failed
     search : source of the transform
     proposed : (n, 4, 4) all hypotheses before refinement, best first; for scans only
     """
@@ -496,9 +497,9 @@ def align(
 ) -> Alignment | None:
     """Search for the transform from source to target: Sec. III-E, in one direction.
 
-    Correspondences propose about 40 hypotheses, which are scored by the agreement of both frames'
-    points. The best distinct hypotheses are refined and ranked by planes, and the best is refined
-    finely.
+    Correspondences propose about 40 hypotheses. They are scored by the agreement of both frames'
+    points; the best distinct hypotheses are refined and ranked by planes, and the best hypothesis
+    is refined finely.
 
     Parameters
     ----------
@@ -508,13 +509,12 @@ def align(
 
     Returns
     -------
-    alignment : the result, or None if fewer than three correspondences agree or all refinements
-        fail
+    alignment : the result; None if fewer than three correspondences agree, or all refinements fail
     """
     a, b = source.geometry, target.geometry
     ups = source.up, target.up
-    hypotheses = _vote(a, b, rng, p, matching, ups)
-    scores = _scores(source, target, hypotheses, p, overlap_p)
+    hypotheses = _vote_hypotheses(a, b, rng, p, matching, ups)
+    scores = _score(source, target, hypotheses, p, overlap_p)
     chosen = select_distinct(hypotheses, scores, p.same_m, p.same_rad, p.n_refined)
     refined = refine_all(a.surface, b.surface, hypotheses[chosen], p.coarse)
     refined = refined[are_level(refined, ups, p.gravity.refined_tilt)]
@@ -536,26 +536,26 @@ def align_scans(
 ) -> tuple[Alignment, Alignment] | None:
     """Search for the transform between two scans, and refine it in both directions.
 
-    Both correspondences and plans propose hypotheses. The best are refined finely before ranking,
-    since plans are coarse and the ranks of coarsely refined hypotheses are unreliable.
+    Both correspondences and plans propose hypotheses. The best hypotheses are refined finely before
+    ranking: plans are coarse, and the ranks of coarsely refined hypotheses are unreliable.
 
     Parameters
     ----------
     query, match : samples of two scans
     rng, p, overlap_p, matching : arguments of `align`
-    other_axes : whether to consider scanners that did not stand upright
+    other_axes : whether to consider that the scanners were not upright
 
     Returns
     -------
-    alignments : query to match and match to query, or None if all refinements fail
+    alignments : query to match, and match to query; None if all refinements fail
     """
     a, b = query.geometry, match.geometry
     ups = query.up, match.up
-    voted = _vote(a, b, rng, p, matching, ups)
+    voted = _vote_hypotheses(a, b, rng, p, matching, ups)
     planned, sliced = _search_plans(query, match, p.plan, other_axes=other_axes)
     hypotheses = np.concatenate([voted, sliced, planned])
-    scores = _scores(query, match, hypotheses, p, overlap_p)
-    priorities = scores.copy()  # slices are too coarse for the scores, so their best have priority
+    scores = _score(query, match, hypotheses, p, overlap_p)
+    priorities = scores.copy()  # slices are too coarse for scores, so the best slices have priority
     priorities[len(voted) : len(voted) + min(len(sliced), p.n_sliced)] = math.inf
     chosen = select_distinct(hypotheses, priorities, p.same_m, p.same_rad, p.n_refined)
     transforms, index = refine_with_index(a.surface, b.surface, hypotheses[chosen], p.coarse)
@@ -582,9 +582,9 @@ def align_scans(
 def _search_plans(
     query: FrameSamples, match: FrameSamples, p: PlanParameters, *, other_axes: bool
 ) -> tuple[Floats, Floats]:
-    """Return the hypotheses of plans, and those of slices for scanners that see all around.
+    """Return the hypotheses of plans, and, for scanners that see all around, of slices.
 
-    Streets require slices, but their scanners stand upright.
+    Streets require slices, but scanners in streets are upright.
     """
     a, b = query.geometry.surface, match.geometry.surface
     if other_axes:
@@ -615,17 +615,17 @@ def are_scans(query: Geometry, match: Geometry) -> bool:
     return all(isinstance(frame.surface.camera, Sphere) for frame in (query, match))
 
 
-def _vote(
+def _vote_hypotheses(
     source: Geometry, target: Geometry, rng: np.random.Generator, p: AlignmentParameters,
     matching: Matching, ups: Ups,
 ) -> Floats:  # fmt: skip
-    """Return the hypotheses from correspondences, without tilted ones."""
-    pairs = _pairs(source, target, rng, p, matching, ups)
+    """Return the hypotheses from correspondences that do not tilt against `ups`."""
+    pairs = _match_patches(source, target, rng, p, matching, ups)
     voted = consensus(source.patches, target.patches, pairs, p.consensus)
     return voted[are_level(voted, ups, p.gravity.proposed_tilt)]
 
 
-def _pairs(
+def _match_patches(
     source: Geometry, target: Geometry, rng: np.random.Generator, p: AlignmentParameters,
     matching: Matching, ups: Ups,
 ) -> Ints32:  # fmt: skip
@@ -656,11 +656,11 @@ def _refine_finally(
     return Alignment(fine.T, others, stiffness, fine, search)
 
 
-def _scores(
+def _score(
     source: FrameSamples, target: FrameSamples, transforms: Floats, p: AlignmentParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Return the shares of inliers minus weighted violations, over both frames' points."""
+    """Return the scores (n,) of transforms: shares of inliers minus weighted violations."""
     total = np.zeros(len(transforms))
     for frame, other, direction in (
         (source, target, transforms), (target, source, inverses(transforms)),

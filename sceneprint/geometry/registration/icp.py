@@ -5,10 +5,10 @@
     covariance  --free_directions-->  directions in which the surfaces can slide
     covariance, R, lever  --transform_covariance-->  covariance in another frame
 
-Projective point-to-plane alignment compares a point with the plane that the target observed in its
-direction. Depth errors of structured-light sensors grow with z^2, so distant points weigh less. If
-the target has no viewpoint, a point is compared with the plane of the nearest point with a similar
-normal.
+Projective point-to-plane alignment compares a point with the plane that the target observed in the
+point's direction. Depth errors of structured-light sensors grow with z^2, so distant points have a
+lower weight. If the target has no viewpoint, a point is compared with the plane of the nearest
+point with a similar normal.
 
 The error of T_parent_child is (x, y, z, rx, ry, rz), as in ROS's PoseWithCovariance: x is added to
 its translation, metres along the parent's axes, and the rotation vector r, radians about the
@@ -68,7 +68,7 @@ class RefinementParameters:
     weight_depth: float = 1.0  #: depth at which weights start to fall as 1 / z^4, metres
     nearest: float = 0.1  #: minimum depth of a point in the target's camera, metres
     reach: float = 0.25  #: maximum distance to a point of an unordered target, metres
-    thinning: int = 1  #: stride of the points in the first iterations
+    thinning: int = 1  #: stride within the points in the first iterations
     last_iterations: int = 2  #: number of iterations with all points
 
 
@@ -90,7 +90,7 @@ class Refinement:
     information : (6, 6) J^T W J per point, in rotation (radians) and translation (metres) about the
         target's origin
     points : number of points in the last step
-    mean_square : mean weighted square of the points' residuals, which measures the noise
+    mean_square : mean weighted square of the points' residuals, a measure of the noise
     """
 
     T: Floats
@@ -100,11 +100,11 @@ class Refinement:
 
 
 @kernel
-def _add(
+def _add_point(
     A: Floats, g: Floats, row: Floats, x: float, y: float, z: float,
     mx: float, my: float, mz: float, residual: float, weight: float,
 ) -> None:  # fmt: skip
-    """Add a transformed point (x, y, z), on a plane with normal m, to the normal equations."""
+    """Add a transformed point (x, y, z) and a plane with normal m to the normal equations."""
     row[0], row[1], row[2] = y * mz - z * my, z * mx - x * mz, x * my - y * mx
     row[3], row[4], row[5] = mx, my, mz
     for a in range(6):
@@ -119,7 +119,7 @@ def _nearest_in_line(
     points: Floats32, width: int, column: Ints32, line: Ints32, beside: int,
     x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
 ) -> None:  # fmt: skip
-    """Update the nearest pixel of each point with three pixels, `beside` lines from its own line.
+    """Update the nearest pixel of each point with three pixels, `beside` lines away from its line.
 
     `nearest` are squared distances, and `best` indices of pixels in row-major order.
     """
@@ -148,7 +148,7 @@ def _nearest_on_rays(
 ) -> None:  # fmt: skip
     """Write the nearest of the nine pixels of a pinhole around each point; see `_nearest_in_line`.
 
-    Its points lie on the rays of their pixels, so that their depth is all that is looked up.
+    A pixel's point lies on the pixel's ray, so only depths are looked up.
     """
     across, down, cx, cy = 1.0 / camera[2], 1.0 / camera[3], camera[4], camera[5]
     for i in range(count):
@@ -176,7 +176,7 @@ def _weigh_points(
 ) -> None:  # fmt: skip
     """Write Jacobians and residuals (7, n) of points at their nearest pixels, and their weights.
 
-    A weight is negative if point and pixel do not correspond.
+    A weight is negative if the point and the pixel do not correspond.
     """
     least_cosine, reference, power = numbers[3], numbers[4], numbers[6]
     per_depth = numbers[7]
@@ -221,10 +221,10 @@ def _select_compatible(weights: Floats, count: int, places: Ints32) -> int:
 
 @disjoint_kernel
 def _add_all(rows: Floats, weights: Floats, places: Ints32, count: int, sums: Floats) -> None:
-    """Add points to the normal equations in their order.
+    """Add points to the normal equations in order.
 
-    `sums` (28,) are the lower triangle of A by rows, -g and the weighted squares. The loop uses
-    scalar variables, because numba keeps only these in registers.
+    `sums` (28,) contains the lower triangle of A by rows, -g and the weighted squares. The loop
+    uses scalar variables: numba stores only scalars in registers.
     """
     r0, r1, r2, r3, r4, r5, r6 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6]
     aa, ba, bb, ca, cb, cc = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
@@ -265,10 +265,10 @@ def _accumulate(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, T: Floats, gate: float,
     numbers: Floats, room: Floats, indices: Ints32, A: Floats, g: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Write the normal equations of a Gauss-Newton step on points (7, N); return the number of
-    points used, and the sum of their weighted squares.
+    """Write the normal equations of a Gauss-Newton step on points (7, N).
 
-    Points are processed in blocks, which can be vectorized, but summed in their order.
+    Return the number of used points and the sum of their weighted squares. The terms of a block are
+    computed together, which can be vectorized, and summed in order.
     """
     height, width = points.shape[0], points.shape[1]
     shown, facing = points.reshape(-1), normals.reshape(-1)
@@ -343,7 +343,7 @@ def _accumulate_near(
         tukey = 1.0 - (residual / gate) ** 2
         near = np.float32(depth_of(kind, source[i, 0], source[i, 1], source[i, 2]) * per_depth)
         weight = tukey * tukey / (0.25 + near**4 * 0.25)
-        _add(A, g, row, at[0], at[1], at[2], mx, my, mz, residual, weight)
+        _add_point(A, g, row, at[0], at[1], at[2], mx, my, mz, residual, weight)
         squares += weight * residual * residual
         used += 1
     return used, squares
@@ -355,10 +355,10 @@ def _refine_one(
     camera: Floats, heads: Ints32, chain: Ints32, T: Floats, numbers: Floats,
     room: Floats, indices: Ints32, information: Floats,
 ) -> tuple[int, float]:  # fmt: skip
-    """Refine T by Gauss-Newton steps; return the number of points in the last step, 0 if it failed,
-    and their mean weighted square before that step.
+    """Refine T by Gauss-Newton steps.
 
-    `whole` and `few` are the points of the last and of the first iterations; see `_transpose`.
+    Return the number of points in the last step (0 if it failed), and their mean weighted square
+    before that step. `whole` and `few` are the points of the last and of the first iterations.
     """
     iterations, minimum = int(numbers[0]), int(numbers[5])
     thinned = iterations - int(numbers[10])
@@ -407,7 +407,7 @@ def _refine_one(
 
 
 @kernel
-def _transpose(source: Floats32, step: int, numbers: Floats) -> Floats32:
+def _transpose_samples(source: Floats32, step: int, numbers: Floats) -> Floats32:
     """Return every `step`-th point, transposed to (7, n), with the fourth power of its depth."""
     kind, per_depth = numbers[8], numbers[7]
     chosen = np.empty((7, (len(source) + step - 1) // step), np.float32)
@@ -424,11 +424,11 @@ def refine_in_place(
     heads: Ints32, chain: Ints32, transforms: Floats, numbers: Floats,
     information: Floats, used: Ints64, squares: Floats,
 ) -> None:  # fmt: skip
-    """Refine each of n transforms (n, 4, 4), and write the results of `_refine_one`."""
+    """Refine n transforms (n, 4, 4) in place, and write the results of `_refine_one`."""
     room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
-    whole = few = _transpose(source, 1, numbers)
+    whole = few = _transpose_samples(source, 1, numbers)
     if int(numbers[9]) > 1 and int(numbers[0]) > int(numbers[10]):
-        few = _transpose(source, int(numbers[9]), numbers)
+        few = _transpose_samples(source, int(numbers[9]), numbers)
     for k in range(len(transforms)):
         used[k], squares[k] = _refine_one(
             source, whole, few, points, normals, camera, heads, chain, transforms[k], numbers,
@@ -450,18 +450,18 @@ def refine(
     source: Floats32, target: Surface, T_target_source: Floats, p: RefinementParameters,
     kind: int = PINHOLE,
 ) -> Refinement | None:  # fmt: skip
-    """Align a source's points to the target's surface, from a nearby transform: Sec. III-E.
+    """Refine a transform by aligning the source's points to the target's surface: Sec. III-E.
 
     Parameters
     ----------
     source : (N, 6) float32 result of `overlap.sample_points` with the stride of `p`
     target : (h, w) surface, or unordered points
     T_target_source : (4, 4) initial transform
-    kind : kind of the source's camera (`camera.kind_of`), which determines the weights
+    kind : kind of the source's camera (`camera.kind_of`); the weights depend on it
 
     Returns
     -------
-    refinement : the result, or None if a step is singular or fewer than `minimum_points` points
+    refinement : the result; None if a step is singular, or fewer than `minimum_points` points
         remain within the gates
     """
     T, information, used, squares = _refine(source, target, T_target_source[None], p, kind)
@@ -471,7 +471,7 @@ def refine(
 def _refine(
     source: Floats32, target: Surface, transforms: Floats, p: RefinementParameters, kind: int
 ) -> tuple[Floats, Floats, Ints64, Floats]:
-    """Return refined transforms (n, 4, 4) with their information, points and mean squares."""
+    """Refine transforms (n, 4, 4); return them with information, points and mean squares."""
     T, n = np.array(transforms, float), len(transforms)
     information, used, squares = np.zeros((n, 6, 6)), np.empty(n, np.int64), np.empty(n)
     t = lookup_target(target, p.nearest, p.reach)
@@ -482,14 +482,14 @@ def _refine(
 def refine_all(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> Floats:
-    """Return the refined hypotheses (n, 4, 4) without those whose refinement failed."""
+    """Refine hypotheses (n, 4, 4); return the successfully refined hypotheses."""
     return refine_with_index(source, target, hypotheses, p)[0]
 
 
 def refine_with_index(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the results of `refine_all` and the indices of their hypotheses."""
+    """Return the result of `refine_all`, and the indices of its hypotheses."""
     points = sample_points(source, p.stride)
     T, _, used, _ = _refine(points, target, hypotheses, p, kind_of(source.camera))
     index = np.flatnonzero(used)
@@ -499,6 +499,7 @@ def refine_with_index(
 Method = Literal["information-scaled", "votes-and-spread"]
 #: Name of the method of `pair_covariance`.
 PAIR_METHOD: Method = "information-scaled"
+#: Name of the method of `fuse_votes`.
 PLACE_METHOD: Method = "votes-and-spread"
 
 #: Indices that reorder (rotation, translation), as in a refinement, to (translation, rotation).
@@ -551,7 +552,7 @@ def adjoint(R: Floats, lever: Floats) -> Floats:
 
 
 def transform_covariance(covariance: Floats, R: Floats, lever: Floats) -> Floats:
-    """Return a covariance (6, 6) in other axes and at another point of the same body: A S A^T.
+    """Transform a covariance (6, 6) to other axes and to another point of the body: A S A^T.
 
     For T_a_b with rotation R and translation t, the arguments (R, lever) are:
 
@@ -559,7 +560,7 @@ def transform_covariance(covariance: Floats, R: Floats, lever: Floats) -> Floats
     * (identity, R t_b_d) for T_a_b T_b_d
     * (R^T, -R^T t) for the inverse T_b_a
 
-    The other transforms are exact.
+    The transforms T_c_a and T_b_d are exact.
     """
     A = adjoint(R, lever)
     moved: Floats = A @ covariance @ A.T
@@ -585,7 +586,7 @@ def pair_covariance(
     """
     p = p or CovarianceParameters()
     information, squares = [], []
-    # `there` has errors at the match's origin; `back` in the query's axes, with opposite sign
+    # `there` has errors at the match's origin; `back` has errors in the query's axes, negated
     for refinement, R, lever in (
         (there, np.eye(3), -T[:3, 3]), (back, T[:3, :3].T, np.zeros(3))
     ):  # fmt: skip
@@ -597,7 +598,7 @@ def pair_covariance(
     if not information:
         return None
     noise = max(float(np.mean(squares)), p.least_square) / p.independent
-    scale = _scale(p)
+    scale = _error_scale(p)
     precision = np.mean(information, axis=0) * np.outer(1 / scale, 1 / scale) / noise
     values, vectors = np.linalg.eigh((precision + precision.T) / 2)
     variances = 1 / np.maximum(values, 1 / p.most**2)
@@ -611,10 +612,10 @@ def free_directions(
     """Return the directions whose deviation far exceeds the minimum, in descending order.
 
     A plane has three: two translations within it, and the rotation about its normal. A corridor has
-    its own direction, and a corner has none.
+    one, its axis; a corner has none.
     """
     p = p or CovarianceParameters()
-    scale = _scale(p)
+    scale = _error_scale(p)
     values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
     deviations = np.sqrt(np.maximum(values, 0.0))
     free = []
@@ -633,7 +634,7 @@ def fuse_votes(
     """Return the most likely pose of the votes that agree, and its covariance (6, 6).
 
     All votes share the query, so only half of their covariances is independent. The spread of the
-    votes, which contains the errors of the map's poses, is added.
+    votes is added, because it contains the errors of the map's poses.
 
     Parameters
     ----------
@@ -673,6 +674,6 @@ def pose_error(T: Floats, true: Floats) -> Floats:
     return np.concatenate([true[:3, 3] - T[:3, 3], rotation])
 
 
-def _scale(p: CovarianceParameters) -> Floats:
+def _error_scale(p: CovarianceParameters) -> Floats:
     """Return the factors that convert the six components of an error to metres."""
     return np.array([1.0, 1.0, 1.0, p.lever, p.lever, p.lever])

@@ -4,15 +4,15 @@
     Surface  --lookup_target-->  LookupTarget    LookupTarget, point  --nearest_alike-->  index
     Geometry  --plane_view-->  PlaneView         transforms  --plane_agreement-->  PlaneAgreement
 
-Points are projected into the target's camera: no search tree is needed, and a point in front of the
-target's surface violates free space, because the target would have seen it. If the target has no
-viewpoint, points are looked up by position, and free space is unknown.
+Points are projected into the target's camera. A point in front of the target's surface violates
+free space, because the target would have observed it. If the target has no viewpoint, points are
+looked up by position, and free space is unknown.
 
 Unordered points are stored in a hash table of cubes. Only one point per small cube is stored, so
 the number of points in a cube is bounded.
 
-A floor may fill half of a frame, but two floors that coincide are weak evidence for a transform.
-Therefore all patches in one plane share one weight.
+A floor may fill half of a frame, but the coincidence of two floors is weak evidence for a
+transform. Therefore, all patches in a plane share one weight.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def _slot(i: int, j: int, k: int, slots: int, secret: int) -> int:
 
 
 @kernel
-def _fill(points: Floats32, cube: float, secret: int, heads: Ints32, chain: Ints32) -> None:
-    """Insert every point into the slot of its cube, in reverse order."""
+def _fill_table(points: Floats32, cube: float, secret: int, heads: Ints32, chain: Ints32) -> None:
+    """Insert all points into the slots of their cubes."""
     for n in range(len(points)):
         slot = _slot(
             int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
@@ -98,8 +98,8 @@ def nearest_alike(
     points: Floats32, normals: Floats32, camera: Floats, heads: Ints32, chain: Ints32,
     at: Floats, facing: Floats, least_cosine: float,
 ) -> tuple[int, float]:  # fmt: skip
-    """Return the nearest point within reach with a similar normal: index, -1 if none, and squared
-    distance.
+    """Return the index of the nearest point within reach with a similar normal, and its squared
+    distance; the index is -1 if there is none.
     """
     reach, secret, slots = camera[2], int(camera[3]), len(heads)
     cube = 2.0 * reach
@@ -136,7 +136,7 @@ def _first_in_cubes(
 ) -> int:
     """Write the indices of the points that are first in their cubes; return their number.
 
-    `table` has slots of -1, in a number that is a power of two; `cells` (N, 3) are the cubes.
+    The number of slots of `table` is a power of two, and they are -1; `cells` (N, 3) are the cubes.
     """
     mask, count = len(table) - 1, 0
     for n in range(len(points)):
@@ -172,12 +172,12 @@ def first_per_cube(points: Floats32, cube: float) -> Ints32:
 
 @cached_per_frame
 def lookup_target(surface: Surface, nearest: float, reach: float) -> LookupTarget:
-    """Return a surface prepared for look-ups.
+    """Prepare a surface for look-ups.
 
     Parameters
     ----------
     surface : surface of any kind
-    nearest : minimum depth of a point in the surface's camera, metres
+    nearest : minimum depth at which points are projected into the surface's camera, metres
     reach : maximum distance to an unordered point, metres
     """
     camera, none = camera_of(surface.camera, nearest), np.zeros(0, np.int32)
@@ -190,12 +190,12 @@ def lookup_target(surface: Surface, nearest: float, reach: float) -> LookupTarge
     points, normals = points[indices], normals[indices]
     slots = 1 << max(int(2 * len(points) - 1).bit_length(), 1)
     heads, chain = np.full(slots, -1, np.int32), np.full(len(points), -1, np.int32)
-    _fill(points, 2.0 * reach, secret, heads, chain)
+    _fill_table(points, 2.0 * reach, secret, heads, chain)
     return LookupTarget(points[None], normals[None], camera, heads, chain)
 
 
 def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
-    """Return at most `most` of a surface's unordered points, evenly distributed.
+    """Thin a surface's unordered points to at most `most`, evenly distributed.
 
     Parameters
     ----------
@@ -205,8 +205,8 @@ def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
 
     Returns
     -------
-    surface : first point in each cube of a sufficiently coarse grid; all valid points if there are
-        at most `most`
+    surface : first point in each cube of a sufficiently coarse grid, or all valid points if there
+        are at most `most`
     """
     points = surface.points[surface.valid]
     indices = np.arange(len(points), dtype=np.int32)
@@ -245,7 +245,7 @@ class OverlapParameters:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Counts of the source's points by agreement."""
+    """Numbers of a source's points by agreement with a target."""
 
     points: int  #: total number of points
     inliers: int  #: points on the target's surface with similar normals
@@ -281,8 +281,8 @@ def _copy_valid(
 def sample_points(surface: Surface, stride: int) -> Floats32:
     """Return the valid points and normals of every `stride`-th row and column, (N, 6) float32.
 
-    Frames of all sensors should contribute equally. Therefore the stride is larger for a sphere
-    with more than `DEPTH_PIXELS` pixels, unless it is 1.
+    Frames of all sensors contribute about equally: unless the stride is 1, it is increased for
+    spheres with more than `DEPTH_PIXELS` pixels.
     """
     if surface.spread is not None and stride > 1:
         points, normals = surface.spread.points[0], surface.spread.normals[0]
@@ -303,7 +303,7 @@ def sample_points(surface: Surface, stride: int) -> Floats32:
 
 #: Verdicts of a target on a point: unobserved, on its surface, or in its free space.
 UNKNOWN, AGREES, VIOLATES = 0, 1, 2
-#: Preliminary verdict of `_compare`, which `_saw_through` replaces.
+#: Preliminary verdict of `_compare`; `_saw_through` replaces it.
 _BEFORE = 3
 
 
@@ -362,7 +362,7 @@ def _saw_through(
             if column < 0 or column >= width:
                 if camera[0] == 0 or camera[6] == 0:
                     continue
-                beside = column % width  # neighbours across the seam of a closed sphere
+                beside = column % width  # closed spheres have neighbours across the seam
             there = depth_at(camera, points, line, beside)
             if there > 0:
                 nearest = min(nearest, there)
@@ -474,7 +474,7 @@ def _weigh_all(
 
 @lru_cache(maxsize=32)
 def tolerances(p: OverlapParameters) -> Floats:
-    """Return the parameters as an array for the kernels."""
+    """Return the parameters as an array for kernels."""
     return np.array(
         [
             p.surface_tolerance, p.point_tolerance, p.normal_cosine,
@@ -484,7 +484,7 @@ def tolerances(p: OverlapParameters) -> Floats:
 
 
 def overlap_target(surface: Surface, p: OverlapParameters) -> LookupTarget:
-    """Return a surface that is prepared for `weigh_overlap`."""
+    """Prepare a surface for `weigh_overlap`."""
     return lookup_target(surface, p.nearest, p.point_tolerance)
 
 
@@ -500,7 +500,7 @@ def agreements(
     Parameters
     ----------
     source : (N, 6) float32 result of `sample_points`
-    target : (h, w) surface, or unordered points, which have no violations
+    target : (h, w) surface; or unordered points, for which there are no violations
     transforms : (n, 4, 4) T_target_source
     weights : (N,) weights of the points; None gives each point a weight of 1
     """
@@ -514,7 +514,7 @@ def agreements(
 def look_up(
     source: Floats32, target: LookupTarget, T_target_source: Floats, tolerances: Floats
 ) -> Bytes:
-    """Return a target's verdicts on points (N, 6): UNKNOWN, AGREES or VIOLATES, (N,) uint8.
+    """Return a target's verdict on each point, (N,) uint8: UNKNOWN, AGREES or VIOLATES.
 
     Parameters
     ----------
@@ -533,7 +533,7 @@ def count_verdicts(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
     chain: Ints32, T: Floats, tolerances: Floats, agree: Ints32, violate: Ints32,
 ) -> int:  # fmt: skip
-    """Count the verdicts of one more target on points (N, 6); return how many points agree."""
+    """Add a target's verdicts on points (N, 6) to the counts; return how many points agree."""
     verdicts, agreeing = np.empty(len(source), np.uint8), 0
     transposed = transpose_points(source, 1)
     _look_up(source, transposed, points, normals, camera, heads, chain, T, tolerances, verdicts)
@@ -547,7 +547,7 @@ def count_verdicts(
 def overlap_counts(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Overlap:
-    """Return the counts of agreeing and violating points under a transform; see `agreements`."""
+    """Count the agreeing and violating points under a transform; see `agreements`."""
     inliers, violations = agreements(source, target, T_target_source[None], p)[0].tolist()
     has_viewpoint = target.camera is not None
     return Overlap(len(source), round(inliers), round(violations) if has_viewpoint else None)
@@ -555,7 +555,7 @@ def overlap_counts(
 
 @dataclass(frozen=True)
 class PlaneParameters:
-    """The limits within which patches lie in one plane."""
+    """Parameters that determine whether patches lie in the same plane."""
 
     coplanar: float = math.radians(15.0)  #: maximum angle between normals
     same_plane: float = 0.06  #: maximum distance of a patch from another patch's plane, metres
@@ -563,12 +563,12 @@ class PlaneParameters:
 
 @dataclass(frozen=True, eq=False)
 class PlaneView:
-    """The patches of a frame, weighted by planes.
+    """The patches of a frame, weighted so that all planes have equal weights.
 
     Parameters
     ----------
     points : (P, 6) float32, means and normals of the patches
-    weights : (P,) float32; weights of patches in one plane have the sum 1
+    weights : (P,) float32; the weights of all patches in a plane have the sum 1
     """
 
     surface: Surface
@@ -592,7 +592,9 @@ class PlaneAgreement:
 
 
 @kernel
-def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Ints32) -> None:
+def _count_coplanar(
+    means: Floats, normals: Floats, cosine: float, apart: float, out: Ints32
+) -> None:
     """Write the number of patches in the plane of each patch; means and normals are (3, P)."""
     x, y, z, nx, ny, nz = means[0], means[1], means[2], normals[0], normals[1], normals[2]
     for i in range(len(out)):
@@ -606,17 +608,17 @@ def _count(means: Floats, normals: Floats, cosine: float, apart: float, out: Int
 
 
 def plane_weights(patches: Patches, p: PlaneParameters) -> Floats32:
-    """Return the weights of patches, (P,): the inverse number of patches in each one's plane."""
+    """Return the weights (P,) of patches: the inverse of the number of patches in their plane."""
     counts = np.zeros(len(patches), np.int32)
     means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
-    _count(means, normals, math.cos(p.coplanar), p.same_plane, counts)
+    _count_coplanar(means, normals, math.cos(p.coplanar), p.same_plane, counts)
     weights: Floats32 = (1.0 / counts).astype(np.float32)
     return weights
 
 
 @cached_per_frame
 def plane_view(geometry: Geometry, p: PlaneParameters) -> PlaneView:
-    """Return a frame that is prepared for `plane_agreement`."""
+    """Prepare a frame for `plane_agreement`."""
     patches = geometry.patches
     points = np.concatenate([patches.means, patches.normals], axis=1).astype(np.float32)
     return PlaneView(geometry.surface, patches, points, plane_weights(patches, p))

@@ -8,8 +8,8 @@ reach, they are its distance in the plane of the patch, its height over that pla
 of its normal to the patch's normal and to its direction. All are invariant under rigid motion.
 
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching is public. A random sample
-of the source's patches is compared with all patches of the target, and each patch corresponds to
-the nearest ones.
+of the source's patches is compared with all patches of the target; a patch corresponds to the
+nearest patches.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import numpy as np
 from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Bytes, Floats, Floats32, Ints32, Patches
 
-#: Number of bins of each angle, the same at every scale.
+#: Number of bins of an angle at every scale.
 ANGLES = 3
 
 
@@ -81,17 +81,17 @@ class Compression:
 
     @cached_property
     def columns(self) -> Floats32:
-        """Return the matrix by bins, (D, d)."""
+        """Return the matrix, transposed to (D, d)."""
         return np.ascontiguousarray(self.matrix.T)
 
 
-#: Maximum absolute value of a component of a unit vector. Few of 128 exceed it. Clipping prevents
-#: one large component, such as that of floors, from outweighing all other components.
+#: Maximum absolute value of a component of a unit vector; few of 128 components exceed it. Clipping
+#: prevents a large component, such as that of floors, from outweighing all other components.
 RANGE = 0.25
 
 
 @disjoint_kernel
-def _squares(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> None:
+def _squared_distances(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> None:
     """Write the squared distances of patch i from all patches."""
     ix, iy, iz = x[i], y[i], z[i]
     for j in range(len(out)):
@@ -100,7 +100,7 @@ def _squares(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> None:
 
 
 @disjoint_kernel
-def _nearer(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
+def _select_near(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
     """Write the indices, except `but`, of squared distances below a limit; return their number."""
     found = 0
     for j in range(count):
@@ -147,9 +147,7 @@ def _spread(
     lies: Floats, places: Ints32, count: int, radius: float, n_flat: int, n_high: int,
     n_angles: int, weights: Floats, starts: Ints32,
 ) -> None:  # fmt: skip
-    """Write the weights (4, n) of patches in bins of distance and height, and the starts of these
-    bins.
-    """
+    """Write the weights (4, n) of patches in distance and height bins, and the bins' starts."""
     flat, height, area = lies[1], lies[2], lies[5]
     for k in range(count):
         i = np.uint64(places[k])
@@ -168,7 +166,7 @@ def _spread(
 
 
 @disjoint_kernel
-def _add(
+def _add_shares(
     lies: Floats, bins: Ints32, places: Ints32, count: int, weights: Floats, starts: Ints32,
     histogram: Floats32,
 ) -> None:  # fmt: skip
@@ -201,16 +199,16 @@ def _accumulate(
     within, near = np.empty(count, np.int32), np.empty(count, np.int32)
     bins, starts = np.empty((4, count), np.int32), np.empty((4, count), np.int32)
     for i in range(count):
-        _squares(points[0], points[1], points[2], i, squares)
-        reached = _nearer(squares, count, i, reach * reach, within)
+        _squared_distances(points[0], points[1], points[2], i, squares)
+        reached = _select_near(squares, count, i, reach * reach, within)
         _locate(points, normals, areas, squares, i, within, reached, angles, lies, bins)
         start = 0
         for s in range(len(scales)):
             radius, n_flat, n_high = scales[s, 0], int(scales[s, 1]), int(scales[s, 2])
-            found = _nearer(lies[0], reached, -1, radius * radius, near)
+            found = _select_near(lies[0], reached, -1, radius * radius, near)
             _spread(lies, near, found, radius, n_flat, n_high, n_angles, weights, starts)
             end = start + n_flat * n_high * n_angles
-            _add(lies, bins, near, found, weights, starts, out[i, start:end])
+            _add_shares(lies, bins, near, found, weights, starts, out[i, start:end])
             start = end
 
 
@@ -247,7 +245,7 @@ def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
 
 
 def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats32:
-    """Return histograms of the macro-scale surroundings of each patch.
+    """Compute a histogram of the macro-scale surroundings of each patch.
 
     Returns
     -------
@@ -260,7 +258,7 @@ def patch_descriptors(patches: Patches, p: PatchDescriptorParameters) -> Floats3
     return out
 
 
-#: Number of bins per block of a multiplication, whose matrix rows fit the cache.
+#: Number of bins per block of a multiplication: the block's matrix rows fit into the cache.
 _BINS = 256
 
 
@@ -293,7 +291,7 @@ def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floa
 
 
 def compress(histograms: Floats32, by: Compression) -> Bytes:
-    """Compress histograms to the bytes that are stored and compared.
+    """Compress histograms to descriptors.
 
     The bytes encode the principal components, normalised to unit length, in steps of 1/255 of the
     interval [-RANGE, RANGE].
@@ -316,7 +314,7 @@ def compress(histograms: Floats32, by: Compression) -> Bytes:
 
 
 def fit_compression(histograms: Floats32, dimension: int) -> Compression:
-    """Return the principal components of histograms.
+    """Compute the principal components of histograms.
 
     Parameters
     ----------
@@ -350,7 +348,7 @@ class MatchingParameters:
 
 
 @kernel
-def _nearest(
+def _match_nearest(
     source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int, slopes: Floats, onto: Floats,
     gate: float, pairs: Ints32,
 ) -> int:  # fmt: skip
@@ -376,7 +374,7 @@ def _nearest(
             for j in range(1, count):
                 if squares[j] < squares[best]:
                     best = j
-            if squares[best] == farthest:  # all other patches have another angle to up
+            if squares[best] == farthest:  # the gate excludes all other patches
                 break
             pairs[found, 0] = drawn[row]
             pairs[found, 1] = best
@@ -387,7 +385,7 @@ def _nearest(
 
 @dataclass(frozen=True, eq=False)
 class SlopeGate:
-    """A gate of correspondences by the slopes of patches, if up is known in both frames.
+    """A gate for correspondences: patches must have similar angles to up in both frames.
 
     Parameters
     ----------
@@ -407,7 +405,7 @@ def correspondences(
     p: MatchingParameters,
     gate: SlopeGate | None = None,
 ) -> Ints32:
-    """Return the correspondences of a random sample of the source's patches: Sec. III-E.
+    """Match a random sample of the source's patches by descriptors: Sec. III-E.
 
     Parameters
     ----------
@@ -418,7 +416,7 @@ def correspondences(
 
     Returns
     -------
-    (M, 2) int32, indices in source and in target; for each sampled patch, the nearest comes first
+    (M, 2) int32 correspondences, indices in source and in target; nearest first for each patch
 
     Raises
     ------
@@ -434,7 +432,7 @@ def correspondences(
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)
     if gate is None:
         gate = SlopeGate(np.zeros(len(source)), np.zeros(len(target)), math.inf)
-    count = _nearest(
+    count = _match_nearest(
         source, target, drawn.astype(np.int32), n_nearest, gate.source, gate.target, gate.most,
         pairs,
     )  # fmt: skip

@@ -4,13 +4,13 @@
     ScanPlan, ScanPlan  --plan_hypotheses, slice_hypotheses-->  (n, 4, 4)
 
 Scans from distant viewpoints share few patches with similar surroundings, so correspondences yield
-no correct transform, but their plans fit. Upright surfaces are drawn, with their normals, into an
-image as seen from above, which is rotated through all yaws and correlated with the other image.
-Level surfaces determine the height. This method is not part of the paper.
+no correct transform, but the scans' plans fit. Upright surfaces are drawn, with their normals, into
+an image as seen from above. The image is rotated through all yaws and correlated with the other
+image. Level surfaces determine the height. This method is not part of the paper.
 
 In streets, few surfaces are as large as the walls of a hall, and the normals of trees and cars are
-unreliable. Therefore the points above the ground are also drawn without normals, in three slices of
-heights, and in cells of double width that cover the whole range of a scanner.
+unreliable. Therefore, the points above the ground are also drawn without normals, in three slices
+of heights, and in cells of double width that cover the whole range of a scanner.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from sceneprint.types import Bytes, Floats, Floats32, Ints32, Sphere, Surface
 _ALONG, _ACROSS = math.cos(math.radians(6.0)), math.sin(math.radians(4.0))
 #: The same limits for the normals that refine up.
 _NEAR, _LEVEL = math.cos(math.radians(8.0)), math.sin(math.radians(8.0))
-#: Maximum numbers of candidates for up and of voting normals, and number of refinement steps.
+#: Maximum number of candidates for up and of voting normals, and number of refinement steps.
 _MOST_CANDIDATES, _MOST_VOTERS, _REFINEMENTS = 100, 1500, 8
 #: Minimum vertical component of the normals of level surfaces, and maximum of upright surfaces.
 _FLAT, _UPRIGHT = 0.9, 0.5
@@ -65,7 +65,7 @@ class PlanParameters:
 
 @dataclass(frozen=True, eq=False)
 class ScanPlan:
-    """The plan of a scan, as seen from above.
+    """The plan of a scan: its points as seen from above, and histograms.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ Plans = list[tuple[ScanPlan, ScanPlan]]
 
 
 def dominant_up(normals: Floats, axis: Floats, tilt: float) -> Floats:
-    """Return the direction to which most surfaces are perpendicular or parallel.
+    """Estimate the direction to which most surfaces are perpendicular or parallel.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def dominant_up(normals: Floats, axis: Floats, tilt: float) -> Floats:
     up: Floats = candidates[int(np.argmax(votes))]
     spread = np.empty((3, 3))
     for _ in range(_REFINEMENTS):
-        _gather(normals, up, _NEAR, _LEVEL, spread)
+        _gather_normals(normals, up, _NEAR, _LEVEL, spread)
         _, vectors = np.linalg.eigh(spread)
         up = vectors[:, -1] * math.copysign(1.0, float(vectors[:, -1] @ up))
     return up
@@ -135,8 +135,8 @@ def _vote(normals: Floats, candidates: Floats, along: float, across: float, vote
 
 
 @kernel
-def _gather(normals: Floats, up: Floats, near: float, level: float, spread: Floats) -> None:
-    """Write the sum of n n^T over normals along `up`, minus half the sum over those across it."""
+def _gather_normals(normals: Floats, up: Floats, near: float, level: float, spread: Floats) -> None:
+    """Write the sum of n n^T over normals along `up`, minus half the sum over normals across it."""
     spread[:] = 0.0
     for i in range(len(normals)):
         cosine = abs(normals[i, 0] * up[0] + normals[i, 1] * up[1] + normals[i, 2] * up[2])
@@ -150,7 +150,7 @@ def _gather(normals: Floats, up: Floats, near: float, level: float, spread: Floa
 def draw_plan(
     surface: Surface, p: PlanParameters, axis: Floats | None = None, up: Floats | None = None
 ) -> ScanPlan:
-    """Return the plan of a scan.
+    """Draw the plan of a scan.
 
     Parameters
     ----------
@@ -171,16 +171,16 @@ def draw_plan(
     R = np.stack([level, np.cross(up, level), up])
     at, facing = at @ R.T, facing @ R.T
     return ScanPlan(
-        R, at.astype(np.float32), facing.astype(np.float32), _slice(at, p),
-        _azimuths(facing, p.n_yaws), _heights(at, facing, p),
+        R, at.astype(np.float32), facing.astype(np.float32), _slice_heights(at, p),
+        _azimuth_histogram(facing, p.n_yaws), _height_histograms(at, facing, p),
     )  # fmt: skip
 
 
 def other_plans(source: Surface, target: Surface, p: PlanParameters) -> Plans:
-    """Return pairs of plans for scanners that did not stand upright.
+    """Return pairs of plans for scanners that were not upright.
 
-    In each pair, only the source lay on its side or upside down, or both scanners were mounted on
-    the same side.
+    In a pair, only the source was on its side or upside down, or both scanners were mounted on the
+    same side.
     """
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     usual_source, usual_target = scanner_axis(source), scanner_axis(target)
@@ -201,10 +201,10 @@ def scanner_axis(surface: Surface) -> Floats:
     return axis
 
 
-def _azimuths(normals: Floats, n_yaws: int) -> Floats:
+def _azimuth_histogram(normals: Floats, n_yaws: int) -> Floats:
     """Return the histogram (n_yaws,) of upright surfaces' directions.
 
-    Square roots prevent one wall from dominating.
+    Square roots limit the influence of a single wall.
     """
     upright = normals[np.abs(normals[:, 2]) < _UPRIGHT]
     turns = np.arctan2(upright[:, 1], upright[:, 0]) / (2 * math.pi) % 1.0
@@ -214,7 +214,7 @@ def _azimuths(normals: Floats, n_yaws: int) -> Floats:
     return result
 
 
-def _heights(points: Floats, normals: Floats, p: PlanParameters) -> Floats:
+def _height_histograms(points: Floats, normals: Floats, p: PlanParameters) -> Floats:
     """Return smoothed roots of the height histograms of surfaces that face up and down, (2, n)."""
     n = 2 * round(p.height_range / p.height_step)
     rows = []
@@ -265,7 +265,7 @@ def _draw(
                 image[0, v + b, u + a] += share * nx
                 image[1, v + b, u + a] += share * ny
                 image[2, v + b, u + a] += share * nz
-    for v in range(side):  # square roots prevent one wall from dominating
+    for v in range(side):  # square roots limit the influence of a single wall
         for u in range(side):
             x, y, z = image[0, v, u], image[1, v, u], image[2, v, u]
             length = np.sqrt(x * x + y * y + z * z)
@@ -276,7 +276,7 @@ def _draw(
 
 @kernel
 def _take_peaks(scores: Floats32, n: int, values: Floats, cells: Ints32) -> None:
-    """Write the n highest peaks of a torus (side, side), at least three cells apart, and their
+    """Write the n highest peaks of a torus (side, side), three cells apart or more, and their
     cells.
     """
     side = len(scores)
@@ -298,8 +298,8 @@ def _draw_slices(
 ) -> None:
     """Write the roots of the numbers of points per cell, at most three, to (n_slices, side, side).
 
-    The roots and the limit prevent one wall from dominating. Cell 0 is centred on the scanner, and
-    negative cells follow the positive ones, so that a half turn reverses both axes.
+    The roots and the limit reduce the influence of a single wall. Cell 0 is centred on the scanner,
+    and negative cells follow the positive cells, so that a half turn reverses both axes.
     """
     side = image.shape[1]
     for i in range(len(points)):
@@ -311,9 +311,9 @@ def _draw_slices(
         image[k, v, u] = np.sqrt(min(image[k, v, u] * image[k, v, u] + 1.0, 3.0))
 
 
-def _slice(points: Floats, p: PlanParameters) -> Bytes:
+def _slice_heights(points: Floats, p: PlanParameters) -> Bytes:
     """Return the slice (N,) of each level point by its height above the lowest neighbour."""
-    reach = math.ceil(p.side / _GROUND_CELLS)  # of the images, beyond which no point is drawn
+    reach = math.ceil(p.side / _GROUND_CELLS)  # no point is drawn beyond it
     squares = np.floor(np.clip(points[:, :2] / (_GROUND_CELLS * p.cell), -reach, reach)).astype(int)
     squares += reach + 1
     lowest = np.full((2 * reach + 3, 2 * reach + 3), np.inf)
@@ -337,12 +337,12 @@ def _slice_spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np
     image = np.zeros((len(_SLICE_EDGES) - 1, p.side, p.side), np.float32)
     _draw_slices(plan.points, plan.slices, math.cos(yaw), math.sin(yaw), 2 * p.cell, image)
     counts = np.bincount(plan.slices, minlength=len(_SLICE_EDGES))[1:, None, None]
-    # square roots prevent a slice with many points from dominating
+    # square roots limit the influence of a slice with many points
     image /= np.sqrt(np.sqrt(np.maximum(counts, 1), dtype=np.float32))
     return np.fft.rfft2(image).astype(np.complex64, copy=False)
 
 
-def _blurred(spectrum: NDArray[np.complex64], blur: float) -> NDArray[np.complex64]:
+def _blur(spectrum: NDArray[np.complex64], blur: float) -> NDArray[np.complex64]:
     """Return the spectrum of a blurred image; a blur of both images is a squared Gaussian."""
     side = spectrum.shape[1]
     squares = np.fft.fftfreq(side)[:, None] ** 2 + np.fft.rfftfreq(side)[None] ** 2
@@ -358,7 +358,7 @@ def _yaw_agreement(source: ScanPlan, target: ScanPlan) -> Floats:
 
 
 def plan_hypotheses(plans: Plans, p: PlanParameters) -> Floats:
-    """Return transforms that align the plan of a scan with the plan of another, best first.
+    """Return transforms that align the plans of two scans, best first.
 
     Parameters
     ----------
@@ -381,22 +381,22 @@ def _correlate_plans(
     """Return transforms (n, 4, 4) that align one plan with the other, and their correlations."""
     yaws = np.argsort(-_yaw_agreement(source, target), kind="stable")[: p.kept_yaws]
     angles = 2 * math.pi * yaws / p.n_yaws
-    blurred = _blurred(_spectrum(target, 0.0, p), p.blur)
+    blurred = _blur(_spectrum(target, 0.0, p), p.blur)
     products = (blurred * _spectrum(source, float(angle), p).conj() for angle in angles)
     return _transforms_at_peaks(source, target, angles, products, p.cell, p.n_kept, p)
 
 
 def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> Floats:
-    """Return transforms (n, 4, 4) T_target_source that align what is above the ground, best first.
+    """Return T_target_source (n, 4, 4) that align the surfaces above the ground, best first.
 
     Only the `sliced_yaws` pairs of opposite yaws at which the plans agree best are tried. A half
-    turn of an image conjugates its spectrum, so one spectrum serves both yaws of a pair.
+    turn of an image conjugates its spectrum, so both yaws of a pair share a spectrum.
     """
     half = p.n_yaws // 2
     agreement = _yaw_agreement(source, target)
     pairs = np.argsort(-(agreement[:half] + agreement[half : 2 * half]), kind="stable")
     angles = 2 * math.pi * pairs[: p.sliced_yaws] / p.n_yaws
-    blurred = _blurred(_slice_spectrum(target, 0.0, p), p.slice_blur)
+    blurred = _blur(_slice_spectrum(target, 0.0, p), p.slice_blur)
 
     def products() -> Iterator[NDArray[np.complex64]]:
         for angle in angles:
@@ -421,7 +421,7 @@ def _transforms_at_peaks(
     angles : yaw of the source in each correlation, radians
     products : products of the spectra of both images, (channels, side, side / 2 + 1)
     cell : width of a cell, metres
-    n_kept : number of distinct yaws and shifts; n is this number times that of heights
+    n_kept : number of distinct yaws and shifts; n is this number times the number of heights
     """
     values = np.empty(len(angles) * p.n_peaks)
     cells = np.empty((len(values), 2), np.int32)
@@ -434,7 +434,7 @@ def _transforms_at_peaks(
     flat[:, 0, 0], flat[:, 0, 1] = np.cos(yaws), -np.sin(yaws)
     flat[:, 1, 0], flat[:, 1, 1] = np.sin(yaws), np.cos(yaws)
     flat[:, :2, 3] = ((cells[:, ::-1] + p.side // 2) % p.side - p.side // 2) * cell
-    # neighbouring yaws propose the same shifts, which would displace different ones
+    # neighbouring yaws propose the same shifts, and would displace different transforms
     best = select_distinct(flat, values, 2 * cell, 3 * math.pi / p.n_yaws, n_kept)
     lifts = _height_offsets(source, target, p)
     level = np.repeat(flat[best], len(lifts), axis=0)

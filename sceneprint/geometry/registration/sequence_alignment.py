@@ -5,7 +5,7 @@
 
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching (GASP, 3DV 2014) is public.
 The descriptor of a patch is the sequence of the patches around it, sorted by azimuth about its
-normal, which does not depend on the viewpoint. Two such cyclic sequences are compared by their
+normal; it does not depend on the viewpoint. These cyclic sequences are compared by their
 Damerau-Levenshtein distance: the cost of replacing, inserting, omitting and swapping neighbours.
 "It suffices to validate at a coarse hierarchical level" (Sec. III-F): the neighbours are coarse
 patches.
@@ -59,10 +59,10 @@ class Sequences:
 
 
 def coarse_patches(patches: Patches, p: SequenceParameters) -> Patches:
-    """Return up to `n_coarse` patches, each the mean of the patches around a distant seed.
+    """Combine patches to up to `n_coarse` patches, the means of the patches around distant seeds.
 
-    The largest patch is the first seed, and each next seed is the farthest from all previous seeds,
-    so the selection does not depend on rigid motion.
+    The largest patch is the first seed, and each further seed is the patch farthest from all
+    previous seeds, so the selection does not depend on rigid motion.
     """
     chosen = [int(np.argmax(patches.areas))]
     squares = np.full(len(patches), np.inf)
@@ -93,7 +93,7 @@ def coarse_patches(patches: Patches, p: SequenceParameters) -> Patches:
 
 
 @kernel
-def _sequences(
+def _write_sequences(
     means: Floats, normals: Floats, others: Floats, other_normals: Floats,
     most: int, minimum: float, radius: float, symbols: Floats, lengths: Ints32,
 ) -> None:  # fmt: skip
@@ -102,7 +102,7 @@ def _sequences(
     found = np.empty((most, 4))
     for i in range(len(means)):
         n = normals[i]
-        # any direction in the plane can be azimuth 0, since the start is selected later
+        # any direction in the plane can be azimuth 0: the start is selected later
         k = 0
         for d in range(1, 3):
             if abs(n[d]) < abs(n[k]):
@@ -154,7 +154,7 @@ def _sequences(
 
 
 def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters) -> Sequences:
-    """Return the canonical sequence of each patch's nearest neighbours.
+    """Compute the canonical sequence of each patch's nearest neighbours.
 
     Neighbours are in counter-clockwise order, as seen from the side of the normal. The sequence
     starts after the widest gap.
@@ -166,7 +166,7 @@ def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters)
     """
     symbols = np.zeros((len(patches), p.n_neighbours, 4))
     lengths = np.zeros(len(patches), np.int32)
-    _sequences(
+    _write_sequences(
         patches.means, patches.normals, about.means, about.normals,
         p.n_neighbours, p.minimum_distance, p.radius, symbols, lengths,
     )  # fmt: skip
@@ -177,7 +177,7 @@ def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters)
 def _replacement_costs(
     a: Floats, m: int, b: Floats, n: int, length: float, angle: float, out: Floats
 ) -> None:
-    """Write the costs, in [0, 1], of replacing each of `m` neighbours by each of `n`."""
+    """Write the costs, in [0, 1], of replacing each of m neighbours by each of n neighbours."""
     for i in range(m):
         for j in range(n):
             off = (abs(a[i, 0] - b[j, 0]) + abs(a[i, 1] - b[j, 1])) / length
@@ -227,7 +227,7 @@ def _cyclic_cost(
     if m == 0 or n == 0:
         return 1.0
     _replacement_costs(a, m, b, n, length, angle, costs)
-    # a fast lower bound, by which most pairs are excluded: each neighbour is replaced or omitted
+    # a fast lower bound excludes most pairs: each neighbour is replaced or omitted
     bound = 0.0
     for i in range(m):
         nearest = gap
@@ -246,7 +246,7 @@ def _cyclic_cost(
 
 
 @kernel
-def _nearest(
+def _match_nearest(
     source: Floats, source_lengths: Ints32, target: Floats, target_lengths: Ints32, drawn: Ints32,
     n_nearest: int, length: float, angle: float, gap: float, swap: float, pairs: Ints32,
 ) -> int:  # fmt: skip
@@ -279,7 +279,7 @@ def _nearest(
 def sequence_correspondences(
     source: Patches, target: Patches, rng: np.random.Generator, p: SequenceParameters
 ) -> Ints32:
-    """Return the correspondences, by sequences, of a random sample of patches: Sec. III-E.
+    """Match a random sample of the source's patches by neighbour sequences: Sec. III-E.
 
     Parameters
     ----------
@@ -288,14 +288,14 @@ def sequence_correspondences(
 
     Returns
     -------
-    (M, 2) int32, indices in source and in target; for each sampled patch, the nearest comes first
+    (M, 2) int32 correspondences, indices in source and in target; nearest first for each patch
     """
     drawn = np.sort(rng.choice(len(source), min(p.n_sources, len(source)), replace=False))
     of_source = neighbour_sequences(source, coarse_patches(source, p), p)
     of_target = neighbour_sequences(target, coarse_patches(target, p), p)
     n_nearest = min(p.n_nearest, len(target))
     pairs = np.empty((len(drawn) * n_nearest, 2), np.int32)
-    count = _nearest(
+    count = _match_nearest(
         of_source.symbols, of_source.lengths, of_target.symbols, of_target.lengths,
         drawn.astype(np.int32), n_nearest, p.length_scale, p.angle_scale, p.gap_cost, p.swap_cost,
         pairs,

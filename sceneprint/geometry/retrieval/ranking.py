@@ -3,8 +3,8 @@
     query (n,), database (N, n) uint8  --distances-->  (N,)  --rank-->  Ranking: R of Sec. III-C
     distances to the query (R,), among R (R, R)  --diversify-->  Selection (k of R)
 
-Tests compare every index with these functions. Distances are exact integers, and ties prefer the
-lower index.
+Tests compare all search indexes with these functions. Distances are exact integers; of equal
+distances, the lower index comes first.
 
 The kernel of Sec. III-D is L_XY = rho_X rho_Y exp(s(X, Y) / sigma) with rho_X = exp(s(X, Q) / (2
 omega)) and s = -distance. The most probable set of k maximises det L_C; the greedy algorithm
@@ -28,8 +28,8 @@ from sceneprint.types import Bytes, Floats
 
 Ints64 = NDArray[np.int64]
 
-#: Number of rows per tile of columns; number of bytes of all queries' tiles, which stay in a core's
-#: cache; and minimum length of a tile, since shorter tiles need more calls.
+#: Number of rows per tile of columns; number of bytes of all queries' tiles, which must fit into a
+#: core's cache; and minimum length of a tile, because shorter tiles need more calls.
 GROUP, _CACHED, _SHORTEST = 16, 262144, 4096
 
 #: Number of bytes that are summed in 32 bits: the maximum power of 2 whose squares fit.
@@ -39,7 +39,7 @@ BLOCK = 32768
 def scan(
     queries: Bytes, database: Bytes, rows: Ints64, *, squared: bool = False, half: bool = False
 ) -> Ints64:
-    """Return the sums of |x - y| or (x - y)^2 over the bytes of each query and row, (Q, r) int64.
+    """Sum |x - y| or (x - y)^2 over the bytes of each query and row; return (Q, r) int64.
 
     Parameters
     ----------
@@ -51,7 +51,9 @@ def scan(
     """
     result = np.zeros((len(queries), len(rows)), np.int64)
     tile = max(_CACHED // max(len(queries), 1), _SHORTEST)
-    _sums(read_only(queries), read_only(database), read_only(rows), squared, half, tile, result)
+    _sum_tiles(
+        read_only(queries), read_only(database), read_only(rows), squared, half, tile, result
+    )
     return result
 
 
@@ -63,18 +65,18 @@ def read_only(array: NDArray[Any]) -> NDArray[Any]:
 
 
 @kernel
-def _absolute(a: Bytes, b: Bytes) -> int:
+def _sum_absolute(a: Bytes, b: Bytes) -> int:
     """Return the sum of |a - b| over at most BLOCK bytes."""
     total = np.int32(0)
     for i in range(len(a)):
-        # only a 32-bit magnitude that is added to 32 bits compiles to one instruction
+        # only a 32-bit magnitude that is added to 32 bits compiles to a single instruction
         d = np.int32(np.int32(a[i]) - np.int32(b[i]))
         total = np.int32(total + abs(d))
     return int(total)
 
 
 @kernel
-def _squares(a: Bytes, b: Bytes) -> int:
+def _sum_squares(a: Bytes, b: Bytes) -> int:
     """Return the sum of (a - b)^2 over at most BLOCK bytes."""
     total = np.int32(0)
     for i in range(len(a)):
@@ -84,7 +86,7 @@ def _squares(a: Bytes, b: Bytes) -> int:
 
 
 @kernel
-def _sums(
+def _sum_tiles(
     queries: Bytes,
     database: Bytes,
     rows: Ints64,
@@ -104,7 +106,7 @@ def _sums(
                     for low in range(0, len(stored), BLOCK):
                         # slices, because a loop that starts at `low` is not vectorized
                         a, b = query[low : low + BLOCK], stored[low : low + BLOCK]
-                        total += _squares(a, b) if squared else _absolute(a, b)
+                        total += _sum_squares(a, b) if squared else _sum_absolute(a, b)
                     result[q, i] += total
 
 
@@ -116,7 +118,7 @@ RANKING_SHARE, SMALLEST_RANKING, LARGEST_RANKING = 0.4, 50, 200
 
 
 def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None = None) -> Ints64:
-    """Return the distances -s(X, Y) from one signature to many: Sec. III-C.
+    """Return the distances -s(X, Y) from a signature to others: Sec. III-C.
 
     Parameters
     ----------
@@ -136,7 +138,7 @@ def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None
     """
     if query.ndim != 1:
         raise ValueError(f"The query has shape {query.shape}. Pass the bytes of one signature.")
-    _check(query[None], database, metric)
+    _require_signatures(query[None], database, metric)
     if rows is not None:
         if rows.ndim != 1 or rows.dtype.kind not in "iu":
             raise ValueError(f"rows are {rows.dtype} {rows.shape}. Pass integer indices (r,).")
@@ -171,7 +173,7 @@ class Ranking:
 def cross_distances(queries: Bytes, database: Bytes, metric: Metric) -> Ints64:
     """Return the distances -s(X, Y) between two sets of signatures, (Q, N) int64: Sec. III-C.
 
-    The database is read once for all queries that fit in the cache.
+    The database is read once for all queries that fit into the cache.
 
     Parameters
     ----------
@@ -181,9 +183,9 @@ def cross_distances(queries: Bytes, database: Bytes, metric: Metric) -> Ints64:
 
     Raises
     ------
-    ValueError : If see `distances`
+    ValueError : See `distances`
     """
-    _check(queries, database, metric)
+    _require_signatures(queries, database, metric)
     return _distances(queries, database, metric)
 
 
@@ -201,14 +203,14 @@ def pairwise_distances(signatures: Bytes, metric: Metric) -> Ints64:
 
     Raises
     ------
-    ValueError : If see `distances`
+    ValueError : See `distances`
     """
-    _check(signatures, signatures, metric)
+    _require_signatures(signatures, signatures, metric)
     above = np.triu(_distances(signatures, signatures, metric, half=True), 1)
     return above + above.T
 
 
-def _check(queries: Bytes, database: Bytes, metric: Metric) -> None:
+def _require_signatures(queries: Bytes, database: Bytes, metric: Metric) -> None:
     if queries.ndim != 2 or database.ndim != 2 or queries.shape[1] != database.shape[1]:
         raise ValueError(
             f"The signatures have {queries.shape[1:]} and {database.shape[1:]} bytes. "
@@ -272,7 +274,7 @@ def distance_share(distances: Ints64, unrelated_distance: float, metric: Metric)
 
 
 def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
-    """Return the nearest `size` rows of a database, ties by index: R of Sec. III-C.
+    """Rank the nearest `size` rows of a database, ties by index: R of Sec. III-C.
 
     Parameters
     ----------
@@ -305,11 +307,11 @@ def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
 def ranking_size(n_map: int) -> int:
     """Return |R| for a map of `n_map` frames: 40 % of them, but at least 50 and at most 200.
 
-    In a denser map, a fixed number of ranks contains only near-duplicates, of which no selection is
-    diverse: among the nearest 50 of 300 frames of one room, diversification increased the observed
-    volume by 10 %, and among 125 by 27 % (Sec. III-D). A fixed share of the map covers the same
-    places. The upper limit bounds the cost of pairwise distances; larger maps have more places, not
-    more views of each place.
+    In a denser map, a fixed number of ranks would contain only near-duplicates, from which no
+    diverse selection is possible: among the nearest 50 of 300 frames of a room, diversification
+    increased the observed volume by 10 %, and among the nearest 125 by 27 % (Sec. III-D). The upper
+    limit bounds the cost of pairwise distances; larger maps have more places, not more views of
+    each place.
 
     Raises
     ------
@@ -342,8 +344,8 @@ class Selection:
 
     Parameters
     ----------
-    indices : (k,) ascending positions in the ranking; the first is always 0
-    gains : (k,) added diversity: conditional variance given the members selected before, in (0, 1]
+    indices : (k,) ascending positions in the ranking, always including 0
+    gains : (k,) added diversity: conditional variance given the previously selected members, (0, 1]
     """
 
     indices: NDArray[np.intp]
@@ -404,7 +406,7 @@ def diversify(
         )
     if n == 0:
         return Selection(np.empty(0, np.intp), np.empty(0))
-    sigma = _sigma(among, p)
+    sigma = _scale_of(among, p)
     omega = p.omega * float(to_query[-1] - to_query[0])
     quality = _log_quality(to_query, omega)
     chosen, gains = select_greedily(quality, similarity_kernel(among, sigma).__getitem__, min(k, n))
@@ -428,7 +430,7 @@ def remaining_gains(
     gains : (R,) conditional variance given the selection, in [0, 1]; 0 for selected members
     """
     among = np.asarray(among, np.float64)
-    similarity = similarity_kernel(among, _sigma(among, p or DiversityParameters()))
+    similarity = similarity_kernel(among, _scale_of(among, p or DiversityParameters()))
     rows = similarity[selected]
     explained = np.einsum("kr,kr->r", rows, np.linalg.solve(rows[:, selected], rows))
     gains: Floats = np.clip(1.0 - explained, 0.0, 1.0)
@@ -436,14 +438,14 @@ def remaining_gains(
     return gains
 
 
-def _sigma(among: Floats, p: DiversityParameters) -> float:
+def _scale_of(among: Floats, p: DiversityParameters) -> float:
     upper = among[np.triu_indices(len(among), 1)]
     return p.sigma * float(np.median(upper)) if upper.size else 0.0
 
 
 def _log_quality(to_query: Floats, omega: float) -> Floats:
-    """Return log rho^2 up to a constant, which does not affect the selection."""
-    if omega <= 0:  # distances are equal or quality is disabled, so only diversity decides
+    """Return log rho^2 up to a constant; the constant does not affect the selection."""
+    if omega <= 0:  # equal distances, or quality is disabled: only diversity decides
         return np.zeros(len(to_query))
     quality: Floats = (to_query[0] - to_query) / omega
     return quality
@@ -452,7 +454,7 @@ def _log_quality(to_query: Floats, omega: float) -> Floats:
 def similarity_kernel(distances: Floats, sigma: float) -> Floats:
     """Return the kernel of Eq. (3) without the quality factors: exp(-d / sigma).
 
-    sigma is 0 if half of all pairs are duplicates; other pairs then have the similarity 0.
+    If half of all pairs are duplicates, sigma is 0, and other pairs have the similarity 0.
     """
     likeness: Floats = np.exp(-distances / sigma) if sigma > 0 else (distances <= 0).astype(float)
     return likeness

@@ -6,9 +6,9 @@
     phi of H levels  --signature-->  psi (25 G H)  --quantise-->  uint8
     psi (n, D)  --fit_whitening-->  Whitening      psi  --whiten-->  (d,) uint8
 
-For the stored signature, psi is centred, projected on the axes of its largest variances, whitened
-and quantised. A Fisher vector has few strong axes, which all rooms share, and many weak axes, which
-distinguish rooms; whitening increases the influence of the weak axes. docs/model.md gives the
+For the stored signature, psi is centred, projected onto the axes of its largest variances, whitened
+and quantised. A Fisher vector has a few strong axes, common to all rooms, and many weak axes that
+distinguish rooms; whitening increases the influence of the weak axes. docs/model.md contains the
 measurements, and docs/paper.md the differences from the paper.
 """
 
@@ -38,7 +38,7 @@ ZERO = 128
 
 @dataclass(frozen=True, eq=False)
 class LevelStatistics:
-    """The sums of Eq. (2) over all pairs of one level.
+    """The sums of Eq. (2) over all pairs of a level.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class LevelStatistics:
     total: float
 
 
-#: Number of rows by which the prefetch of the table is ahead, to hide the latency of the memory.
+#: Number of rows of the table that are prefetched, to hide the latency of memory.
 _AHEAD = 16
 
 
@@ -66,7 +66,7 @@ def _accumulate(
     """Add up sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line.
 
     `components` is the memory of the packed table as int16. A quarter of the bins contain pairs.
-    Their rows are scattered over a table larger than any cache, so they are prefetched.
+    Their rows are scattered over a table that exceeds all caches, so they are prefetched.
     """
     used, n = np.empty(len(counts), np.int32), 0
     for b in range(len(counts)):
@@ -93,7 +93,7 @@ def _accumulate(
 def statistics_of_counts(
     counts: PairCounts, table: PairTable, n_components: int
 ) -> LevelStatistics:
-    """Return the statistics of one level from its counted pairs; `n_components` is G."""
+    """Compute the statistics of a level from its counted pairs; `n_components` is G."""
     d, sums = FEATURE_DIMENSION, np.zeros((n_components, 32))
     _accumulate(counts.weights, table.packed, table.packed.view(np.int16), sums)
     return LevelStatistics(
@@ -102,7 +102,7 @@ def statistics_of_counts(
 
 
 def statistics_of_features(features: Floats, weights: Floats, mixture: Mixture) -> LevelStatistics:
-    """Return the statistics of pairs with all posteriors, against which tests compare the table.
+    """Compute the statistics of pairs with all posteriors; tests compare the table with them.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def statistics_of_features(features: Floats, weights: Floats, mixture: Mixture) 
 
 
 def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
-    """Return the Fisher vector phi of one level: Eq. (2), Sec. III-B.
+    """Compute the Fisher vector phi of a level: Eq. (2), Sec. III-B.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def normalise(phi: Floats) -> Floats:
     The result for a level without pairs is zero.
     """
     rooted = np.sign(phi) * np.sqrt(np.abs(phi))
-    norm = float(np.sqrt(np.abs(phi).sum()))  # sums in BLAS depend on threads
+    norm = float(np.sqrt(np.abs(phi).sum()))  # without BLAS, whose sums depend on threads
     result: Floats = rooted / norm if norm > 0 else rooted
     return result
 
@@ -160,7 +160,7 @@ def signature(levels: Sequence[Floats]) -> Floats:
 
 
 def quantise(psi: Floats, scale: float) -> Bytes:
-    """Return one byte per component of psi (n,): round(psi / scale) + 128, clipped.
+    """Quantise each component of psi (n,) to a byte: round(psi / scale) + 128, clipped.
 
     `scale` is the model's step. L1 distances of quantised signatures times `scale` equal the
     distances of the signatures up to rounding.
@@ -173,8 +173,8 @@ Ints8 = NDArray[np.int8]
 Ints16 = NDArray[np.int16]
 Ints32 = NDArray[np.int32]
 
-#: Integer value of 1 in psi. By the Cauchy-Schwarz inequality, the product with a row of the basis
-#: fits in 32 bits for up to 16 levels of 25,000 components.
+#: Integer that represents 1 in psi. By the Cauchy-Schwarz inequality, the product with a row of the
+#: basis fits into 32 bits for up to 16 levels of 25,000 components.
 UNITS = 1 << 14
 #: Root mean square of the stored components; few components reach the limit of 127.
 GAIN = 26.0
@@ -221,7 +221,7 @@ class Whitening:
 
 
 def psi_units(psi: Floats) -> Ints16:
-    """Return psi (..., D), with components in [-1, 1], as integers in steps of 1 / UNITS."""
+    """Convert psi (..., D), with components in [-1, 1], to integers in steps of 1 / UNITS."""
     units: Ints16 = np.rint(np.asarray(psi) * UNITS).astype(np.int16)
     return units
 
@@ -237,7 +237,7 @@ def _products(basis: Ints8, psi: Ints16, result: Ints32) -> None:
 
 
 def whiten(psi: Floats, whitening: Whitening) -> Bytes:
-    """Return the stored signature of a frame.
+    """Compute the stored signature from psi.
 
     Parameters
     ----------
@@ -266,9 +266,9 @@ def whiten(psi: Floats, whitening: Whitening) -> Bytes:
 
 
 def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) -> Whitening:
-    """Fit the principal axes of psi and their variances by the Gram matrix of the frames.
+    """Fit the principal axes of psi and their variances to training frames.
 
-    There are fewer frames than components, so the Gram matrix is smaller than the covariance.
+    The fit uses the Gram matrix of the frames: it is smaller than the covariance of the components.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) 
 
     Returns
     -------
-    whitening : whitening with an unrelated distance of 1, which must be measured
+    whitening : whitening with an unrelated distance of 1; the caller must measure it
 
     Raises
     ------
@@ -297,6 +297,6 @@ def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) 
     axes *= signs[:, None]
     units = np.abs(axes).max(axis=1) / 127
     basis: Ints8 = np.rint(axes / units[:, None]).astype(np.int8)
-    # single precision drops the last bits, which differ between processors
+    # single precision discards the last bits, which differ between processors
     scales = (units * variances ** (-p.exponent / 2)).astype(np.float32).astype(np.float64)
     return Whitening(levels, basis, scales, basis @ mean, 1.0)

@@ -36,7 +36,7 @@ class MixtureParameters:
 
     n_components: int = 1250  #: G
     iterations: int = 8  #: number of iterations of expectation maximisation
-    variance_floor: float = 0.02  #: constant added to every variance; features have variance 1
+    variance_floor: float = 0.02  #: added to all variances; features have variance 1
     prior_variance: float = 0.02  #: prior of the components' variances
     prior_count: float = 5.0  #: weight of the prior, in samples
     minimum_weight: float = 1e-6  #: minimum p_g
@@ -54,7 +54,7 @@ def log_densities(features: Floats, mixture: Mixture) -> Floats:
 
 
 def posteriors(features: Floats, mixture: Mixture) -> Floats:
-    """Return pi_ij,g of Sec. III-B, the share of each component in each feature (M, 12).
+    """Compute pi_ij,g of Sec. III-B, the posteriors of components for features (M, 12).
 
     Returns
     -------
@@ -74,8 +74,8 @@ def posteriors(features: Floats, mixture: Mixture) -> Floats:
 def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[Mixture]:
     """Fit a mixture by expectation maximisation from a K-Means++ start (Sec. III-F).
 
-    The function yields the start and the mixture after each of `p.iterations` iterations, to show
-    progress. The last mixture is the result.
+    To show progress, the function yields the start, and the mixture after each of `p.iterations`
+    iterations. The last mixture is the result.
 
     Parameters
     ----------
@@ -99,9 +99,9 @@ def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[M
 
 
 def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture:
-    """Return the mixture after one iteration of expectation maximisation.
+    """Return the mixture after an iteration of expectation maximisation.
 
-    Features (M, 12) are processed in blocks, since all posteriors together would fill gigabytes.
+    Features (M, 12) are processed in blocks, because all posteriors would fill gigabytes.
     """
     zeroth, first, second = moments(features, mixture)
     count = np.maximum(zeroth, 1e-9)[:, None]

@@ -10,8 +10,8 @@ alpha, <u, v, w> the Gram-Schmidt basis of (r, n_mu) with w = u x v.
 
 A pair of oriented points has four invariants under rigid motion: the length of r, the angles of
 both normals to r, and the dihedral angle between the normals about r. All thirteen properties are
-functions of these. Therefore pairs are counted in the bins of a grid over the invariants, and a
-table contains projection and posteriors once per bin.
+functions of these invariants. Therefore, pairs are counted in the bins of a grid over the
+invariants, and a table contains features and posteriors per bin.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def neighbour_pairs(patches: Patches, p: PropertyParameters) -> NDArray[np.int64
 
 
 def invariants(patches: Patches, pairs: NDArray[np.int64]) -> Floats:
-    """Return the four rigid invariants of each ordered pair.
+    """Compute the four rigid invariants of each ordered pair.
 
     Parameters
     ----------
@@ -78,14 +78,14 @@ def invariants(patches: Patches, pairs: NDArray[np.int64]) -> Floats:
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     w = np.cross(u, v)
     a_v, a_w = _dot(n_alpha, v), _dot(n_alpha, w)
-    # arctan2 keeps full precision near 0, where arccos loses half the digits
+    # arctan2 has full precision near 0, where arccos loses half of the digits
     theta_mu = np.arctan2(_dot(n_mu, v), _dot(n_mu, u))
     theta_alpha = np.arctan2(np.hypot(a_v, a_w), _dot(n_alpha, u))
     return np.column_stack([d, theta_mu, theta_alpha, np.arctan2(a_w, a_v)])
 
 
 def properties(invariant: Floats, p: PropertyParameters) -> Floats:
-    """Return the 13-D vectors f' of relative properties: Eq. (1), Sec. III-A.
+    """Compute the 13-D vectors f' of relative properties: Eq. (1), Sec. III-A.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def properties(invariant: Floats, p: PropertyParameters) -> Floats:
 
 
 def pair_properties(patches: Patches, pairs: NDArray[np.int64], p: PropertyParameters) -> Floats:
-    """Return the properties (M, 13) of ordered patch pairs (M, 2): Eq. (1)."""
+    """Compute the properties (M, 13) of ordered patch pairs (M, 2): Eq. (1)."""
     return properties(invariants(patches, pairs), p)
 
 
@@ -148,11 +148,11 @@ class Projection:
 
 
 def project(properties: Floats, projection: Projection) -> Floats:
-    """Return the features of properties (M, 13) in the fitted subspace (Sec. III-A).
+    """Project properties (M, 13) to features (M, 12) in the fitted subspace (Sec. III-A).
 
-    Features (M, 12) have unit variance and are uncorrelated over the training pairs.
+    Features have unit variance and are uncorrelated over the training pairs.
     """
-    # einsum, because the order of sums in BLAS depends on threads, and tables must be equal
+    # einsum: the order of sums in BLAS depends on threads, but tables must be equal
     features: Floats = np.einsum("md,fd->mf", properties - projection.mean, projection.matrix)
     return features
 
@@ -171,7 +171,7 @@ def fit_projection(
 
     Returns
     -------
-    projection : projection with positive largest weights, since neither method defines signs
+    projection : projection with positive largest weights, because neither method defines signs
 
     Raises
     ------
@@ -226,13 +226,13 @@ class TableLayout:
     """The grid over the four invariants of a pair.
 
     Angular bins are centred on right angles (dihedral bins also on 0 and 180 degrees), because
-    these are frequent in buildings and must not fall on an edge. With 27 bins the tolerance of 10
+    these are frequent in buildings and must not fall on an edge. With 27 bins, the tolerance of 10
     degrees in Eq. (1) is an edge, so no bin contains the jump of the robust sign. A finer grid with
     this property needs three times as many bins.
     """
 
     distance_bins: int = 20
-    angle_bins: int = 27  #: odd number of bins of an angle to r: one is centred on 90 degrees
+    angle_bins: int = 27  #: bins of an angle to r; odd, so that one is centred on 90 degrees
     dihedral_bins: int = 20  #: multiple of 4; the bins are offset by half a bin
     distance_exponent: float = 1.3  #: distance edges are radius * (i / bins)^exponent
 
@@ -253,7 +253,7 @@ def bin_centres(layout: TableLayout, first: int, last: int, p: PropertyParameter
 
 
 def _diamond(x: Floats, y: Floats) -> Floats:
-    """Return the diamond angle in [0, 4), which increases with atan2(y, x) but is faster."""
+    """Return the diamond angle in [0, 4): it increases with atan2(y, x), but is faster."""
     t = y / (np.abs(x) + np.abs(y))
     diamond: Floats = np.where(x < 0, 2.0 - t, np.where(y < 0, 4.0 + t, t))
     return diamond
@@ -266,7 +266,7 @@ def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Float
     -------
     distance : (distance_bins,) metres
     angle : (angle_bins,) negative cosines of the angle, ascending from -1; the last is infinite
-    dihedral : (dihedral_bins + 1,) diamond angles in [0, 4]; the last edge ends the first bin
+    dihedral : (dihedral_bins + 1,) diamond angles in [0, 4]; the last interval joins the first bin
     """
     distance = p.radius * (np.arange(1, layout.distance_bins + 1) / layout.distance_bins) ** (
         layout.distance_exponent
@@ -279,13 +279,13 @@ def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Float
 
 
 def search_starts(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
-    """Return the first bin of each of `n` equal cells, at which the search for a bin starts.
+    """Return the bin at which the search for a coordinate's bin starts, for `n` equal cells.
 
     Parameters
     ----------
     edges : (m,) upper edges of the bins
     origin, extent : start and length of the range of the coordinate
-    n : number of cells, which must be narrower than all bins
+    n : number of cells; cells must be narrower than all bins
 
     Raises
     ------
@@ -298,14 +298,14 @@ def search_starts(edges: Floats, origin: float, extent: float, n: int = 4096) ->
 
 
 LEADING = 8  #: number of posteriors per bin, with sum 1
-LEAST_POSTERIOR = 1e-3  #: smaller posteriors are 0
+LEAST_POSTERIOR = 1e-3  #: minimum posterior; smaller posteriors become 0
 #: Number of floats of a bin: feature, posteriors, and components as pairs of int16.
 WIDTH = FEATURE_DIMENSION + LEADING + LEADING // 2
 
 
 @dataclass(frozen=True, eq=False)
 class PairTable:
-    """The contribution of a pair to Eq. (2) by bin, 96 bytes (two cache lines) each.
+    """The contributions of pairs to Eq. (2) by bin, 96 bytes (two cache lines) per bin.
 
     Parameters
     ----------
@@ -372,21 +372,21 @@ def _select_leading(
         for k in range(count):
             posteriors[i, k] = np.exp(logits[components[i, k]] - highest)
             total += posteriors[i, k]
-        kept = np.float32(0.0)
+        remainder = np.float32(0.0)
         for k in range(count):
             posteriors[i, k] /= total
             if posteriors[i, k] < np.float32(LEAST_POSTERIOR):
                 posteriors[i, k] = np.float32(0.0)
-            kept += posteriors[i, k]
+            remainder += posteriors[i, k]
         for k in range(count):
-            posteriors[i, k] /= kept
+            posteriors[i, k] /= remainder
 
 
 def compute_bins(
     first: int, last: int,
     layout: TableLayout, p: PropertyParameters, projection: Projection, mixture: Mixture,
 ) -> PairTable:  # fmt: skip
-    """Return bins `first` to `last` - 1 of the table."""
+    """Compute bins `first` to `last` - 1 of the table."""
     invariant = bin_centres(layout, first, last, p)
     features = project(properties(invariant, p), projection).astype(np.float32)
     constants = np.log(mixture.weights) - 0.5 * np.log(mixture.variances).sum(axis=1)
@@ -401,8 +401,8 @@ def compute_bins(
     return pack_table(features, posteriors, components)
 
 
-# The kernels count all ordered pairs, because signatures of samples would differ (docs/paper.md,
-# R11). Their inner loops cover all later patches, so the compiler can vectorize them.
+# The kernels count all ordered pairs: a sample of pairs would change signatures (docs/paper.md,
+# R11). Their inner loops cover all later patches, so that the compiler can vectorize them.
 
 
 @disjoint_kernel
@@ -432,7 +432,7 @@ def _invariants(
 
 @disjoint_kernel
 def _bin(value: float, edges: Floats, hints: Ints32, origin: float, per_unit: float) -> int:
-    """Return the index of the first edge above a value; cells of `hints` are narrower than bins."""
+    """Return the index of the first edge above a value; see `search_starts` for `hints`."""
     cell = min(max((value - origin) * per_unit, 0.0), len(hints) - 1.0)
     b = hints[np.uint64(np.int32(cell))]
     index: int = b + 1 if value >= edges[np.uint64(b)] else b
@@ -445,7 +445,7 @@ def _pair_bins(
     distance: Floats, angle: Floats, dihedral: Floats, of_distance: Ints32, of_angle: Ints32,
     of_dihedral: Ints32, n_angles: int, n_dihedrals: int, there: Ints32, back: Ints32,
 ) -> None:  # fmt: skip
-    """Write the bins of the pairs (i, j) and (j, i); -1 for pairs that do not count."""
+    """Write the bins of the pairs (i, j) and (j, i); -1 for uncounted pairs."""
     per_metre, per_cosine = len(of_distance) / radius, len(of_angle) / 2.0
     per_turn = len(of_dihedral) / 4.0
     for j in range(i + 1, len(d)):
@@ -489,7 +489,7 @@ def _count(
     distance: Floats, angle: Floats, dihedral: Floats,
     hints: Ints32, n_angles: int, n_dihedrals: int, weights: Floats32, counts: Floats32,
 ) -> tuple[int, float]:  # fmt: skip
-    """Add the weights of both orders of every pair; return number and total weight of the pairs."""
+    """Add the weights of both orders of all pairs; return the number and total weight of pairs."""
     n = points.shape[1]
     d, i_u, j_u, turn = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     there, back = np.empty(n, np.int32), np.empty(n, np.int32)
@@ -507,7 +507,7 @@ def _count(
 
 @dataclass(frozen=True, eq=False)
 class PairCounts:
-    """The ordered pairs of one level, counted by bin.
+    """The ordered pairs of a level, counted by bin.
 
     Parameters
     ----------
@@ -523,9 +523,7 @@ class PairCounts:
 
 @lru_cache(maxsize=8)
 def _look_up(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats, Floats, Ints32]:
-    """Return the results of `bin_edges` and their search starts (3, n), which callers must not
-    modify.
-    """
+    """Return the read-only results of `bin_edges` and their search starts (3, n)."""
     distance, angle, dihedral = bin_edges(layout, p)
     starts = np.stack(
         [

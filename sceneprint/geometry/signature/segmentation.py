@@ -5,12 +5,12 @@
     Surface, labels (h, w)  --hierarchy-->  Hierarchy (H levels)
     Patches (P)  --patch_weights-->  (P,)
 
-Images are segmented by SLIC over position and normal, which starts from a grid. The distance has no
+Images are segmented by SLIC over position and normal, starting from a grid. The distance has no
 pixel term, so patches end at both creases and depth edges.
 
 Clouds are segmented by VCCS (Papon 2013): seeds on a grid grow over touching voxels by position and
-normal. A patch ends at creases and does not cross gaps. Unlike in VCCS, the distance is that of
-k-means, and centres move with their patches.
+normal. A patch ends at creases and does not cross gaps. Unlike in VCCS, the distance is the same as
+in k-means, and centres move with their patches.
 
 The hierarchy is an agglomerative K-Means over the positions and normals of the finest patches,
 weighted by area. Farthest-point sampling distributes its seeds evenly over the surface.
@@ -46,7 +46,9 @@ class SegmentationParameters:
 def _spread_centres(
     centres: Floats32, row: int, shift: int, cells: Ints32, columns: int, out: Floats32
 ) -> None:
-    """Write the centre `shift` cells beside each pixel of a row of cells to (7, w); 0 outside."""
+    """Write the centre `shift` cells beside each pixel of a row of cells to `out` (7, w); 0
+    outside.
+    """
     for x in range(len(cells)):
         column = cells[x] + shift
         if row < 0 or row * columns >= len(centres) or column < 0 or column >= columns:
@@ -61,9 +63,9 @@ def _assign_row(
     pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, k: np.int32,
     cells: Ints32, labels: Ints32, nearest: Floats32,
 ) -> None:  # fmt: skip
-    """Assign the pixels of a row to the centres (7, w) beside them if these are nearer.
+    """Assign the pixels of a row to the centres (7, w) beside them if these centres are nearer.
 
-    Unused centres get no pixels. `k` is the centre beside a pixel of the first cell.
+    Unused centres get no pixels. `k` is the index of the centre beside a pixel of the first cell.
     """
     px, py, pz = pixels[0, y], pixels[1, y], pixels[2, y]
     nx, ny, nz = pixels[3, y], pixels[4, y], pixels[5, y]
@@ -87,10 +89,10 @@ def _assign(
     pixels: Floats32, valid: NDArray[np.bool_], centres: Floats32, spacing: float,
     normal_weight: np.float32, columns: int, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Assign every pixel of (6, h, w) to the nearest centre of the nine cells around it.
+    """Assign each pixel of (6, h, w) to the nearest centre of the nine cells around it.
 
-    The pixels of a row are compared with one centre each at a time, so the loop can be vectorized.
-    Centres are copied to the pixels once per row of cells.
+    A loop compares all pixels of a row with a centre each, so it can be vectorized. Centres are
+    copied to the pixels once per row of cells.
     """
     height, width = valid.shape
     rows = len(centres) // columns
@@ -123,7 +125,7 @@ def _assign(
 def _sums(
     points: Floats32, normals: Floats32, weights: Floats32, labels: Ints32, n: int
 ) -> NDArray[np.float64]:
-    """Return sums per label: weight, weighted point (3), weighted normal (3), number of pixels."""
+    """Sum per label: weights, weighted points (3) and normals (3), number of pixels; (n, 8)."""
     height, width = labels.shape
     sums = np.zeros((n, 8))
     for y in range(height):
@@ -142,7 +144,7 @@ def _sums(
 
 @kernel
 def _centres(sums: Floats, spacing: float, focal_length: float, centres: Floats32) -> None:
-    """Write mean point, mean normal and (1 / metric seed spacing)^2 of labels, (n, 7)."""
+    """Write the mean point, mean normal and (1 / metric seed spacing)^2 of each label, (n, 7)."""
     for k in range(len(sums)):
         alive = sums[k, 0] > 0
         weight = sums[k, 0] if alive else 1.0
@@ -171,7 +173,7 @@ def _seed_grid(height: int, width: int, n_patches: int) -> tuple[Ints32, float, 
 
 
 def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
-    """Assign every valid pixel to a patch.
+    """Assign valid pixels to patches.
 
     Patches below either size limit are dropped: their normals would be noise, and in an image of a
     thousand patches they cover less than 1 % of the surface.
@@ -212,7 +214,7 @@ def compact_labels(labels: Ints32, keep: NDArray[np.bool_]) -> Ints32:
 
 
 def extract_patches(surface: Surface, labels: Ints32) -> Patches:
-    """Return the patches of labelled pixels, with means weighted by surface area.
+    """Compute the patches of labelled pixels, with means weighted by surface area.
 
     Parameters
     ----------
@@ -256,7 +258,7 @@ def _move_nearer(
     patches: Floats, centre: Floats, scale: float, weight: float, c: int, first: int, last: int,
     nearest: Floats, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Move patches to cluster `c` if its centre is nearer than their present centre."""
+    """Move patches to cluster `c` if its centre is nearer than their current centre."""
     x, y, z, nx, ny, nz = (
         patches[0], patches[1], patches[2], patches[3], patches[4], patches[5]
     )  # fmt: skip
@@ -270,9 +272,7 @@ def _move_nearer(
 
 @kernel
 def _boxes(patches: Floats, boxes: Floats) -> float:
-    """Write the bounding boxes (6, n) of blocks of patches; return the length of the longest
-    normal.
-    """
+    """Write the bounding boxes (6, n) of blocks of patches; return the maximum normal length."""
     longest = 0.0
     boxes[:3], boxes[3:] = np.inf, -np.inf
     for k in range(patches.shape[1]):
@@ -337,9 +337,9 @@ def _reassign(
     patches: Floats, boxes: Floats, longest: float, scale: float, weight: float, centres: Floats,
     labels: Ints32,
 ) -> None:  # fmt: skip
-    """Assign every patch to the nearest centre, or the first of several equally near centres.
+    """Assign each patch to the nearest centre, or to the first of several equally near centres.
 
-    The distance to the present centre is an upper bound. A block of patches is therefore compared
+    The distance to the current centre is an upper bound. Therefore, a block of patches is compared
     only with centres whose lower bound does not exceed it.
     """
     n, n_blocks = len(labels), boxes.shape[1]
@@ -364,7 +364,7 @@ def _reassign(
 def _k_means(
     patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
 ) -> Ints32:
-    """Return the labels of (6, P) positions and normals; numbers of empty clusters stay unused.
+    """Cluster positions and normals (6, P); return labels. Numbers of empty clusters are unused.
 
     The bounds for blocks of neighbours exclude 95 % of the distances.
     """
@@ -391,7 +391,7 @@ def _k_means(
 
 
 def _cluster(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints32:
-    """Return the parent of each patch: one of at most `n_clusters`, numbered without gaps."""
+    """Cluster patches; return each patch's parent, numbered without gaps below `n_clusters`."""
     scale = n_clusters / float(patches.areas.sum())
     columns = np.ascontiguousarray(np.concatenate([patches.means, patches.normals], axis=1).T)
     labels = _k_means(columns, patches.areas, n_clusters, scale, p.normal_weight, p.iterations)
@@ -401,7 +401,7 @@ def _cluster(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints3
 
 
 def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hierarchy:
-    """Return the levels {X_h}, which are all clustered from the finest patches.
+    """Compute the levels {X_h}; all are clustered from the finest patches.
 
     Parameters
     ----------
@@ -410,8 +410,8 @@ def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hiera
 
     Returns
     -------
-    hierarchy : `n_levels` levels, finest first; each level has 1 / factor of the patches of the
-        previous level, and at least one patch
+    hierarchy : `n_levels` levels, finest first; a level has 1 / factor as many patches as the
+        previous level, but at least one
     """
     levels, labels = [extract_patches(surface, finest)], [finest]
     for h in range(1, p.n_levels):
@@ -427,9 +427,9 @@ def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hiera
 class WeightParameters:
     """Parameters of patch weights; zeros give all pairs the same weight, as in the paper.
 
-    The paper counts every pair once, so the weight of a surface depends on its segmentation, and a
-    patch around a chair's leg counts as much as a patch of floor. Weights by size make the
-    statistics depend on the surface; weights by coherence reduce the influence of curved patches.
+    The paper counts all pairs equally, so the weight of a surface depends on its segmentation, and
+    a patch around a chair leg counts as much as a patch of floor. Weights by size make statistics
+    depend on the surface; weights by coherence reduce the influence of curved patches.
     """
 
     size_exponent: float = 0.5  #: exponent of a patch's share of the image
@@ -437,17 +437,17 @@ class WeightParameters:
 
 
 def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
-    """Return the weights of patches, (P,), positive with mean 1; a pair weighs their product."""
+    """Return positive weights (P,) of patches, with mean 1; a pair has the product as weight."""
     weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
     result: Floats = weights / weights.mean()
     return result
 
 
-#: Ratio of depth to width of a seed's cell; above 1, so that slanted surfaces stay in one cell.
+#: Ratio of depth to width of a seed's cell; above 1, so that a slanted surface lies in one cell.
 _DEPTH = 4.0
-#: Minimum size of a patch, as a share of its seed's cell, so that the search for a spacing ends.
+#: Minimum size of a patch, as a share of its seed's cell; it ensures that a spacing is found.
 _LEAST = 1e-3
-#: Number of growth rounds, by a voxel each, between updates of the centres.
+#: Number of growth rounds, each by a voxel, between updates of the centres.
 _GROWTH = 2
 
 
@@ -455,7 +455,7 @@ _GROWTH = 2
 def _seed_cells(
     points: Floats32, axes: Floats, centre: Floats, unit: float, spacing: float, cells: Ints64
 ) -> None:
-    """Write the cell of each point, by direction and range in `unit`, or by position if it is 0."""
+    """Write the cell of each point, by direction and range / `unit`; by position if it is 0."""
     for i in range(len(points)):
         px, py, pz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = axes[0, 0] * px + axes[0, 1] * py + axes[0, 2] * pz
@@ -474,9 +474,9 @@ def _voxel_centres(
     points: Floats32, normals: Floats32, sides: Floats32, labels: Ints32, spacing: float,
     sums: Floats,
 ) -> None:  # fmt: skip
-    """Write mean point (3), unit mean normal (3) and 1 / spacing^2 per label; 0 if it is unused.
+    """Write mean point (3), unit mean normal (3) and 1 / spacing^2 per label; 0 for unused labels.
 
-    The argument `spacing` is in sides of a voxel, the result in metres.
+    The argument `spacing` is in sides of a voxel; the written spacing is in metres.
     """
     sums[:] = 0.0
     for i in range(len(labels)):
@@ -504,7 +504,7 @@ def _grow(
     points: Floats32, normals: Floats32, offsets: Ints64, indices: Ints32, centres: Floats,
     normal_weight: float, labels: Ints32, out: Ints32,
 ) -> None:  # fmt: skip
-    """Assign every voxel to the nearest of its own centre and the centres of touching voxels."""
+    """Assign each voxel to the nearest of its current centre and the centres of touching voxels."""
     for i in range(len(labels)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -527,9 +527,7 @@ def _grow(
 
 @kernel
 def _components(offsets: Ints64, indices: Ints32, labels: Ints32, parts: Ints32) -> int:
-    """Number the connected parts of all labels in the order of their first voxels; return the
-    number of parts.
-    """
+    """Number the connected parts of all labels by their first voxels; return how many exist."""
     stack = np.empty(len(labels), np.int32)
     parts[:] = -1
     n = 0
@@ -558,7 +556,7 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
     ----------
     seen : V voxels
     spacing : distance between the seeds, in sides of a voxel
-    most : maximum number of patches; the spacing grows until it holds
+    most : maximum number of patches; the spacing grows until there are no more
     p : parameters of the segmentation
 
     Returns
@@ -575,13 +573,11 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
             labels, n = _grow_patches(seen, seeds, spacing, least, p)
             if n <= most:
                 return labels[None]
-        spacing *= (
-            1.03 * (n / most) ** 0.85
-        )  # above the square root, since slanted patches are long
+        spacing *= 1.03 * (n / most) ** 0.85  # more than the square root: slanted patches are long
 
 
 def _seeds(seen: Voxels, spacing: float) -> Ints32:
-    """Return the seed of each voxel (V,), the index of its cell in a grid."""
+    """Return the seed (V,) of each voxel: the index of its cell in a grid."""
     side, unit = float(np.median(seen.sides)), 0.0
     if seen.cloud.has_viewpoint:
         at = seen.points[0] - seen.centre
@@ -596,7 +592,7 @@ def _seeds(seen: Voxels, spacing: float) -> Ints32:
 def _grow_patches(
     seen: Voxels, labels: Ints32, spacing: float, least: float, p: SegmentationParameters
 ) -> tuple[Ints32, int]:
-    """Return the labels (V,) of patches that grow from seeds at a spacing, and their number."""
+    """Grow patches from seeds at a spacing; return labels (V,), and the number of patches."""
     points, normals, links = seen.points[0], seen.normals[0], seen.links
     centres = np.zeros((int(labels.max(initial=-1)) + 1, 8))
     grown = labels.copy()

@@ -4,12 +4,12 @@
     points (6, N)  --move_all, project_all, select_inside, gather_pixels-->  pixels, by block
     range (H, W)  --ray_to_axis-->  z (H, W)  --undistort-->  z (H, W) of a pinhole
 
-Kernels support a pinhole and a sphere about a viewpoint. "Depth" means depth along the axis of a
+Kernels support a pinhole and a sphere around a viewpoint. "Depth" means depth along the axis of a
 pinhole, and range on a sphere; noise and gates depend on it. An empty pixel has the point (0, 0, 0)
-and depth 0.
+and the depth 0.
 
-`ray_to_axis` works on the distorted image, before `undistort`: the ray of a sample passes through
-its distorted pixel. In rectification (x, y) denotes the direction (x/z, y/z).
+`ray_to_axis` is applied to the distorted image, before `undistort`: the ray of a sample passes
+through its distorted pixel. In rectification, (x, y) denotes the direction (x/z, y/z).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32
 
 TURN = 2.0 * math.pi
-#: Points per block of a kernel. The coordinates of a block fit the first level of the cache.
+#: Number of points per block of a kernel. A block's coordinates fit into the first-level cache.
 BLOCK = 256
 
 
@@ -61,7 +61,7 @@ def _project_sphere(camera: Floats, x: float, y: float, z: float) -> tuple[float
 
 @kernel
 def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return column, line and depth of a point; -1 if it is too near.
+    """Project a point; return column (-1 if it is too near), line and depth.
 
     The integer parts of column and line are the pixel.
     """
@@ -84,7 +84,7 @@ def transpose_points(source: Floats32, step: int) -> Floats32:
 
 @disjoint_kernel
 def move_all(points: Floats32, T: Floats, first: int, count: int, out: Floats) -> None:
-    """Write `count` points of (6, N), transformed by T, from index `first`, to `out` (3, n)."""
+    """Transform `count` points of (6, N), from index `first`, by T; write them to `out` (3, n)."""
     for a in range(3):
         x, y, z, own = points[0], points[1], points[2], out[a]
         xx, xy, xz, shift = T[a, 0], T[a, 1], T[a, 2], T[a, 3]
@@ -95,7 +95,7 @@ def move_all(points: Floats32, T: Floats, first: int, count: int, out: Floats) -
 
 @disjoint_kernel
 def project_all(camera: Floats, points: Floats, count: int, out: Floats) -> None:
-    """Write column, line and depth of points (3, n) to `out` (3, n); see `project`."""
+    """Write the columns, lines and depths of points (3, n) to `out` (3, n); see `project`."""
     x, y, z, column, line, depth = points[0], points[1], points[2], out[0], out[1], out[2]
     for i in range(count):
         column[i], line[i], depth[i] = project(camera, x[i], y[i], z[i])
@@ -106,8 +106,9 @@ def select_inside(
     projected: Floats, count: int, left: float, right: float, top: float, bottom: float,
     places: Ints32,
 ) -> int:  # fmt: skip
-    """Write the indices of the points with column in [left, right) and line in [top, bottom) to
-    `places`; return their number.
+    """Write the indices of points with column in [left, right) and line in [top, bottom).
+
+    Return their number.
     """
     column, line, n_inside = projected[0], projected[1], 0
     for i in range(count):
@@ -154,17 +155,17 @@ def growth_at(depth: float, reference: float, power: float) -> float:
     return max(1.0, ratio) if power == 1 else 1.0
 
 
-_BLOCK = 2**18  #: samples per block, a limit of the memory for a 16-megapixel image
+_BLOCK = 2**18  #: number of samples per block; it limits the memory for a 16-megapixel image
 _STEPS = 20  #: maximum number of Newton steps; real lenses need 4
-_TOLERANCE = 1e-7  #: maximum residual of the inverse in x/z, about 1e-4 pixels
+_TOLERANCE = 1e-7  #: maximum residual of the inverse in x/z, approximately 1e-4 pixels
 
 
 def undistort(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
-    """Return the depth image of a pinhole camera, without lens distortion.
+    """Remove lens distortion from a depth image.
 
-    Each pixel takes the nearest sample: interpolation would invent points between an edge and its
-    background. Pixels outside the field of view are 0, and so are pixels at which the distortion
-    polynomial folds back on itself, since it describes no lens there.
+    Each pixel gets the nearest sample: interpolation would invent points between an edge and its
+    background. Pixels outside the field of view are 0, and so are pixels where the distortion
+    polynomial folds back on itself, because it describes no lens there.
 
     Parameters
     ----------
@@ -182,13 +183,13 @@ def undistort(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
     _check_size(depth, intrinsics)
     if not any(intrinsics.distortion):
         return np.array(depth, dtype=np.float32)
-    # index -1 means no sample and selects the appended zero
+    # index -1, for pixels without a sample, selects the appended zero
     samples = np.append(depth.astype(np.float32, copy=False).ravel(), np.float32(0.0))
     return samples[_sources(intrinsics)].reshape(depth.shape)
 
 
 def ray_to_axis(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
-    """Return z along the optical axis from the range along each pixel's ray.
+    """Convert ranges along the pixels' rays to z along the optical axis.
 
     Parameters
     ----------
@@ -213,7 +214,7 @@ def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
     c, k = intrinsics, _coefficients(intrinsics)
     sources = np.full(c.width * c.height, -1, dtype=np.int32)
     for block, x, y in _directions(c):
-        with np.errstate(all="ignore"):  # directions that overflow have no sample
+        with np.errstate(all="ignore"):  # overflows have no sample
             x_seen, y_seen = _distort(x, y, k)
             u, v = c.fx * x_seen + c.cx, c.fy * y_seen + c.cy
             inside = (u >= -0.5) & (u < c.width - 0.5) & (v >= -0.5) & (v < c.height - 0.5)
@@ -221,7 +222,7 @@ def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
         column = np.minimum(np.floor(u[inside] + 0.5), c.width - 1)
         row = np.minimum(np.floor(v[inside] + 0.5), c.height - 1)
         sources[block][inside] = row * c.width + column
-    sources.flags.writeable = False  # shared by every frame of the camera
+    sources.flags.writeable = False  # all frames of the camera share it
     return sources
 
 
@@ -300,14 +301,14 @@ def _unfolded(x: Floats, y: Floats, k: tuple[float, ...]) -> NDArray[np.bool_]:
     unfolded = x * x + y * y < _first_fold(k) ** 2
     for fraction in np.linspace(0.125, 1.0, 8):  # tangential terms move the fold
         xx, xy, yy = _jacobian(fraction * x, fraction * y, k)
-        unfolded &= xx * yy - xy * xy > 0.0  # this is false for NaN too
+        unfolded &= xx * yy - xy * xy > 0.0  # false for NaN
     return unfolded
 
 
 def _first_fold(k: tuple[float, ...]) -> float:
     """Return the minimum tan(angle to the axis) at which the radial function stops growing."""
     r = np.tan(np.linspace(0.0, math.radians(89.9), 4096))
-    with np.errstate(all="ignore"):  # at a pole
+    with np.errstate(all="ignore"):  # poles of the quotient
         radial, slope, below = _radial(r * r, k)
         grows = (radial + 2.0 * r * r * slope > 0.0) & (below > 0.0)
     return math.inf if grows.all() else float(r[max(int(np.argmin(grows)) - 1, 0)])

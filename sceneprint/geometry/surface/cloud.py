@@ -4,7 +4,7 @@
     points (N, 3)  --principal_axes-->  axes (3, 3) that rotate with the cloud
     points (N, 3), axes  --average_cells-->  means (V, 4), side of a cell
 
-Sums over points are sums of integers, which do not depend on the order of the points.
+Sums over points are sums of integers, so they do not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class CloudParameters:
     voxel_size: float = 0.02  #: side of a voxel without a viewpoint, metres
     seed_px: float = 5.2  #: distance between patches, voxels
     validation_seed_px: float = 8.2  #: distance between patches for validation, voxels
-    maximum_patches: int = 1200  #: patches grow until at most this many exist
+    maximum_patches: int = 1200  #: maximum number of patches; patches grow if there are more
     maximum_validation_patches: int = 600  #: maximum number of patches for validation
-    maximum_pixels: int = 160 * 120 * 4  #: voxels and pixels grow until at most this many exist
+    maximum_pixels: int = 160 * 120 * 4  #: maximum number; voxels and pixels grow if there are more
     same_surface: float = 0.03  #: points of a pixel within this share of the range are averaged
     radius_px: int = 3  #: radius of the neighbourhood of a normal, voxels
     range_gate: float = 0.05  #: maximum difference of neighbours in pass 1, share of 1/range
@@ -57,9 +57,9 @@ class CloudParameters:
 
 
 def select_in_range(cloud: Cloud, p: CloudParameters) -> Floats32:
-    """Return the points within the model's range, (M, 3) float32, C-contiguous.
+    """Return the points (M, 3) within the model's range, float32, C-contiguous.
 
-    The result contains all points if the cloud has no viewpoint.
+    If the cloud has no viewpoint, the result contains all points.
 
     Raises
     ------
@@ -133,8 +133,8 @@ def principal_axes(points: Floats32) -> Floats:
     """Return the principal axes of a cloud as the rows of a rotation (3, 3).
 
     They are sorted by descending second moment. The first two point to positive third moments; the
-    third completes a right-handed frame. Axes with equal moments, as of a sphere, are arbitrary.
-    `points @ axes.T` are coordinates along the axes.
+    third completes a right-handed frame. Axes with equal moments, such as those of a sphere, are
+    arbitrary. `points @ axes.T` are coordinates along the axes.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ Ints64 = NDArray[np.int64]
 
 @kernel
 def direction_cell(x: float, y: float, z: float, angle: float) -> int:
-    """Return the cell of a direction on a cube, whose sides are divided into equal angles."""
+    """Return the cell of a direction on a cube with sides divided into equal angles."""
     n = int(np.ceil(np.pi / 2 / angle))
     ax, ay, az = abs(x), abs(y), abs(z)
     if az >= ax and az >= ay:
@@ -196,7 +196,7 @@ def metric_cell(x: float, y: float, z: float, size: float) -> int:
 
 @kernel
 def hash_key(key: int, secret: int) -> int:
-    """Return the slot of a key in a hash table whose size is a power of two.
+    """Return the hash of a key, for tables whose size is a power of two.
 
     The secret prevents attacks by clouds whose cells share a slot. Results must not depend on it.
     """
@@ -211,9 +211,9 @@ def _gather(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, side: float, step: float,
     unit: float, secret: int, keys: Ints64, bins: Ints64, sums: Ints64,
 ) -> int:  # fmt: skip
-    """Sum the points of each occupied cell; return the number of cells, or -1 if it is too large.
+    """Sum the points of each occupied cell; return the number of cells, -1 if there are too many.
 
-    The sums are count, unit / r and direction if `seen`, else count, 0 and coordinates in units.
+    The sums are count, unit / r and direction if `seen`; otherwise count, 0 and coordinates / unit.
     """
     size = 16
     while size < 2 * len(keys):
@@ -256,7 +256,7 @@ def _gather(
 
 @kernel
 def _merge_shells(keys: Ints64, bins: Ints64, order: Ints64, sums: Ints64, out: Ints64) -> int:
-    """Write cells in order of their keys, with adjacent shells of one direction merged."""
+    """Write cells in the order of their keys; merge adjacent shells of the same direction."""
     n, i = 0, 0
     while i < len(order):
         out[n] = sums[order[i]]
@@ -281,15 +281,15 @@ def centroid(points: Floats32) -> Floats:
 def average_cells(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, unit: float, p: CloudParameters
 ) -> tuple[Floats, float]:
-    """Return the means (V, 4) of the occupied cells, and the side of a cell.
+    """Average points by cell; return the means (V, 4) and the side of a cell.
 
     Parameters
     ----------
     points : (N, 3) float32
     axes : (3, 3) axes of the grid, rows
     centre : (3,) origin of the grid
-    seen : whether `centre` is a viewpoint, about which cells are directions with a range
-    unit : side of a cell, radians if `seen`, else metres
+    seen : whether `centre` is a viewpoint; then cells are bins of direction and range
+    unit : unit of length of the sums, metres
     """
     side = p.voxel_angle if seen else p.voxel_size
     room = min(_ROOM * p.maximum_pixels, len(points))

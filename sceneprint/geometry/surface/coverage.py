@@ -1,4 +1,4 @@
-"""Surface and volume that several views of a place observe (the paper's last figure).
+"""Measures of the surface and volume that several views observe (the paper's last figure).
 
 A view is a frame with the pose T_query_view. All lengths are metres in the query's frame.
 """
@@ -92,7 +92,7 @@ def first_seen(
     metres: float = AGREES_M,
     share: float = AGREES_SHARE,
 ) -> tuple[Ints32, Ints32]:
-    """Return the first view that sees each point.
+    """Return the index of the first view that sees each point.
 
     Parameters
     ----------
@@ -102,8 +102,8 @@ def first_seen(
 
     Returns
     -------
-    first : (N,) index of the view, -1 if no view sees the point
-    nearest : (N,) index of the view whose surface is nearest along its ray; 0 by default
+    first : (N,) index of the view; -1 if no view sees the point
+    nearest : (N,) index of the view whose surface is nearest along its ray; 0 if there is none
     """
     first, nearest = np.full(len(points), -1, np.int32), np.zeros(len(points), np.int32)
     error = np.full(len(points), np.inf)
@@ -120,7 +120,7 @@ def share_seen(points: Floats, views: Sequence[DepthFrame]) -> float:
 
 
 def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: float) -> Ints32:
-    """Return the first view that sees each point of a mesh fused from these views, (N,).
+    """Return the index (N,) of the first view that sees each point of a mesh fused from the views.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: floa
 
 
 def added_areas(mesh: TriangleMesh, first: Ints32, views: int) -> Floats:
-    """Return the area that each view adds to the area of the preceding views, (V,), square metres.
+    """Return the area (V,) that each view adds to the preceding views' area, square metres.
 
     A triangle counts for the first view that sees one of its corners; the sum is the mesh's area.
 
@@ -171,11 +171,11 @@ def _mark(
 def observed_volume(views: Sequence[DepthFrame]) -> tuple[float, float]:
     """Return the volume between the cameras and the observed surfaces, and the edge of its cells.
 
-    The volume is in cubic metres and the edge in metres. Distant views enlarge the edge.
+    The volume is in cubic metres, the edge in metres. Distant views enlarge the edge.
 
     Parameters
     ----------
-    views : views; unknown depth is 0
+    views : views with depth 0 for missing samples
     """
     corners = [
         transform_points(view.pose, _outline(view)) for view in views if view.pose is not None

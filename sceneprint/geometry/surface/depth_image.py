@@ -1,4 +1,4 @@
-"""Reduction of a depth image to inverse depth, points and unit normals (Sec. III).
+"""Conversion of a depth image to inverse depth, points and unit normals (Sec. III).
 
     depth (H, W)  --inverse_depth-->  1/z (h, w), with the intrinsics of the reduced map
     1/z (h, w)  --fit_surface-->  points, normals (h, w, 3)
@@ -25,10 +25,10 @@ from sceneprint.types import DepthFrame, Floats32, Intrinsics, Surface
 class DepthParameters:
     """Parameters of the reduction."""
 
-    minimum_depth: float = 0.3  #: nearer samples count as missing, metres
-    maximum_depth: float = 9.0  #: farther samples count as missing, metres
+    minimum_depth: float = 0.3  #: minimum depth of a sample, metres; nearer samples are missing
+    maximum_depth: float = 9.0  #: maximum depth of a sample, metres; farther samples are missing
     same_surface: float = 0.03  #: samples within this share of the nearest depth are averaged
-    focal_length_px: float = 146.0  #: the image is halved until f is nearest to this value
+    focal_length_px: float = 146.0  #: focal length that halvings of the image approximate, pixels
     maximum_pixels: int = 160 * 120 * 4  #: maximum number of pixels after the halvings
     minimum_valid: int = 64  #: minimum number of valid pixels of a usable frame
     minimum_side: int = 8  #: minimum number of rows and columns of a usable image
@@ -41,7 +41,7 @@ def _in_range(depth: Floats32, minimum: float, maximum: float) -> Floats32:
     for y in range(height):
         for x in range(width):
             z = depth[y, x]
-            if z >= minimum and z <= maximum:  # this is false for NaN
+            if z >= minimum and z <= maximum:  # false for NaN
                 q[y, x] = np.float32(1.0) / z
     return q
 
@@ -62,15 +62,15 @@ def _halve(q: Floats32, same_surface: float) -> Floats32:
             wb = one if b >= least else zero
             wc = one if c >= least else zero
             wd = one if d >= least else zero
-            # if all four samples are missing, the mean is 0, which means missing
+            # if all four samples are missing, the mean is 0, and so missing
             half[y, x] = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
     return half
 
 
 def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
-    """Return the camera of an image at half its size, whose pixel centres are at integers.
+    """Return the camera of an image at half its size; pixel centres are at integers.
 
-    An odd last row or column is cut off.
+    An odd last row or column is removed.
     """
     return replace(
         intrinsics,
@@ -94,10 +94,10 @@ def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
 
 
 def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intrinsics]:
-    """Mask and invert a depth image, then halve it as often as `p` says.
+    """Compute the inverse depth of an image, reduced to the resolution of the model.
 
-    Each halving averages the inverse depths of only those samples of a 2 x 2 block that lie on the
-    nearest surface, so it invents no point between an edge and its background.
+    A halving averages only those inverse depths of a 2 x 2 block that lie on the nearest surface,
+    so it invents no point between an edge and its background.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def _why_useless(frame: DepthFrame, p: DepthParameters) -> str:
     )
 
 
-#: Maximum difference of samples on one surface in `double_resolution`, share of the nearest depth.
+#: Maximum difference of samples on a surface in `double_resolution`, share of the nearest depth.
 SAME_SURFACE = 0.05
 
 
@@ -186,7 +186,7 @@ def _double(depth: Floats32, same_surface: float) -> Floats32:
 def double_resolution(frame: DepthFrame) -> DepthFrame:
     """Return the frame at twice the width and height, interpolated within surfaces.
 
-    Code that reads the nearest pixel then gets slopes instead of steps.
+    Code that reads the nearest pixel gets slopes instead of steps.
     """
     k = frame.intrinsics
     camera = replace(
@@ -213,9 +213,7 @@ class NormalParameters:
 def _weigh(
     row: Floats32, centre: Floats32, expected: Floats32, gate: Floats32, w: Floats32, wr: Floats32
 ) -> None:
-    """Write the weights (0 or 1) of a row of samples and their weighted differences from the
-    centre.
-    """
+    """Write the weights (0 or 1) of a row of samples, and weighted differences from the centre."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(len(w)):
         near = abs(row[x] - centre[x] - expected[x]) < gate[x]
@@ -237,8 +235,8 @@ def _fit(
 ) -> None:  # fmt: skip
     """Fit 1/z - centre = c + a dx + b dy around every pixel: out[:, y, x] = c, a, b, n, det.
 
-    A sample counts if |1/z - centre - plane| < constant + relative * centre. Rows are summed for
-    one offset after the other, so that every inner loop writes one array and can be vectorized.
+    A sample counts if |1/z - centre - plane| < constant + relative * centre. Rows are summed offset
+    by offset, so that an inner loop writes a single array and can be vectorized.
     """
     height, width = q.shape
     one = np.float32(1.0)
@@ -330,7 +328,7 @@ def _lift(
 
 
 def fit_surface(q: Floats32, intrinsics: Intrinsics, p: NormalParameters) -> Surface:
-    """Return points and unit normals of least-squares planes in inverse depth around each pixel.
+    """Fit planes in inverse depth around each pixel; return the points and unit normals.
 
     A pixel is invalid if its window determines no plane or the incidence is grazing.
 

@@ -1,8 +1,8 @@
-"""Range images of clouds from their viewpoints, with a plane fitted in each pixel.
+"""Range images of clouds from their viewpoints, with planes fitted to the pixels.
 
     points (N, 3)  --range_image-->  Surface (h, w) with camera Sphere
 
-On the sphere about the viewpoint the inverse range of a plane is linear in the direction u:
+On the sphere around the viewpoint, the inverse range of a plane is linear in the direction u:
 1/r = a . u. A least-squares fit of a over a window gives the normal and the denoised point, as in
 `depth_image.py`.
 """
@@ -21,9 +21,9 @@ from sceneprint.geometry.surface.cloud import CloudParameters, select_in_range
 from sceneprint.geometry.surface.voxels import solve
 from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface
 
-#: Minimum cosine of the angle between an axis and a point near its poles.
+#: Minimum cosine of the angle between an axis and a point near the axis.
 _NEAR_POLE = math.cos(math.radians(30.0))
-#: Maximum width of an empty wedge that does not end the image, pixels.
+#: Maximum width of an empty wedge within an image, pixels.
 _WEDGE_PX = 8
 
 
@@ -59,7 +59,7 @@ def pole_of(points: Floats32) -> int:
 
 @kernel
 def to_angles(points: Floats32, pole: int, out: Floats) -> None:
-    """Write azimuth, elevation and range of each point to `out` (N, 3)."""
+    """Write the azimuth, elevation and range of each point to `out` (N, 3)."""
     first, second = (pole + 1) % 3, (pole + 2) % 3
     for i in range(len(points)):
         a, b = float(points[i, first]), float(points[i, second])
@@ -71,7 +71,7 @@ def to_angles(points: Floats32, pole: int, out: Floats) -> None:
 
 
 def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
-    """Return the camera that shows all points in at most `maximum_pixels` pixels."""
+    """Return the camera that covers all points with at most `maximum_pixels` pixels."""
     low, high = float(angles[:, 1].min()), float(angles[:, 1].max())
     step = p.image_angle
     while True:
@@ -94,7 +94,7 @@ def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
         step *= max(math.sqrt(width * height / p.maximum_pixels), 1.01)
 
 
-#: Ratio of the resolution of `spread_points` to that of the range image.
+#: Ratio of the resolutions of `spread_points` and of the range image.
 FINER = 2
 #: Maximum number of stored points of a scan; docs/clouds.md gives the measurements.
 SPREAD_POINTS = 8192
@@ -106,10 +106,10 @@ _WIDEST = 8.0
 
 
 def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
-    """Return the nearest surfaces around a cloud's viewpoint as an image of points and normals.
+    """Convert a cloud to an image of points and normals of the nearest surfaces.
 
-    Small gaps, such as those between the rings of a spinning sensor, are closed if both sides lie
-    on one plane. The camera is a Sphere cropped to the points; `pole_of` selects its pole.
+    Small gaps, such as between the rings of a spinning sensor, are closed if both sides lie on the
+    same plane. The camera is a Sphere cropped to the points; `pole_of` selects its pole.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
 
     Raises
     ------
-    UselessFrame : If fewer than `minimum_points` points are within range, or fewer pixels show one
+    UselessFrame : If fewer than `minimum_points` are within range, or fewer pixels show points
     """
     pole, angles = _angles_of(cloud, p.minimum_range, p.maximum_range, p.minimum_points)
     camera = fit_camera(angles, pole, p)
@@ -157,8 +157,8 @@ def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
     """Return unordered points of a scan, finer than its range image, for fine refinement.
 
     A pixel of the range image covers .9 degrees: half a metre of wall at 30 m, and several metres
-    of ground. If finer pixels determine no plane, as between distant rings, the points of the range
-    image are used.
+    of ground. Where finer pixels determine no plane, such as between distant rings, the points of
+    the range image are used.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def _sum(
     angles: Floats, pixel: NDArray[np.int64], nearest: Floats, frame: Floats, share: float,
     pole: int, sums: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Sum count, inverse range and direction of the points on each pixel's nearest surface."""
+    """Sum the count, inverse range and direction of the points on each pixel's nearest surface."""
     first, second = (pole + 1) % 3, (pole + 2) % 3
     least, steps = frame[3], frame[4]
     for i in range(len(angles)):
@@ -234,8 +234,8 @@ def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None
 def _average_pixels(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Floats, Floats]:
     """Return the mean inverse range (h, w) and direction (h, w, 3) of each pixel's nearest surface.
 
-    The inverse range of an empty pixel is 0. On a plane 1/r = a . u, the means satisfy the same
-    equation.
+    The inverse range of an empty pixel is 0. The means of points on a plane 1/r = a . u satisfy the
+    same equation.
     """
     shape = (camera.height, camera.width)
     least = max(p.minimum_range, 1e-9)
@@ -260,7 +260,7 @@ def _fit(
     limits: Floats,
     planes: Floats,
 ) -> None:
-    """Write a of 1/r = a . u for every pixel with a point; 0 if its window determines no plane.
+    """Fit the plane 1/r = a . u around each pixel with a point, and write a; 0 without a plane.
 
     The first pass selects by range, the second by distance to the plane. `flat` is the cosine of
     each row's elevation: pixels are narrower towards the poles, so their windows are wider.
@@ -317,8 +317,8 @@ def _close(
 ) -> None:  # fmt: skip
     """Fill gaps in each column between planes that agree across the gap.
 
-    A gap that contains another surface, such as a wire before a wall, is not filled, because
-    nothing was observed behind it.
+    A gap that contains another surface, such as a wire before a wall, is not filled: nothing was
+    observed behind that surface.
     """
     height, width = planes.shape[0], planes.shape[1]
     for x in range(width):
@@ -353,7 +353,7 @@ def _lift(
     planes: Floats, rays: Floats, flat: Floats, numbers: Floats,
     points: Floats32, normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Intersect rays and planes; `numbers` are minimum cosine, range limits and squared step."""
+    """Intersect rays and planes; `numbers`: minimum cosine, range limits and squared step."""
     for y in range(len(planes)):
         for x in range(planes.shape[1]):
             a, ray = planes[y, x], rays[y, x]

@@ -1,7 +1,7 @@
 """Estimation of the up direction and the units of an imported surface.
 
-The floor is the largest level plane of a place, and a place is wider than high. Furniture shows
-which end is the lower one, because more surface is near it.
+The floor is the largest level plane of a place, and places are wider than high. Furniture indicates
+the lower end, because more surface is near the floor.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sceneprint.types import Floats, Floats32, Ints32
 
 Integers = NDArray[np.integer]
 
-#: Maximum number of points and of triangles that are evenly sampled from the surface.
+#: Maximum number of points, and of triangles, that are evenly sampled from the surface.
 _MOST_POINTS, _MOST_TRIANGLES = 1_000_000, 1_000_000
 #: Edges of the cells in which planes are fitted, as shares of the extent, and the minimum mean
 #: number of points per cell: the finest edge that reaches it is used.
@@ -26,16 +26,16 @@ _EDGES, _CELL_POINTS = (1 / 256, 1 / 128, 1 / 64, 1 / 32, 1 / 16), 12.0
 _FEWEST, _NO_LINE, _FLAT = 6, 0.05, 0.1
 #: Number of directions on the hemisphere, and of pieces that vote for them.
 _DIRECTIONS, _VOTERS = 1500, 6000
-#: Minimum cosines to a direction at which a piece votes for it, and at which it votes for no other.
+#: Minimum cosines to a direction at which a piece votes for it, and votes for no other direction.
 _NEAR, _EXCLUSIVE = math.cos(math.radians(12.0)), math.cos(math.radians(25.0))
 #: Maximum number of dominant directions, and minimum share of the votes for each.
 _MOST_PEAKS, _LEAST_SHARE = 5, 0.03
 #: Minimum cosines at which an estimate snaps to the usual axis, or to another axis of the file.
-#: The tolerance allows for sloping ground.
+#: The tolerances allow for sloping ground.
 _SNAP_USUAL, _SNAP = math.cos(math.radians(7.0)), math.cos(math.radians(3.0))
 #: Thickness of a floor, as a share of the extent.
 _LAYER = 0.02
-#: Quantiles that bound the extent, so that stray points do not widen it.
+#: Quantiles that bound the extent: stray points must not widen it.
 _LOW, _HIGH = 0.01, 0.99
 #: Weights of the usual axis relative to other axes, and of its usual end relative to its other end.
 _USUAL, _USUAL_SIGN = 1.8, 0.6
@@ -87,7 +87,7 @@ def estimate_up(points: Floats32, triangles: Ints32 | None, usual: Floats) -> Up
     ----------
     points : (N, 3), finite, N >= 1, any unit
     triangles : (M, 3) indices of points; None for a cloud
-    usual : (3,) unit vector, the up direction of most files of this format, which is selected for
+    usual : (3,) unit vector, the up direction of most files of this format; it is selected for
         symmetric surfaces such as an empty cube
     """
     pieces = flat_pieces(points, triangles)
@@ -127,9 +127,9 @@ _WIDEST_M = 20_000.0
 
 
 def estimate_units(points: Floats32, up: Floats) -> float:
-    """Return the number of units of a surface per metre: 1, 100 or 1000.
+    """Estimate the units of a surface per metre: 1, 100 or 1000.
 
-    The result is 1 unless the place would be too high in metres.
+    The result is 1 unless the place would be too high or too wide in metres.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def estimate_units(points: Floats32, up: Floats) -> float:
 
 
 def _snap(direction: Floats, usual: Floats) -> Floats:
-    """Return the axis of the file that is near the direction, otherwise the direction."""
+    """Return an axis of the file if it is near a direction, otherwise the direction."""
     if abs(float(direction @ usual)) > _SNAP_USUAL:
         return usual
     k = int(np.abs(direction).argmax())
@@ -176,9 +176,7 @@ def _mass(points: Floats32, pieces: Pieces) -> tuple[Floats, Floats]:
 
 
 def _layers(pieces: Pieces, direction: Floats, thickness: float) -> float:
-    """Return the share of the surface in the largest layer across a direction, plus half of the
-    share of the second-largest layer.
-    """
+    """Return the share of the largest layer across a direction, plus half of the second's."""
     across = np.abs(pieces.normals @ direction) > _NEAR
     if not across.any():
         return 0.0
@@ -194,8 +192,8 @@ def _layers(pieces: Pieces, direction: Floats, thickness: float) -> float:
 def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> float:
     """Return the excess of furniture in the lower half, [-1.75, 1.75].
 
-    Walls do not count. Level pieces have an additional weight of one half, and floor and ceiling
-    a small weight: furniture hides more of the floor, and cameras look down.
+    Walls do not count. Level pieces have an additional weight of one half. Floor and ceiling have
+    a small weight: furniture hides the floor, but cameras look down.
     """
     places = (pieces.centres @ direction - low) / height
     cosines = np.abs(pieces.normals @ direction)
@@ -209,14 +207,14 @@ def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> 
 
 
 def _balance(areas: Floats, chosen: NDArray[np.bool_], places: Floats) -> float:
-    """Return the area of the lower half minus that of the upper half, as a share of both."""
+    """Return the difference between the areas of both halves, lower first, over their sum."""
     lower = float(areas[chosen & (places < 0.5)].sum())
     upper = float(areas[chosen & (places >= 0.5)].sum())
     return (lower - upper) / (lower + upper + 0.005 * float(areas.sum()) or 1.0)
 
 
 def flat_pieces(points: Floats32, triangles: Ints32 | None) -> Pieces:
-    """Return the flat pieces of a surface.
+    """Divide a surface into flat pieces.
 
     Parameters
     ----------
@@ -245,7 +243,7 @@ def flat_pieces(points: Floats32, triangles: Ints32 | None) -> Pieces:
 
 
 def _fit_planes(inside: Floats, sample: Floats, cells: Integers, counts: Integers) -> Pieces:
-    """Return the planes of all cells whose points lie in a plane."""
+    """Fit planes to the points of cells; return the planes of cells with flat surfaces."""
     n = len(counts)
 
     def mean(values: Floats) -> Floats:
@@ -273,7 +271,7 @@ def dominant_directions(pieces: Pieces) -> Floats:
     total = float(areas.sum())
     if total <= 0:
         return np.empty((0, 3))
-    # even steps in the cumulative area give a deterministic sample that is weighted by area
+    # even steps in the cumulative area give a deterministic sample, weighted by area
     ranks = np.searchsorted(np.cumsum(areas), (np.arange(_VOTERS) + 0.5) * total / _VOTERS)
     voters = normals[np.minimum(ranks, len(areas) - 1)]
     directions = _hemisphere(_DIRECTIONS)
@@ -293,7 +291,7 @@ def dominant_directions(pieces: Pieces) -> Floats:
 
 
 def _hemisphere(count: int) -> Floats:
-    """Return evenly spread directions (count, 3) with z > 0."""
+    """Return evenly distributed directions (count, 3) with z > 0."""
     z = (np.arange(count) + 0.5) / count
     angle = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
     r = np.sqrt(1.0 - z * z)

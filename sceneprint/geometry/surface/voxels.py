@@ -6,7 +6,7 @@
     places (N, 3), heights (N)                    --link_points-->         Links
 
 Around a viewpoint, voxels grow with range, as in VCCS for a cloud of one camera (Papon 2013): a
-cell is a bin of direction, on a cube, and of the logarithm of range. Without a viewpoint all cells
+cell is a bin of direction, on a cube, and of the logarithm of range. Without a viewpoint, all cells
 have the same size. The grid is aligned with the cloud's principal axes, so it rotates with the
 cloud.
 """
@@ -39,7 +39,7 @@ Ints64 = NDArray[np.int64]
 def solve(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, b: Floats, out: Floats
 ) -> float:
-    """Solve A x = b for a symmetric A (3, 3); return det A. Write x to `out` if det A > 0."""
+    """Solve A x = b for a symmetric A (3, 3); return det A. Write x to `out` only if det A > 0."""
     cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     det = xx * cxx + xy * cxy + xz * cxz
     if det > 0:
@@ -55,9 +55,9 @@ def fit_inverse_planes(
     q: Floats, u: Floats, offsets: Ints64, indices: Ints32, gates: Floats, limits: Floats,
     planes: Floats,
 ) -> None:  # fmt: skip
-    """Write a of 1/r = a . u for the neighbours of each point; 0 if they determine no plane.
+    """Fit the plane 1/r = a . u to the neighbours of each point, and write a; 0 without a plane.
 
-    The first pass selects by range, the second by distance to the plane.
+    The first pass selects neighbours by range, the second by distance to the plane.
     """
     a, b = np.zeros(3), np.zeros(3)
     for i in range(len(q)):
@@ -94,9 +94,9 @@ def fit_inverse_planes(
 
 @kernel
 def least_axis(m: Floats, values: Floats, axis: Floats) -> None:
-    """Write the eigenvalues of a symmetric matrix, and the eigenvector of the smallest, by Jacobi.
+    """Write the eigenvalues of a symmetric matrix, and the eigenvector of the smallest eigenvalue.
 
-    The matrix `m` (3, 3) is overwritten.
+    The Jacobi method overwrites the matrix `m` (3, 3).
     """
     v = np.eye(3)
     for _ in range(8):
@@ -133,9 +133,9 @@ def fit_planes(
     places: Floats, offsets: Ints64, indices: Ints32, gate: float, limits: Floats,
     normals: Floats, at: Floats,
 ) -> None:  # fmt: skip
-    """Write the normals of the planes through the neighbours of each point, towards the origin.
+    """Fit planes to the neighbours of each point; write their normals, towards the origin.
 
-    The projection of each point onto its plane is written to `at`. The first pass uses all
+    The projections of the points onto their planes are written to `at`. The first pass uses all
     neighbours, the second only neighbours near the plane. Normals are 0 if the neighbours determine
     no plane.
     """
@@ -186,7 +186,7 @@ _REACH = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Neighbours of N points: point i has the neighbours `indices[offsets[i] : offsets[i + 1]]`.
+    """Neighbours of N points: those of point i are `indices[offsets[i] : offsets[i + 1]]`.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ class Links:
     indices: Ints32
 
     def select(self, keep: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Links:
-        """Return the links of a mask (M,) between the points of a mask (N,), renumbered."""
+        """Return the links of mask `linked` (M,) between points of mask `keep` (N,), renumbered."""
         number = np.cumsum(keep) - 1
         sources = np.repeat(keep, np.diff(self.offsets))
         selected = linked & sources & keep[self.indices]
@@ -210,7 +210,7 @@ class Links:
     def touching(
         self, places: Floats, reach: float, at: Floats, normals: Floats, gaps: Floats
     ) -> NDArray[np.bool_]:
-        """Return a mask (M,) of the short links within one surface.
+        """Return a mask (M,) of the short links that do not cross a gap in the surface.
 
         Parameters
         ----------
@@ -226,7 +226,7 @@ class Links:
 
 @kernel
 def _grid(cells: Ints64, order: Ints64, secret: int, table: Ints64, starts: Ints64) -> int:
-    """Enter the runs of points with one cell (cells sorted by `order`) into a hash table."""
+    """Insert runs of points with equal cells (sorted by `order`) into a hash table; count them."""
     mask = len(table) - 1
     n = 0
     for i in range(len(order)):
@@ -327,7 +327,7 @@ def _touch(
     places: Floats, square: float, at: Floats, normals: Floats, gaps: Floats, offsets: Ints64,
     indices: Ints32, keep: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Write whether two points are close and one of them lies on the plane of the other point."""
+    """Write whether two points are close and one of them lies on the plane of the other."""
     for i in range(len(at)):
         for k in range(offsets[i], offsets[i + 1]):
             j = indices[k]
@@ -347,9 +347,9 @@ def _touch(
 
 #: Side of a square with the area of the neighbourhood's disc, in radii.
 _SQUARE = math.sqrt(math.pi)
-#: Maximum distance of voxels that touch, in sides: bound of the means of adjacent cells.
+#: Maximum distance between the means of adjacent cells, in sides.
 _TOUCHING = 2.0
-#: Maximum distance of points on one surface from its plane, in sides of a voxel.
+#: Maximum distance of points on a surface from its plane, in sides of a voxel.
 _GAP = 0.25
 
 
@@ -359,7 +359,7 @@ class Voxels(Surface):
 
     Parameters
     ----------
-    cloud : source of the voxels
+    cloud : cloud from which the voxels were computed
     axes : (3, 3) principal axes, rows
     centre : (3,) viewpoint of the cloud, or its centroid if it has no viewpoint, metres
     sides : (V,) float32, widths of the voxels, metres
@@ -379,7 +379,7 @@ class Voxels(Surface):
 
 
 def voxels(cloud: Cloud, p: CloudParameters) -> Voxels:
-    """Return the voxels of a cloud, with normals that point to the viewpoint.
+    """Compute the voxels of a cloud, with normals towards the viewpoint.
 
     Parameters
     ----------
@@ -387,7 +387,7 @@ def voxels(cloud: Cloud, p: CloudParameters) -> Voxels:
 
     Raises
     ------
-    UselessFrame : If fewer than `minimum_points` points are within range, or fewer voxels hold one
+    UselessFrame : If fewer than `minimum_points` points are within range, or fill fewer voxels
     """
     points = select_in_range(cloud, p)
     build = _angular_voxels if cloud.has_viewpoint else _metric_voxels

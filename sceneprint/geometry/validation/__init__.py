@@ -1,1 +1,1 @@
-"""Decision whether a transform is right: acceptance, ambiguity, verification in the map."""
+"""Decisions about transforms: acceptance, ambiguity, verification in the map."""

@@ -1,14 +1,14 @@
 """The acceptance of a transform by its evidence and its rivals (Sec. III-E).
 
-    Evidence  --objection-->  reason to refuse     Evidence, ambiguity  --belief-->  strength
+    Evidence  --objection-->  reason to reject     Evidence, ambiguity  --belief-->  strength
     Evidence, deviation  --sparse_evidence_suffices-->  whether sparse evidence is enough
     T, hypotheses, planes  --best_alternative-->  Rival
 
 A box looks the same from its four sides, and a corridor the same at every door. Two frames of such
-a place agree perfectly under a wrong transform, which only equally good transforms reveal.
-Therefore rivals are searched among the other hypotheses of correspondences, and among versions of
-the transform that are rotated by quarter turns about the normals of the main planes or shifted
-along these planes, since rooms and furniture repeat in these ways.
+a place agree perfectly under a wrong transform; only the existence of equally good transforms
+reveals the error. Therefore, rivals are searched among the other hypotheses of correspondences, and
+among versions of the transform that are rotated by quarter turns about the normals of the main
+planes or shifted along these planes, because rooms and furniture repeat in these ways.
 
 The agreement of a rival is weighted by planes (`overlap.py`). If up is known in both frames, a
 transform that tilts is not a rival.
@@ -59,13 +59,13 @@ class AcceptanceParameters:
     plane_violations: float = 1.0  #: maximum share of violations by planes
     worst_violations: float = 0.05  #: maximum share of violations in either direction
     strong: float = 0.3  #: evidence below which an accepted match is weak
-    weak: float = 0.05  #: ambiguity from which an accepted match is weak
-    ambiguous: float = 0.14  #: ambiguity from which no match is accepted
+    weak: float = 0.05  #: minimum ambiguity at which an accepted match is weak
+    ambiguous: float = 0.14  #: minimum ambiguity at which no match is accepted
     ambiguous_share: float = 0.5  #: maximum ambiguity as a share of `plane_overlap`
     stiffness: float = 1e-5  #: minimum ratio of the eigenvalues of the information
     blind_evidence: float = 0.4  #: minimum evidence
     blind_plane_overlap: float = 0.3  #: minimum plane overlap
-    blind_ambiguous_share: float = 0.75  #: limit in place of both, as fewer rivals are refuted
+    blind_ambiguous_share: float = 0.75  #: replaces both limits, because fewer rivals are refuted
     sparse_evidence: float = 0.1  #: minimum evidence
     sparse_plane_overlap: float = 0.1  #: minimum plane overlap
     sparse_planes: float = 5.0  #: minimum number of distinct planes
@@ -118,7 +118,7 @@ _IN_FREE_SPACE = "of the points lie where the other frame saw free space"
 
 
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
-    """Return the reason to refuse a transform, whatever its rivals; None without one: Sec. III-E.
+    """Return the reason to reject a transform regardless of its rivals, if any: Sec. III-E.
 
     Mode "paper" checks the residual only.
     """
@@ -160,13 +160,13 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
 def sparse_evidence_suffices(
     e: Evidence, deviation_m: float, p: AcceptanceParameters, *, alone: bool = False
 ) -> bool:
-    """Return whether sparse evidence is enough, because all of it supports the transform.
+    """Return whether sparse evidence suffices, because all of it supports the transform.
 
     Two frames that share a tenth of their surfaces cannot reach the overlap that `objection`
-    requires, and one of the searches may miss the transform. For such a transform, refinements in
-    both directions must agree, as must several planes, almost no points may lie in free space of
+    requires, and one of the searches may miss the transform. For such a transform, the refinements
+    in both directions and several planes must agree, almost no points may lie in free space of
     either frame, and the surfaces must constrain it well. Distorted depth separates the refinements
-    of a correct transform by a few centimetres; in this case many planes must agree.
+    of a correct transform by a few centimetres; then many planes must agree.
 
     Parameters
     ----------
@@ -203,9 +203,9 @@ def sparse_evidence_suffices(
 def belief(
     e: Evidence, ambiguity: float, p: AcceptanceParameters
 ) -> tuple[Status, Strength | None, str]:
-    """Return status, strength and reason of a transform without objection, by its ambiguity."""
+    """Return the status, strength and reason of a transform without objection, by its ambiguity."""
     most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
-    if e.violations is None:  # unknown free space refutes no rival
+    if e.violations is None:  # free space is unknown, so it refutes no rival
         most = p.blind_ambiguous_share * e.plane_overlap
     if ambiguity >= most:
         return "ambiguous", None, "another transform explains the frames equally well"
@@ -232,7 +232,7 @@ class AmbiguityParameters:
     n_axes: int = 2  #: number of main directions of normals
     n_planes: int = 3  #: number of largest planes per direction
     same_direction: float = math.radians(12.0)  #: maximum angle of parallel normals
-    shift: float = 0.5  #: step along a corridor, small enough for refinement to converge, metres
+    shift: float = 0.5  #: step along a corridor, metres; small enough that refinements converge
     n_shifts: int = 6  #: number of steps in each direction
     least_crossing: float = 0.5  #: minimum sine of the angle between the main families of planes
     n_proposed: int = 16  #: number of hypotheses of plans that are refined as rivals
@@ -241,9 +241,9 @@ class AmbiguityParameters:
     hopeful_share: float = 0.04  #: minimum share that a rival explains after the first refinement
     hopeful_violations: float = 0.15  #: maximum share of its violations after this refinement
     then: RefinementParameters = COARSE  #: refinement of the remaining rivals
-    refuted: float = 0.02  #: violations that refute a rival if the transform has fewer
+    refuted: float = 0.02  #: violations that refute a rival, unless the transform has more
     rival_m: float = 0.25  #: minimum difference of a rival from the transform, metres
-    rival_rad: float = math.radians(15.0)  #: alternative minimum rotation of a rival, radians
+    rival_rad: float = math.radians(15.0)  #: or minimum rotation from the transform, radians
 
 
 @cached_per_frame
@@ -251,7 +251,7 @@ def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
     """Return motions (n, 4, 4) that map the main planes of the patches onto themselves.
 
     These are rotations by 90, 180 and 270 degrees about the centre of each plane, and shifts along
-    the intersection of the two main families of planes, as along a corridor. n is at most
+    the intersection of the two main families of planes, such as along a corridor. n is at most
     3 n_axes n_planes + 2 n_shifts.
     """
     motions = np.zeros((3 * p.n_axes * p.n_planes + 2 * p.n_shifts, 4, 4))
@@ -268,7 +268,7 @@ def _write_symmetries(
     means: Floats, normals: Floats, areas: Floats, n_axes: int, n_planes: int, cosine: float,
     same_plane: float, least_crossing: float, shift: float, n_shifts: int, motions: Floats,
 ) -> int:  # fmt: skip
-    """Write the motions of `symmetries`, and return their number; means and normals (3, P)."""
+    """Write the motions of `symmetries`; return their number. Means and normals are (3, P)."""
     left, mass, axes = areas.copy(), np.empty(len(areas)), np.zeros((n_axes + 2, 3))
     found = 0
     for number in range(n_axes):
@@ -310,8 +310,8 @@ def _write_turns(
 ) -> int:  # fmt: skip
     """Append quarter turns about the centres of the largest planes across an axis to `motions`.
 
-    Planes consist of patches with positive areas, which are set to 0. `found` is the previous
-    number of motions; the result is the new number.
+    Planes consist of patches with positive areas; these areas are set to 0. `found` is the number
+    of motions before, and the result is the number afterwards.
     """
     x, y, z = axis[0], axis[1], axis[2]
     offsets, R = x * means[0] + y * means[1] + z * means[2], np.empty((3, 3))
@@ -346,7 +346,7 @@ def _write_turns(
 def _sum_parallel(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
     """Write, for each patch, the total area of parallel patches; normals are (3, P).
 
-    The inner loop is over the sums, not over the terms of one sum, so that it is vectorized.
+    The inner loop is over the sums, not over the terms of a sum, so that it is vectorized.
     """
     x, y, z = normals[0], normals[1], normals[2]
     mass[:] = 0.0
@@ -378,10 +378,10 @@ class Rival(NamedTuple):
 
     Parameters
     ----------
-    share : share of the frames that it explains, with equal weights for all planes, 0 to 1; 0
-        without a rival
+    share : share of the frames that the rival explains, with equal weights for all planes, 0 to 1;
+        0 without a rival
     T : (4, 4) transform; None without a rival
-    tilted : maximum share that is explained by a transform that only `up` refutes
+    tilted : maximum share that a transform explains, among transforms that only `up` refutes
     """
 
     share: float
@@ -394,16 +394,16 @@ def best_alternative(
     proposed: Floats, p: AmbiguityParameters, agreement_p: OverlapParameters,
     ups: Ups = NO_UPS, most_tilt: float = math.inf,
 ) -> Rival:  # fmt: skip
-    """Return the best rival of T, and the share of the frames that it explains: Sec. III-E.
+    """Search for the best rival of T: Sec. III-E.
 
     Parameters
     ----------
     query, match : results of `plane_view`
     T : (4, 4) T_match_query
-    violations : violations of T by planes; a rival with as few violations is not refuted
+    violations : violations of T by planes; violations up to this share do not refute a rival
     voted : (n, 4, 4) other refined hypotheses
-    proposed : (m, 4, 4) unrefined hypotheses, best first; the best ones that are rivals of T and of
-        each other are refined
+    proposed : (m, 4, 4) unrefined hypotheses, best first; the best hypotheses that are rivals of T
+        and of each other are refined
     ups : up vectors of query and match
     most_tilt : maximum tilt of a rival, radians
     """

@@ -1,13 +1,13 @@
-"""The confidence of a candidate pose: the probability that it is right.
+"""Confidences of candidate poses: the probabilities that they are right.
 
     PlaceEvidence of all candidates  --compute_confidences-->  P(right) of each, sum <= 1
-    PlaceEvidence  --weakest_evidence-->  sentence on the evidence with the largest penalty
+    PlaceEvidence  --weakest_evidence-->  clause on the evidence with the largest penalty
 
 At most one of the candidates is right. The log odds of a candidate, relative to the case that all
-are wrong, are the log odds of a pose with the best evidence minus one penalty per kind of evidence.
-A penalty is a piecewise linear function that does not increase with better evidence, so more
-support cannot lower a confidence, and a better rival cannot raise it. `sceneprint_lab.confidence`
-fits the penalties to synthetic places; docs/trust.md shows the calibration on recordings.
+are wrong, are the log odds of a pose with the best evidence minus a penalty per kind of evidence.
+Penalties are piecewise linear functions that do not increase with better evidence, so more support
+cannot lower a confidence, and a better rival cannot raise it. `sceneprint_lab.confidence` fits the
+penalties to synthetic places; docs/trust.md shows the calibration on recordings.
 """
 
 from __future__ import annotations
@@ -33,15 +33,14 @@ class PlaceEvidence:
     viewpoints : number of viewpoints of these frames
     excess : share of free-space violations of both sides, minus the share among the map's frames
     weight : sum of the weights of votes for the pose, one per viewpoint: 1 for a strong match, less
-        for a weak or ambiguous match
+        for a weak or ambiguous match; see `LocalizationParameters`
     strong : number of viewpoints of strong matches that vote for the pose
-    accepted : number of viewpoints of accepted matches, including guided matches, that lead to it
+    accepted : number of viewpoints of accepted or guided matches that vote for the pose
     suggested : number of viewpoints of candidates that suggest the pose, accepted or not
-    similarity : similarity between the query's signature and the nearest of these candidates, 0 to
-        1
+    similarity : maximum similarity between these candidates' signatures and the query's, 0 to 1
     rival : score of the best other place relative to the score of this place; 0 if there is none
     rival_weight : maximum weight of the votes for another place
-    rendered : whether most of the agreeing frames are views that were rendered from one surface
+    rendered : whether most of the agreeing frames are views that were rendered from a surface
     """
 
     score: float
@@ -61,7 +60,7 @@ class PlaceEvidence:
 
     @property
     def acceptance(self) -> float:
-        """Return the ratio of accepted matches to frames that see the place (at most 5), 0 to 1.
+        """Return the ratio of accepted matches to frames that see the place (at most 5 count).
 
         At most five matches are validated. At the right place, most of them are accepted if many
         frames see it; at a place that only looks similar, few are accepted.
@@ -71,7 +70,7 @@ class PlaceEvidence:
 
 @dataclass(frozen=True)
 class Penalty:
-    """The penalty of one kind of evidence at its knots; it is 0 at the best knot.
+    """The penalties of a kind of evidence at its knots; 0 at the best knot.
 
     Parameters
     ----------
@@ -88,7 +87,7 @@ class Penalty:
         return self.worst, self.poor, self.fair, 0.0
 
 
-#: The knots: four values of each kind of evidence, worst first. Penalties are linear between them.
+#: Four values of each kind of evidence, worst first; penalties are linear between these knots.
 KNOTS: Mapping[str, tuple[float, float, float, float]] = {
     "score": (0.05, 0.15, 0.3, 0.6),
     "planes": (3.0, 6.0, 12.0, 24.0),
@@ -106,11 +105,11 @@ KNOTS: Mapping[str, tuple[float, float, float, float]] = {
 
 @dataclass(frozen=True)
 class ConfidenceParameters:
-    """Parameters of the confidence, fitted to synthetic places.
+    """Parameters of confidences, fitted to synthetic places.
 
     Parameters
     ----------
-    best : log odds of a pose with the best evidence of every kind
+    best : log odds of a pose with the best evidence of all kinds
     score, planes, ... : penalty of each kind of evidence
     """
 
@@ -130,11 +129,11 @@ class ConfidenceParameters:
 
 @dataclass(frozen=True)
 class ConfidenceModel:
-    """Parameters of the confidence, by the kind of map.
+    """Parameters of confidences by the kind of map.
 
-    Views of one surface agree perfectly with each other, even if the surface is wrong, and show no
-    violations among themselves. For such maps, violations of a real frame are therefore weaker
-    evidence, and other kinds of evidence have more weight.
+    Views that were rendered from a surface agree perfectly with each other, even if the surface is
+    wrong, and have no violations among themselves. Therefore, violations of a real frame are weaker
+    evidence for such maps, and other kinds of evidence have more weight.
 
     Parameters
     ----------
@@ -164,19 +163,19 @@ def compute_penalties(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, fl
 def compute_confidences(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -> list[float]:
     """Return the probabilities that the candidate poses of a query are right.
 
-    1 minus their sum is the probability that all are wrong.
+    The probability that all are wrong is 1 minus their sum.
 
     Parameters
     ----------
-    evidence : evidence for all candidates of one query, which are at different places
+    evidence : evidence for all candidates of a query; the candidates are at different places
     """
     odds = [math.exp(p.of(e).best - sum(compute_penalties(e, p.of(e)).values())) for e in evidence]
     total = 1.0 + sum(odds)
-    return [each / total for each in odds]
+    return [ratio / total for ratio in odds]
 
 
 def weakest_evidence(e: PlaceEvidence, p: ConfidenceModel) -> str:
-    """Return a sentence on the evidence that reduces the confidence of a pose most."""
+    """Return a clause on the evidence that reduces the confidence of a pose most."""
     penalties = compute_penalties(e, p.of(e))
     name = max(penalties, key=penalties.__getitem__)
     return {

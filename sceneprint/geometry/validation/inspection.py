@@ -1,4 +1,4 @@
-"""The evidence of a validation point by point, for display (Sec. III-E).
+"""Point-by-point evidence of a validation, for display (Sec. III-E).
 
     Geometry, Geometry, T  --trace-->  Traces: corresponding patches, inliers, violations
     points, Surface, T  --point_verdicts-->  agreements and violations of free space
@@ -29,7 +29,7 @@ from sceneprint.geometry.registration.overlap import (
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Surface
 
-#: Verdicts: unobserved or beside the surface, on the surface, in free space.
+#: Verdicts: unobserved or beside the surface; on the surface; in free space.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
 #: Maximum residual, and codes of verdicts, as `sceneprint.formats.export` encodes them.
 TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254
@@ -39,7 +39,7 @@ Verdicts = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """The correspondence of two frames under a transform.
+    """Corresponding patches and verdicts on points of two frames under a transform.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Traces:
 
 
 @kernel
-def _judge(
+def _write_verdicts(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, out: Verdicts,
 ) -> None:  # fmt: skip
@@ -76,17 +76,17 @@ def _judge(
 def point_verdicts(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """Return the verdicts (N,), NEITHER, AGREES or VIOLATES, on a source's points (N, 6)."""
+    """Return a verdict on each of a source's points (N, 6): NEITHER, AGREES or VIOLATES, (N,)."""
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
-    _judge(
+    _write_verdicts(
         source, *t, np.ascontiguousarray(T_target_source), tolerances(p), out,
     )  # fmt: skip
     return out
 
 
 @kernel
-def _measure(
+def _write_residuals(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, numbers: Floats, out: Verdicts,
 ) -> None:  # fmt: skip
@@ -115,7 +115,7 @@ def _measure(
 def residuals(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """Return the distances of a source's points from the target's surface, in steps of tolerance.
+    """Return the distances of a source's points from the target's surface, in steps.
 
     Parameters
     ----------
@@ -123,13 +123,13 @@ def residuals(
 
     Returns
     -------
-    (N,) the minimum k from 1 to TOLERANCE such that the point agrees within k / TOLERANCE of
-        `surface_tolerance`, which grows with distance; VIOLATION if it violates free space; OUTSIDE
-        if no pixel sees it or it lies beside or behind the surface
+    (N,) minimum k from 1 to TOLERANCE such that the point agrees within k / TOLERANCE of
+        `surface_tolerance`, which grows with distance; VIOLATION if the point violates free space;
+        OUTSIDE if no pixel sees it, or if it lies beside or behind the surface
     """
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
-    _measure(
+    _write_residuals(
         source, *t, np.ascontiguousarray(T_target_source), tolerances(p), out,
     )  # fmt: skip
     return out
@@ -139,7 +139,7 @@ def trace(
     query: Geometry, match: Geometry, T_match_query: Floats,
     p: OverlapParameters | None = None, patches_p: ConsensusParameters | None = None,
 ) -> Traces:  # fmt: skip
-    """Return the points and patches that a validation counted: Sec. III-E.
+    """Return the points and patches that a validation counts, with verdicts: Sec. III-E.
 
     Parameters
     ----------
@@ -182,8 +182,8 @@ Colour = Literal["source", "normal", "residual"]
 
 #: Colours of the source's points and of the target's points.
 SOURCE, TARGET = (217, 119, 43), (43, 108, 176)
-#: Upper limits of residuals; the colours of points within the limits, of points outside, and of
-#: violations follow.
+#: Upper limits of residuals, and colours of points within each limit, of points outside, and of
+#: violations.
 STEPS = (50, 100, TOLERANCE)
 STEP_COLOURS = np.array(
     [(38, 130, 60), (140, 190, 70), (240, 200, 60), (150, 155, 160), (200, 40, 40)], np.uint8
@@ -194,11 +194,11 @@ def overlay(
     source: Surface, target: Surface, T_target_source: Floats, colour: Colour = "source",
     p: OverlapParameters | None = None,
 ) -> tuple[Floats, Floats, Bytes]:  # fmt: skip
-    """Return both surfaces as one coloured cloud, which starts with the source's points.
+    """Combine both surfaces to a coloured cloud; the source's points come first.
 
     Parameters
     ----------
-    source, target : surfaces, all of whose valid pixels are shown
+    source, target : surfaces; all of their valid pixels are included
     T_target_source : (4, 4) transform that aligns the surfaces
     colour : "source" distinguishes the frames, "normal" shows normals (x, y, z in the target's
         frame from -1 to 1 as red, green, blue from 0 to 255), "residual" shows the distances from
@@ -238,7 +238,7 @@ _RADII = 4.0
 
 
 @kernel
-def _nearest(
+def _assign_patches(
     points: Floats32, means: Floats, normals: Floats, reaches: Floats, least: float, out: Ints32
 ) -> None:
     for i in range(len(points)):
@@ -268,5 +268,5 @@ def patches_at(points: Floats32, patches: Patches) -> Ints32:
     """
     indices = np.full(len(points), -1, np.int32)
     reaches = _RADII * np.sqrt(patches.areas / np.pi)
-    _nearest(points, patches.means, patches.normals, reaches, _COSINE, indices)
+    _assign_patches(points, patches.means, patches.normals, reaches, _COSINE, indices)
     return indices

@@ -1,10 +1,10 @@
-"""Comparison of a query's poses on all frames of the map that would see its surfaces.
+"""Comparison of a query's poses with all frames of the map that would see its surfaces.
 
-    query, poses, MapViews  --compare_poses-->  ScoredPose of each place, the best first
+    query, poses, MapViews  --compare_poses-->  ScoredPose of each place, best first
 
-Two frames can agree under a wrong transform, since a cabinet can look the same from both sides. The
-frames around it distinguish the poses, because each pose predicts what the query observes.
-Therefore a pose is scored on many views: a surface of the query may be visible in only some of
+Two frames can agree under a wrong transform: a cabinet can look the same from both sides. Other
+frames around it distinguish the poses, because a pose predicts the observations of the query.
+Therefore, a pose is scored on many views: a surface of the query may be visible in only some of
 them, and free space in most of them contradicts the pose.
 """
 
@@ -47,33 +47,33 @@ class MapParameters:
     near: float = 2.0  #: radius of the first search for frames of the map, metres
     cell: float = 1.0  #: maximum distance between poses that share a search, metres
     start_shift: float = 0.5  #: maximum distance between an initial pose and its prior, metres
-    least_agreeing: float = 0.03  #: minimum share of agreeing points of a view that counts
+    least_agreeing: float = 0.03  #: minimum share of agreeing points for a view to count
     violation_weight: float = 2.0  #: weight of the violations of either side in the score
     n_poses: int = 40  #: number of poses that are scored on the candidates
     n_places: int = 6  #: number of best places that are scored on all frames
     hopeful: float = 0.2  #: minimum score of a refined place, as a share of the best score
     n_refined: int = 3  #: number of places that are refined
-    n_refining: int = 3  #: number of views with which a pose is refined
+    n_refining: int = 3  #: number of views on which a pose is refined
     n_noise: int = 4  #: number of map frames whose violations measure the noise
-    least_noise: float = 0.02  #: violations of a pose above which noise is measured
+    least_noise: float = 0.02  #: share of violations above which noise is measured
     same_m: float = 0.1  #: maximum difference between equal poses, metres
     same_rad: float = math.radians(6.0)  #: maximum difference between equal poses, radians
-    place_m: float = 0.25  #: maximum difference between poses at one place, metres
-    place_rad: float = math.radians(15.0)  #: maximum difference between poses at one place, radians
+    place_m: float = 0.25  #: maximum difference between poses at a place, metres
+    place_rad: float = math.radians(15.0)  #: maximum difference between poses at a place, radians
     refinement: RefinementParameters = COARSE
     planes: PlaneParameters = field(default_factory=PlaneParameters)
 
 
 @dataclass(frozen=True, eq=False)
 class MapFrame:
-    """A frame with a pose, on which poses of a query are scored.
+    """A frame with a pose, prepared for scoring poses of a query.
 
     Parameters
     ----------
     geometry : geometry of the frame
     target : surface of the frame, prepared for look-ups
     T : (4, 4) T_parent_sensor; T_query_sensor for a frame of the query
-    weighing : limits within which patches lie in one plane
+    weighing : parameters that determine whether patches lie in the same plane
     """
 
     geometry: Geometry
@@ -104,7 +104,7 @@ class ScoredPose:
         planes
     planes : mean number of distinct planes of a query frame that agree
     violations : violations as a share of agreements and violations, for the query's surface
-    hidden : the same for the map's surfaces in the query's free space
+    hidden : share of violations of the map's surfaces in the query's free space
     noise : violations among the map's frames at the pose; 0 if unmeasured
     views : pairs of query frame and map frame that agree, by descending agreement
     starts : (4, 4) poses that were refined to this pose or to its place
@@ -121,12 +121,12 @@ class ScoredPose:
     starts: tuple[Floats, ...] = ()
 
     def is_of(self, T: Floats, p: MapParameters) -> bool:
-        """Return whether a pose (4, 4) is at this place or at a place that was refined to it."""
+        """Return whether a pose (4, 4) is at this place, or at a place that was refined to it."""
         return bool(at_place(np.stack([self.T, *self.starts]), T, p).any())
 
 
 class MapViews:
-    """The frames of one parent frame that may see the surfaces of a query; opened on demand."""
+    """The frames of a parent frame that may see the surfaces of a query; opened on demand."""
 
     def __init__(
         self, poses: Floats, open_geometry: Callable[[int], Geometry | None],
@@ -150,7 +150,7 @@ class MapViews:
         self._frames: dict[int, MapFrame | None] = {}
 
     def __getitem__(self, i: int) -> MapFrame | None:
-        """Return frame i, or None if its artifact is unreadable."""
+        """Return frame i; None if its artifact is unreadable."""
         if i not in self._frames:
             geometry = self._open(i)
             self._frames[i] = None if geometry is None else map_frame(
@@ -169,7 +169,7 @@ class MapViews:
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
-        ahead : whether the sensor looks along z; if both sensors do, directions count too
+        ahead : whether the sensor looks along z; if so, directions of other such sensors count too
         among : indices of the frames to search; None searches all frames
         """
         p = self._p
@@ -185,7 +185,7 @@ class MapViews:
 def map_frame(
     geometry: Geometry, T: Floats, p: MapParameters, overlap_p: OverlapParameters
 ) -> MapFrame:
-    """Return a frame that is prepared for comparison with other frames; T is that of MapFrame."""
+    """Prepare a frame for comparison with other frames; T is `MapFrame.T`."""
     target = overlap_target(geometry.surface, overlap_p)
     return MapFrame(geometry, target, T, p.planes)
 
@@ -203,7 +203,7 @@ def view_separations(
 ) -> Floats:
     """Return the separations (n,) between the views of sensors and the view of a sensor at T.
 
-    Views with a separation of 1 or more are too distant to share surfaces.
+    Views with a separation of 1 or more are too far apart to share surfaces.
 
     Parameters
     ----------
@@ -289,7 +289,7 @@ def map_noise(
 def refine_pose(
     frames: Sequence[MapFrame], pose: ScoredPose, views: MapViews, p: MapParameters
 ) -> Floats | None:
-    """Return the average (4, 4) of a pose's refinements on its best views; None if all fail."""
+    """Refine a pose on its best views; return the average (4, 4), None if all views fail."""
     refined = []
     for number, i in pose.views[: p.n_refining]:
         frame, view = frames[number], views[i]
@@ -303,13 +303,13 @@ def refine_pose(
 
 
 def prior_starts(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
-    """Return a pose and six poses that are shifted by a standard deviation per axis, (7, 4, 4).
+    """Return a pose, and six poses shifted by a standard deviation along the axes, (7, 4, 4).
 
     Parameters
     ----------
     T : (4, 4) T_parent_sensor of the prior
     covariance : (6, 6) covariance of T, metres before radians
-    p : parameters with the maximum shift, from which a refinement still converges
+    p : parameters; `start_shift` limits the shifts, so that refinements converge
     """
     starts = np.tile(T, (7, 1, 1))
     deviations = np.minimum(np.sqrt(np.diag(covariance)[:3]), p.start_shift)
@@ -323,7 +323,7 @@ def refine_starts(
     frames: Sequence[MapFrame], starts: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Refine poses of a prior (n, 4, 4) on the map; return successful results, (m, 4, 4)."""
+    """Refine poses of a prior (n, 4, 4) on the map; return the successful results (m, 4, 4)."""
     refined = []
     for start in starts:
         T = refine_pose(frames, score_pose(frames, start, views, p, overlap_p), views, p)
@@ -338,14 +338,13 @@ def compare_poses(
 ) -> list[ScoredPose]:  # fmt: skip
     """Return the best pose of the query at each place, best first.
 
-    All poses are compared on the candidates, then the best places on all frames that would see
-    them. Before that, the best places are refined on the map, because an error of a few centimetres
-    causes violations.
+    All poses are scored on the candidates, and the best places on all frames that would see them.
+    The best places are also refined on the map: an error of a few centimetres causes violations.
 
     Parameters
     ----------
     frames : frames of the query; see `score_pose`
-    poses : (n, 4, 4) T_parent_query, the most plausible first; at most `n_poses` distinct poses are
+    poses : (n, 4, 4) T_parent_query, most plausible first; at most `n_poses` distinct poses are
         compared
     views : views of the same parent frame
     """
@@ -368,8 +367,8 @@ def _refine_places(
 ) -> list[ScoredPose]:  # fmt: skip
     """Refine places, best first, until `n_refined` different places remain.
 
-    Poses that converge to one result were in the same basin of attraction. They are one place, and
-    must not count as rivals of that result.
+    Poses that converge to the same result are in its basin of attraction. They are the same place,
+    and must not count as rivals of the result.
     """
     hopeful = _select_hopeful(places, p)
     settled: list[ScoredPose] = []
@@ -397,7 +396,7 @@ def _select_hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPo
 
 
 def best_per_place(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
-    """Return the best pose of each place, best first; ties keep their order."""
+    """Return the best pose of each place, best first; ties remain in order."""
     places: list[ScoredPose] = []
     for pose in sorted(scored, key=lambda pose: -pose.score):
         if not places or not at_place(np.stack([place.T for place in places]), pose.T, p).any():
@@ -406,7 +405,7 @@ def best_per_place(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPos
 
 
 def same_place(a: Floats, b: Floats, p: MapParameters) -> bool:
-    """Return whether two poses (4, 4) are at one place."""
+    """Return whether two poses (4, 4) are at the same place."""
     return bool(at_place(a[None], b, p)[0])
 
 

@@ -1,17 +1,17 @@
-"""Alignment of two frames by a rigid transform, and the decision whether it is right (Sec. III-E).
+"""Alignment of two frames by a rigid transform, and the decision about acceptance (Sec. III-E).
 
     Geometry, Geometry, seed  --validate-->  PairValidation
     validations  --rank_accepted-->  C_vld
 
 The paper estimates the transform in both directions independently, and accepts it if they agree.
-This accepts too much, because both estimates may converge to the same wrong place. Therefore the
-transform must also explain both frames: enough of both surfaces must agree, and almost no points
-may lie in free space of the other frame.
+This test accepts too much, because both estimates may converge to the same wrong place. Therefore,
+the transform must also explain both frames: enough of both surfaces must agree, and almost no
+points may lie in free space of the other frame.
 
 It also accepts too little: if two depth images share only a tenth of their surfaces, the search in
 one direction may miss the transform that the other direction finds. Such a transform is refined in
-both directions. Little agreement is enough for a weak match if several planes agree and nothing
-contradicts the transform. The result of the other direction is then one of the rivals.
+both directions. Little agreement suffices for a weak match if several planes agree and nothing
+contradicts the transform; then the result of the other direction is one of the rivals.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ Direction = Literal["query_to_match", "match_to_query"]
 THERE: Direction = "query_to_match"
 BACK: Direction = "match_to_query"
 _NONE = np.empty((0, 4, 4))
-#: Reason for the case that a transform excluded by `up` may be right, because `up` may be wrong.
+#: Reason if a transform that `up` excludes may be right, because `up` may be wrong.
 _MORE_TILTED = (
     "a transform that tilts against `up` explains the frames better. Check the IMU and the axes of "
     "`up`"
@@ -92,7 +92,7 @@ _MORE_TILTED = (
 class ValidationParameters:
     """Parameters of all steps of a validation."""
 
-    minimum_patches: int = 10  #: minimum number of patches of either frame
+    minimum_patches: int = 10  #: minimum number of patches of each frame
     n_hypotheses: int = 4  #: number of further hypotheses per direction, for verification in a map
     guided_m: float = 0.15  #: maximum distance of a guided transform from its prediction, metres
     guided_rad: float = math.radians(6.0)  #: maximum angle from its prediction, radians
@@ -111,11 +111,12 @@ class PairValidation:
     ----------
     status : accepted, rejected, or ambiguous if a rival transform explains the frames equally well
         or a direction is unconstrained
-    strength : strong or, if a rival is close, little agrees, or a frame has no viewpoint, weak;
-        None unless the match is accepted
+    strength : strong; weak if a rival is close, little agrees, or a frame has no viewpoint; None
+        unless the match is accepted
     reason : short explanation of the status
-    T_match_query : (4, 4) best transform, whatever the status: halfway between the two directions
-        or, if they disagree, the direction with more evidence; None without any hypothesis
+    T_match_query : (4, 4) best transform, regardless of the status: halfway between the two
+        directions or, if they disagree, the direction with more evidence; None without any
+        hypothesis
     residual_m, residual_rad : residual of T_match_query T_query_match, the composition of both
         directions; infinite if one is missing. For an accepted match with `T_other`, or with one
         direction only, the residual of its two refinements
@@ -127,9 +128,9 @@ class PairValidation:
     inliers : number of points of both frames that agree under the transform
     ambiguity : agreeing share of both frames, with equal weights for all planes, under the best
         rival that free space does not refute, 0 to 1; 0 if the transform is rejected anyway
-    T_rival : (4, 4) best rival, or None
+    T_rival : (4, 4) best rival; None without a rival
     seed : seed of the random choices
-    covariance : (6, 6) covariance of an accepted T_match_query, else None; see `icp.py`
+    covariance : (6, 6) covariance of T_match_query, see `icp.py`; None unless accepted
     around : whether both frames see all around their sensors, as spinning scanners do
     planes : number of distinct planes that agree, averaged over both frames
     plane_violations : `violations` with equal weights for all planes
@@ -138,10 +139,10 @@ class PairValidation:
     T_other : (4, 4) result of the other direction if the directions disagree; else None
     hypotheses : (n, 4, 4) T_match_query of the best refined hypotheses of both directions and of
         `T_rival`, for verification in a map
-    ups : (3,) up in the query's and in the match's coordinates; None if unknown
+    ups : (3,) unit vectors, up in the query's and in the match's coordinates; None if unknown
     tilt_rad : tilt of the transform against `ups`; None if one of them is unknown
     contradicts_up : whether the transform would be accepted by the surfaces, but tilts too much
-    predicted : (4, 4) T_match_query that the map's poses predict for a guided match; else None
+    predicted : (4, 4) T_match_query that the map's poses predict; None unless the match is guided
     """
 
     status: Status
@@ -172,9 +173,7 @@ class PairValidation:
 
     @property
     def guided(self) -> bool:
-        """Return whether other matches predicted the transform, so that its vote is not
-        independent.
-        """
+        """Return whether other matches predicted the transform: its vote is not independent."""
         return self.predicted is not None
 
 
@@ -189,7 +188,7 @@ def middle(a: Floats, b: Floats) -> Floats:
 def refine_transform(
     query: Geometry, match: Geometry, T_match_query: Floats, p: RefinementParameters | None = None
 ) -> Floats | None:
-    """Refine a transform in both directions, and return the transform halfway between the results.
+    """Refine a transform in both directions; return the transform halfway between the results.
 
     If the initial transform is a reference, the change measures the errors of sensors and reference
     poses.
@@ -229,12 +228,12 @@ def validate(
     ----------
     query, match : geometry artifacts of one model
     seed : non-negative seed of the random choices; equal seeds give equal results
-    mode : "full", or "paper", which accepts by the residual of the two directions only
+    mode : "full", or "paper" to accept by the residual of the two directions only
     matching : method of matching
-    ups : (3,) unit vectors, up in the query's and in the match's coordinates, or None. If both are
-        known, transforms that tilt are excluded; for scans, one of them helps too
-    other_axes : for two scans, whether to consider scanners that were not upright, if `ups` are
-        unknown
+    ups : (3,) unit vectors that point up in the query's and in the match's coordinates; None if
+        unknown. If both are known, transforms that tilt are excluded; for scans, one helps too
+    other_axes : for two scans with unknown `ups`, whether to consider that the scanners were not
+        upright
 
     Raises
     ------
@@ -252,7 +251,7 @@ def validate(
     if fewest < p.minimum_patches:
         reason = f"a frame has {fewest} patches, but validation requires {p.minimum_patches}"
         return _reject(reason, seed, query, match, ups)
-    a, b = _samples(query, match, ups, p)
+    a, b = _prepare_samples(query, match, ups, p)
     numbers = p.alignment, p.agreement, matching
     there: Alignment | None
     back: Alignment | None
@@ -273,7 +272,7 @@ def validate(
     return _decide(a, b, there, back, seed, p, mode)
 
 
-def _samples(
+def _prepare_samples(
     query: Geometry, match: Geometry, ups: Ups, p: ValidationParameters
 ) -> tuple[FrameSamples, FrameSamples]:
     stride, planes = p.agreement.stride, p.rivals.planes
@@ -290,7 +289,7 @@ def validate_guided(
     p: ValidationParameters | None = None,
     ups: Ups = NO_UPS,
 ) -> PairValidation | None:
-    """Check a transform that other matches and the map's poses predict: Sec. III-E without search.
+    """Check a transform that other matches and the map's poses predict: Sec. III-E, without search.
 
     The prediction is refined in both directions. The results must agree, be near the prediction,
     and have the evidence that `validate` requires. The function searches for neither hypotheses nor
@@ -308,7 +307,7 @@ def validate_guided(
     p = p or ValidationParameters()
     if min(len(query.patches), len(match.patches)) < p.minimum_patches:
         return None
-    a, b = _samples(query, match, ups, p)
+    a, b = _prepare_samples(query, match, ups, p)
     there, back = run_both(
         lambda: align_guided(a, b, T_match_query, p.alignment),
         lambda: align_guided(b, a, inverse(T_match_query), p.alignment),
@@ -332,15 +331,15 @@ def validate_without_up(
     p: ValidationParameters | None,
     ups: Ups,
 ) -> PairValidation | None:
-    """Validate by the surfaces only, to check `up` if a query found no match with it.
+    """Validate by the surfaces only, to check `up` after a query without matches.
 
     An accepted transform that does not tilt is a match. A strong transform that tilts indicates a
-    wrong `up` or a similar place; it is rejected, and the reason says so.
+    wrong `up` or a similar place; it is rejected with this reason.
 
     Parameters
     ----------
     query, match, seed, p : arguments of `validate`
-    ups : up vectors, both of which are known
+    ups : up vectors of query and match, both known
 
     Returns
     -------
@@ -384,7 +383,7 @@ class _Proposal:
     ----------
     T : (4, 4) T_match_query
     directions : directions of the search that found T
-    refined_by : one alignment, or the two alignments halfway between which T lies
+    refined_by : one alignment, or two alignments; T lies halfway between the two
     evidence, inliers : see Evidence and PairValidation
     """
 
@@ -428,7 +427,7 @@ def _decide(
     query: FrameSamples, match: FrameSamples, there: Alignment | None, back: Alignment | None,
     seed: int, p: ValidationParameters, mode: Mode,
 ) -> PairValidation:  # fmt: skip
-    residual, estimates = _estimates(there, back, p.acceptance)
+    residual, estimates = _combine_directions(there, back, p.acceptance)
     found_by = tuple(alignment for alignment in (there, back) if alignment is not None)
     transforms = list(estimates.values())
     seen = plane_agreement(query.planes, match.planes, np.stack(transforms), p.agreement)
@@ -436,120 +435,125 @@ def _decide(
     (directions, T), *others = sorted(
         estimates.items(), key=lambda item: item[1] is not transforms[best]
     )
-    evidence = _evidence(query, match, found_by, T, residual, seen, best, p)
-    one = _Proposal(T, directions, found_by, *evidence)
-    verdict = _verdict(query, match, one, there, back, p, mode)
+    evidence = _collect_evidence(query, match, found_by, T, residual, seen, best, p)
+    proposal = _Proposal(T, directions, found_by, *evidence)
+    verdict = _judge(query, match, proposal, there, back, p, mode)
     if verdict.status == "rejected" and mode == "full":
-        sparse = _sparse(query, match, one, there, back, p)
-        one, verdict = sparse or (one, verdict)
-    e, rival, ups = one.evidence, verdict.rival, (query.up, match.up)
-    covariance = one.covariance(p) if verdict.status == "accepted" else None
+        sparse = _accept_sparse(query, match, proposal, there, back, p)
+        proposal, verdict = sparse or (proposal, verdict)
+    e, rival, ups = proposal.evidence, verdict.rival, (query.up, match.up)
+    covariance = proposal.covariance(p) if verdict.status == "accepted" else None
     return PairValidation(
-        verdict.status, verdict.strength, verdict.reason, one.T, e.residual_m, e.residual_rad,
-        e.overlap, e.plane_overlap, e.violations, one.inliers, rival.share, rival.T, seed,
+        verdict.status, verdict.strength, verdict.reason, proposal.T, e.residual_m, e.residual_rad,
+        e.overlap, e.plane_overlap, e.violations, proposal.inliers, rival.share, rival.T, seed,
         covariance, _sees_around(query.geometry) and _sees_around(match.geometry), e.planes,
-        e.plane_violations, found_by[0].search, one.directions, others[0][1] if others else None,
-        _hypotheses(there, back, transforms, rival.T, p.n_hypotheses), ups, tilt_of(one.T, ups),
+        e.plane_violations, found_by[0].search, proposal.directions,
+        others[0][1] if others else None,
+        _collect_hypotheses(there, back, transforms, rival.T, p.n_hypotheses),
+        ups, tilt_of(proposal.T, ups),
     )  # fmt: skip
 
 
-def _verdict(
-    query: FrameSamples, match: FrameSamples, one: _Proposal,
+def _judge(
+    query: FrameSamples, match: FrameSamples, proposal: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters, mode: Mode,
 ) -> _Verdict:  # fmt: skip
-    """Return the verdict on a transform, by the directions' agreement, the evidence and rivals."""
-    e = one.evidence
+    """Decide on a transform by the agreement of the directions, the evidence, and the rivals."""
+    e = proposal.evidence
     against = objection(e, p.acceptance, mode) or _tilt_objection(
-        tilt_of(one.T, (query.up, match.up)), p
+        tilt_of(proposal.T, (query.up, match.up)), p
     )
     if against is not None:
         return _Verdict(against[0], None, against[1])
     if mode == "paper":
         one_view = e.violations is None or e.one_sided
         return _Verdict("accepted", "weak" if one_view else "strong", "the two directions agree")
-    if one.refined_by[0].search == "guided":
+    if proposal.refined_by[0].search == "guided":
         return _Verdict(*belief(e, 0.0, p.acceptance))
-    rival = _rival(query, match, one, there, back, p)
+    rival = _find_rival(query, match, proposal, there, back, p)
     status, strength, reason = belief(e, rival.share, p.acceptance)
     if status == "accepted" and rival.tilted > e.plane_overlap:
         return _Verdict("ambiguous", None, _MORE_TILTED, rival)
     return _Verdict(status, strength, reason, rival)
 
 
-def _rival(
-    query: FrameSamples, match: FrameSamples, one: _Proposal,
+def _find_rival(
+    query: FrameSamples, match: FrameSamples, proposal: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters,
 ) -> Rival:  # fmt: skip
-    """Return the best rival of a transform among the refined hypotheses of both directions."""
+    """Search for the best rival of a transform; see `best_alternative`."""
     voted = [_NONE]
     if there is not None:
         voted += [there.T[None], there.others]
     if back is not None:
         voted += [inverse(back.T)[None], inverses(back.others)]
     return best_alternative(
-        query.planes, match.planes, one.T, one.evidence.plane_violations, np.concatenate(voted),
-        there.proposed if there else _NONE, p.rivals, p.agreement,
+        query.planes, match.planes, proposal.T, proposal.evidence.plane_violations,
+        np.concatenate(voted), there.proposed if there else _NONE, p.rivals, p.agreement,
         (query.up, match.up), p.alignment.gravity.rival_tilt,
     )  # fmt: skip
 
 
-def _sparse(
-    query: FrameSamples, match: FrameSamples, one: _Proposal,
+def _accept_sparse(
+    query: FrameSamples, match: FrameSamples, proposal: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters,
 ) -> tuple[_Proposal, _Verdict] | None:  # fmt: skip
     """Accept a transform of depth images as weak if its evidence is sparse but consistent.
 
-    A transform that only one search found is first refined in both directions; the result of the
-    other search is then a rival.
+    A transform that only one search found is refined in both directions first; then the result of
+    the other search is a rival.
 
     Returns
     -------
-    the transform and its verdict; None if the rejection remains
+    the transform and its verdict; None if the transform remains rejected
     """
-    if one.refined_by[0].search != "correspondences" or are_scans(query.geometry, match.geometry):
+    if proposal.refined_by[0].search != "correspondences" or are_scans(
+        query.geometry, match.geometry
+    ):
         return None
-    alone = len(one.directions) < 2
+    alone = len(proposal.directions) < 2
     if alone:
-        refined = _refine_proposal(query, match, one, p)
+        refined = _refine_proposal(query, match, proposal, p)
         if refined is None:
             return None
-        one = refined
-    e, covariance = one.evidence, one.covariance(p)
-    if covariance is None or _tilt_objection(tilt_of(one.T, (query.up, match.up)), p) is not None:
+        proposal = refined
+    e, covariance = proposal.evidence, proposal.covariance(p)
+    tilt = tilt_of(proposal.T, (query.up, match.up))
+    if covariance is None or _tilt_objection(tilt, p) is not None:
         return None
     deviation = math.sqrt(max(float(np.trace(covariance[:3, :3])), 0.0))
     if not sparse_evidence_suffices(e, deviation, p.acceptance, alone=alone):
         return None
-    rival = _rival(query, match, one, there, back, p)
+    rival = _find_rival(query, match, proposal, there, back, p)
     status, _, _ = belief(e, rival.share, p.acceptance)
     if status != "accepted" or rival.tilted > e.plane_overlap:
         return None
     reason = f"{e.overlap:.0%} of the surfaces agree, in {e.planes:.0f} planes"
     if alone:
         reason += ", but only one direction found it"
-    return one, _Verdict("accepted", "weak", reason, rival)
+    return proposal, _Verdict("accepted", "weak", reason, rival)
 
 
 def _refine_proposal(
-    query: FrameSamples, match: FrameSamples, one: _Proposal, p: ValidationParameters
+    query: FrameSamples, match: FrameSamples, proposal: _Proposal, p: ValidationParameters
 ) -> _Proposal | None:
-    """Refine the transform of one search in both directions; return None if it explains little."""
-    e = one.evidence
+    """Refine the transform of a single search in both directions; None if it explains little."""
+    e = proposal.evidence
     half = p.acceptance.sparse_plane_overlap / 2
     if e.plane_overlap - e.plane_violations < half or e.plane_violations > 2 * half:
         return None
-    there = align_guided(query, match, one.T, p.alignment)
-    back = align_guided(match, query, inverse(one.T), p.alignment)
+    there = align_guided(query, match, proposal.T, p.alignment)
+    back = align_guided(match, query, inverse(proposal.T), p.alignment)
     if there is None or back is None:
         return None
-    residual, _ = _estimates(there, back, p.acceptance)
+    residual, _ = _combine_directions(there, back, p.acceptance)
     T = middle(there.T, inverse(back.T))
     seen = plane_agreement(query.planes, match.planes, T[None], p.agreement)
-    evidence = _evidence(query, match, (there, back), T, residual, seen, 0, p)
-    return _Proposal(T, one.directions, (there, back), *evidence)
+    evidence = _collect_evidence(query, match, (there, back), T, residual, seen, 0, p)
+    return _Proposal(T, proposal.directions, (there, back), *evidence)
 
 
-def _hypotheses(
+def _collect_hypotheses(
     there: Alignment | None, back: Alignment | None, estimates: Sequence[Floats],
     T_rival: Floats | None, each: int,
 ) -> Floats:  # fmt: skip
@@ -563,18 +567,19 @@ def _hypotheses(
 
 
 def _tilt_objection(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] | None:
-    """Return a rejection if the last refinement tilted a transform more than the search allows."""
+    """Return a rejection if a transform tilts more than the search allows; otherwise None."""
     if tilt is None or tilt <= p.alignment.gravity.refined_tilt:
         return None
     return "rejected", f"it tilts by {math.degrees(tilt):.0f} deg against `up`"
 
 
-def _estimates(
+def _combine_directions(
     there: Alignment | None, back: Alignment | None, p: AcceptanceParameters
 ) -> tuple[tuple[float, float], dict[tuple[Direction, ...], Floats]]:
     """Return the residual of the two directions, and T_match_query by the directions that found it.
 
-    If the directions agree, there is one transform halfway between them, otherwise one for each.
+    If the directions agree, the only transform lies halfway between them; otherwise, each direction
+    has a transform.
     """
     if there is not None and back is not None:
         composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
@@ -596,7 +601,7 @@ def _sees_around(frame: Geometry) -> bool:
     return isinstance(camera, Sphere) and camera.sees_around
 
 
-def _evidence(
+def _collect_evidence(
     query: FrameSamples, match: FrameSamples, found_by: Sequence[Alignment], T: Floats,
     residual: tuple[float, float], by_planes: PlaneAgreement, k: int, p: ValidationParameters,
 ) -> tuple[Evidence, int]:  # fmt: skip
@@ -622,8 +627,8 @@ def _evidence(
     return e, inliers
 
 
-#: Error of a depth camera's transform per radian between the two views, metres. It is caused by
-#: distortion and drift of reference poses, which the covariance of a refinement does not contain.
+#: Error of a depth camera's transform per radian between the two views, metres. Its causes are
+#: distortion and drift of reference poses; the covariance of a refinement does not contain them.
 _ERROR_PER_RADIAN = 0.04
 
 
@@ -631,8 +636,8 @@ def rank_accepted(validations: Sequence[PairValidation]) -> list[int]:
     """Return the indices of accepted validations, strong before weak, by descending precision.
 
     The paper preserves the order of R. A weak match has a rival that explains the frames nearly as
-    well, so strong matches precede it. Cameras are ranked by expected error, and frames that see
-    all around by the distance between their sensors.
+    well, so strong matches precede it. Matches of cameras are ranked by expected error, and matches
+    of frames that see all around by the distance between their sensors.
 
     Parameters
     ----------

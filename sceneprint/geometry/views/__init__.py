@@ -1,4 +1,4 @@
-"""Views of an imported surface, as a sensor inside it would observe them.
+"""Views of an imported surface, as a sensor inside the surface would observe it.
 
 surface, parameters  --choose_views-->  ViewPlan, poses (V, 4, 4)
 Renderer(surface, parameters).view(pose)  -->  depth (H, W), or points (K, 3)

@@ -1,11 +1,11 @@
-"""The floors of a surface, and places for a sensor above them.
+"""Detection of a surface's floors, and of places for a sensor above them.
 
     surfels  --find_floors-->  Floors
     Floors, parameters  --candidate_places-->  places (C, 3)
 
 All coordinates are in level axes with z upwards. Floors are the lowest surface that is level over a
-few metres, and further such surfaces at least a storey above. `lookout.py` checks whether a place
-is free.
+few metres, and further such surfaces at least a storey above it. `lookout.py` checks whether a
+place is free.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _LEVEL = 0.9
 _STEP = 0.15
 #: Minimum height of a storey, metres.
 _STOREY = 2.0
-#: Minimum share of the cells around a column that the lowest floor fills, and that higher floors
-#: fill.
+#: Minimum share of the cells around a column that the lowest floor fills, and that a higher floor
+#: fills.
 _LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
 #: Maximum share of a camera's surface below its floor. If there is more, the level surface is a
 #: table in a room whose floor was not observed. Outdoors, more surface may lie below the ground.
@@ -41,7 +41,7 @@ _MOST_STOREYS = 12
 
 @dataclass(frozen=True, eq=False)
 class Floors:
-    """Heights of floors in a grid of columns.
+    """The heights of floors in a grid of columns.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Floors:
 
 
 def robust_extent(pieces: Surfels) -> tuple[Floats, Floats]:
-    """Return the lower and the upper corner of a surface, without distant stray points."""
+    """Return the lower and the upper corner of a surface, ignoring distant stray points."""
     n = len(pieces.points)
     stray = max(n // 2000, min(n // 100, 4))
     ordered = np.sort(pieces.points.astype(np.float64), axis=0)
@@ -72,7 +72,7 @@ def robust_extent(pieces: Surfels) -> tuple[Floats, Floats]:
 
 
 def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Floors:
-    """Return the floors of a surface.
+    """Find the floors of a surface.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
     side : width of a column, metres; it grows if there are too many columns
     has_tables : whether level surfaces may be furniture, as in a depth camera's surface
     """
-    # both sides count, because a mesh may be inside out, and no place above a ceiling is free
+    # both sides count: a mesh may be inside out, and no place above a ceiling is free
     level = pieces.points[np.abs(pieces.normals[:, 2]) > _LEVEL].astype(np.float64)
     low, high = robust_extent(pieces)
     level = level[((level >= low) & (level <= high)).all(axis=1)]
@@ -104,7 +104,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
         exists = is_floor.any(axis=2)
         if not exists.any():
             break
-        # the noise of a floor may fill several bins, of which the fullest is selected
+        # the noise of a floor may fill several bins; select the fullest bin
         first = is_floor.argmax(axis=2)
         near = np.abs(np.arange(shape[2]) - first[..., None]) <= 1
         at = np.where(near, counts, -1.0).argmax(axis=2)[..., None]
@@ -124,7 +124,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
 
 
 def _sum_neighbours(values: Floats) -> Floats:
-    """Return the sums over 3 x 3 columns and over the bins above and below, for each bin."""
+    """Return, for each bin, the sum over 3 x 3 columns and over the bins above and below."""
     for axis in range(3):
         padded = np.pad(values, [(1, 1) if a == axis else (0, 0) for a in range(3)])
         before, own, after = (padded.take(range(k, k + values.shape[axis]), axis) for k in range(3))
@@ -135,8 +135,8 @@ def _sum_neighbours(values: Floats) -> Floats:
 def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing: float) -> Floats:
     """Return places at the heights of the sensor above the floors, (C, 3) in level axes.
 
-    In a cloud, a place requires a floor below it. In a mesh, places over an unobserved floor are
-    included too, since the front of a mesh shows free space. If there is no floor, places are
+    In a cloud, a place requires a floor below it. In a mesh, places above an unobserved floor are
+    included too, because the front of a mesh indicates free space. Without a floor, places are
     distributed over all heights.
 
     Parameters
@@ -192,4 +192,4 @@ def _has_floor(level: Floats, places: Floats, heights: Floats, reach: float) -> 
             for dz in (-1, 0, 1):
                 near |= np.isin(key(at + np.array([dx, dy, dz])), occupied)
             around += near
-    return around >= 6  # fewer of the nine cells would include places beside a floor
+    return around >= 6  # fewer of the nine cells would admit places beside a floor

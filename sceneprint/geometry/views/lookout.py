@@ -3,7 +3,7 @@
     Surfels, place  --Lookout.look-->  Sight
 
 Pieces of the surface are drawn on the faces of a cube around the place, with pixels of a few
-degrees. An element is a piece of surface as seen from one side at one distance: (piece, azimuth,
+degrees. An element is a piece of surface, seen from a direction and a distance: (piece, azimuth,
 octave).
 """
 
@@ -25,11 +25,11 @@ from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 _FACE_PX = 28
 #: Maximum elevation of horizontal directions from a place, rad.
 _BESIDE = math.radians(30.0)
-#: Number of azimuths from which a piece can be seen, and of octaves of distance.
+#: Number of azimuths from which a piece can be seen, and number of octaves of distance.
 SIDES, OCTAVES = 6, 3
 #: Bit of a mask for a piece that is seen from behind, against its normal.
 BEHIND = np.uint32(1 << 31)
-#: Tolerance of the depth buffer: share of the distance, plus a number of cells.
+#: Tolerance of the depth buffer: a share of the distance, plus a number of cells.
 _SAME_SHARE, _SAME_CELLS = 0.03, 1.5
 
 
@@ -40,7 +40,7 @@ class Sight:
     Parameters
     ----------
     elements : (E,) int32 visible elements
-    masks : (E,) uint32; bit d is set if view d shows the element, and BEHIND if seen from behind
+    masks : (E,) uint32; bit d is set if view d shows the element, BEHIND if it is seen from behind
     hit : (D,) share of each view with a surface within range
     beside : share of the directions from the horizon to 30 degrees above it with a surface
     back : (D,) share of the surface in each view that is seen from behind
@@ -58,14 +58,12 @@ class Sight:
 
 
 @kernel
-def _see(
+def _write_visible(
     points: Floats32, normals: Floats32, starts: Ints64, ends: Ints64, place: Floats, turn: Floats,
     size: int, depth: Floats32, reach: float, gap: float, views: Floats, limits: Floats,
     elements: Ints32, masks: NDArray[np.uint32],
 ) -> int:  # fmt: skip
-    """Write the elements that are visible on a face of the cube, and their views; return their
-    number.
-    """
+    """Write the elements that are visible on a face of the cube, and their masks; count them."""
     count = 0
     half = size / 2.0
     for block in range(len(starts)):
@@ -109,11 +107,11 @@ def _see(
 
 
 @kernel
-def _assess(
+def _sum_solid_angles(
     depth: Floats32, item: Ints32, normals: Floats32, rays: Floats, lengths: Floats,
     inside: NDArray[np.bool_], forward: Floats, farthest: float, close: float, sums: Floats,
 ) -> None:  # fmt: skip
-    """Sum the solid angles of all rays, hits, hits from behind, and near hits for each view."""
+    """Sum, for each view, the solid angles of rays, hits, hits from behind, and hits too near."""
     for n in range(len(depth)):
         distance, weight, i = depth[n] * lengths[n], lengths[n] ** -3.0, item[n]
         behind = False
@@ -130,7 +128,7 @@ def _assess(
 
 
 class Lookout:
-    """The pieces of a surface, whose visibility from places can be computed.
+    """A computer of the visibility of a surface's pieces from places.
 
     Parameters
     ----------
@@ -184,7 +182,7 @@ class Lookout:
         return len(self.points) * SIDES * OCTAVES
 
     def look(self, place: Floats) -> Sight:
-        """Return the visible parts from a place (3,)."""
+        """Return the parts of the surface that are visible from a place (3,)."""
         size, gap = _FACE_PX, _SAME_CELLS * self._cell
         depths = np.full((6, size, size), np.inf, np.float32)
         items = np.full((6, size, size), -1, np.int32)
@@ -196,7 +194,7 @@ class Lookout:
             draw_discs(
                 self.points, self.normals, self._radii, starts, ends, T, self._pinhole, depth, item
             )
-            n = _see(
+            n = _write_visible(
                 self.points, self.normals, starts, ends, place, R, size, depth, self._reach, gap,
                 self._views, self._limits, self._elements, self._masks,
             )  # fmt: skip
@@ -204,7 +202,7 @@ class Lookout:
         elements, masks = (np.concatenate(parts) for parts in zip(*visible, strict=True))
         depth, item = depths.reshape(-1), items.reshape(-1)
         sums = np.zeros((len(self._views) + 1, 4))
-        _assess(
+        _sum_solid_angles(
             depth, item, self.normals, self._rays, self._lengths, self._inside, self._forward,
             self._farthest, self._close, sums,
         )  # fmt: skip

@@ -1,6 +1,6 @@
 """Parameters of views, derived from a model and a robot's sensor.
 
-Lengths are shares of the sensor's range, except heights above the floor, which depend on the robot.
+Lengths are shares of the sensor's range; heights above the floor depend on the robot.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from sceneprint.types import Intrinsics
 _FARTHEST_CAMERA = 20.0
 #: Default camera, a Kinect at half its resolution.
 DEFAULT_CAMERA = Intrinsics(width=320, height=240, fx=292.5, fy=292.5, cx=159.5, cy=119.5)
-#: Default heights of the sensor above the floor, metres: cameras on a small robot, on a large robot
-#: and in a hand, then a scanner on a robot.
+#: Default heights of the sensor above the floor, metres: for cameras on a small robot, on a large
+#: robot and in a hand, and for a scanner on a robot.
 CAMERA_HEIGHTS: tuple[float, ...] = (0.4, 1.0, 1.6)
 SCANNER_HEIGHTS: tuple[float, ...] = (1.0,)
 #: Maximum elevation of a scanner above and below its horizon, rad.
@@ -32,11 +32,11 @@ class SensorModel(Protocol):
 
     @property
     def depth(self) -> DepthParameters:
-        """Return the parameters that contain the range of a depth camera."""
+        """Return the parameters of depth images, with the range of a camera."""
 
     @property
     def cloud(self) -> CloudParameters:
-        """Return the parameters that contain the range and resolution of a scanner."""
+        """Return the parameters of clouds, with the range and resolution of a scanner."""
 
 
 @dataclass(frozen=True)
@@ -73,18 +73,18 @@ class ViewParameters:
 def view_parameters(
     model: SensorModel, camera: Intrinsics | None = None, heights: Sequence[float] | None = None
 ) -> ViewParameters:
-    """Return the parameters of views for a model.
+    """Derive the parameters of views from a model.
 
     Parameters
     ----------
     model : parameters of the model; a range above 20 m means a scanner
-    camera : camera of the robot, without lens distortion; None selects a scanner for a scanner's
-        model, else a default camera
+    camera : camera of the robot, without lens distortion; None selects a scanner for models of
+        scanners, and a default camera for other models
     heights : heights of the sensor above the floor, metres; None selects defaults of the sensor
 
     Raises
     ------
-    InvalidRequest : If there are no heights or one is not above 0
+    InvalidRequest : If there are no heights, or a height is not above 0
     """
     if heights is not None and not (heights and all(0 < h < math.inf for h in heights)):
         raise InvalidRequest(

@@ -1,10 +1,10 @@
-"""The selection of poses whose views cover a surface.
+"""Selection of poses whose views cover a surface.
 
     surface, parameters  --choose_views-->  ViewPlan
 
-Candidates are views from free places above the floors, if they show enough surface. A greedy loop
-selects the view that shows most of the insufficiently covered surface. Coverage is counted by piece
-of surface, side and distance, because robots may see a piece from any side and distance.
+Candidates are views from free places above the floors that show enough surface. A greedy loop
+selects the view that adds most to the coverage. Coverage is counted by piece of surface, side and
+distance, because robots may see a piece from any side and distance.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _REACH = 0.5
 _LEAST_HIT, _LEAST_AROUND, _LEAST_BESIDE = 0.45, 0.25, 0.25
 #: Minimum median depth of a camera's view, as a share of the range.
 _LEAST_DEPTH = 1.0 / 11.0
-#: Minimum share of directions with a surface, for places that vote on the front of a mesh.
+#: Minimum share of directions with a surface at places that vote on the front of a mesh.
 _INDOORS = 0.6
 #: Maximum share of surface that is seen from behind in a camera's view of a mesh, in a scanner's
 #: view, which shows both sides of partitions, and in a cloud, whose sides are estimated.
@@ -44,27 +44,27 @@ _WALL = 0.7
 _ONE_SIDED = 0.1
 #: Number of yaws, and pitches in degrees, of a camera's views from one place.
 _TURNS, _PITCHES = 8, (-25.0, 10.0)
-#: Gain of the first, the second and all further views of an element.
+#: Gains of the first, the second and all further views of an element.
 _WORTH = np.array([1.0, 0.5, 0.0])
-#: Share of the first view's gain at which the selection ends, for a camera, and for a scanner,
-#: which sees all around and needs fewer views.
+#: Share of the first view's gain at which the selection ends, for a camera, and for a scanner: it
+#: sees all around and needs fewer views.
 _LEAST_GAIN, _LEAST_GAIN_AROUND = 0.01, 0.03
-#: Number of the map's views per test view, minimum and maximum number of test views.
+#: Number of the map's views per test view, and minimum and maximum number of test views.
 _VIEWS_A_TEST, _LEAST_TESTS, _MOST_TESTS = 4, 20, 60
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPlan:
-    """The views of a surface.
+    """The selected views of a surface.
 
     Parameters
     ----------
     poses : (V, 4, 4) T_map_sensor in the order of selection, in the coordinates of the surface
         without its offset
-    held_out : (H, 4, 4) poses of test views, which are not in the map
+    held_out : (H, 4, 4) poses of test views, not in the map
     floor : height of the lowest floor along `up`, metres; None without a floor
     candidates : number of candidate views
-    covered : share that the selected views show, of the surface that is visible from free space
+    covered : share of the surface visible from free space that the selected views show
     """
 
     poses: Floats
@@ -75,9 +75,9 @@ class ViewPlan:
 
 
 def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewPlan:
-    """Return poses in the free space of a surface whose views cover it.
+    """Select poses in the free space of a surface whose views cover the surface.
 
-    The result is deterministic, and has no poses if there is no free space.
+    The result is deterministic; it has no poses if there is no free space.
     """
     if not len(surface.points if surface.triangles is None else surface.triangles):
         return ViewPlan(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), None, 0, 0.0)
@@ -131,7 +131,7 @@ def level_axes(up: Floats) -> Floats:
 
 
 def camera_turns() -> Floats:
-    """Return R_level_camera (D, 3, 3) of a camera's views from one place."""
+    """Return R_level_camera (D, 3, 3) of a camera's views from a place."""
     turns = []
     for yaw in np.arange(_TURNS) * (2.0 * math.pi / _TURNS):
         for pitch in np.radians(_PITCHES):
@@ -154,7 +154,7 @@ def _is_free(sight: Sight, p: ViewParameters, one_sided: bool) -> bool:
 def _select_front(
     free: list[tuple[Floats, Sight]], pieces: Surfels, lookout: Lookout, p: ViewParameters
 ) -> list[tuple[Floats, Sight]]:
-    """Return the places in front of one-sided surfaces."""
+    """Return the places that see the front of surfaces."""
     if pieces.one_sided:
         # a mesh that is inside out shows its back in all free space
         shares = np.array([sight.back.mean() for _, sight in free if sight.hit.mean() > _INDOORS])
@@ -163,7 +163,7 @@ def _select_front(
         if p.camera is None:
             free = [(place, sight) for place, sight in free if sight.back[0] <= _MOST_BACK_AROUND]
         return free
-    # only walls distinguish the sides of a surface, since all places see floors from above
+    # only walls distinguish the sides of a surface: all places see floors from above
     is_wall = (lookout.normals != 0).any(axis=1) & (np.abs(lookout.normals[:, 2]) < _WALL)
     votes = np.zeros((len(lookout.points), 2))
     for _, sight in free:
@@ -180,7 +180,7 @@ def _select_front(
 
 
 def _useful_views(sight: Sight, p: ViewParameters) -> list[int]:
-    """Return the views that show enough surface from its front, at a sufficient distance."""
+    """Return the views that show enough surface, from the front and at a sufficient distance."""
     if p.camera is None:
         return [0]
     useful = (sight.hit >= _LEAST_HIT) & (sight.close <= 0.5) & (sight.back <= _MOST_BACK)
@@ -192,7 +192,7 @@ def _gain(
     elements: NDArray[np.int32], masks: NDArray[np.uint32], bit: int, counts: NDArray[np.uint8],
     worth: Floats,
 ) -> float:  # fmt: skip
-    """Return the gain of a view, by the number of selected views of each element."""
+    """Return the gain of a view; it depends on the number of selected views of each element."""
     gain, of_view = 0.0, np.uint32(1) << np.uint32(bit)
     for i in range(len(elements)):
         if masks[i] & of_view:

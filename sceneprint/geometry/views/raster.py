@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 
-#: Minimum depth that is drawn, metres.
+#: Minimum drawn depth, metres.
 NEAREST = 1e-3
 #: Maximum radius of a disc, pixels.
 _WIDEST_PX = 64.0
 #: Radius below which a disc is one pixel.
 _SMALLEST_PX = 0.7
 #: Maximum distance along the ray between the plane of such a disc and its centre, in pixel widths
-#: beyond the radius. For larger distances, the pixel shows the centre.
+#: beyond the radius. At larger distances, the pixel shows the centre.
 _GRAZING = 3.0
 
 
@@ -41,10 +41,10 @@ def draw_triangles(
     points: Floats32, triangles: Ints32, starts: Ints64, ends: Ints64, T: Floats, camera: Floats,
     depth: Floats32, back: NDArray[np.uint8],
 ) -> None:  # fmt: skip
-    """Draw the triangles of blocks.
+    """Draw the triangles of visible blocks.
 
     Edges are planes through the camera, so clipping is unnecessary. Adjacent triangles compute
-    their common edge with equal numbers, so no ray passes between them.
+    their common edge from the same numbers, so no ray passes between them.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def draw_triangles(
     starts, ends : (B,) range of each visible block
     T : (4, 4) T_camera_points
     camera : result of `pinhole`
-    depth : (H, W) depth of the nearest triangle, which is updated, metres; inf without a triangle
+    depth : (H, W) depth of the nearest triangle, metres, inf without a triangle; updated
     back : (H, W) uint8, 1 if the nearest triangle is seen from behind
     """
     height, width = depth.shape
@@ -108,12 +108,12 @@ def draw_discs(
     points: Floats32, normals: Floats32, radii: Floats32, starts: Ints64, ends: Ints64, T: Floats,
     camera: Floats, depth: Floats32, item: Ints32,
 ) -> None:  # fmt: skip
-    """Draw the discs of blocks.
+    """Draw the discs of visible blocks.
 
     Parameters
     ----------
     points : (N, 3) centres
-    normals : (N, 3) normals of either sign; a disc whose normal is 0 faces the camera
+    normals : (N, 3) normals of either sign; a disc with the normal 0 faces the camera
     radii : (N,) metres
     starts, ends, T, camera, depth : arguments of `draw_triangles`
     item : (H, W) index of the visible disc; -1 for pixels without a disc

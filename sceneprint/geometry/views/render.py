@@ -25,7 +25,7 @@ from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurf
 
 #: Radius of a point's disc, as a share of the spacing of points.
 _OVERLAP = 0.7
-#: The same for a point without a plane, such as a point of a wire or a leaf.
+#: Radius of the disc of a point without a plane, such as on a wire or a leaf, as the same share.
 _LONELY = 0.3
 #: Width of the cells for the neighbours of a normal, in spacings of points.
 _NEIGHBOURHOOD = 3.0
@@ -61,7 +61,7 @@ def rays_of(camera: Intrinsics) -> Floats32:
 
 
 class Renderer:
-    """A renderer of one surface for one sensor."""
+    """A renderer of a surface for a sensor."""
 
     def __init__(self, surface: ReferenceSurface, parameters: ViewParameters) -> None:
         self._p = p = parameters
@@ -123,7 +123,7 @@ class Renderer:
         return np.concatenate(points)
 
     def _face(self, T_map_sensor: Floats, R: Floats) -> tuple[Floats32, NDArray[np.bool_]]:
-        """Return the depth of one image, inf if empty, and a mask of pixels seen from behind."""
+        """Return the depth of an image, inf if empty, and a mask of pixels seen from behind."""
         turn = np.eye(4)
         turn[:3, :3] = R
         T, camera = inverse(T_map_sensor @ turn), pinhole(self._camera)

@@ -21,8 +21,8 @@ from sceneprint.types import Floats, Floats32, Ints32, Ints64, ReferenceSurface
 _MOST_CELLS = 1 << 20
 #: Maximum ratio of the smallest to the middle variance of neighbours on a plane.
 _FLAT = 0.15
-#: Half the maximum number of samples of a mesh. If a mesh has more triangles, only a part of the
-#: triangles with one sample is sampled.
+#: Half the maximum number of samples of a mesh. If a mesh has more triangles, only some of its
+#: single-sample triangles are sampled.
 _MOST_SAMPLES = 2_000_000
 
 
@@ -49,7 +49,7 @@ def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
 
 
 def fitting_cell(points: Floats32, cell: float) -> float:
-    """Return the side of a cell, enlarged until keys can number all cells."""
+    """Return the side of a cell, enlarged if keys cannot number all cells."""
     return max(cell, float(np.ptp(points, axis=0).max(initial=0.0)) / (_MOST_CELLS - 4))
 
 
@@ -74,13 +74,11 @@ def average_cells(points: Floats32, cell: float) -> Floats32:
 
 
 @kernel
-def _fit(
+def _fit_cells(
     points: Floats32, order: Ints64, starts: Ints64, keys: Ints64, shape: Ints64, flat: float,
     normals: Floats32, heights: Floats, crowds: Floats,
 ) -> None:  # fmt: skip
-    """Write the normal and the height normal . x of the plane through the points in and around
-    each cell, and the mean number of points per cell.
-    """
+    """Fit a plane n . x = h to the points around each cell; write n, h, and points per cell."""
     m, values, axis = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for cell in range(len(keys)):
         first, second, n, cells = np.zeros(3), np.zeros((3, 3)), 0, 0
@@ -117,8 +115,8 @@ def _fit(
 def project_to_planes(points: Floats32, cell: float) -> tuple[Floats32, Floats32, Floats32]:
     """Project the points of a cloud onto the planes of their neighbours.
 
-    Drift makes the walls of a map thick, and a rendered sensor would see their nearest points
-    instead of their middle.
+    Drift makes the walls of a map thick; without projection, a rendered sensor would see the
+    nearest points of the walls instead of their middle.
 
     Parameters
     ----------
@@ -139,7 +137,7 @@ def project_to_planes(points: Floats32, cell: float) -> tuple[Floats32, Floats32
     normals, crowds = np.zeros((len(starts), 3), np.float32), np.zeros(len(starts))
     heights = np.zeros(len(starts))
     ends = np.append(starts, len(keys))
-    _fit(points, order, ends, ordered[starts], shape, _FLAT, normals, heights, crowds)
+    _fit_cells(points, order, ends, ordered[starts], shape, _FLAT, normals, heights, crowds)
     index = np.searchsorted(ordered[starts], keys)
     spacing = (cell / np.sqrt(crowds)).astype(np.float32)
     towards = normals[index]
@@ -168,18 +166,18 @@ class Surfels:
 
 
 def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
-    """Return pieces of a surface, one per cell and main direction of the normal.
+    """Sample pieces of a surface, one per cell and main direction of the normal.
 
     Parameters
     ----------
-    cell : side of a cell, metres; it grows until there are at most `most` pieces
+    cell : side of a cell, metres; it grows until at most `most` pieces remain
     most : maximum number of pieces
     """
     if surface.triangles is None:
         points = average_cells(surface.points, cell / 6)
         points, normals, _ = project_to_planes(points, cell / 2)
     else:
-        points, normals = _samples(surface.points, surface.triangles, cell / 2)
+        points, normals = _sample_mesh(surface.points, surface.triangles, cell / 2)
     cell = fitting_cell(points, cell)
     while True:
         keys, _ = cell_keys(points, cell)
@@ -194,24 +192,24 @@ def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
 
 @kernel
 def _count_samples(points: Floats32, triangles: Ints32, step: float, every: int) -> float:
-    """Return an upper bound of the number of samples that `_sample` writes."""
+    """Return an upper bound of the number of samples that `_write_samples` writes."""
     total = 0.0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
-        one = np.ceil(np.sqrt(((b - a) ** 2).sum()) / step)
-        other = np.ceil(np.sqrt(((c - a) ** 2).sum()) / step)
-        count = max(one, 1.0) * max(other, 1.0)
+        along = np.ceil(np.sqrt(((b - a) ** 2).sum()) / step)
+        across = np.ceil(np.sqrt(((c - a) ** 2).sum()) / step)
+        count = max(along, 1.0) * max(across, 1.0)
         if count > 1.0 or m % every == 0:
             total += count
     return total
 
 
 @kernel
-def _sample(
+def _write_samples(
     points: Floats32, triangles: Ints32, step: float, every: int, places: Floats32,
     normals: Floats32,
 ) -> int:  # fmt: skip
-    """Write points on a grid over each triangle, or its centre, with its normal."""
+    """Write points on a grid over each triangle (its centre if it is small), and its normal."""
     n = 0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
@@ -220,13 +218,13 @@ def _sample(
         area = np.sqrt(x * x + y * y + z * z)
         if not area > 0:
             continue
-        one = max(int(np.ceil(np.sqrt((u * u).sum()) / step)), 1)
-        other = max(int(np.ceil(np.sqrt((v * v).sum()) / step)), 1)
-        if one * other == 1 and m % every != 0:
+        along = max(int(np.ceil(np.sqrt((u * u).sum()) / step)), 1)
+        across = max(int(np.ceil(np.sqrt((v * v).sum()) / step)), 1)
+        if along * across == 1 and m % every != 0:
             continue
-        for i in range(one):
-            for j in range(other):
-                s, t = (i + 1 / 3) / one, (j + 1 / 3) / other
+        for i in range(along):
+            for j in range(across):
+                s, t = (i + 1 / 3) / along, (j + 1 / 3) / across
                 if s + t >= 1.0:
                     continue
                 for k in range(3):
@@ -236,8 +234,8 @@ def _sample(
     return n
 
 
-def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32, Floats32]:
-    """Return points and normals on a mesh at a spacing of `step`, or more for large meshes."""
+def _sample_mesh(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32, Floats32]:
+    """Sample points and normals on a mesh at a spacing of `step`, or more for large meshes."""
     points = np.require(points, np.float32, ["C", "W"])
     triangles = np.require(triangles, np.int32, ["C", "W"])
     every = max(len(triangles) // _MOST_SAMPLES, 1)
@@ -245,13 +243,13 @@ def _samples(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32
         step *= 1.3
     places = np.empty((int(total), 3), np.float32)
     normals = np.empty((int(total), 3), np.float32)
-    n = _sample(points, triangles, step, every, places, normals)
+    n = _write_samples(points, triangles, step, every, places, normals)
     return places[:n], normals[:n]
 
 
 @kernel
 def bounding_balls(points: Floats32, triangles: Ints32, middles: Floats32, reach: Floats32) -> None:
-    """Write the mean of the corners of each triangle, and their maximum distance from it."""
+    """Write the mean of each triangle's corners, and the maximum distance of a corner from it."""
     for m in range(len(triangles)):
         for axis in range(3):
             total = 0.0
@@ -286,7 +284,7 @@ class Blocks:
     def in_view(
         self, T: Floats, camera: Floats, shape: tuple[int, ...], farthest: float
     ) -> tuple[Ints64, Ints64]:
-        """Return starts and ends of the blocks that may be visible in a camera.
+        """Return the starts and ends of the blocks that may be visible to a camera.
 
         Parameters
         ----------
@@ -302,7 +300,7 @@ class Blocks:
             (x, camera[0], camera[2], shape[1]), (y, camera[1], camera[3], shape[0]),
         ):  # fmt: skip
             for slope, sign in ((-(middle + 0.5) / focal, 1.0), ((size - middle) / focal, -1.0)):
-                # a block is invisible if it lies farther than its radius beyond a side of the view
+                # a block is invisible if it lies more than its radius beyond a side of the view
                 seen &= sign * (along - slope * z) > -r * math.sqrt(1.0 + slope * slope)
         return self.starts[seen], self.ends[seen]
 
