@@ -1,4 +1,4 @@
-"""Atomic and durable writes of files, and the permissions of the store's files."""
+"""Atomic and durable file writes, and the permissions of the store's files."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 
-#: Permissions of the store's folders and files, whatever the umask: frames show private rooms, and
-#: the database contains the hashes of keys.
+#: Permissions of the store's folders and files, regardless of the umask: frames show private rooms,
+#: and the database contains the hashes of keys.
 PRIVATE_FOLDER, PRIVATE_FILE = 0o700, 0o600
 
 
@@ -45,10 +45,10 @@ def nearest_folder(folder: Path) -> Path:
 
     Raises
     ------
-    OSError : If a parent folder may not be entered.
+    OSError : If the process has no permission to enter a parent folder.
     """
     folder = folder.absolute()
-    return next(one for one in (folder, *folder.parents) if one.is_dir())
+    return next(parent for parent in (folder, *folder.parents) if parent.is_dir())
 
 
 def warn_if_public(folder: Path) -> None:
@@ -62,7 +62,7 @@ def warn_if_public(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Check, before long work, that `write_whole` can write a file.
+    """Check that `write_whole` can write a file, before a long computation.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def check_writable(path: Path) -> None:
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    part = _beside(path)
+    part = _temporary_path(path)
     try:
         part.touch()
     except OSError as error:
@@ -79,7 +79,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes, *, private: bool = False) -> None:
-    """Write a file atomically: if the process is killed, the previous file or none remains.
+    """Write a file atomically: if the process is killed, the previous file, if any, is unchanged.
 
     Parameters
     ----------
@@ -91,12 +91,12 @@ def write_whole(path: Path, data: bytes, *, private: bool = False) -> None:
     ------
     OSError : If the file cannot be written. No partial file remains.
     """
-    _put(path, data, private=private, durable=False)
+    _write_file(path, data, private=private, durable=False)
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path for a library that writes files itself; replace the file at the end.
+    """Yield a temporary path for a library that writes files itself; then move the file to `path`.
 
     If the block writes no file or raises an exception, the previous file remains.
 
@@ -104,7 +104,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     ------
     OSError : If the file cannot be replaced.
     """
-    part = _beside(path)
+    part = _temporary_path(path)
     try:
         yield part
         if part.exists():
@@ -115,27 +115,27 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> None:
-    """Write a private file atomically and durably: it survives a loss of power after the return.
+    """Write a private file atomically and durably: after the return, it survives a loss of power.
 
     Parameters
     ----------
     path : path of the file; its folder must exist
     data : content of the file
-    folder_is_new : whether the folder was created recently, so that its parent must be synced
+    folder_is_new : whether the folder's parent must be synced, because the folder may be new
 
     Raises
     ------
     OSError : If the file cannot be written, or its folder cannot be synced. In the latter case the
         file exists, but may be lost.
     """
-    _put(path, data, private=True, durable=True)
+    _write_file(path, data, private=True, durable=True)
     sync_folder(path.parent)
     if folder_is_new:
         sync_folder(path.parent.parent)
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents durably, if they are missing.
+    """Create a folder and its missing parents durably.
 
     Only the owner may read new folders; the permissions of existing folders are not changed.
 
@@ -145,12 +145,12 @@ def make_folder(folder: Path) -> None:
     """
     if folder.is_dir():
         return
-    missing = [one for one in (folder, *folder.parents) if not one.exists()]
-    for one in reversed(missing):
-        one.mkdir(PRIVATE_FOLDER, exist_ok=True)
+    missing = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+    for parent in reversed(missing):
+        parent.mkdir(PRIVATE_FOLDER, exist_ok=True)
     folder.mkdir(PRIVATE_FOLDER, exist_ok=True)  # raises FileExistsError for a file
-    for one in missing:
-        sync_folder(one.parent)
+    for parent in missing:
+        sync_folder(parent.parent)
 
 
 def put_new(part: Path, path: Path) -> None:
@@ -175,12 +175,9 @@ def put_new(part: Path, path: Path) -> None:
 
 @contextmanager
 def folder_turn(folder: Path) -> Iterator[bool]:
-    """Hold the write lock of a folder, which is created if missing; yield False if it is taken.
-
-    The kernel releases the lock when the process ends, for whatever reason.
-    """
+    """Create a folder if it is missing, and lock it; yield False if it is locked already."""
     make_folder(folder)
-    # with a new descriptor, flock excludes other threads of this process too
+    # flock on a new descriptor excludes other threads of this process too
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     descriptor = os.open(folder / ".lock", flags, PRIVATE_FILE)
     try:
@@ -194,8 +191,8 @@ def folder_turn(folder: Path) -> Iterator[bool]:
         os.close(descriptor)
 
 
-def _put(path: Path, data: bytes, *, private: bool, durable: bool) -> None:
-    part = _beside(path)
+def _write_file(path: Path, data: bytes, *, private: bool, durable: bool) -> None:
+    part = _temporary_path(path)
     try:
         with os.fdopen(create_private(part), "wb") if private else part.open("wb") as file:
             file.write(data)
@@ -212,7 +209,7 @@ def _put(path: Path, data: bytes, *, private: bool, durable: bool) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable.
+    """Sync a folder, so that its entries survive a loss of power.
 
     Raises
     ------
@@ -227,7 +224,7 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _beside(path: Path) -> Path:
+def _temporary_path(path: Path) -> Path:
     return path.with_name(
         f".{secrets.token_hex(6)}.part"
     )  # the name of `path` may be too long for a suffix

@@ -1,16 +1,16 @@
-"""The exceptions of sceneprint, for clients and internal.
+"""The exceptions of sceneprint.
 
     SceneprintError, and all of sceneprint_client.errors
       x DamagedIndex            a cache file of the index is missing or damaged
-      x DecoderFailure          an upload crashes its decoder, or exceeds its limits
+      x DecoderFailure          a decoder crashes, or exceeds its time or memory
       x BusyIndex               another process is building this index
       x StoreError
-        - LostLease             another worker has the job
+        - LostLease             the lease of a job expired, and another worker claimed the job
         - BundleError           a bundle cannot be written or restored
           - DamagedBundle       the bytes of a bundle have changed
-      x TrainingError           too little data, or parameters that cannot be fitted
+      x TrainingError           a model cannot be trained
 
-The classes are shared, so `except sceneprint.errors.UnknownMap` catches exceptions of the client.
+The client raises the same classes, so `except sceneprint.errors.UnknownMap` catches its exceptions.
 """
 
 from sceneprint_client.errors import (
@@ -159,7 +159,7 @@ class BusyIndex(SceneprintError):
 
 
 class LostLease(StoreError):
-    """The lease of a job expired, and another worker has the job."""
+    """The lease of a job expired, and another worker claimed the job."""
 
 
 class BundleError(StoreError):

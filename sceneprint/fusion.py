@@ -1,8 +1,8 @@
-"""Fusion of views of one place to a surface, by a truncated signed distance.
+"""Fusion of depth images of a place to a mesh, by a truncated signed distance function (TSDF).
 
 views (V)  --fuse-->  TriangleMesh, voxel
 
-Only this module imports Open3D, at the first fusion.
+Only this module imports Open3D; it does so at the first fusion.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PACKAGES = "libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
 
 
 def open3d(feature: str) -> Any:
-    """Return the module open3d, limited to one thread.
+    """Import open3d, limit it to one thread, and return the module.
 
     Parameters
     ----------
@@ -50,8 +50,9 @@ def open3d(feature: str) -> Any:
 
 #: Number of voxels along the edge of a block.
 _SIDE = 8
-#: Number of voxels before and behind a surface, along the ray, that store its distance. Surfaces at
-#: less than asin(1 / 6), 10 degrees, to the ray have holes; a wider band would merge thin objects.
+#: Half width of the band around a surface, along the ray, in voxels: the truncation distance.
+#: Surfaces at less than asin(1 / 6), 10 degrees, to the ray get holes; a wider band would merge
+#: the two sides of thin objects.
 BAND = 6.0
 
 
@@ -62,9 +63,9 @@ class FusionParameters:
     voxel_m: float | None = None  #: edge of a voxel; None selects the finest possible edge
     nearest_m: float = 0.3  #: minimum depth of a fused sample
     farthest_m: float = 6.0  #: maximum depth of a fused sample; farther samples are inaccurate
-    finest_m: float = 0.01  #: minimum automatic edge; finer voxels store noise
-    #: Maximum number of blocks. A block of 512 voxels has 4 KiB and about 50 points, so the maximum
-    #: takes 64 MiB and gives a mesh file of about 50 MB.
+    finest_m: float = 0.01  #: minimum edge if `voxel_m` is None; finer voxels store noise
+    #: Maximum number of blocks. A block of 512 voxels has 4 KiB and gives about 50 points, so the
+    #: maximum needs 64 MiB and gives a mesh file of about 50 MB.
     most_blocks: int = 16_384
     most_samples: int = 640 * 480  #: maximum number of samples per view; larger images are thinned
 
@@ -72,11 +73,11 @@ class FusionParameters:
 def fuse(
     views: Sequence[DepthFrame], p: FusionParameters | None = None
 ) -> tuple[TriangleMesh, float]:
-    """Fuse several views to one surface, deterministically.
+    """Fuse several depth images to one mesh, deterministically.
 
     Parameters
     ----------
-    views : views with pose T_parent_view, in one parent frame
+    views : images with poses T_parent_view (4, 4), in one parent frame
 
     Returns
     -------
@@ -92,7 +93,7 @@ def fuse(
     p = p or FusionParameters()
     o3d = open3d("A reconstruction")
     prepared = [prepare_view(view, p) for view in views]
-    points = [_points(view) for view in prepared]
+    points = [_sensor_points(view) for view in prepared]
     if not sum(map(len, points)):
         raise UselessFrame(
             f"No sample of the {len(views)} views lies between {p.nearest_m:g} and "
@@ -103,14 +104,14 @@ def fuse(
 
 
 def prepare_view(view: DepthFrame, p: FusionParameters) -> DepthFrame:
-    """Return a view thinned to `most_samples`, without samples out of range.
+    """Return a view with at most `most_samples` samples, all within the depth range.
 
-    Samples are omitted instead of averaged, because a mean across an edge would be a false surface.
+    Large images are subsampled, not averaged: a mean across an edge would be a false surface.
     """
     depth, camera = np.asarray(view.depth, np.float32), view.intrinsics
     while depth.size > p.most_samples:
         camera = halve_camera(camera)
-        # the first of 2 x 2 samples lies a quarter of a new pixel to the top left of its centre
+        # the retained sample is a quarter pixel to the top left of the new pixel's centre
         depth = depth[: 2 * camera.height : 2, : 2 * camera.width : 2]
         camera = replace(camera, cx=camera.cx + 0.25, cy=camera.cy + 0.25)
     with np.errstate(invalid="ignore"):
@@ -119,8 +120,8 @@ def prepare_view(view: DepthFrame, p: FusionParameters) -> DepthFrame:
     return replace(view, depth=in_range, intrinsics=camera)
 
 
-def _points(view: DepthFrame) -> Floats:
-    """Return the samples (N, 3) of a view in its sensor's frame."""
+def _sensor_points(view: DepthFrame) -> Floats:
+    """Return the points (N, 3) of a view in its sensor's frame, metres."""
     k = view.intrinsics
     y, x = np.nonzero(view.depth)
     z = view.depth[y, x].astype(np.float64)
@@ -130,9 +131,9 @@ def _points(view: DepthFrame) -> Floats:
 def _select_voxel(
     views: Sequence[DepthFrame], points: Sequence[Floats], p: FusionParameters
 ) -> float:
-    """Return the requested edge, or the minimum that leaves no gaps and needs few enough blocks."""
+    """Return the edge of the voxels, metres: `p.voxel_m`, or the smallest edge without gaps."""
     if p.voxel_m is not None:
-        count = _count(views, points, p.voxel_m)
+        count = _count_blocks(views, points, p.voxel_m)
         if count > p.most_blocks:
             # the number of blocks on surfaces is inversely proportional to the squared edge
             enough = p.voxel_m * math.sqrt(count / p.most_blocks) * 1.05
@@ -148,19 +149,21 @@ def _select_voxel(
         if len(own)
     ]
     voxel = max(p.finest_m, round(2 * float(np.median(pixels)), 3))
-    while _count(views, points, voxel) > p.most_blocks:
+    while _count_blocks(views, points, voxel) > p.most_blocks:
         voxel = round(voxel * 1.25, 4)
     return voxel
 
 
-def _count(views: Sequence[DepthFrame], points: Sequence[Floats], voxel: float) -> int:
+def _count_blocks(views: Sequence[DepthFrame], points: Sequence[Floats], voxel: float) -> int:
     """Return the number of blocks that the surfaces of all views touch."""
-    blocks = [_blocks(_pose(v), own, voxel) for v, own in zip(views, points, strict=True)]
+    blocks = [
+        _band_blocks(_require_pose(v), own, voxel) for v, own in zip(views, points, strict=True)
+    ]
     return len(np.unique(np.concatenate(blocks), axis=0))
 
 
-def _blocks(T: Floats, points: Floats, voxel: float) -> NDArray[np.int32]:
-    """Return the blocks (B, 3) within the band along the rays of a view; T is T_parent_view."""
+def _band_blocks(T: Floats, points: Floats, voxel: float) -> NDArray[np.int32]:
+    """Return the indices (B, 3) of the blocks within the band of a view; T is T_parent_view."""
     if not len(points):
         return np.zeros((0, 3), np.int32)
     band, edge = BAND * voxel, _SIDE * voxel
@@ -188,8 +191,8 @@ def _extract_mesh(
         block_resolution=_SIDE, block_count=2048, device=core.Device("CPU:0"),
     )  # fmt: skip
     for view, own in zip(views, points, strict=True):
-        T = _pose(view)
-        blocks, k = _blocks(T, own, voxel), view.intrinsics
+        T = _require_pose(view)
+        blocks, k = _band_blocks(T, own, voxel), view.intrinsics
         if not len(blocks):
             continue
         camera = np.array([[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1.0]])
@@ -198,10 +201,9 @@ def _extract_mesh(
             core.Tensor(inverse(T)), 1.0, p.farthest_m, BAND,
         )  # fmt: skip
     try:
-        mesh = grid.extract_triangle_mesh(
-            0.5
-        )  # the threshold accepts surfaces that only one view saw
-    except RuntimeError as error:  # Open3D raises it for a mesh without points
+        # the threshold accepts surfaces that only one view observed
+        mesh = grid.extract_triangle_mesh(0.5)
+    except RuntimeError as error:  # Open3D raises this for a mesh without points
         raise UselessFrame(
             f"The {len(views)} views give no surface at voxels of {voxel:g} m. Request smaller "
             "voxels, or select other frames."
@@ -214,28 +216,27 @@ def _extract_mesh(
 
 
 def _sort_mesh(points: Floats, normals: Floats, triangles: NDArray[np.int32]) -> TriangleMesh:
-    """Return a mesh in an order that does not depend on the order of Open3D's hash table."""
+    """Return a mesh with sorted points and triangles; Open3D's hash table has a random order."""
     order = np.lexsort(points.T[::-1])
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     triangles = place[triangles].reshape(-1, 3)
     start = triangles.argmin(axis=1) if len(triangles) else np.zeros(0, np.intp)
-    order_of_corners = (
-        start[:, None] + np.arange(3)
-    ) % 3  # the lowest index comes first, with the same winding
+    # rotate each triangle so that its lowest index comes first, with the same winding
+    order_of_corners = (start[:, None] + np.arange(3)) % 3
     triangles = np.take_along_axis(triangles, order_of_corners, axis=1)
     triangles = triangles[np.lexsort(triangles.T[::-1])]
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return TriangleMesh(points[order], (normals / np.maximum(length, 1e-12))[order], triangles)
 
 
-def _pose(view: DepthFrame) -> Floats:
+def _require_pose(view: DepthFrame) -> Floats:
     if view.pose is None:
         raise ValueError(f"The view {view.name!r} has no pose. Pass views with T_parent_view.")
     return view.pose
 
 
-#: Colours of the views, which are repeated if there are more views. The query's grey comes first.
+#: Colours of the views, the query's grey first. They repeat if there are more views.
 PALETTE = np.array(
     [
         (150, 154, 160), (49, 112, 184), (222, 126, 46), (52, 160, 105), (158, 84, 172),

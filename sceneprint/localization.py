@@ -1,11 +1,11 @@
-"""The pose of a query from its validated matches: found, ambiguous, or not found.
+"""Localization of a query: its pose from validated matches and the frames of the map.
 
 matches, poses, MapViews  --localize-->  PoseEstimate
 
 Accepted matches vote with their poses. These poses, and further poses that candidates suggest, are
-evaluated on the frames of the map that would see the same surfaces. The evidence for a pose gives
-its confidence, the probability that it is right. The best pose is `found` if its confidence reaches
-the confidence that the query requires; all other poses together have at most the remainder.
+compared with the frames of the map that would see the same surfaces. A pose's confidence is the
+probability that it is right, given this evidence. The confidences of all poses add up to at most 1.
+The best pose is `found` if its confidence reaches the confidence that the query requires.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ from sceneprint.places import (
 from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]
-#: Evidence that decided: strong matches that vote for the pose; the map's frames, if no match is
-#: strong; or the robot's prior, if the map supports no other pose better.
+#: Evidence that confirmed the answer: strong matches that vote for the pose; the map's frames, if
+#: no match is strong; or the robot's prior, if the map supports several poses.
 Verifier = Literal["matches", "map", "prior"]
 
 
 @dataclass(frozen=True, eq=False)
 class AlternativePose:
-    """A pose that the evidence supports.
+    """A possible pose of the query.
 
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    support : number of viewpoints of matches that vote for the pose
+    support : number of different viewpoints of the matches that vote for the pose
     confidence : probability that the pose is right; None without a map
     evidence : evidence for the confidence; None without a map
     """
@@ -79,12 +79,12 @@ class PoseEstimate:
     status : found, ambiguous, or not_found
     reason : short explanation of the status
     parent : parent frame of the poses
-    average : T_parent_query with the spread and number of agreeing votes; None unless found
-    covariance : (6, 6) covariance of `average`, in the order of `pose_error`; None if a vote
-        has none
+    average : T_parent_query, with the spread and number of agreeing votes; None unless found
+    covariance : (6, 6) covariance of `average`, in the order of `pose_error`; None if a vote has no
+        covariance
     strength : strength of the matches that vote for the answer; None unless found
-    verified_by : evidence that decided; None unless found
-    alternatives : plausible poses, best first; only the answer if found
+    verified_by : evidence that confirmed the answer; None unless found
+    alternatives : plausible poses, best first; if found, only the answer
     votes : number of accepted matches with a pose in the parent frame
     members : rows of the matches that vote for the answer
     guided : number of guided matches among `members`
@@ -129,11 +129,11 @@ def localize(
     Parameters
     ----------
     frames : one or more frames of the query
-    poses : T_parent_sensor (4, 4) of all rows of the database, or by row for the matches
+    poses : T_parent_sensor (4, 4) of all rows of the database, or of the matches by row
     parents : parent frames of the rows; None for a single parent frame. Poses are compared only
         within the parent frame of the prior or of most matches
-    views_of : see ViewsOf; None decides by pairs only
-    prior : pose that the robot expects
+    views_of : see ViewsOf; None decides by the matches only, without the map
+    prior : pose that the robot expects; None if it has no expectation
     p : parameters; None selects the parameters of the artifacts' model
 
     Returns
@@ -147,7 +147,7 @@ def localize(
     if not places:
         return None
     blind = all(frame.geometry.surface.camera is None for frame in frames)
-    estimate = _estimate_of(parent, places, prior, p, blind=blind)
+    estimate = _estimate_from_places(parent, places, prior, p, blind=blind)
     return replace(estimate, places=tuple(places))
 
 
@@ -155,10 +155,10 @@ class QueryDatabase(Protocol):
     """The frames that a query searches, in the store of a service or in an evaluation."""
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
-        """Return the estimated pose of the last frame, from all frames' matches; see `localize`."""
+        """Return the pose of the last frame, estimated from all frames' matches; see `localize`."""
 
     def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
-        """Return the matches of a frame's candidates, without guided ones.
+        """Validate a frame's candidates, without guidance by other matches.
 
         Parameters
         ----------
@@ -167,14 +167,14 @@ class QueryDatabase(Protocol):
 
         Returns
         -------
-        matches : result of `associate`; None if the deadline passed
+        matches : result of `associate`; None if the deadline has passed
         """
 
     def posed(self, rows: Sequence[int]) -> Mapping[int, PosedFrame]:
         """Return the rows that have a pose."""
 
     def compare(self, rows: Sequence[int]) -> Sequence[PairMatch]:
-        """Return the matches of the last frame with `rows`, without guided ones."""
+        """Validate the last frame against `rows`, without guidance by other matches."""
 
 
 def decide(
@@ -183,8 +183,8 @@ def decide(
 ) -> PoseEstimate | None:  # fmt: skip
     """Estimate the pose of a query's last frame, after all validations that may change it.
 
-    Guided matches do not vote. If no pose is found with guided matches, their frames are searched.
-    Before a pose is found, similar frames of other places are compared; see `rival_rows`.
+    If no pose is found and some matches are guided, their transforms are searched without guidance.
+    Before a pose counts as found, similar frames of other places are compared; see `rival_rows`.
 
     Parameters
     ----------
@@ -198,14 +198,14 @@ def decide(
     of_candidates = [frame.matches for frame in frames]
     elsewhere: Sequence[PairMatch] = ()
 
-    def located() -> PoseEstimate | None:
-        every = [*of_candidates[:-1], [*of_candidates[-1], *elsewhere]]
+    def locate() -> PoseEstimate | None:
+        all_matches = [*of_candidates[:-1], [*of_candidates[-1], *elsewhere]]
         return database.locate(
-            [replace(frame, matches=own) for frame, own in zip(frames, every, strict=True)]
+            [replace(frame, matches=own) for frame, own in zip(frames, all_matches, strict=True)]
         )
 
-    def settled() -> PoseEstimate | None:
-        estimate = located()
+    def settle() -> PoseEstimate | None:
+        estimate = locate()
         if estimate is None or estimate.status == "found":
             return estimate
         again = [
@@ -215,15 +215,15 @@ def decide(
         if not any(again):
             return estimate
         of_candidates[:] = [new or old for new, old in zip(again, of_candidates, strict=True)]
-        return located()
+        return locate()
 
-    estimate = settled()
+    estimate = settle()
     tried = {match.index for match in of_candidates[-1]}
     ahead = looks_ahead(frames[-1].geometry)
     rows = rival_rows(estimate, ranking, tried, database.posed, ahead, p)
     if rows:
         elsewhere = database.compare(rows)
-    return settled() if elsewhere else estimate
+    return settle() if elsewhere else estimate
 
 
 def views_of_rows(
@@ -236,14 +236,14 @@ def views_of_rows(
     ahead: Sequence[bool] | None = None,
     rendered: Sequence[bool] | None = None,
 ) -> ViewsOf:
-    """Return a function that opens the map's frames for `localize`, from poses in memory.
+    """Return the `views_of` of `localize` for a map whose poses are in memory.
 
     Parameters
     ----------
-    matches : matches of the query, on whose rows poses are compared first
+    matches : matches of the query; poses are compared with their rows first
     poses : T_parent_sensor (4, 4) of every row
     open_geometry : function that returns the artifact of a row, or None
-    parents : parent frame of every row; None for a single parent frame
+    parents : parent frames of all rows; None for a single parent frame
     ahead : whether the sensor of each row looks along z; None means that all do
     rendered : whether each row is a view rendered from a surface; None means that none is
     """
@@ -266,7 +266,7 @@ def views_of_rows(
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """A frame of the map, with its T_parent_sensor (4, 4) and whether its sensor looks along z."""
+    """A frame of the map: its pose T_parent_sensor (4, 4), and whether its sensor looks along z."""
 
     parent: str
     T: Floats
@@ -281,23 +281,23 @@ def rival_rows(
     query_ahead: bool,
     p: LocalizationParameters | None = None,
 ) -> list[int]:
-    """Return similar frames at other places than the estimate.
+    """Return database rows of similar frames whose places differ from the estimate's.
 
     If two identical rooms were mapped from the same viewpoints, each signature is in the database
-    twice, and all members of C may show the wrong room. Therefore frames of other places whose
-    signatures are as near as those of the voting matches are validated before a pose is found.
+    twice, and all members of C may show the wrong room. Therefore, frames of other places whose
+    signatures are about as near as those of the voting matches are validated too.
 
     Parameters
     ----------
     estimate : result of `localize`
     ranking : R
     tried : rows that were validated
-    posed : function that returns the rows with a pose
+    posed : function that returns those of the rows that have a pose
     query_ahead : whether the query's sensor looks along z
 
     Returns
     -------
-    rows : first such rows of R, at most `p.rivals`; none unless matches or the map decided
+    rows : first such rows of R, at most `p.rivals`; empty unless a pose was confirmed
     """
     p = p or LocalizationParameters()
     if estimate is None or estimate.average is None or estimate.verified_by == "prior":
@@ -321,7 +321,7 @@ def rival_rows(
 
 
 def mark_unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
-    """Return an estimate as ambiguous, because similar frames of other places were not compared."""
+    """Return a found estimate as ambiguous: similar frames of other places were not compared."""
     if estimate.average is None:
         return estimate
     return replace(
@@ -332,33 +332,33 @@ def mark_unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
     )  # fmt: skip
 
 
-def _estimate_of(
+def _estimate_from_places(
     parent: str, places: Sequence[Place], prior: PosePrior | None, p: LocalizationParameters, *,
     blind: bool = False,
 ) -> PoseEstimate:  # fmt: skip
-    """Return the estimate for evaluated places.
+    """Return the estimate from evaluated places.
 
     Parameters
     ----------
     parent, prior, places : results of `judge_places`, with at least one place
-    blind : whether free space is unknown
+    blind : whether the free space of all query frames is unknown
     """
     if all(place.evidence is None for place in places):
         return _estimate_by_votes(parent, places, blind, p)
-    judged = _confidences(places, p)
-    order = sorted(range(len(places)), key=lambda i: (-judged[i], -places[i].score))
+    confidences = _place_confidences(places, p)
+    order = sorted(range(len(places)), key=lambda i: (-confidences[i], -places[i].score))
     best = places[order[0]]
-    if judged[order[0]] >= p.confidence:
+    if confidences[order[0]] >= p.confidence:
         verified_by: Verifier = "matches" if best.strong else "map"
-        return _found(parent, best, places, verified_by, judged[order[0]], p)
+        return _found_estimate(parent, best, places, verified_by, confidences[order[0]], p)
     if prior is not None:
-        inside = _confirmed_by_prior(places, prior, p)
+        inside = _confirm_by_prior(places, prior, p)
         if inside is not None:
             place, confidence = inside
-            return _found(parent, place, places, "prior", confidence, p)
-    worth = [i for i in order if judged[i] >= p.worth][: p.views]
+            return _found_estimate(parent, place, places, "prior", confidence, p)
+    worth = [i for i in order if confidences[i] >= p.worth][: p.views]
     alternatives = tuple(
-        AlternativePose(places[i].T, places[i].support, judged[i], places[i].evidence)
+        AlternativePose(places[i].T, places[i].support, confidences[i], places[i].evidence)
         for i in worth
     )
     reason = weakest_evidence(_known(best.evidence), p.judgement)
@@ -372,51 +372,52 @@ def _known(evidence: PlaceEvidence | None) -> PlaceEvidence:
     return evidence
 
 
-def _confidences(places: Sequence[Place], p: LocalizationParameters) -> list[float]:
-    """Return the confidence of each place; 0 for places without the votes that they require."""
-    judged = compute_confidences([_known(place.evidence) for place in places], p.judgement)
+def _place_confidences(places: Sequence[Place], p: LocalizationParameters) -> list[float]:
+    """Return the confidence of each place; 0 for places without votes if `p.voted_only`."""
+    confidences = compute_confidences([_known(place.evidence) for place in places], p.judgement)
     return [
         0.0 if p.voted_only and not place.votes else confidence
-        for place, confidence in zip(places, judged, strict=True)
+        for place, confidence in zip(places, confidences, strict=True)
     ]
 
 
-#: Number of viewpoints as which a prior counts.
+#: Minimum number of suggesting viewpoints of a pose that the prior expects.
 _SUGGESTED_BY_PRIOR = 2
 
 
-def _confirmed_by_prior(
+def _confirm_by_prior(
     places: Sequence[Place], prior: PosePrior, p: LocalizationParameters
 ) -> tuple[Place, float] | None:
-    """Return the place that the prior selects, and its confidence; None if it selects none.
+    """Return the place that the prior confirms, and its confidence; None if there is none.
 
-    Unexpected places are not rivals of expected places that fit the map equally well.
+    Only places that the prior expects are rivals. The confirmed place must also have at least
+    `p.prior_share` of the best score of all places.
     """
     inside = [place for place in places if prior.expects(place.T)]
     most = max(place.score for place in places)
     within = []
     for place in inside:
-        others = [other for other in inside if other is not place]
+        own, others = _known(place.evidence), [q for q in inside if q is not place]
         rival = max((other.score for other in others), default=0.0)
         evidence = replace(
-            _known(place.evidence), rival=rival / place.score if place.score > 0 else 1.0,
+            own, rival=rival / place.score if place.score > 0 else 1.0,
             rival_weight=max((other.weight for other in others), default=0.0),
-            suggested=max(_known(place.evidence).suggested, _SUGGESTED_BY_PRIOR),
+            suggested=max(own.suggested, _SUGGESTED_BY_PRIOR),
         )  # fmt: skip
         within.append(replace(place, evidence=evidence))
-    judged = _confidences(within, p)
-    best = max(range(len(within)), key=judged.__getitem__, default=None)
+    confidences = _place_confidences(within, p)
+    best = max(range(len(within)), key=confidences.__getitem__, default=None)
     if best is None or within[best].score < p.prior_share * most:
         return None
-    none = max(1.0 - sum(judged), 0.0)
-    confidence = p.prior_odds * judged[best] / (p.prior_odds * sum(judged) + none)
+    none = max(1.0 - sum(confidences), 0.0)
+    confidence = p.prior_odds * confidences[best] / (p.prior_odds * sum(confidences) + none)
     return (within[best], confidence) if confidence >= p.confidence else None
 
 
 def _estimate_by_votes(
     parent: str, places: Sequence[Place], blind: bool, p: LocalizationParameters
 ) -> PoseEstimate:
-    """Return the estimate for places by their votes only, without a map."""
+    """Return the estimate from the votes for places, without a map."""
     order = sorted(places, key=lambda place: (not place.accepted, -place.weight))
     best, heaviest = order[0], max((place.weight for place in order[1:]), default=0.0)
     against = None
@@ -427,7 +428,7 @@ def _estimate_by_votes(
     elif not best.strong and not blind:
         against = "the accepted matches are weak"
     if against is None:
-        return _found(parent, best, places, "matches", None, p)
+        return _found_estimate(parent, best, places, "matches", None, p)
     alternatives = tuple(
         AlternativePose(place.T, place.support, None, None) for place in order[: p.views]
     )
@@ -435,11 +436,11 @@ def _estimate_by_votes(
     return PoseEstimate("ambiguous", against, parent, None, None, None, None, alternatives, votes)
 
 
-def _found(
+def _found_estimate(
     parent: str, place: Place, places: Sequence[Place], verified_by: Verifier,
     confidence: float | None, p: LocalizationParameters,
 ) -> PoseEstimate:  # fmt: skip
-    """Return the estimate of a query that was taken at a place."""
+    """Return the `found` estimate for a place."""
     accepted = place.accepted
     votes = accepted[: p.views]
     covariances = [vote.covariance for vote in votes if vote.covariance is not None]
@@ -464,7 +465,7 @@ def _found_reason(
     average: PoseAverage, agreeing: int, guided: int, accepted: int, support: int,
     verified_by: Verifier,
 ) -> str:  # fmt: skip
-    """Return a sentence on the evidence for the answer."""
+    """Return a clause that describes the evidence for the answer."""
     if verified_by == "map":
         return "the map's frames confirm this pose, and all other poses fit much worse"
     if verified_by == "prior":

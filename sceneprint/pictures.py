@@ -32,7 +32,7 @@ UNKNOWN = 40
 
 
 def normal_colours(normals: Floats32, valid: NDArray[np.bool_]) -> Bytes:
-    """Return the colours of normals as in the paper's Fig. 1: red, green, blue for x, y, z.
+    """Return normals as colours like the paper's Fig. 1: red, green, blue for x, y, z.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def normal_colours(normals: Floats32, valid: NDArray[np.bool_]) -> Bytes:
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-#: Minimum and maximum number of pixels along the longer side of a view from above.
+#: Minimum and maximum number of pixels along the longer side of a view of unordered points.
 _LEAST, _MOST = 16, 320
 _OPTICAL = "x right, y down, z forward"
 _AXES = "x, y and z in the axes of the cloud"
@@ -57,13 +57,13 @@ _AXES = "x, y and z in the axes of the cloud"
 
 @dataclass(frozen=True, eq=False)
 class Vista:
-    """An image of a surface.
+    """The pixels of a picture of a surface, as indices of its points.
 
     Parameters
     ----------
-    pixels : (h, w) int32, index of the point of each pixel; -1 for pixels without a point
+    pixels : (h, w) int32, index of each pixel's point; -1 for pixels without a point
     distances : (N,) float64, distances of the points, metres
-    what : kind of distances: "depth" along a camera's axis, "range" from a viewpoint, or "height"
+    what : kind of `distances`: "depth" along a camera's axis, "range" from a viewpoint, or "height"
     axes : description of the axes of normals
     """
 
@@ -73,7 +73,7 @@ class Vista:
     axes: str
 
     def of(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Return the values (h, w, ...) of the shown points; arbitrary for pixels without one."""
+        """Return the values (h, w, ...) of the pixels' points; arbitrary for empty pixels."""
         chosen: NDArray[Scalar] = values[self.pixels]
         return chosen
 
@@ -84,10 +84,9 @@ class Vista:
 
 
 def vista_of(surface: Surface) -> Vista:
-    """Return the image of a surface from its camera or around its viewpoint.
-
-    The view of unordered points is along the axis of their minimum extent, which is vertical in a
-    building.
+    """Return the picture of a surface from its camera or around its viewpoint.
+    Unordered points are viewed along the axis of their minimum extent, which is vertical in most
+    buildings.
 
     Parameters
     ----------
@@ -99,25 +98,25 @@ def vista_of(surface: Surface) -> Vista:
     if isinstance(surface.camera, Intrinsics):
         return Vista(pixels, points[:, 2], "depth", _OPTICAL)
     if isinstance(surface.camera, Sphere):
-        # azimuth increases to the left if the pole is up; y of an optical frame points down
+        # azimuth increases to the left if the pole is up; an optical frame's y axis points down
         flipped = pixels[::-1] if surface.camera.pole == 1 else pixels[:, ::-1]
         return Vista(flipped, np.linalg.norm(points, axis=1), "range", _AXES)
     return _along_least_extent(points, surface.valid.ravel())
 
 
 def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Ints32) -> Ints32:
-    """Return the labels of unordered points at the pixels of a picture of the same surface.
+    """Assign the labels of unordered points to the pixels of a picture of the same surface.
 
     Parameters
     ----------
-    vista : vista of `surface`
-    surface : surface that is drawn
-    points : (N, 3) metres, in the coordinates of the surface
-    labels : (N,) label of each point; -1 without a label
+    vista : picture of `surface`, a result of `vista_of`
+    surface : (h', w') points, metres
+    points : (N, 3) metres, in the coordinates of `surface`
+    labels : (N,) label of each point; -1 for unlabelled points
 
     Returns
     -------
-    labels : (h, w) label of the point that is nearest to each pixel's point; -1 without a label
+    labels : (h, w) label of the point nearest to each pixel's point; -1 for pixels without a label
     """
     from scipy.spatial import KDTree
 
@@ -128,38 +127,37 @@ def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Int
 
 
 def _along_least_extent(points: Floats, valid: NDArray[np.bool_]) -> Vista:
-    """Return a view of unordered points along the axis of their least extent, which is vertical in
-    a room but crosses a wall. Each pixel shows the point that is farthest along that axis.
+    """Return a view of points (N, 3) along the axis of their least extent.
+    This axis is vertical for a room, and horizontal for a single wall. Each pixel shows the point
+    that is farthest along it.
     """
-    seen = np.flatnonzero(valid)
-    if not seen.size:
+    valid_points = np.flatnonzero(valid)
+    if not valid_points.size:
         return Vista(np.full((1, 1), -1, np.int32), np.zeros(len(points)), "height", _AXES)
-    centred = points - points[seen].mean(axis=0)
-    _, axes = np.linalg.eigh(centred[seen].T @ centred[seen])
+    centred = points - points[valid_points].mean(axis=0)
+    _, axes = np.linalg.eigh(centred[valid_points].T @ centred[valid_points])
     for i in (0, 2):  # orient the axes like the nearest coordinate axes
         axes[:, i] *= np.sign(axes[np.argmax(np.abs(axes[:, i])), i])
     above, right = axes[:, 0], axes[:, 2]
     heights = centred @ above
-    flat = np.stack(
-        [centred @ np.cross(right, above), centred @ right], axis=1
-    )  # image axes: down, right
-    low = flat[seen].min(axis=0)
-    size = np.maximum(flat[seen].max(axis=0) - low, 1e-6)
-    longer = min(max(math.isqrt(len(seen)), _LEAST), _MOST)
+    flat = np.stack([centred @ np.cross(right, above), centred @ right], axis=1)  # down, right
+    low = flat[valid_points].min(axis=0)
+    size = np.maximum(flat[valid_points].max(axis=0) - low, 1e-6)
+    longer = min(max(math.isqrt(len(valid_points)), _LEAST), _MOST)
     cell = size.max() / (longer - 1)
-    rows, columns = np.rint((flat[seen] - low) / cell).astype(np.intp).T
+    rows, columns = np.rint((flat[valid_points] - low) / cell).astype(np.intp).T
     pixels: Ints32 = np.full((rows.max() + 1, columns.max() + 1), -1, np.int32)
-    order = np.argsort(heights[seen], kind="stable")  # the highest point is written last
-    pixels[rows[order], columns[order]] = seen[order]
+    order = np.argsort(heights[valid_points], kind="stable")  # the highest point is written last
+    pixels[rows[order], columns[order]] = valid_points[order]
     return Vista(pixels, heights, "height", _AXES)
 
 
-#: Maximum number of rows; pictures with more rows are scaled down.
+#: Maximum number of rows of a picture; larger pictures are scaled down.
 MOST_ROWS = 2560
 
-#: Percentiles of near and far depth, so that stray samples do not darken the picture.
+#: Percentiles of depth at the ends of the colour map: stray samples must not compress the rest.
 _RANGE = (1.0, 99.0)
-#: Colours of the map viridis at equal steps; the error of linear interpolation is at most 6 of 255.
+#: Equally spaced colours of viridis; the error of linear interpolation is at most 6 of 255.
 _VIRIDIS = np.array(
     [
         (68, 1, 84), (72, 24, 106), (71, 45, 123), (66, 64, 134), (59, 82, 139), (51, 99, 141),
@@ -169,9 +167,9 @@ _VIRIDIS = np.array(
     ],
     np.float64,
 )  # fmt: skip
-#: Number of additional colours, so that the last patches have a choice too.
+#: Number of additional colours, so that the last patches can choose from several colours too.
 _SPARE = 64
-#: Conversion of Oklab to linear sRGB: to the cube roots of cone responses, then to the primaries.
+#: Matrices from Oklab to cube roots of cone responses, and from cone responses to linear sRGB.
 _TO_CONES = np.array(
     [(1, 0.3963377774, 0.2158037573), (1, -0.1055613458, -0.0638541728),
      (1, -0.0894841775, -1.2914855480)]
@@ -183,9 +181,9 @@ _TO_PRIMARIES = np.array(
 
 
 def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
-    """Return depth in a perceptually uniform colour map: near is yellow, far is violet.
+    """Return depths in a perceptually uniform colour map: near is yellow, far is violet.
 
-    For clouds, the view shows the range or, from above, the height: high is yellow.
+    A cloud with a viewpoint shows ranges, a cloud without one shows heights: high is yellow.
 
     Parameters
     ----------
@@ -194,13 +192,13 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     Returns
     -------
     colours : (h', w', 3) uint8, pixels of `vista_of`; dark grey if unknown
-    meaning : `near_m` and `far_m`, the depths or ranges at the ends of the colour map; for heights
-        `low_m` and `high_m`, relative to the mean height
+    meaning : `near_m` and `far_m`, depths or ranges at the ends of the colour map, or `low_m` and
+        `high_m`, heights relative to the mean; and a description
     """
     vista = vista_of(surface)
     z, shown = vista.of(vista.distances), vista.shown
-    seen = z[shown]
-    near, far = np.percentile(seen, _RANGE).tolist() if seen.size else (0.0, 0.0)
+    shown_depths = z[shown]
+    near, far = np.percentile(shown_depths, _RANGE).tolist() if shown_depths.size else (0.0, 0.0)
     share = (far - z) / max(far - near, 1e-9)
     mixed = viridis(1.0 - share if vista.what == "height" else share)
     ends, words = ("near_m", "far_m"), (f"{near:.2f} m or nearer", f"{far:.2f} m or farther")
@@ -215,7 +213,7 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
 
 def viridis(shares: Floats) -> Bytes:
-    """Return colours (..., 3) of shares: violet at 0 and below, yellow at 1 and above."""
+    """Map shares (...) to colours (..., 3): violet at 0 and below, yellow at 1 and above."""
     place = np.clip(shares, 0.0, 1.0) * (len(_VIRIDIS) - 1)
     steps = np.arange(len(_VIRIDIS))
     mixed = np.stack([np.interp(place, steps, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
@@ -245,7 +243,7 @@ def normals_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
 
 def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
-    """Return patches in colours that differ between neighbours.
+    """Colour patches so that neighbours differ.
 
     Parameters
     ----------
@@ -253,23 +251,23 @@ def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
 
     Returns
     -------
-    colours : (h, w, 3) uint8, deterministic; dark grey without a patch
+    colours : (h, w, 3) uint8, deterministic; dark grey for pixels without a patch
     meaning : description of the colours
     """
     count = int(labels.max(initial=-1)) + 1
-    palette = np.concatenate([_colours_of(labels, count), np.full((1, 3), UNKNOWN, np.uint8)])
-    text = f"{count} patches of the finest level, one colour per patch; dark grey is no patch"
+    palette = np.concatenate([_assign_colours(labels, count), np.full((1, 3), UNKNOWN, np.uint8)])
+    text = f"{count} patches of the finest level, one colour per patch; dark grey is unassigned"
     return palette[labels], {"patches": str(count), "Description": text}
 
 
 def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
-    """Return colours as a PNG file of a width; pixels are repeated or omitted, but not mixed.
+    """Encode colours as a PNG file. Scaling repeats or omits pixels, but does not mix them.
 
     Parameters
     ----------
     colours : (h, w, 3) uint8
-    width : number of columns; it is reduced if there would be more than MOST_ROWS rows
-    text : texts for the tEXt chunks of the file
+    width : number of columns; reduced if the picture would have more than MOST_ROWS rows
+    text : values of the file's tEXt chunks by keyword
 
     Raises
     ------
@@ -292,22 +290,22 @@ def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
 
 #: Colours (red, green, blue) of the query and of the match, as on the dashboard.
 QUERY_COLOUR, MATCH_COLOUR = (217, 119, 43), (43, 108, 176)
-#: Number of pixels along the longer side of a panel, and of points in a pixel of full colour.
+#: Number of pixels along the longer side of a panel, and number of points for a saturated pixel.
 _PANEL, _FULL = 480, 1.5
 
 
 def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title: str) -> bytes:
-    """Draw two frames from above, before and after the transform, side by side as a PNG.
+    """Draw two frames from above, before and after the transform; return two panels as a PNG file.
 
     Parameters
     ----------
     query, match : surfaces in their cameras' coordinates, metres
     T_match_query : (4, 4) transform from the query to the match
-    title : line of ASCII above the panels
+    title : line of ASCII text above the panels
     """
     from PIL import Image, ImageDraw
 
-    # in the view from above, x points to the right and z, the axis of the match's camera, upwards
+    # x of the match's camera points right in the picture, z (its optical axis) points up
     ours, theirs = (surface.points[surface.valid].astype(np.float64) for surface in (query, match))
     aligned = transform_points(T_match_query, ours)
     everything = np.concatenate([theirs, ours, aligned])[:, [0, 2]]
@@ -338,12 +336,12 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
 
 
 def _sample_indices(n: int, wanted: int) -> NDArray[np.intp]:
-    """Return the indices of the pixels, of `n`, at the centres of `wanted` pixels."""
+    """Return the indices of the source pixels, of `n`, at the centres of `wanted` target pixels."""
     return ((np.arange(wanted) + 0.5) * n / wanted).astype(np.intp)
 
 
-def _colours_of(labels: Ints32, count: int) -> Bytes:
-    """Return a colour per patch: the free colour that differs most from its neighbours' colours."""
+def _assign_colours(labels: Ints32, count: int) -> Bytes:
+    """Return a colour per patch: the unused colour that differs most from its neighbours'."""
     lab = _palette(count + _SPARE)
     squares = (lab**2).sum(axis=1)[:, None]
     neighbours = _neighbours(labels, count)
@@ -362,7 +360,7 @@ def _colours_of(labels: Ints32, count: int) -> Bytes:
 
 
 def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
-    """Return the patches that share an edge of pixels with each patch."""
+    """Return, for each patch, the patches that adjoin it by a pixel edge."""
     across = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
     down = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
     pairs = np.concatenate([across, down])
@@ -373,7 +371,7 @@ def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
 
 
 def _palette(count: int) -> Floats:
-    """Return colours (count, 3) in Oklab, evenly distributed over hues and lightnesses."""
+    """Return colours (count, 3) in Oklab, evenly distributed over hue and lightness."""
     n = np.arange(1, count + 1)
     # powers of the plastic number distribute points evenly over the square (Roberts 2018)
     plastic = 1.32471795724474602596

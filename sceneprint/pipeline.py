@@ -1,4 +1,4 @@
-"""The stages of the paper's Fig. 1.
+"""Functions for the stages of the paper's Fig. 1.
 
 frame --prepare--> signature, geometry
 signature, database --retrieve--> R --diversify--> C --associate--> C_vld --localize--> pose
@@ -77,22 +77,22 @@ __all__ = [
 
 
 def sign(frame: AnyFrame, signer: Signer) -> Signature:
-    """Return the stored signature of a frame: Sec. III-A, III-B, III-F.
+    """Compute the signature of a frame: Sec. III-A, III-B, III-F.
 
     Raises
     ------
-    UselessFrame : If no samples lie within the sensor's range, or no two patches are within reach
+    UselessFrame : If no sample lies within the sensor's range, or no two patches form a pair
     """
     p = signer.model.parameters
     return encode(hierarchy_of(see(frame, p), p, frame.name), signer, frame.name)
 
 
 def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
-    """Return the signature and the geometry artifact of a frame, which share its surface.
+    """Compute the signature and the geometry artifact of a frame; the surface is computed once.
 
     Raises
     ------
-    UselessFrame : If `sign` raises it
+    UselessFrame : See `sign`
     """
     p = signer.model.parameters
     seen = see(frame, p)
@@ -103,7 +103,7 @@ def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
 
 
 def geometry_of(seen: Surface, model: Model) -> Geometry:
-    """Return the geometry artifact of a surface, for validation: Sec. III-E.
+    """Compute the geometry artifact of a surface, which validation requires: Sec. III-E.
 
     Parameters
     ----------
@@ -114,31 +114,31 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
     _PARAMETERS[model.id] = p.validation, model.answer
     shown = seen
     if isinstance(seen, Voxels):
-        shown = _scan(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
+        shown = _scan_image(seen.cloud, p.cloud) if seen.cloud.has_viewpoint else seen.plain
     patches = patches_for_validation(seen, p)
     histograms = patch_descriptors(patches, p.surroundings)
     return Geometry(shown, patches, compress(histograms, model.compression), model.id)
 
 
-def _scan(cloud: Cloud, p: CloudParameters) -> Surface:
-    """Return the range image of a cloud, with spread points if the sensor sees all around."""
+def _scan_image(cloud: Cloud, p: CloudParameters) -> Surface:
+    """Return the range image of a cloud, with spread points if the sensor covers a full turn."""
     shown = range_image(cloud, p)
     if not (isinstance(shown.camera, Sphere) and shown.camera.sees_around):
         return shown
     points = spread_points(cloud, shown, p)
-    # distant surfaces have few points, so cubes must be narrower than for evenly spread points
+    # distant surfaces have few points, so the cubes must be smaller than for evenly spread points
     even = math.sqrt(float(points.areas.sum(dtype=float)) / SPREAD_POINTS)
     return replace(shown, spread=thin_points(points, SPREAD_POINTS, even / 12))
 
 
 def distance(a: Signature, b: Signature) -> int:
-    """Return the distance between two stored signatures: -s(X, Y) of Sec. III-C.
+    """Return the distance between two signatures: -s(X, Y) of Sec. III-C.
 
     Raises
     ------
-    ModelMismatch : If the signatures are of two models
+    ModelMismatch : If the signatures are of different models
     """
-    _same_model(a, b)
+    _require_same_model(a, b)
     return int(distances(a.vector, b.vector[None], a.metric)[0])
 
 
@@ -151,17 +151,19 @@ def retrieve(
     ----------
     database : N signatures
     model : model of all signatures
-    size : size of R; None selects it by the size of the map, see `ranking_size`
+    size : number of members of R; None selects it from N, see `ranking_size`
 
     Raises
     ------
-    ModelMismatch : If the signatures are of several models, or not of `model`
+    ModelMismatch : If a signature is not of `model`
     """
-    _same_model(query, model)
+    _require_same_model(query, model)
     for signature in database:
-        _same_model(query, signature)
+        _require_same_model(query, signature)
     size = ranking_size(len(database)) if size is None else size
-    stored = _stack(database) if len(database) else np.empty((0, len(query.vector)), np.uint8)
+    stored = (
+        _stack_vectors(database) if len(database) else np.empty((0, len(query.vector)), np.uint8)
+    )
     return rank(distances(query.vector, stored, model.metric), size, model.unrelated_distance)
 
 
@@ -171,13 +173,14 @@ def diversify(
     k: int = 10,
     p: DiversityParameters | None = None,
 ) -> Selection:
-    """Return C, the `k` members of R that are near the query and diverse: Sec. III-D.
+    """Select C, `k` members of R that are near the query and differ from each other: Sec. III-D.
 
     Parameters
     ----------
     ranking : R
     database : signatures to which R refers
     k : size of C
+    p : parameters; None selects the defaults
 
     Returns
     -------
@@ -185,7 +188,7 @@ def diversify(
     """
     ranked = [database[i] for i in ranking.indices]
     metric: Metric = ranked[0].metric if ranked else "l2"
-    among = pairwise_distances(_stack(ranked), metric)
+    among = pairwise_distances(_stack_vectors(ranked), metric)
     return select(ranking.distances, among, k, p)
 
 
@@ -205,19 +208,19 @@ def validate(
     Parameters
     ----------
     query, match : geometry artifacts of one model
-    seed : seed of the random choices, which the result contains
-    p : parameters; None selects `model.parameters.validation` of the artifacts' model
-    mode : "full", or "paper", which applies only the paper's test
-    matching : "histograms", or "sequence" for the paper's matching, which is slower
+    seed : seed of the random choices; the result contains it
+    p : parameters; None selects those of the artifacts' model
+    mode : "full", or "paper" to apply only the paper's test
+    matching : "histograms", or "sequence" for the paper's slower matching
     ups : (3,) unit vectors, up in the query's and in the match's coordinates; None if unknown
-    other_axes : whether to consider scanners that did not stand upright
+    other_axes : whether to consider that the scanners were not upright
 
     Raises
     ------
-    ModelMismatch : If the artifacts are of two models, or of a model that this process has not used
-        and `p` is missing
+    ModelMismatch : If the artifacts are of different models, or if `p` is None and this process has
+        not used their model
     """
-    _same_model(query, match)
+    _require_same_model(query, match)
     p = p or _validation_parameters(query)
     return validate_geometry(query, match, seed, p, mode, matching, ups=ups, other_axes=other_axes)
 
@@ -226,15 +229,16 @@ def validate_guided(
     query: Geometry, match: Geometry, T_match_query: Floats, seed: int,
     p: ValidationParameters | None, ups: Ups,
 ) -> PairValidation | None:  # fmt: skip
-    """Check a transform (4, 4) that other matches and the map's poses predict: Sec. III-E.
+    """Check a predicted transform T_match_query (4, 4): Sec. III-E.
 
-    See `sceneprint.geometry.validation.validation.validate_guided`.
+    Other matches and the map's poses predict it; for the result, see
+    `sceneprint.geometry.validation.validation.validate_guided`.
 
     Raises
     ------
-    ModelMismatch : If `validate` raises it
+    ModelMismatch : See `validate`
     """
-    _same_model(query, match)
+    _require_same_model(query, match)
     return check_predicted(
         query, match, T_match_query, seed, p or _validation_parameters(query), ups
     )
@@ -243,19 +247,19 @@ def validate_guided(
 def validate_without_up(
     query: Geometry, match: Geometry, seed: int, p: ValidationParameters | None, ups: Ups
 ) -> PairValidation | None:
-    """Validate by the surfaces only, if a query found no match with `up`: Sec. III-E.
+    """Validate by the surfaces only, for a query whose `up` contradicts all matches: Sec. III-E.
 
-    See `sceneprint.geometry.validation.validation.validate_without_up`.
+    For the result, see `sceneprint.geometry.validation.validation.validate_without_up`.
 
     Raises
     ------
-    ModelMismatch : If `validate` raises it
+    ModelMismatch : See `validate`
     """
-    _same_model(query, match)
+    _require_same_model(query, match)
     return check_up(query, match, seed, p or _validation_parameters(query), ups)
 
 
-#: Parameters of the models that this process has used, by id, since an artifact stores only the id.
+#: Parameters of the models that this process has used, by id. An artifact stores only the id.
 _PARAMETERS: dict[str, tuple[ValidationParameters, AnswerParameters]] = {}
 
 
@@ -278,38 +282,38 @@ def answer_parameters(geometry: Geometry) -> AnswerParameters:
 
 
 def _learn_presets(model_id: str) -> None:
-    """Store the parameters of the presets if those of the model are unknown."""
+    """Register the parameters of the presets if the model is unknown."""
     if model_id not in _PARAMETERS:
         for model in map(read_model, PRESETS):
             _PARAMETERS[model.id] = model.parameters.validation, model.answer
 
 
-def _stack(signatures: Sequence[Signature]) -> Bytes:
+def _stack_vectors(signatures: Sequence[Signature]) -> Bytes:
     if not len(signatures):
         return np.empty((0, 0), np.uint8)
     return np.stack([signature.vector for signature in signatures])
 
 
-def _same_model(a: Signature | Geometry, b: Signature | Geometry | Model) -> None:
+def _require_same_model(a: Signature | Geometry, b: Signature | Geometry | Model) -> None:
     other = b.id if isinstance(b, Model) else b.model_id
     if a.model_id != other:
         raise ModelMismatch(
-            f"Frames of two models cannot be compared: {a.model_id[:12]} and {other[:12]}. "
+            f"Frames of different models cannot be compared: {a.model_id[:12]} and {other[:12]}. "
             "Sign both frames with one model."
         )
 
 
-#: Default number of accepted matches per query, for which confidences are fitted.
+#: Default number of accepted matches per query. Confidences are fitted to this number.
 VERDICT_MATCHES = 5
 
-#: Function that returns the parent frame and T_parent_sensor (4, 4) of a row of the database, or
-#: None.
+#: Function of a database row that returns its parent frame and T_parent_sensor (4, 4); None for a
+#: row without a pose.
 PoseOf = Callable[[int], tuple[str, Floats] | None]
 
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    """A database frame and its validation against a query.
+    """A database frame with its validation against a query.
 
     Parameters
     ----------
@@ -341,36 +345,36 @@ def associate(
     known: Mapping[int, PairValidation] | None = None,
     retry: bool = True,
 ) -> list[PairMatch]:
-    """Validate candidates in the order of R until `k` are accepted: Sec. III-E.
+    """Validate candidates in the order of R until `k` matches are accepted: Sec. III-E.
 
     If two strong matches from different viewpoints agree on the query's pose, the map's poses
-    predict the transforms of later candidates. Predicted transforms are refined and checked, and
-    searched only if the check fails.
+    predict the transforms of later candidates. A predicted transform is refined and checked; the
+    transform is searched only if the check fails. If no match is accepted, the first candidates are
+    validated again without `up`, and scans with other axes.
 
     Parameters
     ----------
     query : geometry artifact
     ranking : R
-    among : ascending positions in R to validate: C, or the first of R
+    among : ascending positions in R to validate: C, or the first members of R
     open_geometry : function that returns the artifact of a row; None skips the row
-    k : number of accepted matches after which to stop, at least 1
+    k : number of accepted matches at which to stop, at least 1
     seed, p, mode, matching : arguments of `validate`
     go_on : function that is called before each candidate; False ends the search
-    up : (3,) up, a unit vector in the query's sensor; None if unknown
-    up_of : function that returns the same for a row of the database
+    up : (3,) unit vector that points up in the query's sensor frame; None if unknown
+    up_of : function that returns `up` of a database row
     pose_of : see PoseOf; by default no row has a pose, and every transform is searched
-    known : validations by row, which are not repeated
-    retry : whether to validate the first candidates in other ways if no match is accepted
+    known : existing validations by row, which are reused
+    retry : whether to validate the first candidates again if no match is accepted
 
     Returns
     -------
     matches : all validated candidates: C_vld first (`rank_accepted`), then transforms that fit but
-        tilt against `up`, then the remaining ones. If no match is accepted, the first candidates
-        are validated again without `up`, and scans with other axes.
+        tilt against `up`, then the remaining candidates
 
     Raises
     ------
-    ModelMismatch : If the artifacts are of two models
+    ModelMismatch : See `validate`
     ValueError : If k is below 1
     """
     if k < 1:
@@ -388,7 +392,7 @@ def associate(
         ups = up, up_of(index)
         T = None
         if mode == "full" and validation is None:
-            T = _predicted(tried, index, pose_of, answer_parameters(query).map)
+            T = _predict_transform(tried, index, pose_of, answer_parameters(query).map)
         if T is not None:
             validation = validate_guided(query, geometry, T, seed, p, ups)
         if validation is None:
@@ -414,23 +418,23 @@ def associate(
 
 
 def unguided_validations(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
-    """Return the validations by search, by row; None if no match was guided."""
+    """Return the unguided validations by row; None if no match was guided."""
     if not any(match.validation.guided for match in matches):
         return None
     return {m.index: m.validation for m in matches if not m.validation.guided}
 
 
-#: Number of strong matches from different viewpoints that guide other matches.
+#: Number of strong matches from different viewpoints that are required to guide other matches.
 _GUIDES = 2
 
 
-def _predicted(
+def _predict_transform(
     tried: Sequence[PairMatch], index: int, pose_of: PoseOf, p: MapParameters
 ) -> Floats | None:
-    """Return T_match_query of a candidate as its pose and the previous matches predict it.
+    """Return T_match_query of a candidate, predicted from its pose and the previous matches.
 
-    The result is None if too few of these matches are strong, or if an accepted or ambiguous match
-    supports another pose.
+    The result is None if the candidate has no pose, too few of these matches are strong, or an
+    accepted or ambiguous match supports another pose.
     """
     own = pose_of(index)
     if own is None:
@@ -457,8 +461,7 @@ def _predicted(
     return inverse(own[1]) @ T_parent_query
 
 
-#: Number of candidates that are validated again for a scanner that did not stand upright or a wrong
-#: `up`.
+#: Number of candidates to validate again in case a scanner was not upright or `up` is wrong.
 _TILTED_TRIES = 3
 
 
@@ -466,7 +469,7 @@ def _retry_tilted(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Validate the first candidates again for a scanner on its side or upside down.
+    """Validate the first candidates again, in case a scanner was on its side or upside down.
 
     Accepted results replace earlier ones in `tried`.
     """
@@ -489,7 +492,7 @@ def _retry_without_up(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Validate the first candidates by surfaces only, since `up` may be wrong; update `tried`."""
+    """Validate the first candidates again, in case `up` is wrong; update `tried`."""
     for place, before in enumerate(tried[:_TILTED_TRIES]):
         geometry, ups = open_geometry(before.index), before.validation.ups
         if geometry is None or not go_on():

@@ -1,9 +1,9 @@
-"""Evaluation of the places where a query may have been taken, by matches, map and prior.
+"""Evidence for the places where a query may have been taken, from matches, map and prior.
 
 matches, poses, MapViews  --judge_places-->  Place, ...
 
 Accepted matches vote with their poses. These poses, and further poses that candidates suggest, are
-compared on the frames of the map that would see the same surfaces.
+compared with the frames of the map that would see the same surfaces.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ from sceneprint.types import Floats, Geometry
 
 @dataclass(frozen=True)
 class LocalizationParameters:
-    """Parameters of the answer; docs/trust.md describes how they were tuned."""
+    """Parameters of localization; docs/trust.md describes how they were tuned."""
 
     confidence: float = 0.99  #: minimum confidence of a pose that is found
     worth: float = 0.05  #: minimum confidence of an alternative
     views: int = 5  #: maximum number of averaged votes, and of alternatives
-    half_weight: float = 1 / 30  #: separation of views at which the weight of a vote is halved
+    half_weight: float = 1 / 30  #: separation of views that halves the weight of a vote
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong match has weight 1
     outweigh: float = 2.0  #: minimum ratio of the weights of the best two places, without a map
     voted_only: bool = False  #: whether a pose requires the vote of a match
-    prior_odds: float = 20.0  #: factor of the odds of a pose that a prior expects
-    prior_share: float = 0.9  #: minimum score for a prior to select a pose, share of the best
-    most_noise: float = 0.2  #: maximum noise of the map that excuses violations
+    prior_odds: float = 20.0  #: factor by which a prior raises the odds of an expected pose
+    prior_share: float = 0.9  #: minimum score of a pose that a prior confirms, share of the best
+    most_noise: float = 0.2  #: maximum share of violations that the map's noise may explain
     rivals: int = 2  #: maximum number of frames of other places that are compared
-    rival_distance: float = 1.2  #: their maximum distance, as a multiple of the farthest vote's
+    rival_distance: float = 1.2  #: their maximum distance, relative to the farthest voting match
     map: MapParameters = field(default_factory=MapParameters)
     judgement: ConfidenceModel = field(default_factory=ConfidenceModel)
 
     @classmethod
     def of(cls, answer: AnswerParameters) -> LocalizationParameters:
-        """Return the parameters from a model's parameters of the answer."""
+        """Return parameters with a model's answer parameters."""
         return cls(map=answer.map, judgement=answer.confidence)
 
 
@@ -81,13 +81,13 @@ class QueryFrame:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The pose at which a robot expects itself.
+    """The pose that a robot expects, with its uncertainty.
 
     Parameters
     ----------
     parent : parent frame of the pose
     T : (4, 4) T_parent_query
-    covariance : (6, 6) of errors (x, y, z, rx, ry, rz) in the parent's axes, metres and radians
+    covariance : (6, 6) of the error (x, y, z, rx, ry, rz) in the parent's axes, metres and radians
     """
 
     parent: str
@@ -95,16 +95,16 @@ class PosePrior:
     covariance: Floats
 
     def reaches(self, pose: Floats, p: MapParameters) -> bool:
-        """Return whether a frame at T_parent_sensor (4, 4) may see the robot's surroundings.
+        """Return whether a frame at T_parent_sensor (4, 4) may see the same surfaces as the robot.
 
-        Its maximum distance is `p.same_surfaces` plus three standard deviations of the prior.
+        The maximum distance is `p.same_surfaces` plus three standard deviations of the prior.
         """
         deviation = math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
         apart = float(np.linalg.norm(pose[:3, 3] - self.T[:3, 3]))
         return apart <= p.same_surfaces + 3 * deviation
 
     def expects(self, T: Floats) -> bool:
-        """Return whether a pose T_parent_query (4, 4) is within 99.9 % of the prior."""
+        """Return whether T_parent_query (4, 4) lies in the prior's 99.9 % confidence region."""
         error = pose_error(self.T, T)
         return float(error @ np.linalg.solve(self.covariance, error)) <= _CHI_SQUARE_6
 
@@ -115,9 +115,9 @@ _CHI_SQUARE_6 = 22.458
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
-    """The vote of a match: its pose T and its viewpoint, (4, 4) in the parent frame.
+    """A match's vote for a pose T of the query; T and `viewpoint` are (4, 4) in the parent frame.
 
-    `separation` is that of the query's view from the match's; see `view_separations`.
+    `separation` is the separation of the query's and the match's views; see `view_separations`.
     """
 
     match: PairMatch
@@ -139,8 +139,8 @@ class Place:
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    votes : votes of matches, the most reliable first
-    support : number of viewpoints of the voting matches
+    votes : votes for the place, the most reliable first
+    support : number of different viewpoints of the voting matches
     weight : total weight of the votes: 1 for a strong match, less for a weak or ambiguous match
     evidence : evidence for the pose; None without a map
     """
@@ -163,19 +163,19 @@ class Place:
 
     @property
     def score(self) -> float:
-        """Return the score on the map; 0 without a map."""
+        """Return how well the pose fits the map; 0 without a map."""
         return 0.0 if self.evidence is None else self.evidence.score
 
 
-#: Function that returns the frames of a parent frame that may see the surroundings of poses
-#: (n, 4, 4).
+#: Function of a parent frame and poses (n, 4, 4) that returns the map's frames that may see the
+#: same surfaces.
 ViewsOf = Callable[[str, Floats], MapViews]
 
 _NONE = np.empty((0, 4, 4))
 
 
 def model_parameters(frames: Sequence[QueryFrame]) -> LocalizationParameters:
-    """Return the parameters of the query's model; see `answer_parameters`."""
+    """Return the localization parameters of the query's model; see `answer_parameters`."""
     return LocalizationParameters.of(answer_parameters(frames[0].geometry))
 
 
@@ -193,12 +193,14 @@ def judge_places(
     Returns
     -------
     parent : parent frame in which poses are compared
-    prior : the argument; None if its parent frame is another
+    prior : the argument; None if it has another parent frame
     places : places with votes first, then by score
     """
-    parent = _parent(frames, parents)
+    parent = _select_parent(frames, parents)
     if prior is not None and prior.parent != parent:
-        if _accepts(frames, parents, parent) and not _accepts(frames, parents, prior.parent):
+        if _has_accepted(frames, parents, parent) and not _has_accepted(
+            frames, parents, prior.parent
+        ):
             prior = None  # it has no meaning in another parent frame
         else:
             parent = prior.parent
@@ -209,18 +211,20 @@ def judge_places(
         for frame in frames
     ]  # fmt: skip
     suggested = _suggest_poses(own, poses)
-    votes = _votes(own, poses, p)
+    votes = _collect_votes(own, poses, p)
     if views_of is None or (not len(suggested.T) and prior is None):
-        return parent, prior, [_place(group, None, p) for group in _group_votes(votes, [], p)]
+        return parent, prior, [_make_place(group, None, p) for group in _group_votes(votes, [], p)]
     ready = [map_frame(frame.geometry, frame.T, p.map, overlap_p) for frame in frames]
     starts = _NONE if prior is None else prior_starts(prior.T, prior.covariance, p.map)
     views = views_of(parent, np.concatenate([starts[:1], suggested.T]))
     near = refine_starts(ready, starts, views, p.map, overlap_p)
     scored = compare_poses(ready, np.concatenate([near, suggested.T]), views, p.map, overlap_p)
-    return parent, prior, _places(votes, scored, suggested, views, p)
+    return parent, prior, _combine_places(votes, scored, suggested, views, p)
 
 
-def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None) -> str:
+def _select_parent(
+    frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None
+) -> str:
     """Return the parent frame with the most strong, then accepted, then validated matches."""
     counts: dict[str, tuple[int, int, int]] = {}
     for frame in frames:
@@ -234,7 +238,7 @@ def _parent(frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, 
     return max(counts, key=counts.__getitem__, default="")
 
 
-def _accepts(
+def _has_accepted(
     frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None, parent: str
 ) -> bool:
     return any(
@@ -264,18 +268,18 @@ class _Suggestions:
 def _suggest_poses(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats]
 ) -> _Suggestions:
-    of_each = [
+    of_match = [
         (match, poses[match.index] @ match.validation.hypotheses @ inverse(frame.T))
         for frame in frames
         for match in frame.matches
         # a transform that contradicts `up` suggests no pose
         if len(match.validation.hypotheses) and not match.validation.contradicts_up
     ]
-    most = max((len(hypotheses) for _, hypotheses in of_each), default=0)
+    most = max((len(hypotheses) for _, hypotheses in of_match), default=0)
     ranked = [
         (hypotheses[rank], match)
         for rank in range(most)
-        for match, hypotheses in of_each
+        for match, hypotheses in of_match
         if rank < len(hypotheses)
     ]
     return _Suggestions(
@@ -285,7 +289,7 @@ def _suggest_poses(
     )
 
 
-def _votes(
+def _collect_votes(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
     p: LocalizationParameters,
 ) -> list[_Vote]:  # fmt: skip
@@ -317,7 +321,7 @@ def _votes(
 def _group_votes(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
 ) -> list[list[_Vote]]:
-    """Group votes by place: the places of scored poses in their order, then further places."""
+    """Group votes by place: one list per scored pose, in order, then one per other place."""
     groups: list[list[_Vote]] = [[] for _ in scored]
     others: list[list[_Vote]] = []
     for vote in votes:
@@ -331,41 +335,41 @@ def _group_votes(
     return groups + others
 
 
-def _places(
+def _combine_places(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: _Suggestions,
     views: MapViews, p: LocalizationParameters,
 ) -> list[Place]:  # fmt: skip
     """Return the places of votes and scored poses, with their evidence."""
     groups = _group_votes(votes, scored, p)
-    weights = [_weight(group, p)[1] for group in groups]
+    weights = [_count_votes(group, p)[1] for group in groups]
     scores = [pose.score for pose in scored]
     places = []
     for k, group in enumerate(groups):
         pose = scored[k] if k < len(scored) else None
         others = scores[:k] + scores[k + 1 :]
-        evidence = _evidence(
+        evidence = _place_evidence(
             group, pose, suggested, views,
             max(others, default=0.0), max(weights[:k] + weights[k + 1 :], default=0.0), p,
         )  # fmt: skip
-        places.append(_place(group, pose, p, evidence))
+        places.append(_make_place(group, pose, p, evidence))
     return sorted(places, key=lambda place: not place.votes)
 
 
-def _place(
+def _make_place(
     group: list[_Vote], pose: ScoredPose | None, p: LocalizationParameters,
     evidence: PlaceEvidence | None = None,
 ) -> Place:  # fmt: skip
     """Return the place of votes, a scored pose, or both."""
     accepted = any(vote.accepted for vote in group)
     T = group[0].T if pose is None or accepted else pose.T
-    support, weight = _weight(group, p)
+    support, weight = _count_votes(group, p)
     return Place(T, group, support, weight, evidence)
 
 
-def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
-    """Return the number of voting viewpoints, and the total weight of the first vote of each.
+def _count_votes(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
+    """Return the number of voting viewpoints, and the total weight of their first votes.
 
-    Copies of a view and guided matches do not count.
+    Guided matches and further votes from the same viewpoint do not count.
     """
     voting = [vote for vote in group if not vote.match.validation.guided]
     viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
@@ -373,22 +377,22 @@ def _weight(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, flo
     return len(different), sum(voting[i].weight for i in different)
 
 
-def _evidence(
+def _place_evidence(
     group: Sequence[_Vote], pose: ScoredPose | None, suggested: _Suggestions,
     views: MapViews, rival: float, rival_weight: float, p: LocalizationParameters,
 ) -> PlaceEvidence:  # fmt: skip
-    """Return the evidence for a place, from its votes and its pose on the map.
+    """Compute the evidence for a place from its votes and its pose on the map.
 
     Parameters
     ----------
     group : votes for the place
-    pose : scored pose; None without one
+    pose : scored pose of the place; None if no pose was scored there
     suggested : result of `_suggest_poses`
     views : the map's frames
-    rival, rival_weight : best score and maximum weight of the other places
+    rival, rival_weight : maximum score and maximum weight of the other places
     """
-    weight = _weight(group, p)[1]
-    strong = _weight([v for v in group if v.match.validation.strength == "strong"], p)[0]
+    weight = _count_votes(group, p)[1]
+    strong = _count_votes([v for v in group if v.match.validation.strength == "strong"], p)[0]
     leading = np.array([v.viewpoint for v in group if v.accepted]).reshape(-1, 4, 4)
     accepted = len(distinct_viewpoints(leading, p.map))
     T = group[0].T if pose is None else pose.T

@@ -1,8 +1,8 @@
-"""Set-up and instrumentation of a process: logs, limits, stop signals, secrets, context, latencies.
+"""Process set-up: logs, limits, stop signals, secrets, context variables and latency histograms.
 
-A log line is one JSON object on standard error. Container engines pass secrets in files instead of
-the environment. The id, tenant and actor of the current request are context variables, which
-threads inherit. Latencies are counted in histograms, which can be added over processes.
+A log line is one JSON object on standard error. Secrets may be passed in files instead of the
+environment. The id, tenant and actor of the current request are context variables that threads
+inherit. Latency histograms of several processes can be added.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from types import FrameType
 
 from sceneprint.errors import InvalidRequest
 
-#: Attributes of every log record. All others come from `extra` and are written unchanged.
+#: Attributes of every log record. Other attributes come from `extra` and are written unchanged.
 _OWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
 
 
@@ -41,7 +41,7 @@ def name_request(request_id: str | None) -> None:
 
 @contextmanager
 def of_request(request_id: str | None) -> Iterator[None]:
-    """Set the request id within the context; see `name_request`."""
+    """Set the request id within a `with` block; see `name_request`."""
     before = _request.set(request_id)
     try:
         yield
@@ -50,7 +50,7 @@ def of_request(request_id: str | None) -> Iterator[None]:
 
 
 def request_id() -> str | None:
-    """Return the id of the current request, if there is one."""
+    """Return the id of the current request; None outside requests."""
     return _request.get()
 
 
@@ -58,7 +58,7 @@ class JsonFormatter(logging.Formatter):
     """A formatter of log records as JSON: time, level, logger, message, request, and `extra`."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line of a record."""
+        """Return a record as a line of JSON."""
         line = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -83,8 +83,8 @@ def log_as_json(level: int = logging.INFO) -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
 
 
-#: Maximum limit of open files, sufficient for any number of maps. Some systems allow a billion, and
-#: programs that close all descriptors one by one would then start slowly.
+#: Highest limit of open files that is set; it suffices for any number of maps. Some systems allow a
+#: billion, but then programs that close all descriptors one by one would start slowly.
 MOST = 1 << 20
 
 
@@ -99,10 +99,10 @@ def raise_descriptors() -> int:
 
 
 def limit_memory(more: int) -> None:
-    """Limit the additional memory that this process may allocate, beyond which MemoryError occurs.
+    """Limit the memory that this process may allocate from now on; then, raise MemoryError.
 
-    The limit covers private writable memory, but not tables and indexes, which are mapped from
-    files.
+    The limit covers private writable memory, but not files that are mapped into memory, such as
+    tables and indexes.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def limit_memory(more: int) -> None:
 
 
 class StopSignal:
-    """A handler of SIGTERM and SIGINT; create one per process, in the main thread.
+    """A handler of SIGTERM and SIGINT; create a single instance, in the main thread.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class StopSignal:
         self.requested = True
 
 
-#: Variables with secrets. A variable with the suffix `_FILE` contains the path of a file instead.
+#: Variables with secrets. `NAME_FILE` may contain the path of a file with the secret instead.
 SECRETS = (
     "SCENEPRINT_DATABASE_URL", "PGPASSWORD", "AWS_ACCESS_KEY_ID",
     "AWS_SECRET_ACCESS_KEY", "AZURE_STORAGE_ACCOUNT_KEY",
@@ -154,10 +154,10 @@ MOST_BYTES = 16 << 10
 
 
 def read_secret_files(environment: MutableMapping[str, str]) -> None:
-    """Set the secrets that are specified by files; final line ends are removed.
+    """Replace each `NAME_FILE` variable with `NAME`, the content of the file without line ends.
 
-    The initial environment of a process, which other users may see (`docker inspect`, `/proc`),
-    then contains no secret.
+    With secrets in files, the initial environment of a process contains no secret. Other users may
+    see it (`docker inspect`, `/proc`).
 
     Raises
     ------
@@ -200,14 +200,14 @@ BINS = 92
 
 
 def bin_of(seconds: float) -> int:
-    """Return the bin of a time."""
+    """Return the index of the bin that counts a time."""
     if seconds <= FIRST_S:
         return 0
     return min(int(math.log(seconds / FIRST_S, STEP)), BINS - 1)
 
 
 def quantile(histogram: Mapping[int, int], share: float) -> float | None:
-    """Return a quantile of the times in a histogram.
+    """Estimate a quantile of the times in a histogram.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def quantile(histogram: Mapping[int, int], share: float) -> float | None:
 
     Returns
     -------
-    seconds : geometric mean of the bounds of the bin; None for an empty histogram
+    seconds : geometric mean of the bounds of the quantile's bin; None for an empty histogram
     """
     total = sum(histogram.values())
     if total == 0:
@@ -230,7 +230,7 @@ def quantile(histogram: Mapping[int, int], share: float) -> float | None:
 
 
 class Latencies:
-    """A histogram to which times are added."""
+    """A histogram of times."""
 
     def __init__(self) -> None:
         self._bins: Counter[int] = Counter()
@@ -240,7 +240,7 @@ class Latencies:
         self._bins[bin_of(seconds)] += 1
 
     def as_json(self) -> dict[str, int]:
-        """Return the histogram as it is stored."""
+        """Return the counts by bin index, for storage as JSON."""
         return {str(place): number for place, number in sorted(self._bins.items())}
 
 
@@ -253,9 +253,9 @@ def merged(parts: list[Mapping[str, int]]) -> dict[int, int]:
     return dict(total)
 
 
-# The actor of a request or a command, which is written to the audit log with each change.
+# Each entry of the audit log contains the actor of the request or command.
 
-#: Name of the actor of a command on the data folder, which no key may have.
+#: Actor of commands that run on the data folder. No key may have this name.
 COMMAND = "command"
 
 
@@ -283,7 +283,7 @@ def set_actor(actor: Actor | None) -> None:
 
 @contextmanager
 def acting_as(name: str) -> Iterator[None]:
-    """Set the actor within the context."""
+    """Set the actor within a `with` block."""
     before = _actor.set(Actor(name))
     try:
         yield
@@ -292,11 +292,11 @@ def acting_as(name: str) -> Iterator[None]:
 
 
 def current_actor() -> Actor | None:
-    """Return the current actor; None for a worker, which executes the requests of other actors."""
+    """Return the current actor; None in a worker, which acts for others."""
     return _actor.get()
 
 
-# The tenant of a request or a job, to whom its work is charged.
+# The work of a request or job counts towards the limits of its tenant.
 
 #: Tenant of work without a key: commands, upkeep, or a service that requires no keys.
 NOBODY = ""
@@ -311,7 +311,7 @@ def set_tenant(name: str) -> None:
 
 @contextmanager
 def work_of(name: str) -> Iterator[None]:
-    """Set the tenant within the context; see `set_tenant`."""
+    """Set the tenant within a `with` block; see `set_tenant`."""
     before = _current.set(name)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Records that are written as JSON with a checksum, such as manifests.
+"""Storage of records, such as manifests, as JSON with a checksum.
 
 record  --seal-->  bytes  --unseal-->  JSON values, which the record's class validates
 """
@@ -13,13 +13,13 @@ from pydantic import BaseModel, ConfigDict
 
 
 class StrictRecord(BaseModel):
-    """An immutable record that accepts no other fields and converts no values."""
+    """An immutable record that rejects unknown fields and values of other types."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 def seal(record: StrictRecord) -> bytes:
-    """Return a record as JSON with a checksum; equal records give equal bytes."""
+    """Serialize a record as JSON with a checksum; equal records give equal bytes."""
     values = json.loads(record.model_dump_json())
     return json.dumps(values | {"sha256": _checksum(values)}, indent=1).encode()
 

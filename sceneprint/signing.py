@@ -1,4 +1,4 @@
-"""The signature of a frame (Sec. III-A and III-B).
+"""Computation of a frame's signature (Sec. III-A and III-B).
 
 Frame  --describe-->  Hierarchy  --encode-->  Signature
 """
@@ -51,15 +51,15 @@ from sceneprint.types import AnyFrame, Bytes, Cloud, Floats, Hierarchy, Patches,
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """The signature of one frame, as it is stored and compared.
+    """The stored signature of a frame.
 
     Parameters
     ----------
-    vector : (d,) uint8, whitened; (25 G H,), psi, for a model without a whitening
+    vector : uint8; whitened (d,), or quantised psi (25 G H,) for a model without whitening
     model_id : id of the model; signatures of different models cannot be compared
     n_patches : number of patches of each level, finest first
-    n_pairs : number of ordered pairs of each level
-    metric : metric of the vectors
+    n_pairs : number of ordered pairs of each level, finest first
+    metric : metric that compares vectors of this model
     """
 
     vector: Bytes
@@ -84,30 +84,30 @@ def open_signer(
     *,
     cached: bool = True,
 ) -> Signer:
-    """Open a preset, a model file or a model, and its pair table.
+    """Load a model, and load or build its pair table.
 
     The first call on a machine builds the table, which takes seconds, and caches it. Further calls
-    map the cached table.
+    map the cached table into memory.
 
     Parameters
     ----------
     model : "depth", "lidar", "paper", the path of a model file, or a model
-    cache_dir : folder of derived files; None selects the user's cache folder
-    progress : callback for the number of finished bins and their total while the table is built
-    cached : whether to use the cache; False suits a model that is used once
+    cache_dir : folder of cached tables; None selects the user's cache folder
+    progress : callback with the numbers of finished bins and of all bins, while the table is built
+    cached : whether to use the cache; pass False for a model that is used once
 
     Raises
     ------
-    UnreadableModel : If `read_model` raises it
+    UnreadableModel : See `read_model`
     """
-    read = model if isinstance(model, Model) else read_model(model)
+    loaded = model if isinstance(model, Model) else read_model(model)
     if not cached:
-        return Signer(read, build_table(read, progress))
-    return Signer(read, open_table(read, cache_dir, progress))
+        return Signer(loaded, build_table(loaded, progress))
+    return Signer(loaded, open_table(loaded, cache_dir, progress))
 
 
 def see(frame: AnyFrame, p: ModelParameters) -> Surface:
-    """Return points and normals of a frame's surface, the input of Sec. III.
+    """Compute the points and normals of a frame's surface, the input of Sec. III.
 
     Returns
     -------
@@ -115,7 +115,7 @@ def see(frame: AnyFrame, p: ModelParameters) -> Surface:
 
     Raises
     ------
-    UselessFrame : If no samples lie within the sensor's range
+    UselessFrame : If no sample lies within the sensor's range
     """
     if isinstance(frame, Cloud):
         return voxels(frame, p.cloud)
@@ -124,12 +124,12 @@ def see(frame: AnyFrame, p: ModelParameters) -> Surface:
 
 
 def describe(frame: AnyFrame, p: ModelParameters) -> Hierarchy:
-    """Return the segmentation hierarchy of a frame; see `see` and `hierarchy_of`."""
+    """Compute the segmentation hierarchy of a frame; see `see` and `hierarchy_of`."""
     return hierarchy_of(see(frame, p), p, frame.name)
 
 
 def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy:
-    """Return the segmentation hierarchy of a surface: Sec. III-F.
+    """Segment a surface into a hierarchy of patches: Sec. III-F.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
 
     Raises
     ------
-    UselessFrame : If the samples lie on no surface
+    UselessFrame : If the samples are too scattered for any patch
     """
     if isinstance(seen, Voxels):
         finest = supervoxels(seen, p.cloud.seed_px, p.cloud.maximum_patches, p.segmentation)
@@ -148,14 +148,14 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
         samples, advice = "depth samples", "Check that the image is depth and its scale is right"
     if finest.max(initial=-1) < 0:
         raise UselessFrame(
-            f"{_named(name)}the {samples} lie on no surface: they are too scattered for a patch. "
+            f"{_prefix(name)}the {samples} lie on no surface: they are too scattered for a patch. "
             f"{advice}, or send another frame."
         )
     return hierarchy(seen, finest, p.hierarchy)
 
 
 def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
-    """Return patches of a fixed size for correspondences: Sec. III-E.
+    """Segment a surface into patches of a fixed size, for correspondences: Sec. III-E.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def patches_for_validation(seen: Surface, p: ModelParameters) -> Patches:
 
 
 def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
-    """Return the stored signature of a hierarchy of patches: Sec. III-A and III-B.
+    """Compute the signature of a hierarchy of patches: Sec. III-A and III-B.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
 
     Raises
     ------
-    UselessFrame : If the finest level has no pair of patches within reach
+    UselessFrame : If no two patches of the finest level are close enough to form a pair
     """
     model, whitening = signer.model, signer.model.whitening
     used = [patches.levels[level] for level in model.levels]
@@ -195,7 +195,7 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
 
 
 def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
-    """Return the pair statistics of one level, computed with the 4-D table."""
+    """Compute the pair statistics of one level with the 4-D table."""
     p = signer.model.parameters
     weights = patch_weights(level, p.weights)
     counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
@@ -203,7 +203,7 @@ def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
 
 
 def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
-    """Return the pair statistics of one level without the table: slow, for tests of the table."""
+    """Compute the pair statistics of one level without the table: slow, for tests of the table."""
     p = model.parameters.properties
     pairs = neighbour_pairs(level, p)
     weights = patch_weights(level, model.parameters.weights)[pairs].prod(axis=1)
@@ -214,7 +214,7 @@ def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
 def float_signature(levels: list[LevelStatistics], model: Model, name: str = "") -> Floats:
     """Return psi before quantisation: the normalised Fisher vectors of all levels, concatenated.
 
-    The part of a coarse level without pairs is zero.
+    A coarse level without pairs contributes zeros.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def float_signature(levels: list[LevelStatistics], model: Model, name: str = "")
     if levels[0].n_pairs == 0:
         radius = model.parameters.properties.radius
         raise UselessFrame(
-            f"{_named(name)}no two surface patches lie within {radius:g} m of each other, so no "
+            f"{_prefix(name)}no two surface patches lie within {radius:g} m of each other, so no "
             "geometry can be described. Send a frame that shows more of the scene."
         )
     return signature(
@@ -239,5 +239,5 @@ def float_signature(levels: list[LevelStatistics], model: Model, name: str = "")
     )
 
 
-def _named(name: str) -> str:
+def _prefix(name: str) -> str:
     return f"{name}: " if name else ""

@@ -1,4 +1,4 @@
-"""Fair shares of a limited number of turns among tenants, whatever their number of requests.
+"""Fair scheduling of a limited number of turns among tenants, regardless of their request rates.
 
     enter  -->  waiting  --admit-->  holding  --release-->      TurnOrder
     ThreadTurns.acquire, release                                for threads
@@ -17,26 +17,26 @@ from typing import Generic, TypeVar
 
 Waiter = TypeVar("Waiter")
 
-#: Time after its latest request for which turns are reserved for a tenant, seconds.
+#: Seconds after its latest request during which a tenant counts as present: others leave it turns.
 PRESENT_S = 60.0
-#: Time after its latest request for which other tenants rest for a tenant, and maximum rest,
-#: seconds.
+#: Seconds after its latest request during which a tenant counts as active: others rest for it.
+#: Also the maximum duration of a rest.
 ACTIVE_S = 1.0
 
 
 class TurnOrder(Generic[Waiter]):
-    """The waiting tenants, the tenants that hold turns, and their order; not thread-safe.
+    """The tenants that wait for turns or hold turns, and the order of admission; not thread-safe.
 
-    If several tenants are present, each may hold at most `beside` turns, so that other tenants need
-    not wait for its work to end. A single tenant may hold all turns.
+    If several tenants are present, each may hold at most `beside` turns, so that turns remain for
+    the others. A single tenant may hold all turns.
 
     Parameters
     ----------
     count : total number of turns
     beside : maximum number of turns per tenant if several are present; None selects half of `count`
     clock : monotonic clock, seconds
-    rests : whether a tenant rests after a turn for the duration of that turn, at most ACTIVE_S,
-        while another tenant is active; its work then uses at most half of the processors' time
+    rests : whether a tenant, after its turns, waits for as long as they took (at most ACTIVE_S)
+        while another tenant is active; it then uses at most half of the processors' time
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class TurnOrder(Generic[Waiter]):
         self._beside = max(count // 2, 1) if beside is None else beside
         self._held: Counter[str] = Counter()
         self._waiting: dict[str, deque[tuple[int, Waiter]]] = {}
-        # time of each tenant's latest request and number of its latest turn, the oldest first
+        # time of each tenant's latest request, and number of its latest turn; oldest request first
         self._seen: OrderedDict[str, tuple[float, int]] = OrderedDict()
         self._turns = 0
         # start of each tenant's latest turn, and end of its rest
@@ -56,30 +56,30 @@ class TurnOrder(Generic[Waiter]):
         self._rested_at: float | None = None
 
     def enter(self, tenant: str, waiter: Waiter, weight: int = 1) -> int:
-        """Add a waiter for `weight` simultaneous turns; return the admissible number of turns."""
+        """Add a waiter for `weight` turns at once, but at most half of all; return their number."""
         weight = min(weight, max(self._count // 2, 1))
-        self._see(tenant)
+        self._record_request(tenant)
         self._waiting.setdefault(tenant, deque()).append((weight, waiter))
         return weight
 
     def leave(self, tenant: str, waiter: Waiter) -> bool:
         """Remove a waiter; return False if it was admitted already."""
-        for one in self._waiting.get(tenant, ()):
-            if one[1] is waiter:
-                self._waiting[tenant].remove(one)
+        for entry in self._waiting.get(tenant, ()):
+            if entry[1] is waiter:
+                self._waiting[tenant].remove(entry)
                 if not self._waiting[tenant]:
                     del self._waiting[tenant]
                 return True
         return False
 
     def admit(self) -> list[Waiter]:
-        """Return the next waiters, which hold turns from now on."""
+        """Admit and return the next waiters, in order."""
         admitted: list[Waiter] = []
         most = self._count if len(self._seen) < 2 else self._beside
         while True:
             now = self._clock()
-            resting = {one for one in self._waiting if self._is_resting(one, now)}
-            self._rested_at = min((self._resting[one] for one in resting), default=None)
+            resting = {name for name in self._waiting if self._is_resting(name, now)}
+            self._rested_at = min((self._resting[name] for name in resting), default=None)
             may = [
                 (self._held[tenant], self._seen[tenant][1], tenant, queue[0][0])
                 for tenant, queue in self._waiting.items()
@@ -100,7 +100,7 @@ class TurnOrder(Generic[Waiter]):
             admitted.append(waiter)
 
     def release(self, tenant: str, weight: int = 1) -> None:
-        """Release turns."""
+        """Release `weight` turns of a tenant."""
         self._held[tenant] -= weight
         if not self._held[tenant]:
             del self._held[tenant]
@@ -109,12 +109,12 @@ class TurnOrder(Generic[Waiter]):
                 self._resting[tenant] = now + min(now - began, ACTIVE_S)
 
     def rest_s(self) -> float | None:
-        """Return the seconds until the next rest of a waiting tenant ends; None if none rests."""
+        """Return the seconds until a waiting tenant's rest ends; None if none of them rests."""
         return None if self._rested_at is None else max(self._rested_at - self._clock(), 0.0)
 
     def waiters(self) -> list[Waiter]:
         """Return all waiters."""
-        return [one for queue in self._waiting.values() for _, one in queue]
+        return [waiter for queue in self._waiting.values() for _, waiter in queue]
 
     def _is_resting(self, tenant: str, now: float) -> bool:
         until = self._resting.get(tenant)
@@ -126,12 +126,12 @@ class TurnOrder(Generic[Waiter]):
         return True
 
     def _is_beside(self, tenant: str, now: float) -> bool:
-        """Return whether another tenant is active."""
-        others = (seen for one, (seen, _) in reversed(self._seen.items()) if one != tenant)
+        """Return whether another tenant sent a request within the last ACTIVE_S."""
+        others = (seen for other, (seen, _) in reversed(self._seen.items()) if other != tenant)
         latest = next(others, None)
         return latest is not None and latest > now - ACTIVE_S
 
-    def _see(self, tenant: str) -> None:
+    def _record_request(self, tenant: str) -> None:
         now = self._clock()
         self._seen[tenant] = now, self._seen.pop(tenant, (now, 0))[1]
         while True:
@@ -153,8 +153,11 @@ class ThreadTurns:
         self._closed = False
 
     def acquire(self, tenant: str, longest_s: float) -> bool:
-        """Wait for a turn; return False if none is free in time, or after `close`."""
-        mine = threading.Lock()  # it is released when this thread is admitted
+        """Wait at most `longest_s` seconds for a turn; return whether the thread holds a turn.
+
+        After `close`, the result is False.
+        """
+        mine = threading.Lock()  # released when this thread is admitted
         mine.acquire()
         with self._lock:
             if self._closed:
@@ -170,7 +173,7 @@ class ThreadTurns:
         return not self._leave(tenant, mine)
 
     def release(self, tenant: str) -> None:
-        """Release a turn."""
+        """Release a turn of a tenant."""
         with self._lock:
             self._order.release(tenant)
             self._admit()
@@ -179,8 +182,8 @@ class ThreadTurns:
         """Admit no more threads, and wake all waiting threads."""
         with self._lock:
             self._closed = True
-            for one in self._order.waiters():
-                one.release()
+            for waiter in self._order.waiters():
+                waiter.release()
 
     def _leave(self, tenant: str, mine: threading.Lock) -> bool:
         with self._lock:
@@ -191,5 +194,5 @@ class ThreadTurns:
 
     def _admit(self) -> None:
         if not self._closed:
-            for one in self._order.admit():
-                one.release()
+            for waiter in self._order.admit():
+                waiter.release()

@@ -1,7 +1,7 @@
-"""The records that modules exchange: frames, and the results of their processing.
+"""Records that modules exchange: frames and what is computed from them.
 
 Lengths are metres, angles radians, times seconds; other units are in the name. Camera frames are
-optical: x right, y down, z forward. Clouds keep their sensor's axes.
+optical: x right, y down, z forward. Clouds have their sensor's axes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Sphere:
-    """The camera of a range image about a viewpoint: azimuth by elevation, in equal steps.
+    """The camera of a range image around a viewpoint, with equal steps in azimuth and elevation.
 
     Let (a, b, c) be the sensor's axes in cyclic order such that c is the pole. A direction has
     azimuth = atan2(b, a) and elevation = asin(c); column = (azimuth - left) / step, with the
@@ -86,7 +86,7 @@ class Sphere:
 
     @property
     def sees_around(self) -> bool:
-        """Return whether the image covers at least three quarters of a turn."""
+        """Return whether the image covers more than three quarters of a turn."""
         return self.width * self.step > 1.5 * math.pi
 
 
@@ -103,7 +103,7 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
-    """An undistorted depth image, the input of the geometry.
+    """An undistorted depth image, from which signatures and artifacts are computed.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class DepthFrame:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """A point cloud, the input of the geometry.
+    """A point cloud, from which signatures and artifacts are computed.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class Cloud:
         free space is unknown
     name : name of the frame in messages
     pose : (4, 4) T_parent_sensor; None if unknown. The signature does not depend on it
-    note : description of earlier changes to the points, for display; may be empty
+    note : displayed description of earlier changes to the points; may be empty
     """
 
     points: Floats32
@@ -150,8 +150,8 @@ class ReferenceSurface:
     triangles : (M, 3) int32 indices of points, counterclockwise as seen from the front; None for a
         cloud
     offset : (3,) float64, metres; points + offset are the coordinates of the file. It is zero
-        unless the origin is more than a kilometre away
-    up : (3,) float64, unit vector against gravity
+        unless the points are more than a kilometre from the origin
+    up : (3,) float64, unit vector that points up, against gravity
     """
 
     points: Floats32
@@ -168,7 +168,7 @@ AnyFrame = DepthFrame | Cloud
 class Surface:
     """The observed surface, as an image of points and normals.
 
-    Unordered points, such as those of a cloud, are an image of one row without a camera.
+    Unordered points, such as a cloud, form an image of one row without a camera.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ class Surface:
     valid : (h, w) bool
     areas : (h, w) float32, square metres of surface per pixel; 0 if invalid
     camera : camera of this image; None for unordered points
-    spread : unordered points that are evenly distributed over the surface of a scan
+    spread : for a scan, unordered points that are evenly distributed over its surface
         (`range_image.spread_points`); None for other frames
     """
 
@@ -190,7 +190,7 @@ class Surface:
 
     @property
     def fitted(self) -> Surface:
-        """Return the target of fine alignment: the spread points of a scan, else this surface."""
+        """Return the surface for fine alignment: the spread points of a scan, or this surface."""
         return self if self.spread is None else self.spread
 
 
@@ -204,7 +204,7 @@ class Patches:
     normals : (P, 3) float64 unit vectors towards the sensor; n of Eq. (1)
     areas : (P,) float64, square metres
     sizes : (P,) int32, number of pixels
-    coherences : (P,) float64 in (0, 1], length of the mean of the pixels' normals; 1 if flat
+    coherences : (P,) float64 in (0, 1], length of the mean normal of the pixels; 1 if flat
     """
 
     means: Floats
@@ -233,7 +233,7 @@ class Hierarchy:
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The geometry artifact: all data of a frame that validation requires.
+    """The geometry artifact of a frame: all data that validation requires.
 
     Parameters
     ----------
@@ -254,12 +254,12 @@ PINHOLE, SPHERE, NOWHERE = 0, 1, 2
 
 
 def camera_of(camera: Camera | None, nearest: float) -> Floats:
-    """Return a camera as an array for kernels, (7,): its kind, `nearest`, and five parameters.
+    """Return a camera as an array (7,) for kernels: its kind, `nearest`, and five parameters.
 
     Parameters
     ----------
     camera : camera; None for unordered points
-    nearest : minimum depth of a point that is looked up, metres
+    nearest : minimum depth at which kernels project points, metres
     """
     if isinstance(camera, Intrinsics):
         return np.array([PINHOLE, nearest, camera.fx, camera.fy, camera.cx, camera.cy, 0.0])
