@@ -3,7 +3,7 @@
 
 import { h } from "../lib/dom.js";
 import { count } from "../lib/format.js";
-import { tokenOf } from "./scene.js";
+import { tintOf } from "./scene.js";
 
 /**
  * @param {import("./data.js").Path[]} paths that are drawn
@@ -23,7 +23,7 @@ export function legend(paths, hidden, onchange) {
   };
   const rows = paths.map((one, i) => h("li", {}, h("label", { class: "paths-run" },
     boxes[i],
-    h("span", { class: "paths-label", style: { borderColor: `var(${tokenOf(one.colour)})` }, "aria-hidden": "true" }, String(i + 1)),
+    h("span", { class: "paths-label", style: { borderColor: `var(--${tintOf(one)})` }, "aria-hidden": "true" }, String(i + 1)),
     h("span", { class: "paths-name" }, nameOf(one), one.robot !== null && one.robot !== one.session && h("span", { class: "muted" }, ` ${one.robot}`)),
     h("span", { class: "number muted" }, poses(one)))));
   return [

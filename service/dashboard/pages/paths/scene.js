@@ -5,6 +5,7 @@ import { metres } from "../lib/format.js";
 import { spread } from "../lib/labels.js";
 import { letterOf } from "../query/alternatives.js";
 import { Orbit, VIEW } from "../viewer/camera.js";
+import { colourOf } from "../viewer/colours.js";
 import { around } from "../viewer/layers.js";
 import { dot } from "../viewer/matrix.js";
 import { links } from "../viewer/shapes.js";
@@ -26,17 +27,8 @@ const ASKED = ["query", "ellipsoid", "alternatives", "matches", "matched"];
 /** Where a picture in 3-D begins. */
 const ASIDE = { azimuth: 0.6, elevation: 0.55 };
 
-/** Colour of a run: a token of paths.css. @param {number} colour */
-export const tokenOf = (colour) => `--path-${colour}`;
-
-/** That of a run. @param {import("./data.js").Run} run */
-export const runToken = (run) => tokenOf(run.colour);
-
-/** The same as the theme has it now: red, green, blue. @param {import("./data.js").Run} run */
-export const tintOf = (run) => colourOf(runToken(run));
-
-/** A token's colour as the theme has it now. @param {string} token @returns {number[]} red, green, blue */
-const colourOf = (token) => rgb(getComputedStyle(document.documentElement).getPropertyValue(token));
+/** Name of a run's colour in paths.css. @param {import("./data.js").Run} run */
+export const tintOf = (run) => `path-${run.colour}`;
 
 /**
  * @param {HTMLElement} place where the canvas goes
@@ -84,7 +76,6 @@ export class Scene {
     this.canvas = canvas;
     this.#parts = parts;
     this.onview = onview;
-    window.addEventListener("sceneprint:theme", () => this.#paint(), { signal });
     signal.addEventListener("abort", () => this.#viewer?.destroy(), { once: true });
   }
 
@@ -139,11 +130,10 @@ export class Scene {
     this.#size = Math.max(size, 0.5) * 0.035;
     this.#ground();
     paths.forEach((one, i) => {
-      this.#viewer.lines(`path ${i}`, { positions: polyline(one.world.map((m) => this.near(placeOf(m)))), width: 2 });
+      this.#viewer.lines(`path ${i}`, { positions: polyline(one.world.map((m) => this.near(placeOf(m)))), tint: tintOf(one), width: 2 });
     });
     this.#ratio = 0;
     this.#thin(1);
-    this.#paint();
     this.#label();
   }
 
@@ -175,7 +165,7 @@ export class Scene {
     const shapes = ones.map(({ pose, camera }) => copies(sensor(camera, size), [this.moveOrigin(pose)]));
     const trails = ones.map(({ trail = [] }) => polyline(trail.map((pose) => this.near(placeOf(pose)))));
     const joined = (parts) => ({ positions: Float32Array.from(parts.flatMap((one) => [...one])),
-      colours: parts.flatMap((one, i) => { const tint = colourOf(ones[i].token); return Array.from(one, (_, k) => tint[k % 3]); }) });
+      colours: parts.flatMap((one, i) => { const tint = colourOf(ones[i].token.slice(2)); return Array.from(one, (_, k) => tint[k % 3]); }) });
     this.#viewer.lines(id, { ...joined(shapes), width: 3 });
     this.#viewer.lines(`${id} trails`, { ...joined(trails), width: 1.5 });
   }
@@ -293,9 +283,8 @@ export class Scene {
       const share = Math.max(Math.ceil((FRUSTUMS * ratio * one.world.length) / Math.max(total, 1)), 2);
       const size = this.#size / Math.sqrt(ratio), chosen = spaced(one.world.map(placeOf), 0.7 * size, share);
       const positions = copies(this.#sensor(one, size), chosen.map((k) => this.moveOrigin(one.world[k])));
-      this.#viewer.lines(`frustums ${i}`, { positions, width: 1.5, visible: !this.#hidden.has(i) });
+      this.#viewer.lines(`frustums ${i}`, { positions, tint: tintOf(one), width: 1.5, visible: !this.#hidden.has(i) });
     });
-    this.#paint();
   }
 
   #ground() {
@@ -311,17 +300,10 @@ export class Scene {
     put(this.#parts.ground, `Grid ${metres(step)}${this.#under.floor !== null ? "" : height === 0 ? ", at height 0" : ", at the lowest pose"}`);
   }
 
-  #paint() {
-    this.#drawn.forEach((one, i) => {
-      const tint = tintOf(one);
-      for (const kind of ["path", "frustums"]) this.#viewer.lines(`${kind} ${i}`, { tint });
-    });
-  }
-
   #label() {
     const made = [];
     this.#drawn.forEach((one, i) => {
-      if (one.world.length) made.push({ path: i, at: this.near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(${runToken(one)})` } }, String(i + 1)) });
+      if (one.world.length) made.push({ path: i, at: this.near(placeOf(one.world[0])), node: h("span", { class: "paths-label", style: { borderColor: `var(--${tintOf(one)})` } }, String(i + 1)) });
     });
     this.#asked?.alternatives.forEach((pose, i) => {
       made.push({ at: this.near(placeOf(pose)), node: h("span", { class: "paths-label", dataset: { kind: "alternative" } }, letterOf(i)) });
@@ -367,8 +349,3 @@ export class Scene {
 
 // a cloud's ring is as wide as a frustum
 const sensor = (camera, size) => frustum(camera, camera ? size : size / 2);
-
-function rgb(text) {
-  const number = parseInt(text.trim().slice(1), 16);
-  return [(number >> 16) & 255, (number >> 8) & 255, number & 255];
-}

@@ -2,7 +2,7 @@
 
 import { h, put } from "../lib/dom.js";
 import { count, time } from "../lib/format.js";
-import { runToken } from "../paths/scene.js";
+import { tintOf } from "../paths/scene.js";
 
 export const COLOURS = [["height", "Height"], ["session", "Session"], ["seen", "Times seen"], ["age", "Last seen"]];
 const MOST_SESSIONS = 12;
@@ -79,7 +79,7 @@ function sessions(names, runs) {
   return [
     h("ul", { class: "place-sessions" }, shown.map((name, i) => {
       const run = runs[names.length - shown.length + i] ?? null;
-      return h("li", {}, h("span", { class: "place-swatch", style: { background: run === null ? "var(--muted)" : `var(${runToken(run)})` } }), h("span", { class: "paths-name" }, name));
+      return h("li", {}, h("span", { class: "place-swatch", style: { background: run === null ? "var(--muted)" : `var(--${tintOf(run)})` } }), h("span", { class: "paths-name" }, name));
     })),
     h("p", { class: "muted" }, `A cell has the colour of the session that saw it last.${names.length > shown.length ? ` The last ${count(shown.length)} of ${count(names.length)}.` : ""}`),
   ];

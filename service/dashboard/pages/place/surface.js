@@ -245,7 +245,7 @@ export class Surface {
 
   /** Colours of sessions, as the theme has them. */
   palette() {
-    return Uint8Array.from(this.runs.flatMap((one) => (one === null ? colourOf("muted") : tintOf(one))));
+    return Uint8Array.from(this.runs.flatMap((one) => colourOf(one === null ? "muted" : tintOf(one))));
   }
 
   #extent() {

@@ -1,7 +1,5 @@
 // Colours of the theme as WebGL takes them, and those of data that mean the same in every theme.
 
-const TOKENS = new Set(["query", "match", "rival", "violation", "accent", "muted", "ink", "good",
-  "warn", "bad", "line", "edge", "surface", "sunken", "bg", "raised"]);
 /** Of a residual: within a fifth, two fifths, and all of what validation allows; as overlay.ply. */
 export const STEPS = [[38, 130, 60], [140, 190, 70], [240, 200, 60]];
 export const BESIDE = [150, 155, 160];
@@ -10,6 +8,7 @@ export const VIOLATES = [200, 40, 40];
 /** @type {any} the context that colours are read from, once there is one */
 let pen = null;
 const known = new Map(); // a token's bytes, until the theme changes
+window.addEventListener("sceneprint:theme", () => known.clear()); // before those that draw hear of it
 
 /** @param {string} text any CSS colour @returns {number[]} red, green, blue, 0 to 255 */
 function bytesOf(text) {
@@ -21,28 +20,13 @@ function bytesOf(text) {
 }
 
 /**
- * @param {string | number[]} tint a token's name ("query", "match", ...) or red, green, blue
+ * @param {string | number[]} tint a token's name ("query", "path-3", ...) or red, green, blue
  * @returns {number[]} 0 to 255, as the theme has it now
  */
 export function colourOf(tint) {
   if (Array.isArray(tint)) return tint;
-  const name = TOKENS.has(tint) ? tint : "muted";
-  if (!known.has(name)) {
-    const told = getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
-    known.set(name, bytesOf(told || "#808080"));
-  }
-  return known.get(name);
-}
-
-/** Tells when the theme changes, by the system or by the page; returns how to stop. */
-export function onTheme(changed) {
-  const turned = () => { known.clear(); changed(); };
-  const watcher = new MutationObserver(turned);
-  watcher.observe(document.documentElement, { attributeFilter: ["data-theme"] });
-  const dark = matchMedia("(prefers-color-scheme: dark)");
-  dark.addEventListener("change", turned);
-  known.clear(); // it may have turned while nobody watched
-  return () => { watcher.disconnect(); dark.removeEventListener("change", turned); };
+  if (!known.has(tint)) known.set(tint, bytesOf(getComputedStyle(document.documentElement).getPropertyValue(`--${tint}`).trim()));
+  return known.get(tint);
 }
 
 /**

@@ -2,7 +2,7 @@
 
 import { hands } from "../lib/hands.js";
 import { Orbit, VIEW } from "./camera.js";
-import { colourOf, onTheme } from "./colours.js";
+import { colourOf } from "./colours.js";
 import { CellsLayer } from "./cells.js";
 import { CloudLayer, ShapeLayer, around } from "./layers.js";
 import { dot, transformed } from "./matrix.js";
@@ -82,7 +82,7 @@ export class Viewer {
     canvas.style.setProperty("touch-action", "none");
     const { signal } = this.#end;
     this.#hands(signal);
-    signal.addEventListener("abort", onTheme(() => this.redraw()));
+    window.addEventListener("sceneprint:theme", () => this.redraw(), { signal });
     canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault(); // or it never comes back
       this.#lost = true;
