@@ -108,10 +108,12 @@ def preset_scenes(preset: str) -> tuple[Scenes, int]:
 #: the transform do not refute a rival.
 _MOST_VIOLATIONS = 0.08
 #: Acceptance for scans. Planes and free space decide, because two scans may share little surface.
-#: Corridors look similar, so six distinct planes must agree, with few violations of free space.
+#: Corridors look similar, so six distinct planes must agree, with few violations of free space. In
+#: streets, many small planes agree, although two scans share little surface.
 _SCAN_ACCEPTANCE = AcceptanceParameters(
     residual_m=0.2, residual_rad=math.radians(3.0), violation_weight=0.0, evidence=0.0,
-    plane_overlap=0.0, strong=0.0, net_strong=0.15, planes=6.0, plane_violations=_MOST_VIOLATIONS,
+    plane_overlap=0.0, strong=0.0, net_strong=0.15, planes=6.0, many_planes=10.0,
+    plane_violations=_MOST_VIOLATIONS,
 )  # fmt: skip
 #: Ratio of the lengths for a scanner to those for a depth camera.
 _FACTOR = 5.0

@@ -100,7 +100,7 @@ def test_scans_are_held_to_more(
 
 def test_scans_may_share_little_but_not_against_free_space() -> None:
     scans = preset_parameters("lidar")[0].validation.acceptance
-    little = replace(GOOD, overlap=0.06, plane_overlap=0.16, violations=0.0)
+    little = replace(GOOD, overlap=0.06, plane_overlap=0.16, violations=0.0, planes=10.0)
     assert objection(little, scans, "full") is None
     assert belief(little, 0.0, scans)[:2] == ("accepted", "strong")
     assert belief(replace(little, plane_overlap=0.14), 0.0, scans)[:2] == ("accepted", "weak")
@@ -109,6 +109,11 @@ def test_scans_may_share_little_but_not_against_free_space() -> None:
         "rejected",
         "the plane overlap is 16%, but 2.5% of the points lie where the other frame saw free space",
     )
+    # less is enough if more than ten planes agree
+    many = replace(little, planes=10.1, violations=0.033)
+    assert objection(many, scans, "full") is None
+    assert belief(many, 0.0, scans)[:2] == ("accepted", "weak")
+    assert objection(replace(many, violations=0.034), scans, "full") is not None
 
 
 SPARSE = Evidence(0.01, 0.01, 0.15, 0.2, 0.004, 1e-3, planes=8.0, worst_violations=0.01)

@@ -32,8 +32,9 @@ BARE = {
         "residual_rad", "violation_weight", "evidence", "plane_overlap", "strong", "weak",
         "ambiguous", "ambiguous_share", "stiffness", "blind_ambiguous_share",
         "blind_evidence", "blind_plane_overlap", "net_weight", "net", "net_strong", "planes",
-        "plane_violations", "worst_violations", "sparse_evidence", "sparse_plane_overlap",
-        "sparse_planes", "sparse_plane_violations", "sparse_worst_violations", "alone_planes",
+        "many_planes", "many_planes_net", "plane_violations", "worst_violations", "sparse_evidence",
+        "sparse_plane_overlap", "sparse_planes", "sparse_plane_violations",
+        "sparse_worst_violations", "alone_planes",
         "apart_rad", "apart_planes", "apart_plane_overlap",
     },
     "AmbiguityParameters": {

@@ -54,6 +54,10 @@ class AcceptanceParameters:
     plane_overlap: float = 0.15  #: minimum plane overlap
     net_weight: float = 3.0  #: net plane overlap = plane overlap - net_weight * violations
     net: float = 0.1  #: minimum net plane overlap
+    many_planes: float = (
+        math.inf
+    )  #: number of distinct planes above which `many_planes_net` applies
+    many_planes_net: float = 0.06  #: minimum net plane overlap if many planes agree
     net_strong: float = 0.1  #: net plane overlap below which an accepted match is weak
     planes: float = 0.0  #: minimum number of distinct planes that agree
     plane_violations: float = 1.0  #: maximum share of violations by planes
@@ -140,7 +144,7 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
         return "rejected", f"{e.violations:.1%} {_IN_FREE_SPACE}"
     if e.plane_overlap < (p.blind_plane_overlap if blind else p.plane_overlap):
         return "rejected", f"mostly one plane agrees (plane overlap {e.plane_overlap:.0%})"
-    if e.net(p) < p.net:
+    if e.net(p) < (p.many_planes_net if e.planes > p.many_planes else p.net):
         return "rejected", (
             f"the plane overlap is {e.plane_overlap:.0%}, but {e.violations or 0.0:.1%} "
             f"{_IN_FREE_SPACE}"
