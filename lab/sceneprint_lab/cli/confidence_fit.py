@@ -44,8 +44,8 @@ TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
 FLAWS = {"depth": MapFlaws(0.5, 0.01, 0.004), "lidar": MapFlaws(0.9, 0.0, 0.0)}
 #: Flaws of maps whose frames are fused to one surface, which has fewer gaps.
 SURFACE_FLAWS = {"depth": MapFlaws(0.3, 0.01, 0.004), "lidar": MapFlaws(0.3, 0.0, 0.0)}
-#: Smallest penalty of a pose that a single view supports. Two scans of a real street often agree
-#: at offsets of metres along it, and synthetic streets have too much detail to show this.
+#: Smallest penalty of a pose that a single view supports. A fit to 1,200 queries without it found
+#: fewer poses in recordings of scanners; neither fit found a wrong one.
 LONE = {"depth": 0.0, "lidar": 2.5}
 
 
