@@ -59,8 +59,8 @@ class AdminMethods(JobMethods):
 
     @Call
     async def keys(self) -> list[Key]:
-        """Return all keys by name, without secrets."""
-        return [one async for one in self._pages(Page[Key], "/v1/keys")]
+        """Return all keys, sorted by name, without their secrets."""
+        return [key async for key in self._pages(Page[Key], "/v1/keys")]
 
     @Call
     async def rotate_key(self, name: str, overlap_s: float = 3600.0) -> MadeKey:
@@ -108,18 +108,18 @@ class AdminMethods(JobMethods):
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         follow: bool = True,
     ) -> AsyncIterator[Event]:  # fmt: skip
-        """Yield events in order: first stored events, then new ones as they occur.
+        """Yield events in order: stored events after `after`, then new events as they occur.
 
-        The client reconnects after a broken stream without losing or repeating an event. If the
-        service no longer stores some of them, one event `events.missed` replaces these.
+        After a broken connection, the client reconnects without losing or repeating events. An
+        event `events.missed` replaces events that the service no longer stores.
 
         Parameters
         ----------
-        map_name : name of a map whose events are returned; default: all maps
-        kinds : prefixes of the kinds to return, such as `frame.`; default: all
-        after : id of the event before the first one to return; "0" starts with the oldest stored
-            event. Default: "0", or with `follow` only new events
-        follow : whether to wait for new events without end
+        map_name : map of the events; default: all maps
+        kinds : prefixes of the kinds of events, such as `frame.`; default: all kinds
+        after : id of an event; only later events are returned, "0" selects all stored events.
+            Default: "0", or with `follow` only new events
+        follow : whether to wait for new events indefinitely
 
         Raises
         ------
@@ -136,7 +136,7 @@ class AdminMethods(JobMethods):
         self, map_name: str | None = None, *, kinds: Sequence[str] = (), after: str | None = None,
         cursor: str | None = None, limit: int = 100, newest_first: bool = True,
     ) -> EventPage:  # fmt: skip
-        """Return a page of stored events; `cursor` is the `next_cursor` of the page before."""
+        """Return a page of stored events; `cursor` is the `next_cursor` of the previous page."""
         parameters = without_none(
             map=map_name, kind=list(kinds), after=after, cursor=cursor, limit=limit,
             order="newest" if newest_first else "oldest",
@@ -147,6 +147,7 @@ class AdminMethods(JobMethods):
     async def _stored_events(
         self, map_name: str | None, kinds: Sequence[str], after: str | None
     ) -> AsyncIterator[Event]:
+        """Yield the events of all pages, oldest first."""
         cursor = None
         while True:
             page = await self.event_page(
@@ -160,7 +161,7 @@ class AdminMethods(JobMethods):
 
     @Call
     async def stats(self, map_name: str | None = None, *, minutes: int = 60) -> Stats:
-        """Return statistics of the service or one map, and their history of up to 60 minutes.
+        """Return statistics of the service or of a map, with a history of 1 to 60 minutes.
 
         Raises
         ------
@@ -172,5 +173,5 @@ class AdminMethods(JobMethods):
 
     @Call
     async def models(self) -> list[ModelInfo]:
-        """Return the models that ship with the service, and those that its maps use or used."""
+        """Return the models that the service includes, or that its maps use or have used."""
         return (await self._call(Page[ModelInfo], "GET", "/v1/models")).items

@@ -1,4 +1,4 @@
-"""Methods that are written once, as coroutines, for clients that block and for clients that do not.
+"""Descriptors that turn one coroutine into a method of the blocking and the asynchronous client.
 
 class MapMethods(ServiceConnection):
     @Call
@@ -25,7 +25,7 @@ class Blocking:
 
 
 class _Method(Generic[P, T]):
-    """Descriptor of a method: the function itself, or of a client that blocks, one that ends it."""
+    """Descriptor of a coroutine function, or, on a Blocking client, of its blocking version."""
 
     def __init__(self, function: Callable[..., Any], finish: Callable[[Any], object]) -> None:
         self._function = function
@@ -75,7 +75,7 @@ class Series(_Method[P, T]):
 
 
 def result_of(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Return the result of a coroutine that never suspends."""
+    """Return the result of a coroutine; raise AssertionError if it suspends."""
     try:
         coroutine.send(None)
     except StopIteration as end:
@@ -96,5 +96,5 @@ def items_of(items: AsyncIterator[T]) -> Iterator[T]:
 
 
 async def settled(value: T | Awaitable[T]) -> T:
-    """Return a value, or the result of an awaitable, as httpx's two classes return them."""
+    """Return a value, or await it: httpx.Client returns values, httpx.AsyncClient awaitables."""
     return await value if inspect.isawaitable(value) else value

@@ -45,7 +45,7 @@ class Status(ApiRecord):
 
 
 class ServiceMethods(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, AdminMethods):
-    """All methods of both clients."""
+    """Methods of both clients."""
 
     def __init__(
         self, url: str = DEFAULT_URL, key: str | None = None, *, timeout_s: float = 60.0
@@ -59,7 +59,7 @@ class ServiceMethods(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, Ad
 
     @Call
     async def healthy(self) -> bool:
-        """Return whether the service answers one request within a short timeout."""
+        """Return whether the service answers a health check within 5 seconds."""
         try:
             timeout = min(self._timeout_s, _HEALTHY_S)
             response = await settled(self._http.get("/healthz", timeout=timeout))
@@ -69,9 +69,9 @@ class ServiceMethods(MapMethods, SurfaceMethods, UploadMethods, QueryMethods, Ad
 
 
 class AsyncClient(ServiceMethods):
-    """The methods of Client as coroutines; lists of frames and the like are for `async for`.
+    """Asynchronous client with the methods of Client, as coroutines or asynchronous iterators.
 
-    Use it in one event loop, with `async with`. A cancelled call closes its connection, and is not
+    Use it in one event loop, with `async with`. A cancelled call closes its connection and is not
     repeated; the service may have executed it. Files are read in threads.
 
     Parameters
@@ -91,7 +91,7 @@ class AsyncClient(ServiceMethods):
 
 
 class Client(ServiceMethods, Blocking):
-    """Maps, frames and queries of a service; safe to share between threads.
+    """Blocking client of a service; safe to share between threads.
 
     Requests are repeated after brief failures and while the service is busy. Repeating an upload
     is safe, since a map stores the same frame only once.
@@ -99,8 +99,8 @@ class Client(ServiceMethods, Blocking):
     Parameters
     ----------
     url : address of the service
-    key : key of the API; None if the service requires none
-    timeout_s : longest time without data from the service
+    key : API key; None if the service requires no key
+    timeout_s : maximum time without data from the service, seconds
 
     Raises
     ------
@@ -130,7 +130,7 @@ class Client(ServiceMethods, Blocking):
                 "Client.embedded runs the service in this process, and its package is not "
                 "installed. In a clone, run: pip install ."
             )
-        # The client has no dependency on the service, so its package is imported by name.
+        # The package of the service is not a dependency of the client.
         service = import_module("service.embedded").LocalService(Path(path))
         client = cls.__new__(cls)
         ServiceConnection.__init__(client, _EMBEDDED_URL, None, _EMBEDDED_S, service, service)

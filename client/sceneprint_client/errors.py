@@ -1,12 +1,12 @@
-"""All errors that a client of sceneprint raises deliberately, with their common base.
+"""Errors that sceneprint raises deliberately, with their common base class.
 
     SceneprintError
       x FrameError              the caller's frame is invalid; a retry cannot help
-        - UnreadableFrame       its bytes do not decode to a depth image
-        - UnreadableCloud       its bytes do not decode to a point cloud
-        - InvalidIntrinsics     its intrinsics do not describe a camera
-        - InvalidPose           its pose is not a rigid transform
-        - UselessFrame          it decodes, but has no surface to sign
+        - UnreadableFrame       the bytes do not decode to a depth image
+        - UnreadableCloud       the bytes do not decode to a point cloud
+        - InvalidIntrinsics     the intrinsics do not describe a camera
+        - InvalidPose           the pose is not a rigid transform
+        - UselessFrame          the frame decodes, but has no surface to sign
         - UnreadableArchive     a file of many frames is not an archive, or is unsafe to read
       x DatasetError            a folder or file is not a sequence of frames
       x ModelError
@@ -26,12 +26,12 @@
         - JoinStands            poses depend on the join of an association
         - NotIndexed            the result of a frame or job does not exist yet
       x InvalidRequest          a field of a request is missing, unknown or out of range
-        - MalformedBody         its body cannot be parsed
+        - MalformedBody         the body cannot be parsed
         - UnsupportedType       the operation does not read bodies of this type
-        - TooLarge              its body exceeds the limit of the service
-        - SlowBody              its body arrived too slowly
-        - AmbiguousKey          it has more than one Authorization header
-        - IdempotencyConflict   its Idempotency-Key was used for another request
+        - TooLarge              the body exceeds the limit of the service
+        - SlowBody              the body arrived too slowly
+        - AmbiguousKey          the request has more than one Authorization header
+        - IdempotencyConflict   the Idempotency-Key was used for another request
       x PreconditionFailed      the object was edited after the caller read it
       x KeyRequired             the service requires a key; it is missing or invalid
       x Forbidden               the key lacks the required scope
@@ -45,7 +45,8 @@
           - StoreFull           the disk is full
           - ReadOnlyStore       the folder or database is read-only
           - StoreLocked         another process has locked the database for too long
-        - NewerSchema           a later version of sceneprint wrote it
+          - StoreAway           the database or blob server does not answer
+        - NewerSchema           a later version of sceneprint wrote the database
         - DamagedBlob           stored bytes are missing or damaged
         - DamagedSignature      the checksum of a stored signature does not match
       x ServiceError            a service refused a request or is unreachable
@@ -55,15 +56,13 @@
 
 A message says what happened, why, and what to do. Commands print it on one line and exit with
 code 2. `ValueError` and `TypeError` indicate mistakes in the calling program.
-
-A message says what happened, why, and what to do. Commands print it on one line
 """
 
 import re
 
 
 def kebab_case(name: str) -> str:
-    """Return the name of a class as in the type of a problem: UnknownMap becomes unknown-map."""
+    """Convert a class name to the last part of a problem's type: UnknownMap to unknown-map."""
     return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name).lower()
 
 
@@ -75,7 +74,7 @@ class SceneprintError(Exception):
 
 
 def printable(text: str) -> str:
-    """Return an external text as one printable line; names in damaged files may hold any bytes."""
+    """Return text from a file as one printable line; damaged files may contain any characters."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
@@ -201,7 +200,7 @@ class InvalidRequest(SceneprintError):
     Parameters
     ----------
     message : description of what happened, why, and what to do
-    fields : (place, reason) of each invalid field
+    fields : (name, reason) of each invalid field
     """
 
     def __init__(self, message: str, fields: tuple[tuple[str, str], ...] = ()) -> None:
@@ -234,9 +233,7 @@ class IdempotencyConflict(InvalidRequest):
 
 
 class KeyRequired(SceneprintError):
-    """The service requires a key, and that of the request is missing, unknown, revoked or
-    expired.
-    """
+    """The service requires a key, and the request has no valid key."""
 
 
 class Forbidden(SceneprintError):

@@ -31,7 +31,7 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
 
     Parameters
     ----------
-    limit : maximum accepted size, bytes; a larger file is rejected unread
+    limit : maximum size of the file, bytes
     error : class of the error to raise
 
     Raise `error` if the file is missing, is not a regular file (reading a pipe could block
@@ -57,7 +57,7 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
 
 
 def _read_some(file: BinaryIO, most: int) -> bytes:
-    """Return at most `most` bytes; `file.read(most)` would allocate `most` bytes at once."""
+    """Read at most `most` bytes in pieces; a single read would allocate `most` bytes at once."""
     pieces, left = [], most
     while piece := file.read(min(left, _PIECE)):
         pieces.append(piece)
@@ -96,7 +96,7 @@ def read_object(
 
 
 def data_lines(text: str) -> Iterator[tuple[int, str]]:
-    """Yield number and content of each line that is neither empty nor a # comment."""
+    """Yield the number and content of each line that is neither empty nor a # comment."""
     for number, line in enumerate(text.splitlines(), start=1):
         content = line.strip()
         if content and not content.startswith("#"):
@@ -153,7 +153,7 @@ def npy_header(
 
 
 def _fields(data: bytes, error: type[FrameError]) -> tuple[dict[str, object], int]:
-    """Return the header and the offset of the numbers."""
+    """Return the header of an NPY file and the offset of its numbers; raise `error` if invalid."""
     damaged = "The header of the NPY file cannot be read. Write the file with numpy.save."
     size = {1: 2, 2: 4, 3: 4}.get(data[6]) if len(data) >= 12 else None
     if size is None:
@@ -179,6 +179,7 @@ def _fields(data: bytes, error: type[FrameError]) -> tuple[dict[str, object], in
 def _dtype(
     described: object, error: type[FrameError], advice: str, types: tuple[str, ...]
 ) -> np.dtype[Any]:
+    """Return the described type if it is one of `types`; raise `error` with `advice` if not."""
     if described == "|O":
         raise error(
             "The NPY file holds pickled Python objects, which can run code when they are loaded. "
@@ -331,7 +332,7 @@ def read_livox_scan(data: bytes, *, ros1: bool = False) -> SerializedCloud:
 
 
 def _is_encapsulated(data: bytes) -> bool:
-    """Return whether bytes begin as plain CDR: 0, byte order, and options with only padding."""
+    """Return whether the bytes start with a plain CDR header: 0, byte order, 0, padding."""
     return len(data) >= _HEAD and data[0] == 0 and data[1] <= 1 and data[2] == 0 and data[3] <= 3
 
 
@@ -389,7 +390,7 @@ class _Reader:
         return self.bytes(1)[0]
 
     def align(self, size: int) -> None:
-        """Skip padding before a number of `size` bytes; ROS 1 has none."""
+        """Skip the padding before a number of `size` bytes; ROS 1 does not pad."""
         self.bytes(0 if self.is_ros1 else (_HEAD - self._at) % size)
 
     def word(self) -> int:
@@ -411,7 +412,7 @@ class _Reader:
 
 @contextmanager
 def naming(subject: str) -> Iterator[None]:
-    """Prefix the message of any error that is raised inside with a subject, such as a path."""
+    """Prefix the messages of errors in the block with a subject, such as a path."""
     try:
         yield
     except SceneprintError as error:

@@ -16,8 +16,8 @@ from importlib import import_module
 from pathlib import PurePath
 from typing import Any, Literal, cast
 
-#: A depth image; the points of one scan; a whole map; an archive of frames; a ROS recording; a
-#: capture of another system with frames and poses.
+#: Content: a depth image, the points of one scan, a whole map, an archive of frames, a ROS
+#: recording, or a capture of another system with frames and poses.
 Kind = Literal["depth", "cloud", "map", "archive", "recording", "capture"]
 #: Names of the formats of point clouds.
 CloudFormat = Literal["ply", "pcd", "kitti", "npy", "las", "pointcloud2"]
@@ -39,8 +39,8 @@ class Format:
     content : description of the data that the reader uses, in Markdown
     signature : regular expression for the first bytes, as Latin-1, for Python and JavaScript; empty
         if they do not determine the format. Its groups are width and height
-    reader : MODULE:FUNCTION that takes the bytes, or, for a capture, the path and a name; empty if
-        one reader handles all formats of the kind
+    reader : MODULE:FUNCTION that accepts the bytes, or, for a capture, the path and a name; empty
+        if one reader handles all formats of the kind
     size : MODULE:FUNCTION that returns width and height from the first bytes of a depth image
     """
 
@@ -55,7 +55,7 @@ class Format:
     size: str = ""
 
     def begins(self, head: bytes) -> bool:
-        """Return whether the first bytes of a file show this format."""
+        """Return whether the first bytes of a file match this format's signature."""
         return bool(self.signature) and _pattern(self.signature).match(head) is not None
 
 
@@ -74,7 +74,7 @@ _NUMPY_IMAGE = _NUMPY + r"(?:[^}]*'shape': *\((?=\d+, *(\d+)\))(\d+))?"
 _NUMPY_ROWS = (
     _NUMPY + r"[\s\S]{4,6}(?=[^}]*'descr': *'[<>]f[248]')(?=[^}]*'shape': *\(\d+L?, *[34]L?,? *\))"
 )
-#: CDR header of either byte order, followed anywhere by the names of three fields.
+#: CDR header of either byte order, followed anywhere by the field names x, y and z.
 _CDR = r"\x00[\x00\x01]\x00[\x00-\x03]" + "".join(
     rf"(?=[\s\S]*?(?:\x02\x00\x00\x00|\x00\x00\x00\x02){axis}\x00)" for axis in "xyz"
 )
@@ -223,24 +223,24 @@ FORMATS = (
 
 def formats_of(*kinds: Kind) -> tuple[Format, ...]:
     """Return the formats of the given kinds, in the order of the table."""
-    return tuple(one for one in FORMATS if one.kind in kinds)
+    return tuple(entry for entry in FORMATS if entry.kind in kinds)
 
 
 def media_types_of(*kinds: Kind) -> tuple[str, ...]:
     """Return the media types of the given kinds; the last is `BYTES`, valid for any file."""
-    found = dict.fromkeys(one.media_type for one in formats_of(*kinds))
-    return (*(one for one in found if one != BYTES), BYTES)
+    media_types = dict.fromkeys(entry.media_type for entry in formats_of(*kinds))
+    return (*(media_type for media_type in media_types if media_type != BYTES), BYTES)
 
 
 def titles_of(*kinds: Kind, last: str = "and") -> str:
     """Return the titles of the given kinds as an enumeration, such as "PNG, NPY and PFM"."""
-    *most, final = dict.fromkeys(one.title for one in formats_of(*kinds))
+    *most, final = dict.fromkeys(entry.title for entry in formats_of(*kinds))
     return f"{', '.join(most)} {last} {final}"
 
 
 def format_at(head: bytes, *kinds: Kind) -> Format | None:
     """Return the format that the first `HEAD` bytes of a file indicate, or None."""
-    return next((one for one in formats_of(*kinds) if one.begins(head)), None)
+    return next((entry for entry in formats_of(*kinds) if entry.begins(head)), None)
 
 
 def format_named(file: str, *kinds: Kind) -> Format | None:
@@ -249,19 +249,19 @@ def format_named(file: str, *kinds: Kind) -> Format | None:
     If several kinds use the suffix, the first one in the table is returned.
     """
     suffix = PurePath(file).suffix.lower()
-    return next((one for one in formats_of(*kinds) if suffix in one.suffixes), None)
+    return next((entry for entry in formats_of(*kinds) if suffix in entry.suffixes), None)
 
 
 def format_of(head: bytes) -> CloudFormat | None:
-    """Return the point cloud format that the first `HEAD` bytes indicate; KITTI files have none."""
-    found = format_at(head, "cloud")
-    return None if found is None else cast(CloudFormat, found.name)
+    """Return the point cloud format of a file from its first `HEAD` bytes; None for KITTI files."""
+    entry = format_at(head, "cloud")
+    return None if entry is None else cast(CloudFormat, entry.name)
 
 
 def is_cloud(file: str) -> bool:
-    """Return whether a file of this name always holds points; an .npy may be a depth image."""
-    found = format_named(file, "depth", "cloud")
-    return found is not None and found.kind == "cloud"
+    """Return whether files of this name always contain points; an .npy may be a depth image."""
+    entry = format_named(file, "depth", "cloud")
+    return entry is not None and entry.kind == "cloud"
 
 
 @lru_cache(maxsize=64)

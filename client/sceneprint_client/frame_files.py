@@ -111,7 +111,7 @@ class FrameFile:
         return "depth" if self.cloud is None else "cloud"
 
     def read_bytes(self) -> bytes:
-        """Return the bytes of the frame as they are sent.
+        """Return the bytes of the frame as an upload sends them.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class FrameFile:
     def pose(self) -> NDArray[np.float64] | None:
         """Return T_parent_sensor (4, 4), or None if unknown; each call reads the file again.
 
-        Raise InvalidPose if the file does not hold a rigid transform; names the file.
+        Raise InvalidPose, which names the file, if it does not hold a rigid transform.
         """
         if isinstance(self.pose_source, Path):
             return read_pose(self.pose_source)
@@ -155,13 +155,13 @@ def find_frame_file(file: Path) -> FrameFile:
     if is_cloud(file.name) or _is_npy_of_points(file):
         source = find_cloud_source(folder)
         return FrameFile(name, file, None, pose_source=pose, cloud=source)
-    # A path that the user specified is a depth image whatever its name; its content decides.
+    # Any other file counts as a depth image; decoding checks its content.
     return FrameFile(name, file, find_camera(folder), pose_source=pose, sequence=number)
 
 
 #: Names of folders for the pose files of the frames beside them.
 POSE_FOLDERS = ("pose", "poses")
-NO_POSE_FILE = "no NAME.pose.txt is beside them, nor NAME.txt in a folder pose"
+NO_POSE_FILE = "there is no NAME.pose.txt beside them and no NAME.txt in a folder `pose`"
 
 
 def find_pose_file(folder: Path, stem: str) -> Path | None:
@@ -176,16 +176,16 @@ def find_pose_file(folder: Path, stem: str) -> Path | None:
     name = stem.removesuffix(".depth")
     renamed = [f"{name.replace('depth', 'pose')}.txt"] if "depth" in name else []
     beside = [f"{name}.pose.txt", *renamed]
-    listed, found = [f"{name}.txt", *beside], [folder / one for one in beside]
+    listed, candidates = [f"{name}.txt", *beside], [folder / name for name in beside]
     for place in [folder, folder.parent] if "depth" in folder.name.lower() else [folder]:
-        found += [place / below / one for below in POSE_FOLDERS for one in listed]
-    return next((one for one in found if one.is_file()), None)
+        candidates += [place / below / name for below in POSE_FOLDERS for name in listed]
+    return next((path for path in candidates if path.is_file()), None)
 
 
 def is_kitti(path: Path) -> bool:
-    """Return whether a file is a KITTI scan. Only its name shows it."""
-    found = format_named(path.name, "cloud")
-    return found is not None and found.name == "kitti"
+    """Return whether a file is a KITTI scan, according to its name."""
+    entry = format_named(path.name, "cloud")
+    return entry is not None and entry.name == "kitti"
 
 
 def _is_npy_of_points(file: Path) -> bool:
@@ -267,12 +267,12 @@ def meta_of(
 
 
 def file_name(name: str) -> str | None:
-    """Return a file name as metadata may hold it; an invalid name must not block the frame.
+    """Return a file name that is valid as metadata, so that no name blocks an upload.
 
     Returns
     -------
-    name : relative path with `/`, `_` for each forbidden character, and only the end of a name
-        that is too long; None if nothing is left
+    name : relative path with `/` and with `_` for each forbidden character, shortened from the
+        left if it is too long; None if nothing is left
     """
     text = name.encode("utf-8", "replace").decode()  # a lone surrogate cannot be encoded
     text = re.sub(r"[\x00-\x1f\x7f\\]", "_", text)
@@ -300,7 +300,7 @@ def _direction(up: Sequence[float] | None) -> GivenDirection | None:
 
 
 def _depth_fields(camera: Camera) -> dict[str, Any]:
-    """Return the metadata that specify how to read the samples of a depth image."""
+    """Return the metadata fields for reading the samples of a depth image."""
     lens = camera.intrinsics
     return {
         "intrinsics": CameraIntrinsics(
@@ -318,11 +318,11 @@ def _depth_fields(camera: Camera) -> dict[str, Any]:
 
 
 def _cloud_fields(reference: FrameFile) -> dict[str, Any]:
-    """Return the metadata that specify how to read the points of a cloud."""
+    """Return the metadata fields for reading the points of a cloud."""
     source = reference.cloud or CloudSource()
     file_format = source.file_format
     if reference.row is not None:
-        file_format = None  # rows_as_npy converts it to NPY, whose header shows the format
+        file_format = None  # rows_as_npy converts the file to NPY
     elif file_format is None and is_kitti(reference.path):
         file_format = "kitti"
     fields: dict[str, Any] = {"format": file_format, "units_per_metre": source.units_per_metre}
@@ -337,7 +337,7 @@ def sendable(
     frame: FrameInput, meta: MetaInput | None, *, with_pose: bool,
     up: Sequence[float] | None = None,
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
-    """Return the bytes and metadata of a frame; a path's camera is read from its sidecar file.
+    """Return the bytes and metadata of a frame; those of a file come from its sidecar files.
 
     `with_pose` includes the pose, the file's name and its index in the sequence. `up` overrides
     `meta` and the sidecar file.
@@ -363,7 +363,7 @@ def sendable(
             raise TypeError("the bytes of a depth image need `meta` with at least the intrinsics")
         return frame, metadata or FrameMeta(up=_direction(up))
     if isinstance(frame, FrameFile):
-        found = frame
+        reference = frame
     elif not isinstance(frame, str | os.PathLike):
         raise TypeError(
             "pass a path, the bytes of a file, a FrameFile, a numpy array, or an image or cloud "
@@ -376,13 +376,13 @@ def sendable(
             metadata = _with_name(metadata, path.name, seven_scenes_number(path.name))
         return data, metadata
     else:
-        found = _frame_at(Path(frame))
-    data = found.read_bytes()
+        reference = _frame_at(Path(frame))
+    data = reference.read_bytes()
     if metadata is None:
-        return data, meta_of(found, with_pose=with_pose, up=up, with_name=with_pose)
+        return data, meta_of(reference, with_pose=with_pose, up=up, with_name=with_pose)
     if not with_pose:
         return data, metadata
-    return data, _with_name(metadata, found.original or found.path.name, found.sequence)
+    return data, _with_name(metadata, reference.original or reference.path.name, reference.sequence)
 
 
 def library_array(frame: Any) -> NDArray[Any] | None:
@@ -416,14 +416,14 @@ _MAXIMUM_UNITS = 65_535
 
 
 def _with_name(metadata: FrameMeta, name: str, sequence: int | None) -> FrameMeta:
-    """Add name and sequence index of the file to metadata that have none."""
+    """Return the metadata with the file's name and sequence index, unless they are already set."""
     labels = {"name": file_name(name), "sequence": sequence}
     missing = {field: label for field, label in labels.items() if getattr(metadata, field) is None}
     return metadata.model_copy(update=missing)
 
 
 def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
-    """Return the metadata of a frame in a file; raise TypeError if they have another type."""
+    """Return the metadata for a frame that is not an array; raise TypeError for other types."""
     if meta is None or isinstance(meta, FrameMeta):
         return meta
     if isinstance(meta, CameraIntrinsics | PinholeCamera):
@@ -438,7 +438,7 @@ def _meta_without_array(meta: MetaInput | None) -> FrameMeta | None:
 def array_sendable(
     array: NDArray[Any], meta: MetaInput | None, *, up: Sequence[float] | None = None
 ) -> tuple[bytes, FrameMeta]:
-    """Return an array as an NPY file, and its metadata: depth if it has a camera, else points.
+    """Return the NPY bytes and metadata of an array: depth if it has a camera, else points.
 
     Parameters
     ----------
@@ -474,7 +474,7 @@ _DEPTH = ("u2", "f2", "f4", "f8")
 
 
 def _checked_points(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array of points; raise UnreadableFrame if it is depth without a camera."""
+    """Return an array of points; raise UnreadableFrame or UnreadableCloud for other arrays."""
     if array.ndim == 2 and array.shape[1] in (3, 4) and array.dtype.kind == "f":
         if array.dtype.itemsize in (2, 4, 8):
             return array
@@ -541,14 +541,14 @@ def rows_as_npy(data: bytes, row: tuple[str, ...]) -> bytes:
     return _npy(rows[:, [row.index(axis) for axis in "xyz"]])
 
 
-#: Maximum rounding error of coordinates in float32, metres; large ones such as UTM need float64.
+#: Maximum rounding error in float32, metres. Large coordinates, such as UTM, require float64.
 _ROUNDING_M = 1e-4
 
 
 def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
-    """Return an NPY file, uncompressed since compressing takes longer than sending.
+    """Return an NPY file, uncompressed because compressing takes longer than sending.
 
-    float64 is converted to float32 if no number changes by more than `most_lost`.
+    float64 is converted to float32 if no coordinate changes by more than `most_lost`.
     """
     file, compact = io.BytesIO(), array
     if array.dtype.itemsize == 8:
@@ -561,13 +561,13 @@ def _npy(array: NDArray[Any], most_lost: float = np.inf) -> bytes:
 
 
 def _frame_at(path: Path) -> FrameFile:
-    """Return the frame of a path that the caller passed."""
+    """Return the frame at a path; raise DatasetError if the path is not one frame."""
     if path.is_dir():
         raise DatasetError(
             f"{path}: This is a folder, and a single frame is required. Specify a depth image or "
             "a cloud, or send the frames that sceneprint.find_sequences returns."
         )
-    # A name such as .. identifies no file; the user knows a symlink by its own name.
+    # `..` must be resolved; a symbolic link keeps its own name.
     file = path.resolve() if ".." in path.parts else path.absolute()
     if not file.is_file():
         raise DatasetError(f"{path}: There is no such file or folder. Check the path.")
@@ -582,6 +582,7 @@ def _frame_at(path: Path) -> FrameFile:
 
 
 def _read_content(path: Path, *, is_cloud: bool) -> bytes:
+    """Return the content of a frame's file; raise UnreadableCloud or UnreadableFrame."""
     if is_cloud:
         return read_bytes(path, MAXIMUM_CLOUD_BYTES, UnreadableCloud)
     return read_bytes(path, MAXIMUM_IMAGE_BYTES, UnreadableFrame)

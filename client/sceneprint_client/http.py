@@ -106,7 +106,7 @@ def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
 
 def frames_form(frames: Sequence[FrameInput], metas: Sequence[MetaInput | None]) -> dict[str, Any]:
     """Return the arguments of a request that sends several frames with their poses."""
-    sent = [frame_bytes(*one, with_pose=True) for one in zip(frames, metas, strict=True)]
+    sent = [frame_bytes(*pair, with_pose=True) for pair in zip(frames, metas, strict=True)]
     return {
         "files": [("frame", ("frame", data, "application/octet-stream")) for data, _ in sent],
         "data": {"metas": json.dumps([meta_json(meta) for _, meta in sent])},
@@ -114,7 +114,7 @@ def frames_form(frames: Sequence[FrameInput], metas: Sequence[MetaInput | None])
 
 
 def meta_json(meta: FrameMeta) -> dict[str, Any]:
-    """Return metadata as JSON; a null viewpoint states that the points have no viewpoint."""
+    """Return the non-default fields as JSON; a null viewpoint means that points have none."""
     return meta.model_dump(mode="json", exclude_defaults=True)
 
 
@@ -165,7 +165,7 @@ def surface_tile_path(map_name: str, digest: str) -> str:
 
 
 def _path_part(name: str, what: str, error: type[SceneprintError]) -> str:
-    """Return a name that is safe as one part of a path; `..` would lead to another resource."""
+    """Return a name that is a safe path segment (unlike `..`); otherwise raise `error`."""
     if not re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9._-]*", name):
         raise error(f"There is no {what} {name!r:.80}. Check the name.")
     return name
@@ -195,7 +195,7 @@ class QueryOptions(TypedDict, total=False):
 
 
 def check_options(how: QueryOptions) -> None:
-    """Raise TypeError for unknown options of a query, before the frame is read."""
+    """Raise TypeError for unknown options of a query."""
     unknown = how.keys() - Query.model_fields.keys()
     if unknown:
         raise TypeError(
@@ -205,7 +205,7 @@ def check_options(how: QueryOptions) -> None:
 
 
 def query_of(kind: type[Any], how: QueryOptions, **more: Any) -> Any:
-    """Return a query with options that `check_options` has accepted."""
+    """Return a record of type `kind` with options that `check_options` has accepted."""
     stages: Any = how.get("stages")
     if stages is not None and not isinstance(stages, str):
         how = {**how, "stages": tuple(stages)}
@@ -231,7 +231,7 @@ def query_target(
 def compared_frame(
     frame: FrameInput | NamedFrame | tuple[str, str], meta: MetaInput | None
 ) -> QueryFrame:
-    """Return one of two frames to compare."""
+    """Return a frame of a comparison, stored or as bytes with metadata."""
     if isinstance(frame, tuple):
         return checked(NamedFrame, "The frame", map=frame[0], frame_id=frame[1])
     if isinstance(frame, NamedFrame):
@@ -252,7 +252,7 @@ def query_form(data: bytes, meta: FrameMeta, query: Query) -> dict[str, Any]:
 
 
 def form_text(value: object) -> str:
-    """Return the text of a form field: names joined by commas, or else JSON."""
+    """Return a value as the text of a form field: lists joined by commas, other values as JSON."""
     if isinstance(value, str):
         return value
     if isinstance(value, list):
@@ -267,21 +267,21 @@ Item = TypeVar("Item")
 
 #: Number of records on a page.
 PAGE = 500
-#: Number of attempts of a call, and seconds after which no new one starts: time for a restart of
-#: the service.
+#: Maximum number of attempts, and time after which no new attempt starts, seconds: long enough for
+#: a restart of the service.
 TRIES, LIMIT_S = 8, 30.0
 #: Number of attempts if the service never answered, so that a wrong address fails soon.
 TRIES_UNMET = 2
-#: Seconds before the second attempt; the delay then about doubles, up to the longest.
+#: Delay before the second attempt, and maximum delay, seconds; the delay doubles each time.
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.25, 5.0
-#: Seconds without data after which a stream counts as broken: three intervals of its heartbeat.
+#: Time without data after which a stream counts as broken, seconds: three heartbeat intervals.
 SILENCE_S = 50.0
-#: Seconds before a stream that ended is opened again, unless the stream specifies another delay.
+#: Delay before a stream is reopened, seconds, unless the stream specifies another delay.
 STREAM_PAUSE_S = 1.0
 
 _BUSY = (HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE)
 #: Errors for which a retry is pointless.
-_HOPELESS = (httpx.UnsupportedProtocol, httpx.LocalProtocolError, httpx.ProxyError)
+_PERMANENT = (httpx.UnsupportedProtocol, httpx.LocalProtocolError, httpx.ProxyError)
 
 
 class LocalWorker(Protocol):
@@ -297,8 +297,8 @@ class ServiceConnection:
     Parameters
     ----------
     url : address of the service, with http:// or https://
-    key : key of the API; None if the service requires none
-    timeout_s : longest time without data from the service
+    key : API key; None if the service requires no key
+    timeout_s : maximum time without data from the service, seconds
     transport : transport of the requests; default: the network
     worker : worker that runs jobs in this process; default: workers of the service
 
@@ -309,7 +309,7 @@ class ServiceConnection:
     MissingDependency : If a SOCKS proxy is set and its package is not installed.
     """
 
-    #: The same client for its own calls: its methods are coroutines, which never suspend.
+    #: Copy of a blocking client whose methods are coroutines, which never suspend.
     _core: ServiceConnection | None = None
 
     def __init__(
@@ -364,7 +364,7 @@ class ServiceConnection:
             await http.aclose()
 
     async def _run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that computes or reads files; not in the thread of an event loop."""
+        """Call a function that blocks; an asynchronous client runs it in another thread."""
         if self._is_blocking:
             return function(*args, **kwargs)
         return await asyncio.to_thread(function, *args, **kwargs)
@@ -373,11 +373,11 @@ class ServiceConnection:
         await settled((time if self._is_blocking else asyncio).sleep(seconds))
 
     async def _call(self, kind: type[Record], method: str, path: str, **request: Any) -> Record:
-        """Send a request and return its answer as a record."""
+        """Send a request and return its answer as a record of type `kind`."""
         return read_record(kind, await self._send(method, path, **request))
 
     async def _create(self, kind: type[Record], path: str, options: BaseModel) -> Record:
-        """Create a job from a record of its options and return it."""
+        """Create a job from its options and return its record, of type `kind`."""
         document = options.model_dump(mode="json", exclude_unset=True)
         return await self._call(kind, "POST", path, json=document)
 
@@ -403,8 +403,9 @@ class ServiceConnection:
                 return
 
     async def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
-        """Send a request with retries; 404 counts as success if an earlier DELETE was lost."""
+        """Send a request with retries; return a successful response, raise the error of others."""
         response, lost = await self._persist(lambda: self._http.request(method, path, **request))
+        # An attempt without a response may have deleted the object.
         deleted_before = method == "DELETE" and lost > 0 and response.status_code == 404
         if response.is_success or deleted_before:
             return response
@@ -425,26 +426,26 @@ class ServiceConnection:
         Unreachable : If the service does not answer.
         """
         until, lost = time.monotonic() + LIMIT_S, 0
-        for tried in range(1, TRIES + 1):
-            pause = min(FIRST_PAUSE_S * 2 ** (tried - 1), LONGEST_PAUSE_S)
+        for attempt in range(1, TRIES + 1):
+            pause = min(FIRST_PAUSE_S * 2 ** (attempt - 1), LONGEST_PAUSE_S)
             pause *= random.uniform(0.5, 1.5)
-            hopeless = tried == TRIES
+            is_last = attempt == TRIES
             error: httpx.TransportError | None = None
             response: httpx.Response | None = None
             try:
                 response = await settled(send())
             except httpx.TransportError as caught:
                 error = caught
-                nobody = isinstance(caught, (httpx.ConnectError, httpx.ConnectTimeout))
-                lost += not nobody
-                hopeless |= isinstance(caught, _HOPELESS)
-                hopeless |= nobody and not self._answered and tried >= TRIES_UNMET
+                is_unconnected = isinstance(caught, (httpx.ConnectError, httpx.ConnectTimeout))
+                lost += not is_unconnected
+                is_last |= isinstance(caught, _PERMANENT)
+                is_last |= is_unconnected and not self._answered and attempt >= TRIES_UNMET
             if response is not None:
                 self._answered = True
                 if response.status_code not in _BUSY:
                     return response, lost
                 pause = max(pause, retry_after_s(response.headers.get("Retry-After", "")))
-            if hopeless or time.monotonic() + pause > until:
+            if is_last or time.monotonic() + pause > until:
                 if response is not None:
                     return response, lost
                 raise unreachable(self._url, error) from error
@@ -454,7 +455,7 @@ class ServiceConnection:
     async def _open_stream(
         self, path: str, last: str | None, parameters: dict[str, Any]
     ) -> httpx.Response:
-        """Open a stream of events that starts after an id."""
+        """Open a stream of events that starts after the id `last`; raise the service's error."""
 
         async def send() -> httpx.Response:
             headers = {"Accept": "text/event-stream"} | without_none(**{"Last-Event-ID": last})
@@ -474,12 +475,12 @@ class ServiceConnection:
     async def _follow(
         self, path: str, after: str | None, parameters: dict[str, Any]
     ) -> AsyncIterator[Event]:
-        """Yield events without end; a stream that ends or breaks is opened again.
+        """Yield events indefinitely; a stream that ends or breaks is reopened.
 
         Parameters
         ----------
         path, parameters : address of the stream
-        after : id of the event before the first one; None yields only new events
+        after : id of an event; only later events are returned. None: only new events
         """
         place, met = StreamPosition(after), False
         while True:
@@ -512,7 +513,7 @@ class ServiceConnection:
 
 
 class RequestLogFilter(logging.Filter):
-    """Filter that removes httpx's line for each request to a service from the log."""
+    """Log filter that removes httpx's lines about requests to a service."""
 
     def __init__(self, url: str) -> None:
         super().__init__()
@@ -521,11 +522,11 @@ class RequestLogFilter(logging.Filter):
     def filter(self, record: logging.LogRecord) -> bool:
         """Return False for httpx's lines about requests to the service."""
         about = record.args if isinstance(record.args, tuple) else ()
-        return not any(str(one).startswith(self._url) for one in about)
+        return not any(str(argument).startswith(self._url) for argument in about)
 
 
 def _checked_key(key: str) -> str:
-    """Return a key without surrounding whitespace; errors must not show the key."""
+    """Return a key without surrounding whitespace; raise KeyRequired if it is malformed."""
     key = key.strip()
     if not key or not all(33 <= ord(sign) < 127 for sign in key):
         raise errors.KeyRequired(
@@ -536,9 +537,9 @@ def _checked_key(key: str) -> str:
 
 
 def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
-    """Return the trusted certificates: those of SSL_CERT_FILE and SSL_CERT_DIR, if set.
+    """Return the certificates of SSL_CERT_FILE and SSL_CERT_DIR; True, the default, if not set.
 
-    httpx reads these variables too, but not if it ignores proxies.
+    httpx reads these variables itself, but not if it ignores proxies.
     """
     file, folder = os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR")
     if url.scheme != "https" or not (file or folder):
@@ -553,8 +554,8 @@ def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
 
 #: Statuses of a proxy that cannot reach the service.
 _OF_PROXY = (502, 503, 504)
-#: Statuses without a problem document for a URL and headers that are too long, and the least number
-#: of bytes that some proxies refuse.
+#: Statuses without a problem document that indicate a too long URL or headers, and the length above
+#: which some proxies reject these, bytes.
 _OF_LONG_HEADS, _LONG_HEAD = (400, 414, 431), 8 << 10
 
 
@@ -577,7 +578,7 @@ def unreachable(url: str, error: Exception | None) -> errors.Unreachable:
 
 
 def retry_after_s(text: str) -> float:
-    """Return the seconds of a `Retry-After` header; 0 if its value is not understood."""
+    """Return the delay of a `Retry-After` header, seconds; 0 if its value is invalid."""
     text = text.strip()
     if text.isascii() and text.isdigit():
         return float(text[:9])
@@ -607,7 +608,7 @@ def read_record(kind: type[Record], response: httpx.Response) -> Record:
 
 
 def error_of(response: httpx.Response) -> errors.SceneprintError:
-    """Return the error of an answer, in the class that its `type` names, or else Refused."""
+    """Return the error that a response reports, in the class of its problem type or as Refused."""
     error = _error_of(response)
     error.retry_after_s = retry_after_s(response.headers.get("Retry-After", ""))
     return error
@@ -655,14 +656,14 @@ def problem_kinds() -> dict[str, type[errors.SceneprintError]]:
 
 
 def _fields(problem: Problem) -> tuple[tuple[str, str], ...]:
-    """Return (place, reason) of each invalid field, as far as the document names them."""
+    """Return (name, reason) of each invalid field in a problem document."""
     entries: Any = (problem.model_extra or {}).get("errors")
     if not isinstance(entries, list):
         return ()
     return tuple(
-        (str(one["field"]), str(one["reason"]))
-        for one in entries
-        if isinstance(one, dict) and {"field", "reason"} <= one.keys()
+        (str(entry["field"]), str(entry["reason"]))
+        for entry in entries
+        if isinstance(entry, dict) and {"field", "reason"} <= entry.keys()
     )
 
 
@@ -676,7 +677,7 @@ class StreamPosition:
     Parameters
     ----------
     last : id of the last event; None before the first
-    pause_s : seconds to wait before the stream is opened again
+    pause_s : delay before the stream is reopened, seconds
     """
 
     last: str | None
@@ -685,7 +686,7 @@ class StreamPosition:
     _data: list[str] = field(default_factory=list, init=False, compare=False)
 
     def read(self, line: str) -> Event | None:
-        """Return the event that a line completes, after the position was moved behind it."""
+        """Process the next line; return the event that it completes, otherwise None."""
         name, _, value = line.partition(":")
         value = value.removeprefix(" ")
         if not line:
@@ -716,7 +717,7 @@ _PAUSES_S = (0.02, 0.5)
 
 
 def growing_pauses(until: float) -> Iterator[float]:
-    """Yield growing pauses until a time of `time.monotonic`; none if it has passed."""
+    """Yield increasing pauses, seconds, until `until` on the clock of `time.monotonic`."""
     pause, longest = _PAUSES_S
     while (left := until - time.monotonic()) > 0:
         yield min(pause, left)

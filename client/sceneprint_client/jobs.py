@@ -128,14 +128,14 @@ class JobMethods(ServiceConnection):
         ------
         UnknownJob : If one of the jobs does not exist.
         """
-        order, known = list(job_ids), dict[str, Job]()
+        order, latest = list(job_ids), dict[str, Job]()
         waiting = list(dict.fromkeys(order))
         total, until = len(waiting), time.monotonic() + timeout_s
         for pause in growing_pauses(until):
-            while waiting:  # repeats without a pause while jobs of the window have ended
+            while waiting:  # without a pause while jobs of the window have ended
                 window = waiting[:_WINDOW]
-                known |= {job_id: await self.job(job_id) for job_id in window}
-                left = [job_id for job_id in window if not known[job_id].state.over]
+                latest |= {job_id: await self.job(job_id) for job_id in window}
+                left = [job_id for job_id in window if not latest[job_id].state.over]
                 waiting[:_WINDOW] = left
                 if progress is not None:
                     progress(total - len(waiting), total)
@@ -144,7 +144,7 @@ class JobMethods(ServiceConnection):
             if not waiting:
                 break
             await self._work_or_wait(pause)
-        return [known[job_id] if job_id in known else await self.job(job_id) for job_id in order]
+        return [latest[job_id] if job_id in latest else await self.job(job_id) for job_id in order]
 
     @Call
     async def import_archive(
@@ -156,9 +156,9 @@ class JobMethods(ServiceConnection):
         ----------
         archive : zip or tar (plain, .gz, .bz2 or .xz) of a 7-Scenes scene or sequence, a TUM RGB-D
             folder, or depth images with their intrinsics.json; or an MCAP file or ROS 1 bag
-        options : metadata of all frames; default: a name from that of the file. With `as` =
-            `recording`, `name` is the name of the file, and `progress.recording` of the job lists
-            its topics
+        options : metadata of all frames; default: only a name, derived from the file name. With
+            `as` = `recording`, `name` is the file name, and `progress.recording` of the job lists
+            the topics
 
         Returns
         -------
@@ -180,14 +180,14 @@ class JobMethods(ServiceConnection):
     async def import_map(
         self, map_name: str, file: Path | BinaryIO, options: ImportOptions | None = None
     ) -> Job:
-        """Import a map from a single file, a cloud or a mesh: a worker renders views of it.
+        """Import a map from a file with a cloud or a mesh; a worker renders views of it.
 
         Parameters
         ----------
         map_name : name of the map that receives the views as frames
         file : PCD, PLY (points or mesh), LAS, LAZ, OBJ, STL, glTF or E57
-        options : options with `as` = `map`; default: these and the file's name. For a file object,
-            the suffix of `name` determines the format
+        options : options with `as` = `map`; default: `as` = `map` and the file's name. For a file
+            object, the suffix of `name` determines the format
 
         Returns
         -------
@@ -208,12 +208,12 @@ class JobMethods(ServiceConnection):
 
     @Series
     def import_items(self, map_name: str, job_id: str) -> AsyncIterator[ImportItem]:
-        """Yield the results for the members of an archive so far, in the order of the archive."""
+        """Yield the available results of an import, in the order of the archive."""
         job = job_path(job_id).rpartition("/")[2]
         return self._pages(Page[ImportItem], f"{map_path(map_name)}/imports/{job}/items")
 
     async def _send_archive(self, map_name: str, archive: BinaryIO, options: ImportOptions) -> Job:
-        """Send an archive; each attempt starts at its beginning."""
+        """Send a file to import and return the job; each attempt sends it from the beginning."""
         path = f"{map_path(map_name)}/imports"
         parameters = {"options": options.model_dump_json(exclude_defaults=True, by_alias=True)}
 
@@ -230,7 +230,7 @@ class JobMethods(ServiceConnection):
         return read_record(Job, response)
 
     def _pieces(self, archive: BinaryIO) -> Any:
-        """Return an iterator over the content of an archive, of the kind that httpx requires."""
+        """Return an iterator over the content of an archive, asynchronous for AsyncClient."""
         if self._is_blocking:
             return iter(lambda: archive.read(_CHUNK), b"")
 
@@ -247,7 +247,7 @@ class JobMethods(ServiceConnection):
     ) -> _Product:  # fmt: skip
         """Compute a product of a map: coverage, an association, or a difference of sessions.
 
-        An association finds where two sessions see the same places, or one returns to a place.
+        An association finds places that two sessions share, or to which one session returns.
 
         Parameters
         ----------
@@ -307,9 +307,9 @@ class JobMethods(ServiceConnection):
         self, product: _Product, *, timeout_s: float = 3600.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> _Product:  # fmt: skip
-        """Wait until a product has ended or the time is over, and return its latest state.
+        """Wait until a product has ended, and return its latest state.
 
-        Check `state.over`: the end of the time raises no error.
+        A timeout raises no error; check `state.over`.
 
         Parameters
         ----------
@@ -331,10 +331,10 @@ class JobMethods(ServiceConnection):
 
     @Call
     async def undo_join(self, map_name: str, job_id: str) -> Association:
-        """Undo the join of an association, and return its frames to the poses of their uploads.
+        """Undo the join of an association: its frames regain their uploaded poses.
 
-        Frames that other joins move keep the result of these. The sessions of the map are not
-        joined again automatically.
+        The effects of other joins on these frames remain. The sessions are not joined again
+        automatically.
 
         Raises
         ------
@@ -423,8 +423,8 @@ class JobMethods(ServiceConnection):
 
     @Call
     async def difference_points(self, map_name: str, job_id: str) -> SurfacePoints:
-        """Return the cells of both sessions as points. `patches` holds the kind of each: SAME,
-        GONE, NEW, UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
+        """Return the cells of both sessions as points. `patches` contains the class of each point:
+        SAME, GONE, NEW, UNSEEN_AFTER or UNSEEN_BEFORE of `sceneprint_client.api.sessions`.
 
         Raises
         ------
@@ -451,7 +451,7 @@ class JobMethods(ServiceConnection):
 
         Returns
         -------
-        reconstruction : the job; its `result` is set in the state `succeeded`, else its `error`
+        reconstruction : the job, with its `result` if it has succeeded or its `error` if it failed
 
         Raises
         ------

@@ -1,9 +1,9 @@
-"""Join the scans of the last metres of a drive to one cloud, corrected for motion.
+"""Join recent scans of a moving scanner into one cloud, corrected for motion.
 
 points (N, 3), seconds (N,)  --Joiner.add-->  Joiner.cloud: points (M, 3) in the newest scan's axes
 
-Scanners with a narrow view or few rings see too little of a place in one scan. The odometry relates
-the scans, and moves each point to the position of the sensor at the scan's stamp.
+Scanners with a narrow view or few rings capture too little of a place in one scan. Odometry aligns
+the scans and corrects each point for motion between its capture and the stamp of its scan.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from sceneprint_client.poses import Floats
 from sceneprint_client.ros_messages import LONGEST_SCAN_S
 from sceneprint_client.transforms import FASTEST
 
-#: Length of the way whose scans are joined, metres.
+#: Length of the path whose scans are joined, metres.
 JOIN_M = 2.0
 #: Edge of the voxels in which a joined cloud has one point, metres.
 VOXEL_M = 0.1
-#: Maximum number of scans in a cloud: 5 s at 10 Hz, also of a robot that stands still.
+#: Maximum number of scans in a cloud, 5 s at 10 Hz, even if the robot stands still.
 MOST_SCANS = 50
-#: Longest interval between two poses of a scan, seconds. Within it, each point moves along a line;
-#: at 180 degrees a second, the line is 0.1 mm from the arc at a distance of 100 m.
+#: Longest interval between two poses of a scan, seconds. Motion is linear within an interval; at
+#: 180 degrees per second, the error at a distance of 100 m is 0.5 mm.
 _STEP_S = 0.002
 
-#: Function from stamps, nanoseconds, to poses T_odom_sensor (4, 4); None where a pose is unknown.
+#: Function that returns T_odom_sensor (4, 4) at each stamp, nanoseconds; None if unknown.
 Odometry = Callable[[Sequence[int]], Sequence[Floats | None]]
 
 
@@ -44,24 +44,23 @@ class _JoinedScan:
 class Joiner:
     """Scans of the last metres of a drive.
 
-    Each point is moved to the sensor's position at the stamp of its scan if its time is known. A
-    scan is left out if the odometry does not cover its duration, or implies more than 50 m/s
-    within it. If the odometry jumps between two scans, or the stamps go back, the joiner forgets
-    the earlier scans.
+    A point with a known time is corrected for motion between its capture and its scan's stamp. A
+    scan is rejected if the odometry does not cover its duration or implies more than 50 m/s. If
+    the odometry jumps between two scans, or the stamps decrease, earlier scans are discarded.
 
     Parameters
     ----------
     odometry : function that returns interpolated poses of the sensor, such as
         `partial(tree.poses, "odom", "lidar")` of a TransformTree
-    metres : length of the way whose scans are joined, at most `MOST_SCANS`
-    voxel_m : edge of the voxels; the newest point in each remains
+    metres : length of the path whose scans, at most `MOST_SCANS`, are joined
+    voxel_m : edge of a voxel, metres; the newest point in each voxel remains
     """
 
     def __init__(
         self, odometry: Odometry, metres: float = JOIN_M, *, voxel_m: float = VOXEL_M
     ) -> None:
-        #: Numbers of scans: all, without sufficient odometry, without times of the points (joined
-        #: as if all points were measured at the stamp), and after which earlier ones are forgotten.
+        #: Number of all scans, of rejected scans, of scans without point times (all points count as
+        #: measured at the stamp), and of scans at which earlier scans were discarded.
         self.counts = {"scans": 0, "without_odometry": 0, "untimed": 0, "restarts": 0}
         self._odometry, self._metres, self._voxel_m = odometry, metres, voxel_m
         self._scans: list[_JoinedScan] = []
@@ -71,13 +70,13 @@ class Joiner:
         return len(self._scans)
 
     def add(self, stamp_ns: int, points: Floats, seconds: Floats | None = None) -> bool:
-        """Add the next scan; return False if it is left out.
+        """Add the next scan; return False if it is rejected.
 
         Parameters
         ----------
         stamp_ns : stamp of the scan, nanoseconds
         points : (N, 3) in the sensor's axes at the time of each point, metres
-        seconds : (N,) time of each point after the stamp; None if unknown
+        seconds : (N,) times of the points after the stamp, seconds; None if unknown
 
         Raises
         ------
@@ -93,10 +92,10 @@ class Joiner:
                     f"A point was measured {float(np.abs(seconds).max()):g} s from the stamp of "
                     "its scan. Pass finite seconds after the stamp, at most 1."
                 )
-            # multiples of the step include the stamp itself
+            # The multiples of the step include 0, the time of the stamp.
             times = _STEP_S * np.arange(np.floor(first / _STEP_S), np.ceil(last / _STEP_S) + 1)
             times = np.unique(np.clip(times, first, last))
-        poses = self._odometry([stamp_ns + round(1e9 * one) for one in times])
+        poses = self._odometry([stamp_ns + round(1e9 * seconds_after) for seconds_after in times])
         valid = [pose for pose in poses if pose is not None]
         if len(valid) < len(times) or _is_jump(np.array(valid)[:, :3, 3], times):
             self.counts["without_odometry"] += 1
@@ -113,7 +112,7 @@ class Joiner:
                 self._scans.clear()
         thinned = _first_in_voxels(points.astype(np.float32), self._voxel_m)
         self._scans.append(_JoinedScan(stamp_ns, thinned, T_odom_sensor))
-        positions = np.array([one.T_odom_sensor[:3, 3] for one in self._scans])
+        positions = np.array([scan.T_odom_sensor[:3, 3] for scan in self._scans])
         del self._scans[: window_start(positions, self._metres)]
         return True
 
@@ -127,12 +126,12 @@ class Joiner:
 
 
 def window_start(positions: Floats, metres: float) -> int:
-    """Return the index of the first of N scans that are joined with the last one.
+    """Return the index of the earliest scan that is joined with the last scan.
 
     Parameters
     ----------
-    positions : (N, 3) positions of the sensor in chronological order
-    metres : longest way from the first to the last position
+    positions : (N, 3) positions of the sensor in chronological order, metres
+    metres : maximum length of the path to the last position
     """
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     way_to_last = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
@@ -140,13 +139,13 @@ def window_start(positions: Floats, metres: float) -> int:
 
 
 def _is_jump(positions: Floats, seconds: Floats) -> bool:
-    """Return whether consecutive positions (N, 3) imply an impossible speed, or time goes back."""
+    """Return whether positions (N, 3) imply an impossible speed, or their times decrease."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return bool((steps > FASTEST * np.diff(seconds)).any())
 
 
 def _moved_points(points: Floats, seconds: Floats, times: Floats, poses: Floats) -> Floats:
-    """Return points (N, 3) moved by the pose at the time of each, between poses (K, 4, 4)."""
+    """Transform each point (N, 3) by the pose at its time, interpolated in K poses (K, 4, 4)."""
     before = np.clip(np.searchsorted(times, seconds, "right") - 1, 0, len(times) - 2)
     share = ((seconds - times[before]) / (times[before + 1] - times[before]))[:, None]
     ends = [
@@ -158,7 +157,7 @@ def _moved_points(points: Floats, seconds: Floats, times: Floats, poses: Floats)
 
 
 def _first_in_voxels(points: NDArray[np.float32], edge: float) -> NDArray[np.float32]:
-    """Return the first point of each voxel, in order."""
+    """Return the first point in each voxel of width `edge`, metres, in the order of the points."""
     cells = np.floor(points / edge).astype(np.int64) & 0x1FFFFF
     keys = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
     _, first = np.unique(keys, return_index=True)

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 class MapMethods(ServiceConnection):
-    """Client methods for maps, their frames and the results of these."""
+    """Client methods for maps, frames, and data derived from frames."""
 
     @Call
     async def create_map(
@@ -67,17 +67,17 @@ class MapMethods(ServiceConnection):
 
         Raises
         ------
-        InvalidRequest : If the name is not a slug, or the model or a limit does not exist.
+        InvalidRequest : If the name, the model or a limit is invalid.
         MapExists : If a map of that name has another title, model or limits.
         Forbidden : If a quota is set and the key does not have `admin` for `*`.
         """
-        known: dict[str, Any] = limits if up is None else {**limits, "up": list(up)}
-        new = checked(NewMap, "The map", name=name, title=title, model=model, **known)
+        fields: dict[str, Any] = limits if up is None else {**limits, "up": list(up)}
+        new = checked(NewMap, "The map", name=name, title=title, model=model, **fields)
         return await self._call(Map, "POST", "/v1/maps", json=new.model_dump(exclude_unset=True))
 
     @Call
     async def maps(self) -> list[Map]:
-        """Return all maps by name."""
+        """Return all maps, sorted by name."""
         return (await self._call(Page[Map], "GET", "/v1/maps")).items
 
     @Call
@@ -150,15 +150,15 @@ class MapMethods(ServiceConnection):
         has_pose: bool | None = None, content_id: str | None = None, name: str | None = None,
         find: str | None = None, order: Literal["asc", "desc", "taken"] = "asc",
     ) -> AsyncIterator[Frame]:  # fmt: skip
-        """Yield the frames of a map in order of arrival; deleted frames only with `state`.
+        """Yield the frames of a map that meet all conditions; deleted frames only with `state`.
 
-        A frame must meet all conditions; a frame without the field does not meet its condition.
+        A frame does not meet a condition on a property that it lacks, such as a time.
 
         Parameters
         ----------
         state : state of the frames
         robot, session : one or several names
-        tags : tags that a frame must all have
+        tags : tags, all of which a frame must have
         captured_after, captured_before : start (inclusive) and end of the capture time, with a
             time zone
         received_after, received_before : start (inclusive) and end of the upload time
@@ -310,7 +310,7 @@ class MapMethods(ServiceConnection):
         while True:
             done = await self._call(FramesRestored, "POST", path)
             count += done.frames
-            refused |= {one.frame_id: one for one in done.refused}
+            refused |= {frame.frame_id: frame for frame in done.refused}
             if not done.remaining or not done.frames:
                 update = {"frames": count, "refused": list(refused.values())}
                 return done.model_copy(update=update)
@@ -398,10 +398,10 @@ class MapMethods(ServiceConnection):
         ----------
         map_name, session : names of the map and the session
         robot : name of the robot; required if several robots have a session of that name
-        parent_frame : parent frame; required if the poses have several
+        parent_frame : parent frame; required if the poses have several parent frames
         captured_after, captured_before : start and end of the capture time, with a time zone
-        clock : time stamps: "captured" (`captured_at`), "sequence", or "received" (every frame has
-            it); "taken": `captured_at`, or `sequence` if no frame has one
+        clock : source of the timestamps: "captured" (`captured_at`), "sequence", or "received"
+            (every frame has it); "taken": `captured_at`, or `sequence` if no frame has it
         most : maximum number of poses, evenly spaced; `posed` is the number of all poses
 
         Raises
@@ -449,7 +449,7 @@ class MapMethods(ServiceConnection):
         self, map_name: str, frame_id: str, within: CloudFrame = "optical",
         limit: int = MOST_DRAWN,
     ) -> SurfacePoints:  # fmt: skip
-        """Return the points of `cloud` as arrays, which takes a third of the bytes.
+        """Return the points of `cloud` as arrays; the response has a third of the size.
 
         Parameters
         ----------
@@ -499,7 +499,7 @@ class MapMethods(ServiceConnection):
     async def map_copy(
         self, map_name: str, have: Sequence[str] = ()
     ) -> tuple[MapCopy, dict[str, bytes]]:
-        """Return a map at one moment, with those missing parts of its rows that fit one answer.
+        """Return a map's state at one moment, and parts not in `have` that fit into one response.
 
         Raises
         ------
@@ -510,10 +510,10 @@ class MapMethods(ServiceConnection):
         data = (await self._send("POST", f"{map_path(map_name)}/copy", json=body)).content
         line, _, rest = data.partition(b"\n")
         head, parts, start = MapCopy.model_validate_json(line), dict[str, bytes](), 0
-        for one in head.parts:
-            if one.sent:
-                parts[one.digest] = rest[start : start + one.bytes]
-                start += one.bytes
+        for part in head.parts:
+            if part.sent:
+                parts[part.digest] = rest[start : start + part.bytes]
+                start += part.bytes
         return head, parts
 
     @Call
@@ -535,15 +535,15 @@ def _run(
     session: str, robot: str | None, parent_frame: str | None, after: datetime | None,
     before: datetime | None, most: int | None, clock: Clock,
 ) -> Run:  # fmt: skip
+    """Return the validated selection of a run; raise InvalidRequest if it is invalid."""
     return checked(
         Run, "The run", session=session, robot=robot, parent_frame=parent_frame,
-        captured_after=after, captured_before=before, most=most,
-        clock=clock,
+        captured_after=after, captured_before=before, most=most, clock=clock,
     )  # fmt: skip
 
 
 def _run_request(map_name: str, run: Run, accept: str) -> dict[str, Any]:
-    """Return the arguments of a request for a trajectory."""
+    """Return the arguments of a request for a trajectory of the media type `accept`."""
     parameters = run.model_dump(mode="json", exclude_none=True)
     path = f"{map_path(map_name)}/trajectory"
     return {"path": path, "params": parameters, "headers": {"Accept": accept}}
@@ -569,7 +569,7 @@ class SurfaceMethods(ServiceConnection):
     async def begin_surface(self, map_name: str) -> MapSurface:
         """Build the surface of a map immediately, or add new frames to it.
 
-        Workers do this by themselves, unless `SCENEPRINT_BUILD_SURFACES` is `on_request`.
+        Workers do this automatically unless `SCENEPRINT_BUILD_SURFACES` is `on_request`.
 
         Raises
         ------
@@ -592,7 +592,7 @@ class SurfaceMethods(ServiceConnection):
         Parameters
         ----------
         parent : parent frame; default: the most common parent frame
-        level : level; 0 is the finest
+        level : number of the level; 0 has the finest cells
 
         Raises
         ------

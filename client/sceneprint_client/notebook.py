@@ -1,4 +1,4 @@
-"""HTML of records in notebooks: a table of the fields that people read, and a plan of poses.
+"""HTML representation of records in notebooks: a table of their fields, and a plan of poses.
 
 record  --html_of-->  HTML, in which every text of the record is escaped
 """
@@ -13,13 +13,13 @@ from pydantic import BaseModel
 from sceneprint_client.api.base import CameraIntrinsics, Transform, Vector
 from sceneprint_client.api.query import Alternative, Answer, Localization, Location
 
-#: Fields that only programs read.
+#: Fields that the table omits.
 _INTERNAL = {
     "base", "content_id", "etag", "exact", "frame", "index_version", "milliseconds", "model_id",
     "seed",
 }  # fmt: skip
 _COLUMNS = ("rank", "frame", "map", "similarity", "overlap", "validation")
-#: Most entries of a list, and most characters of a text.
+#: Maximum number of entries of a list, and of characters of a text.
 _MOST, _LONGEST = 5, 160
 #: Width and height of a plan, its margin, and the length of a heading, pixels.
 _SIDE, _MARGIN, _ARROW = 160, 20, 14
@@ -32,19 +32,19 @@ def html_of(record: BaseModel) -> str:
     if isinstance(record, Answer | Localization):
         located = record.location if isinstance(record, Answer) else record
         pose = located.pose if located else None
-        parts.append(_plan(pose, [one.pose for one in record.alternatives]))
+        parts.append(_plan(pose, [alternative.pose for alternative in record.alternatives]))
     if isinstance(record, Answer) and record.matches:
         rows = [
-            [str(one.rank), one.frame_id, one.map, f"{one.similarity:.2f}",
-             text_of(one.validation.overlap), one.validation.status]
-            for one in record.matches[:_MOST]
+            [str(match.rank), match.frame_id, match.map, f"{match.similarity:.2f}",
+             text_of(match.validation.overlap), match.validation.status]
+            for match in record.matches[:_MOST]
         ]  # fmt: skip
         parts.append(_table([list(_COLUMNS), *rows]))
     return "".join(parts)
 
 
 def text_of(value: object) -> str:
-    """Return a value as a short text; empty if there is nothing to read."""
+    """Return a value as short text; empty for None and for records without a text form."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -63,7 +63,7 @@ def text_of(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{text_of(count)} {name}" for name, count in value.items())
     if isinstance(value, list):
-        texts = [text for one in value[:_MOST] if (text := text_of(one))]
+        texts = [text for item in value[:_MOST] if (text := text_of(item))]
         more = len(value) - _MOST
         return "; ".join(texts) + (f" and {more} more" if texts and more > 0 else "")
     if value is None or isinstance(value, BaseModel):
@@ -77,12 +77,12 @@ def _table(rows: list[list[str]]) -> str:
     return f"<table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
 
-def _plan(found: Transform | None, others: list[Transform]) -> str:
-    """Return x and y of poses as SVG: the found one filled, the others as circles."""
-    poses = ([found] if found else []) + others[:_MOST]
+def _plan(best: Transform | None, others: list[Transform]) -> str:
+    """Return a plan of x and y as SVG: `best` as a filled circle, the others as open circles."""
+    poses = ([best] if best else []) + others[:_MOST]
     if not poses:
         return ""
-    xs, ys = ([one.matrix[axis][3] for one in poses] for axis in (0, 1))
+    xs, ys = ([pose.matrix[axis][3] for pose in poses] for axis in (0, 1))
     span = max(max(xs) - min(xs), max(ys) - min(ys), 1.0)
     scale = (_SIDE - 2 * _MARGIN) / span
     marks = []
@@ -91,7 +91,7 @@ def _plan(found: Transform | None, others: list[Transform]) -> str:
         top = round(_SIDE - _MARGIN - (y - min(ys)) * scale)
         forward = 2 if pose.child_frame.endswith(".optical") else 0
         right, up = (round(_ARROW * pose.matrix[axis][forward]) for axis in (0, 1))
-        fill = "currentColor" if pose is found else "none"
+        fill = "currentColor" if pose is best else "none"
         marks.append(
             f'<circle cx="{left}" cy="{top}" r="4" fill="{fill}"/>'
             f'<path d="M{left} {top}l{right} {-up}"/>'

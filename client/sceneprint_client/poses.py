@@ -108,11 +108,11 @@ def interpolate(
     after = np.clip(np.searchsorted(t, times), 0, last)  # t[after - 1] < time <= t[after]
     before = np.where(t[after] == times, after, np.maximum(after - 1, 0))
     span = t[after] - t[before]
-    known = (t[before] <= times) & (times <= t[after]) & (span <= longest_gap)
+    is_valid = (t[before] <= times) & (times <= t[after]) & (span <= longest_gap)
     near = np.where(t[after] - times < times - t[before], after, before)
-    alone = ~known & (np.abs(t[near] - times) <= tolerance)
+    alone = ~is_valid & (np.abs(t[near] - times) <= tolerance)
     before, after = np.where(alone, near, before), np.where(alone, near, after)
-    known, span = known | alone, t[after] - t[before]
+    is_valid, span = is_valid | alone, t[after] - t[before]
     w = np.where(span > 0.0, times - t[before], 0.0) / np.where(span > 0.0, span, 1.0)
 
     positions = trajectory.positions[before]
@@ -120,11 +120,12 @@ def interpolate(
     quaternions = slerp(trajectory.quaternions[before], trajectory.quaternions[after], w)
     return [
         _transform(p, q) if ok else None
-        for p, q, ok in zip(positions, quaternions, known, strict=True)
+        for p, q, ok in zip(positions, quaternions, is_valid, strict=True)
     ]
 
 
 def _transform(position: Floats, quaternion: Floats) -> Floats:
+    """Return the pose (4, 4)."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_of(quaternion)
     pose[:3, 3] = position
@@ -132,7 +133,7 @@ def _transform(position: Floats, quaternion: Floats) -> Floats:
 
 
 def first_since(stamps_ns: array[int], span_ns: int) -> int:
-    """Return the index of the first stamp within a span before the last, in order of arrival."""
+    """Return the index of the first stamp that is at most `span_ns` older than the last stamp."""
     times = np.frombuffer(stamps_ns, np.int64)
     return int(np.argmax(times >= times[-1] - span_ns)) if len(times) else 0
 
@@ -141,13 +142,13 @@ def first_since(stamps_ns: array[int], span_ns: int) -> int:
 
 #: Half width of the window in which accelerations are averaged, seconds.
 WINDOW_S = 0.5
-#: Smallest number of samples in the window.
+#: Minimum number of samples in the window.
 _FEWEST = 10
-#: The robot is at rest if the length of the mean acceleration is within this of gravity, m/s^2, ...
+#: Gravity, and maximum deviation of the mean acceleration from it at rest, m/s^2.
 _GRAVITY, _OFF = 9.81, 0.3
-#: ... the standard deviation of all axes is below this, m/s^2, ...
+#: Maximum standard deviation of the acceleration at rest, over all axes, m/s^2.
 _SPREAD = 0.25
-#: ... and the mean angular velocity is below this, rad/s.
+#: Maximum mean angular velocity at rest, rad/s.
 _TURN = 0.05
 _MOST_SAMPLES = 10_000_000
 
@@ -178,7 +179,7 @@ class Accelerations:
         self._rows.extend(row)
 
     def forget(self, span_ns: int) -> None:
-        """Drop measurements that arrived more than `span_ns` before the latest."""
+        """Drop measurements that are more than `span_ns` older than the latest."""
         old = first_since(self._stamps_ns, span_ns)
         del self._stamps_ns[:old], self._rows[: 6 * old]
 
@@ -192,11 +193,11 @@ class Accelerations:
         times = recorded[order]
         rows = np.frombuffer(self._rows, np.float64).reshape(-1, 6)[order]
         window = int(WINDOW_S * 1e9)
-        found: list[Floats | None] = []
+        directions: list[Floats | None] = []
         for stamp in stamps_ns:
             a, b = np.searchsorted(times, [stamp - window, stamp + window + 1])
-            found.append(_up(rows[a:b]) if b - a >= _FEWEST else None)
-        return found
+            directions.append(_up(rows[a:b]) if b - a >= _FEWEST else None)
+        return directions
 
 
 def _up(rows: Floats) -> Floats | None:

@@ -141,7 +141,7 @@ class QueryMethods(ServiceConnection):
         check_options(how)
         if metas is not None and len(metas) != len(frames):
             raise InvalidRequest(
-                f"There are {len(frames)} frames and {len(metas)} `metas`. Pass one for each.",
+                f"There are {len(frames)} frames and {len(metas)} `metas`. Pass one per frame.",
                 (("metas", "pass one for each frame"),),
             )
         request = await self._run(
@@ -181,12 +181,12 @@ class QueryMethods(ServiceConnection):
         body = how.model_dump(mode="json", exclude_defaults=True, by_alias=True)
         files = {}
         for name, frame, meta in (("a", a, meta_a), ("b", b, meta_b)):
-            found = await self._run(compared_frame, frame, meta)
-            if isinstance(found, NamedFrame):
-                body[f"frame_{name}"] = found.model_dump()
+            target = await self._run(compared_frame, frame, meta)
+            if isinstance(target, NamedFrame):
+                body[f"frame_{name}"] = target.model_dump()
             else:
-                files[name] = (name, found[0], "application/octet-stream")
-                body[f"meta_{name}"] = meta_json(found[1])
+                files[name] = (name, target[0], "application/octet-stream")
+                body[f"meta_{name}"] = meta_json(target[1])
         if not files:
             return await self._call(Similarity, "POST", "/v1/similarity", json=body)
         fields = {name: form_text(value) for name, value in body.items()}
@@ -248,7 +248,7 @@ class QueryMethods(ServiceConnection):
 
     @Call
     async def keep_answer(self, query_id: str, title: str | None = None) -> QueryRecord:
-        """Keep an answer until it is released, or change the title of a kept one.
+        """Keep an answer until it is released, or change the title of a kept answer.
 
         Parameters
         ----------
@@ -300,7 +300,7 @@ class QueryMethods(ServiceConnection):
         Raises
         ------
         UnknownQuery : If the answer is not stored.
-        InvalidRequest : If a limit is out of range.
+        InvalidRequest : If `limit` is out of range.
         """
         return await self._call(
             Similarities, "GET", f"{query_path(query_id)}/similarities", params={"limit": limit}
@@ -364,7 +364,7 @@ def _query_request(frame: QueryFrame, query: Query, robot: str | None) -> dict[s
 
 
 def _with_robot(robot: str | None, data: bytes, meta: FrameMeta) -> tuple[bytes, FrameMeta]:
-    """Add the name of the querying robot to a frame whose metadata names none."""
+    """Return a frame with the robot's name in its metadata, unless these already name a robot."""
     if robot is None or meta.robot is not None:
         return data, meta
     return data, meta.model_copy(update={"robot": robot})

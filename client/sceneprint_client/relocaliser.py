@@ -63,14 +63,15 @@ class RelocaliserParameters:
     ----------
     odom_frame : parent frame of the robot's odometry
     base_frame : frame of the robot's base
-    parent_frame : parent frame of the service's map that is published as `map`; empty: that of the
-        first fix. A fix in another parent frame is not reported, since no transform relates them
+    parent_frame : parent frame of the service's map that is published as `map`; empty: the parent
+        frame of the first fix. Fixes in other parent frames are not reported
     rectified : whether depth images are rectified, so that their camera is P of the camera info
-    interval_s : shortest time between two queried frames, seconds
-    join_m : length of the way whose scans are joined to one frame, metres; 0: each scan alone
-    wait_s : longest wait of a frame for its transforms, by the stamps of later frames, seconds
-    stale_s : age of the last frame from which no pose is reported, seconds
-    planar : whether the robot drives on the plane z = 0 of the map; `T_map_odom` then keeps only
+    interval_s : minimum time between two queried frames, seconds
+    join_m : length of the path whose scans are joined into one frame, metres; 0: no joining
+    wait_s : maximum time that a frame waits for its transforms, by the stamps of later frames,
+        seconds
+    stale_s : maximum age of the last frame for a pose to be reported, seconds
+    planar : whether the robot drives on the plane z = 0 of the map; if so, `T_map_odom` has only
         x, y and the heading of the base
     """
 
@@ -118,7 +119,7 @@ class Report:
     state : state of the tracker
     stamp_ns : stamp of the latest frame, nanoseconds; 0 before the first
     pose : pose while tracking, else None
-    is_fix : whether the robot is tracked and was not at the last report
+    is_fix : whether the robot is tracked and was not tracked at the last report
     level, message, values : fields of the diagnostics
     """
 
@@ -133,7 +134,7 @@ class Report:
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Pose from odometry at the time of a frame."""
+    """Poses of the sensor and the base in the odometry frame at the time of a frame."""
 
     stamp_ns: int
     T_odom_sensor: Floats
@@ -142,7 +143,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class _Arrival:
-    """Message that waits for its transforms, with the points of a scan that is to be joined."""
+    """Message that waits for its transforms, with its points and times if scans are joined."""
 
     stamp_ns: int
     message: Any
@@ -150,7 +151,7 @@ class _Arrival:
 
     @property
     def covered_ns(self) -> int:
-        """Time whose pose is known once odometry after the last point has arrived."""
+        """Stamp after the last point of the scan, nanoseconds; odometry must cover it."""
         if self.scan is None or self.scan[1] is None:
             return self.stamp_ns
         last_s = max(float(self.scan[1].max()), 0.0)
@@ -170,7 +171,7 @@ class Relocaliser:
 
     def __init__(self, tracker: Tracker, parameters: RelocaliserParameters | None = None) -> None:
         self.parameters = parameters or RelocaliserParameters()
-        self.counts = {"frames": 0, "asked": 0, "without_transform": 0, "unreadable": 0}
+        self.counts = {"frames": 0, "queried": 0, "without_transform": 0, "unreadable": 0}
         self._tracker, self._questions = tracker, AsyncTracker(tracker)
         self._tree = TransformTree()
         self._edges_of_tf: set[tuple[str, str]] = set()
@@ -188,21 +189,21 @@ class Relocaliser:
     # Input.
 
     def take_camera_info(self, message: Any) -> None:
-        """Take a sensor_msgs CameraInfo; that of an uncalibrated camera is ignored."""
+        """Process a sensor_msgs CameraInfo; ignore it if the camera is not calibrated."""
         if is_calibrated(message):
             self._info = message
 
     def take_transforms(self, message: Any, *, fixed: bool) -> None:
-        """Take a tf2_msgs TFMessage; `fixed` marks messages of /tf_static."""
-        for one in message.transforms:
-            parent, child = str(one.header.frame_id), str(one.child_frame_id)
+        """Process a tf2_msgs TFMessage; `fixed` marks messages of /tf_static."""
+        for transform in message.transforms:
+            parent, child = str(transform.header.frame_id), str(transform.child_frame_id)
             self._edges_of_tf.add((frame_name(parent), frame_name(child)))
-            row = transform_row(one.transform)
-            self._tree.add(parent, child, stamp_of(one.header), row, fixed=fixed)
+            row = transform_row(transform.transform)
+            self._tree.add(parent, child, stamp_of(transform.header), row, fixed=fixed)
         self._sweep()
 
     def take_odometry(self, message: Any) -> None:
-        """Take a nav_msgs Odometry; it is ignored if tf has the same transform."""
+        """Process a nav_msgs Odometry; ignore it if tf has the same transform."""
         parent, child = frame_name(message.header.frame_id), frame_name(message.child_frame_id)
         if parent and child and (parent, child) not in self._edges_of_tf:
             row = pose_row(message.pose.pose)
@@ -210,7 +211,7 @@ class Relocaliser:
             self._sweep()
 
     def take_imu(self, message: Any) -> None:
-        """Take a sensor_msgs Imu; it is ignored if it has no accelerometer."""
+        """Process a sensor_msgs Imu; ignore it if it has no accelerometer."""
         if float(message.linear_acceleration_covariance[0]) < 0:
             return
         frame = frame_name(message.header.frame_id)
@@ -223,9 +224,8 @@ class Relocaliser:
         self._sweep()
 
     def take_frame(self, message: Any) -> None:
-        """Take a sensor_msgs depth Image, CompressedImage or PointCloud2.
-
-        The frame waits for its transforms until a call of `step` finds them.
+        """Queue a sensor_msgs depth Image, CompressedImage or PointCloud2 until `step` has its
+        transforms.
         """
         stamp = stamp_of(message.header)
         self.counts["frames"] += 1
@@ -248,7 +248,7 @@ class Relocaliser:
             self.counts["without_transform"] += 1
 
     def take_livox_scan(self, data: bytes) -> None:
-        """Take a CustomMsg of livox_ros_driver2 as ROS 2 serialised it."""
+        """Queue a CustomMsg of livox_ros_driver2 that ROS 2 serialised; see `take_frame`."""
         try:
             message = read_livox_scan(data)
         except SceneprintError as error:
@@ -302,7 +302,7 @@ class Relocaliser:
         return 0 if self._last is None else self._last.stamp_ns
 
     def _sweep(self) -> None:
-        """Remove old data at intervals."""
+        """Remove old transforms and accelerations after every 512 messages."""
         self._unswept += 1
         if self._unswept >= _SWEEP_INTERVAL:
             self._unswept = 0
@@ -311,7 +311,7 @@ class Relocaliser:
                 self._imu[1].forget(round(_MEMORY_S * 1e9))
 
     def _restart(self, reason: str) -> None:
-        """Start again with another clock; fixed transforms remain."""
+        """Discard all data of the previous clock, except fixed transforms."""
         self._tree.forget_moving()
         self._imu, self._last, self._joiner = None, None, None
         self._waiting.clear()
@@ -321,6 +321,7 @@ class Relocaliser:
     # Frames.
 
     def _place(self, stamp_ns: int, sensor: str) -> _Place | None:
+        """Return the odometry poses at a stamp, or None if a transform is unknown."""
         odom, base = self.parameters.odom_frame, self.parameters.base_frame
         (T_odom_sensor,) = self._tree.poses(odom, sensor, [stamp_ns])
         (T_odom_base,) = self._tree.poses(odom, base, [stamp_ns])
@@ -354,7 +355,7 @@ class Relocaliser:
             self._note(error)
         else:
             self._queried_ns = place.stamp_ns
-            self.counts["asked"] += 1
+            self.counts["queried"] += 1
 
     def _join(self, arrival: _Arrival) -> bool:
         """Join a scan to the earlier ones; return False if the odometry does not cover it."""
@@ -367,7 +368,7 @@ class Relocaliser:
         return self._joiner[1].add(arrival.stamp_ns, *arrival.scan)
 
     def _frame(self, message: Any) -> tuple[FrameInput, CameraIntrinsics | None]:
-        """Return frame and camera of a message for the query."""
+        """Return frame and camera for a query; raise SceneprintError if they cannot be read."""
         if self._joiner is not None:
             return self._joiner[1].cloud(), None
         if hasattr(message, "point_step"):
@@ -391,7 +392,7 @@ class Relocaliser:
             return None
         frame, accelerations = self._imu
         T_sensor_imu = self._tree.fixed_transform(frame_name(message.header.frame_id), frame)
-        # Later measurements have not arrived yet, so the window ends at the frame.
+        # The window ends at the frame because later measurements have not arrived yet.
         (up,) = accelerations.up_at([stamp_ns - round(WINDOW_S * 1e9)])
         if T_sensor_imu is None or up is None:
             return None
@@ -439,7 +440,7 @@ class Relocaliser:
         )  # fmt: skip
 
     def _pose(self, state: State, last: _Place) -> TrackedPose:
-        """Return the pose of a tracked state."""
+        """Return the pose of a tracked state at the last frame."""
         if state.T_map_odom is None or state.T_map_sensor is None or state.covariance is None:
             raise AssertionError("a tracked state has a pose")
         T_map_odom, T_map_base = state.T_map_odom, state.T_map_odom @ last.T_odom_base
@@ -452,7 +453,7 @@ class Relocaliser:
         return TrackedPose(T_map_odom, T_map_base, covariance)
 
     def _missing_frame_reason(self, silent_s: float) -> str:
-        """Return the reason for the lack of a recent frame."""
+        """Return the reason why there has been no frame with transforms for `silent_s` seconds."""
         p = self.parameters
         if not self.counts["frames"]:
             return _NOTHING
@@ -490,19 +491,19 @@ def planar(T: Floats) -> Floats:
 
 
 def write_pose(message: Any, T: Floats) -> None:
-    """Fill a geometry_msgs Pose."""
+    """Write a pose (4, 4) to a geometry_msgs Pose."""
     _write_vector(message.position, T[:3, 3])
     _write_rotation(message.orientation, T)
 
 
 def write_transform(message: Any, T: Floats) -> None:
-    """Fill a geometry_msgs Transform."""
+    """Write a transform (4, 4) to a geometry_msgs Transform."""
     _write_vector(message.translation, T[:3, 3])
     _write_rotation(message.rotation, T)
 
 
 def write_stamp(message: Any, stamp_ns: int) -> None:
-    """Fill a builtin_interfaces Time."""
+    """Write a stamp to a builtin_interfaces Time."""
     message.sec, message.nanosec = divmod(stamp_ns, 1_000_000_000)
 
 

@@ -75,7 +75,7 @@ def depth_samples(message: Any) -> NDArray[Any]:
 
 
 def _samples(message: Any, kind: np.dtype[Any]) -> NDArray[Any]:
-    """Return the samples (H, W) of an image whose rows may have padding."""
+    """Return the samples (H, W) of an image, without the padding of its rows."""
     width, height, step = int(message.width), int(message.height), int(message.step)
     row = width * kind.itemsize
     if not 0 < width * height <= MAXIMUM_SAMPLES or step < row:
@@ -165,10 +165,10 @@ def inverse_depth(samples: NDArray[np.uint16], a: float, b: float) -> NDArray[np
 
 
 def rvl_samples(data: bytes) -> NDArray[np.uint16]:
-    """Return the samples (H, W) of an image compressed by RVL, which follows width and height.
+    """Return the samples (H, W) of RVL data that follow a width and a height.
 
-    Runs of zeros alternate with runs of values. A value is the zigzag-coded difference to its
-    predecessor. Numbers are groups of three bits, lowest first, each with a continuation bit, in
+    Runs of zeros alternate with runs of values, stored as zigzag-coded differences between
+    neighbours. Numbers are groups of three bits, lowest first, each with a continuation bit, in
     big-endian words of 32 bits (Wilson, Fast Lossless Depth Image Compression, 2017).
 
     Raise UnreadableFrame if the data is truncated, the size is invalid, or a sample exceeds 16
@@ -281,9 +281,9 @@ def _distortion(info: Any) -> tuple[float, ...]:
 
 
 def _numbers(info: Any, name: str, count: int) -> list[float] | None:
-    """Return a matrix of a CameraInfo; its name is upper case in ROS 1, lower case in ROS 2."""
-    found = getattr(info, name, None)
-    numbers = [float(value) for value in (getattr(info, name.upper()) if found is None else found)]
+    """Return the `count` numbers of a matrix of a CameraInfo (ROS 1: upper-case name), or None."""
+    values = getattr(info, name, None)
+    numbers = [float(v) for v in (getattr(info, name.upper()) if values is None else values)]
     return numbers if len(numbers) == count else None
 
 
@@ -291,8 +291,8 @@ def _numbers(info: Any, name: str, count: int) -> list[float] | None:
 
 #: NumPy types by the type number of sensor_msgs/PointField.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-#: Fields of a PointCloud2 with the time of a point. Whole numbers are nanoseconds, others seconds.
-#: They count from the stamp, but those of `timestamp` from the epoch of the stamp's clock.
+#: Fields of a PointCloud2 with the time of a point: integers in nanoseconds, floating point in
+#: seconds, after the message's stamp, or for `timestamp` after the epoch of its clock.
 TIME_FIELDS = (
     "offset_time",  # CustomMsg of Livox
     "t",  # Ouster
@@ -313,26 +313,26 @@ _BLOCK = 1 << 16
 def cloud_points(message: Any) -> NDArray[np.float32]:
     """Return the valid points (N, 3) of a message, metres.
 
-    Points that are not finite are dropped, and points at the sensor's origin, which some drivers
+    Points are invalid if they are noise, not finite, or at the sensor's origin, which some drivers
     write for missing returns.
 
     `message`: sensor_msgs PointCloud2 with fields x, y and z, organised or not. Raise
     UnreadableCloud if x, y or z is missing, or the sizes contradict each other.
     """
-    table, found = cloud_table(message), []
+    table, blocks = cloud_table(message), []
     with np.errstate(all="ignore"):  # coordinates that overflow count as missing
         for block in cloud_blocks(table):
             points = block.astype(np.float32)
-            found.append(points[np.isfinite(points).all(axis=1)])
-    return np.concatenate(found) if found else np.empty((0, 3), np.float32)
+            blocks.append(points[np.isfinite(points).all(axis=1)])
+    return np.concatenate(blocks) if blocks else np.empty((0, 3), np.float32)
 
 
 def timed_points(message: Any) -> tuple[Floats, Floats | None]:
     """Return the valid points (N, 3) of a message, metres, and their times after its stamp (N,).
 
-    The times, in seconds, are None if the points have none that belong to one scan. If they are of
-    another clock than the stamp, the first point is assigned to the stamp. The parameter and the
-    errors are those of `cloud_points`.
+    The times, seconds, are None if they are missing or span more than one scan. If they come from
+    another clock than the stamp, they count from the earliest point. The parameter and the errors
+    are those of `cloud_points`.
     """
     table = cloud_table(message)
     points = np.concatenate([np.empty((0, 3)), *cloud_blocks(table)])
@@ -346,7 +346,7 @@ def timed_points(message: Any) -> tuple[Floats, Floats | None]:
     if name == "timestamp":
         stamp_ns = stamp_of(message.header)
         by_unit = [times - stamp_ns * 1e-9, (times - stamp_ns) * 1e-9]
-        seconds = min(by_unit, key=lambda one: abs(float(one[0])))
+        seconds = min(by_unit, key=lambda times_after: abs(float(times_after[0])))
     else:
         seconds = times * unit
     if not np.ptp(seconds) <= LONGEST_SCAN_S:
@@ -357,14 +357,14 @@ def timed_points(message: Any) -> tuple[Floats, Floats | None]:
 
 
 def time_field(table: NDArray[np.void]) -> str | None:
-    """Return the field of a `cloud_table` with the time of each point; None without one."""
+    """Return the name of the time field of a `cloud_table`, or None."""
     return next((name for name in TIME_FIELDS if name in (table.dtype.names or ())), None)
 
 
 def cloud_table(message: Any) -> NDArray[np.void]:
-    """Return the fields of a PointCloud2 that are read (rows, columns) as a view.
+    """Return x, y, z, time and Livox tag of a PointCloud2 as a structured view (rows, columns).
 
-    They are x, y, z, the time, and the tag of Livox; see `cloud_points`.
+    The parameter and the errors are those of `cloud_points`.
     """
     width, height = int(message.width), int(message.height)
     step, row = int(message.point_step), int(message.row_step)
@@ -389,7 +389,7 @@ def cloud_table(message: Any) -> NDArray[np.void]:
 
 
 def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:
-    """Yield blocks of points (n, 3) in order, with NaN for noise and the sensor's origin."""
+    """Yield the points of a table in blocks (n, 3), with NaN for noise and the sensor's origin."""
     height, width = table.shape
     rows = max(1, _BLOCK // max(width, 1))
     for first in range(0, height, rows):
@@ -405,31 +405,31 @@ def cloud_blocks(table: NDArray[np.void]) -> Iterator[Floats]:
 
 
 def _point_type(message: Any, step: int) -> np.dtype[Any]:
-    """Return the type of the fields that are read, in a point of `step` bytes."""
+    """Return the structured type of a point of `step` bytes, with the fields of `cloud_table`."""
     order = ">" if message.is_bigendian else "<"
-    found: dict[str, tuple[str, int]] = {}
+    fields: dict[str, tuple[str, int]] = {}
     for field in message.fields:
         kind = _TYPES.get(int(field.datatype))
         if kind is not None and int(field.count) in (0, 1):
-            found[str(field.name)] = (order + kind, int(field.offset))
+            fields[str(field.name)] = (order + kind, int(field.offset))
     names = list("xyz")
-    if not found.keys() >= set(names):
+    if not fields.keys() >= set(names):
         listed = ", ".join(str(field.name) for field in message.fields[:20])
         raise UnreadableCloud(
             f"The cloud has the fields {printable(listed[:120]) or 'none'}, but x, y and z are "
             "required. Specify the topic of the points."
         )
-    names += [name for name in TIME_FIELDS if name in found][:1]
-    if "line" in found and found.get("tag", ("", 0))[0].endswith("u1"):
+    names += [name for name in TIME_FIELDS if name in fields][:1]
+    if "line" in fields and fields.get("tag", ("", 0))[0].endswith("u1"):
         names.append("tag")
-    if any(found[name][1] + np.dtype(found[name][0]).itemsize > step for name in names):
+    if any(fields[name][1] + np.dtype(fields[name][0]).itemsize > step for name in names):
         raise UnreadableCloud(
             f"The fields of the cloud do not fit into its points of {step} bytes. Record it again."
         )
     layout: Any = {
         "names": names,
-        "formats": [found[name][0] for name in names],
-        "offsets": [found[name][1] for name in names],
+        "formats": [fields[name][0] for name in names],
+        "offsets": [fields[name][1] for name in names],
         "itemsize": step,
     }
     points: np.dtype[Any] = np.dtype(layout)

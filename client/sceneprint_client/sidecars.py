@@ -98,8 +98,8 @@ def read_camera(path: Path) -> Camera:
     Fields: width, height, fx, fy, cx, cy in pixels. Optional fields and their defaults:
     depth_scale (1000), distortion (none), depth_along_ray (false), up (unknown).
 
-    Raise InvalidIntrinsics if the file cannot be read, is not a JSON object, lacks a field, has an
-    unknown field, or has an invalid value; names the file.
+    Raise InvalidIntrinsics, which names the file, if it cannot be read, is not a JSON object, lacks
+    a field, has an unknown field, or has an invalid value.
     """
     fields = read_object(path, _MAXIMUM_BYTES, InvalidIntrinsics, _INTRINSICS_EXAMPLE)
     with naming(str(path)):
@@ -145,6 +145,7 @@ def _camera(fields: dict[str, object]) -> Camera:
 
 
 def _whole(fields: dict[str, object], name: str) -> int:
+    """Return an integer field; raise InvalidIntrinsics for another type."""
     value = fields[name]
     if isinstance(value, bool) or not isinstance(value, int):
         raise InvalidIntrinsics(
@@ -154,7 +155,8 @@ def _whole(fields: dict[str, object], name: str) -> int:
 
 
 def _number(name: str, value: object, error: type[SceneprintError]) -> float:
-    # bool is a subclass of int, but true is not a length in pixels.
+    """Return the value of a field as float; raise `error` if it is not a number."""
+    # bool is a subclass of int.
     if not isinstance(value, bool) and isinstance(value, int | float):
         with suppress(OverflowError):  # integers in JSON have no upper limit
             return float(value)
@@ -192,7 +194,7 @@ _FORMATS: tuple[CloudFormat, ...] = get_args(CloudFormat)
 
 
 class Unsaid(Enum):
-    """Marker for a viewpoint that is not specified: that of the file, or else the origin."""
+    """Marker of an unspecified viewpoint: the viewpoint in the file, otherwise the origin."""
 
     UNSAID = "unsaid"
 
@@ -208,7 +210,7 @@ class CloudSource:
     ----------
     file_format : format; None if the first bytes determine it
     viewpoint : position of the sensor in the file's axes, metres; None for points from many
-        viewpoints; UNSAID: that of the file, or else the origin
+        viewpoints; UNSAID: the viewpoint in the file, otherwise the origin
     up : unit vector in the file's axes if the sensor is carried level; None if unknown
     row : names of the float32 values in each row of a .bin file, such as x, y, z, i, ring; None: x,
         y, z and intensity
@@ -264,8 +266,8 @@ def find_cloud_source(folder: Path) -> CloudSource:
         row = fields.get("row")
         if row is not None and file_format not in (None, "kitti"):
             raise DatasetError(
-                f"row is valid only for .bin files, but format is {file_format}. Remove one of the "
-                "two."
+                f"row is valid only for .bin files, but format is {file_format}. Remove row or "
+                "format."
             )
         return CloudSource(
             file_format, _viewpoint(fields), units, _up(fields.get("up"), DatasetError),
@@ -289,6 +291,7 @@ def _viewpoint(fields: dict[str, object]) -> Position | Unsaid | None:
 
 
 def _cloud_number(name: str, value: object) -> float:
+    """Return the value of a field as float; raise DatasetError if it is not a finite number."""
     number = _number(name, value, DatasetError)
     if not math.isfinite(number):
         raise DatasetError(f"{name} is {number}, not a finite number. Write a finite number.")
@@ -303,7 +306,7 @@ _MAXIMUM_POSE_BYTES = 65_536
 def read_pose(path: Path) -> NDArray[np.float64]:
     """Return T_parent_sensor (4, 4) of a text file with 16 numbers, row by row.
 
-    Raise InvalidPose if the file cannot be read or its matrix is not rigid; names the file.
+    Raise InvalidPose, which names the file, if it cannot be read or its matrix is not rigid.
     """
     words = read_text(path, _MAXIMUM_POSE_BYTES, InvalidPose).split()
     with naming(str(path)):

@@ -1,8 +1,8 @@
-"""A spool: frames that a robot stores on its disk while it is offline, and uploads later.
+"""Spool in which a robot stores frames on disk while it is offline, to upload them later.
 
 frame, meta  --Spool.add-->  a durable row of one SQLite file
 rows, oldest first  --Spool.sync, Client.upload_batch-->  frames of a map, without duplicates
-two places  --separation-->  their distance, which determines the frames that a full spool drops
+two places  --separation-->  their distance; a full spool drops frames with small distances
 """
 
 from __future__ import annotations
@@ -56,17 +56,17 @@ BATCH_BYTES = 4 << 20
 _PAUSE_S = 1.0
 #: Longest wait for another process's lock on the file, seconds.
 _LOCKED_S = 30.0
-#: Size of a page of the file, bytes. A frame counts as whole pages, plus one for its index rows.
+#: Size of a page of the file, bytes. A frame occupies whole pages, and one page for its index rows.
 _PAGE = 4096
-#: Number of pages that the journal reserves on disk. Removing or rejecting the frames of one
-#: request changes fewer pages, so it works on a full disk.
+#: Number of pages reserved for the journal on disk. Removing or rejecting the frames of one request
+#: changes fewer pages, so these operations work on a full disk.
 _RESERVE = 512
 #: Application id that marks the file as a spool, and version of its schema.
 _APPLICATION, _SCHEMA = 0x53705370, 1
 
-# `frames.reason` is null for a waiting frame and '' for a rejected one. Both take the same space,
-# so a change does not rewrite the frame, for which a full disk has no room. `data` is last, so
-# reading the other columns does not load it.
+# `frames.reason` is null for a waiting frame and '' for a rejected frame. Both need the same space,
+# so a change does not rewrite the frame, which would fail on a full disk. `data` is the last
+# column, so reading the other columns does not load it.
 _TABLES = """
 CREATE TABLE frames (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -222,9 +222,8 @@ class Spool:
 
     A full spool first drops rejected frames. Then it drops the waiting frame with the smallest
     separation, in pose and time, from the frames before and after it in its run (one session of
-    one robot). A metre, 30 degrees and a minute have the same weight; without poses only time
-    counts, and the oldest of equal frames is dropped. First and last frames of runs are dropped
-    last.
+    one robot). A metre, 30 degrees and a minute have the same weight. Without poses, only time
+    counts. Of equal frames, the oldest is dropped. First and last frames of runs are dropped last.
 
     Parameters
     ----------
@@ -292,9 +291,9 @@ class Spool:
             invalid in another way that `Client.upload` detects without decoding. Sidecar files
             are read only if `meta` is omitted.
         """
-        data, known = frame_bytes(frame, meta, with_pose=True, up=up)
-        _check_sendable(data, known)
-        text = json.dumps(meta_json(known))
+        data, metadata = frame_bytes(frame, meta, with_pose=True, up=up)
+        _check_sendable(data, metadata)
+        text = json.dumps(meta_json(metadata))
         digest = hashlib.sha256(text.encode() + b"\0" + data).hexdigest()
         size = (len(data) + len(text) + 2 * _PAGE - 1) // _PAGE * _PAGE
         with self._transaction() as database:
@@ -309,11 +308,11 @@ class Spool:
                 return False
             while database.execute("SELECT bytes FROM counters").fetchone()[0] + size > most:
                 _drop_frame(database)
-            parent = None if known.pose is None else known.pose.parent_frame
-            run = json.dumps([known.robot, known.session, parent])
+            parent = None if metadata.pose is None else metadata.pose.parent_frame
+            run = json.dumps([metadata.robot, metadata.session, parent])
             last = _neighbour(database, run, None, -1)
-            stamp = known.captured_at.timestamp() if known.captured_at else time.time()
-            T = pose_matrix(known.pose)
+            stamp = metadata.captured_at.timestamp() if metadata.captured_at else time.time()
+            T = pose_matrix(metadata.pose)
             pose = None if T is None else json.dumps(T.tolist())
             database.execute(
                 "INSERT INTO frames (digest, run, stamp, pose, bytes, meta, data) "
@@ -344,10 +343,10 @@ class Spool:
                 "LEFT JOIN reasons ON frame = id WHERE frames.reason IS NOT NULL ORDER BY id",
                 (_NO_REASON,),
             ).fetchall()
-        known = [(FrameMeta.model_validate_json(text), reason) for text, reason in rows]
+        refusals = [(FrameMeta.model_validate_json(text), reason) for text, reason in rows]
         return [
             SpoolRefusal(meta.name, meta.session, meta.captured_at, reason)
-            for meta, reason in known
+            for meta, reason in refusals
         ]
 
     def retry_refused(self) -> int:
@@ -402,7 +401,7 @@ class Spool:
     # Uploads.
 
     def _next_batch(self, last: int) -> list[_Waiting]:
-        """Return the first waiting frames up to an id, as many as fit one request."""
+        """Return the first waiting frames with ids up to `last`, as many as fit one request."""
         with self._transaction(write=False) as database:
             rows = database.execute(
                 "SELECT id, length(data) FROM frames WHERE reason IS NULL AND id <= ? "
@@ -416,19 +415,19 @@ class Spool:
                     break
                 count += 1
             query = "SELECT id, data, meta FROM frames WHERE id = ?"
-            found = [database.execute(query, (one,)).fetchone() for one, _ in rows[:count]]
+            waiting = [database.execute(query, (number,)).fetchone() for number, _ in rows[:count]]
         return [
             _Waiting(number, data, FrameMeta.model_validate_json(meta))
-            for number, data, meta in found
+            for number, data, meta in waiting
         ]
 
     def _send(self, target: _Target, batch: list[_Waiting], report: SyncReport) -> None:
-        """Upload frames and record the results; a batch that is rejected as a whole is halved."""
+        """Upload a batch and record the results; split the batch if it is rejected as a whole."""
         try:
             items = _persist(
                 target,
                 lambda: target.client.upload_batch(
-                    target.map_name, [one.data for one in batch], [one.meta for one in batch],
+                    target.map_name, [row.data for row in batch], [row.meta for row in batch],
                     **target.how,
                 ),
             )  # fmt: skip
@@ -445,26 +444,26 @@ class Spool:
             self._send(target, batch[:half], report)
             self._send(target, batch[half:], report)
             return
-        uploaded, refused, beyond = [], {}, None
-        for one, item in zip(batch, items, strict=True):
+        uploaded, refused, last_item = [], {}, None
+        for frame, item in zip(batch, items, strict=True):
             if item.frame is not None:
-                uploaded.append(one.id)
+                uploaded.append(frame.id)
                 report.received += item.status != 200
                 report.there += item.status == 200
                 report.poses += item.frame.has_pose
                 if item.frame.samples is not None:
                     report.ranges.append(item.frame.samples)
             elif item.status in _FRAME_STATUSES:
-                refused[one.id] = item.problem.detail if item.problem else "no reason was stated"
+                refused[frame.id] = item.problem.detail if item.problem else "no reason was stated"
             else:
-                beyond = item
+                last_item = item
         self._record_results(uploaded, refused)
         report.refused += len(refused)
-        if beyond is not None:
-            raise _error_of(beyond)
+        if last_item is not None:
+            raise _error_of(last_item)
 
     def _record_results(self, uploaded: list[int], refused: dict[int, str]) -> None:
-        """Remove uploaded frames, and mark others as rejected."""
+        """Remove uploaded frames by id, and mark `refused` frames with their reasons."""
         with self._transaction() as database:
             for number in uploaded:
                 removed = database.execute("DELETE FROM frames WHERE id = ?", (number,)).rowcount
@@ -485,12 +484,12 @@ class Spool:
     # The file.
 
     def _open(self, most_bytes: int | None) -> None:
-        """Create or check the tables."""
+        """Create the tables; for an existing spool, check them and set its limit."""
         with self._translated_errors():
             self._database.execute("PRAGMA journal_mode = PERSIST")
             self._database.execute("PRAGMA synchronous = FULL")
-            # With secure_delete, which Debian's SQLite enables, removing a frame would write all
-            # of its pages to the journal.
+            # With secure_delete, the default in Debian, removing a frame would write all of its
+            # pages to the journal.
             self._database.execute("PRAGMA secure_delete = OFF")
         with self._transaction() as database:
             mark = database.execute("PRAGMA application_id").fetchone()[0]
@@ -514,9 +513,9 @@ class Spool:
         self._reserve_journal()
 
     def _reserve_journal(self) -> None:
-        """Reserve disk space for the journal, which keeps it after each transaction.
+        """Reserve disk space for the journal, which retains its size after each transaction.
 
-        Without it a full disk could not be emptied, since removing frames writes to the journal.
+        Removing frames writes to the journal, so this must work on a full disk.
         """
         journal = self._path.with_name(self._path.name + "-journal")
         if journal.is_file() and journal.stat().st_size >= _RESERVE * _PAGE:
@@ -546,7 +545,7 @@ class Spool:
 
     @contextmanager
     def _translated_errors(self) -> Iterator[None]:
-        """Convert errors of SQLite, by their messages: Python 3.10 does not expose error codes."""
+        """Convert SQLite errors by their messages; Python 3.10 does not expose error codes."""
         try:
             yield
         except sqlite3.Error as error:
@@ -567,7 +566,7 @@ class Spool:
 
 
 def _check_sendable(data: bytes, meta: FrameMeta) -> None:
-    """Raise FrameError for errors that the service would report and the robot can still fix."""
+    """Raise FrameError if the service would reject the frame, while the robot can still fix it."""
     if not data:
         raise errors.UnreadableFrame("The frame is empty. Write it again.")
     if data.startswith(b"\x89PNG") and meta.intrinsics is None:
@@ -581,7 +580,7 @@ def _check_sendable(data: bytes, meta: FrameMeta) -> None:
 
 
 def separation(a: SpoolPlace, b: SpoolPlace) -> float:
-    """Return metres / 1 + degrees / 30 + seconds / 60 between two frames; time alone if a pose is
+    """Return metres + degrees / 30 + seconds / 60 between two frames, or only the time if a pose is
     unknown.
     """
     apart = abs(a.stamp - b.stamp) / SECONDS
@@ -632,7 +631,7 @@ def _drop_frame(database: sqlite3.Connection) -> None:
 
 
 def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side: int) -> int | None:
-    """Return the waiting frame before (-1) or after (1) a frame of a run; the last for None."""
+    """Return the waiting frame before (-1) or after (1) an id; for id None, the run's last."""
     order, compared = ("DESC", "<") if side < 0 else ("ASC", ">")
     row = database.execute(
         f"SELECT id FROM frames WHERE reason IS NULL AND run = ? AND id {compared} ? "
@@ -655,7 +654,7 @@ def _update_novelty(database: sqlite3.Connection, number: int | None) -> None:
             places = []
             break
         places.append(_place(*database.execute(query, (beside,)).fetchone()[1:]))
-    novelty = sum(separation(_place(*own), one) for one in places) if places else None
+    novelty = sum(separation(_place(*own), place) for place in places) if places else None
     database.execute("UPDATE frames SET novelty = ? WHERE id = ?", (novelty, number))
 
 
@@ -664,7 +663,7 @@ def _place(stamp: float, pose: str | None) -> SpoolPlace:
 
 
 def _statements(script: str) -> Iterator[str]:
-    """Yield the statements of a script, since `executescript` would commit the transaction."""
+    """Yield the statements of a script; `executescript` would commit the transaction."""
     statement = ""
     for line in script.splitlines(keepends=True):
         statement += line
@@ -675,19 +674,19 @@ def _statements(script: str) -> Iterator[str]:
 
 # Answers of the service.
 
-#: Statuses that concern one frame and not the next one.
+#: Status codes that concern a single frame, so the upload continues with the next frame.
 _FRAME_STATUSES = (400, 409, 413, 415, 422)
 
 
 def _is_about_content(error: errors.SceneprintError) -> bool:
-    """Return whether the service refused the content of a request."""
+    """Return whether the service refused a request because of its content."""
     if isinstance(error, errors.Refused):  # an answer of a proxy, or an unknown problem
         return error.status in (409, 413, 415, 422)
     return isinstance(error, (errors.FrameError, errors.Conflict, errors.InvalidRequest))
 
 
 def _persist(target: _Target, send: Callable[[], T]) -> T:
-    """Send a request, and repeat it while the service is busy and time is left."""
+    """Call `send`, and repeat the call while the service is busy and time is left."""
     while True:
         try:
             return send()
@@ -699,7 +698,7 @@ def _persist(target: _Target, send: Callable[[], T]) -> T:
 
 
 def _error_of(item: BatchItem) -> errors.SceneprintError:
-    """Return the reason why the service accepts no more frames."""
+    """Return the error for an item whose status shows that the service accepts no more frames."""
     detail = "The service rejected a frame." if item.problem is None else item.problem.detail
     if item.status == 403:
         return errors.QuotaExceeded(detail)

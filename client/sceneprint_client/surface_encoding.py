@@ -21,7 +21,7 @@ HEADER = struct.Struct("<4sHHII3f3fIf")
 POINT = np.dtype(
     [("position", "<u2", 3), ("patch", "<u2"), ("normal", "i1", 3), ("residual", "u1")]
 )
-#: Flags of the header: attributes of each point.
+#: Flags of the header for the attributes of its points.
 NORMALS, PATCHES, RESIDUALS = 1, 2, 4
 #: Index of points that lie on no validation patch.
 NO_PATCH = 65535
@@ -91,11 +91,11 @@ def _refusal(why: str) -> Refused:
 
 #: A cell: position in its tile, number of sightings, and session and time of the last one.
 CELL = np.dtype([("at", "u1", 3), ("seen", "u1"), ("session", "<u2"), ("taken", "<u2")])
-#: Number of cells along each side of a tile, and number of steps of a position along it.
+#: Number of cells along each side of a tile, and number of position steps along each side.
 SIDE, STEPS = 64, 256
-#: Steps per doubling of the number of frames that saw a cell, which is stored in one byte.
+#: A cell stores log2(1 + number of frames that saw it) in steps of 1 / SEEN_STEPS.
 SEEN_STEPS = 16.0
-#: Values of cells that no frame with a session saw, and that no frame with a time saw.
+#: Values of `session` and `taken` if no frame with a session, or with a time, saw the cell.
 NO_SESSION, NO_TIME = 65535, 65535
 
 

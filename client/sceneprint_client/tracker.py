@@ -1,4 +1,4 @@
-"""Continuous localization of a robot: answers of a service over time, combined with odometry.
+"""Continuous localization of a robot from the answers of a service and odometry.
 
     tracker = Tracker(client, "warehouse", camera=(525, 525, 319.5, 239.5))
     state = tracker.update(depth, T_odom_sensor, stamp=stamp)
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 __all__ = ["AsyncTracker", "Observation", "State", "Tracker", "TrackerParameters", "replay"]
 
-#: Errors after which a later query may succeed.
+#: Errors after which the next query may succeed.
 _AWAY = (errors.Unreachable, errors.Busy, errors.RateLimited, errors.StoreAway, errors.StoreLocked)
 #: Maximum age of earlier frames in a query, seconds.
 _MAXIMUM_AGE_S = 30.0
@@ -57,7 +57,7 @@ _FIRST_FAULT = 500
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """A frame as it is sent, alone or with later frames."""
+    """A frame in the form in which queries send it."""
 
     stamp: float
     T_odom_sensor: NDArray[np.float64]
@@ -169,20 +169,20 @@ class Tracker:
 
     def _earlier(self, view: _View) -> list[_View]:
         """Return the earlier frames of the next query; none while tracking."""
-        views = [one for one in self._views if 0 <= view.stamp - one.stamp <= _MAXIMUM_AGE_S]
-        poses = [one.T_odom_sensor for one in (*views, view)]
+        views = [item for item in self._views if 0 <= view.stamp - item.stamp <= _MAXIMUM_AGE_S]
+        poses = [item.T_odom_sensor for item in (*views, view)]
         places = spaced_views(poses, self._core.parameters.frames)
         return [views[place] for place in places[:-1]]
 
     def _remember(self, view: _View) -> None:
-        """Store a frame for later queries; a robot that stands still keeps its earlier frames."""
+        """Store a frame for later queries, unless the robot has not moved since the last frame."""
         if not self._views or is_new_view(self._views[-1].T_odom_sensor, view.T_odom_sensor):
             self._views.append(view)
 
     def _observe(
         self, view: _View, earlier: list[_View], prior: PoseEvidence | None
     ) -> tuple[Observation, bool]:
-        """Return the answer to a frame, and whether the service accepted the frame."""
+        """Query a frame; return the evidence, and whether the service could read the frame."""
         try:
             answer, used = self._localize(view, earlier, prior)
         except errors.UselessFrame as error:
@@ -193,28 +193,28 @@ class Tracker:
             if error.status < _FIRST_FAULT:
                 raise
             return Observation("unanswered", reason=f"no answer: {error}"), False
-        poses = tuple(one.T_odom_sensor for one in used)
+        poses = tuple(item.T_odom_sensor for item in used)
         return replace(observation_of(answer), earlier=poses), True
 
     def _localize(
         self, view: _View, earlier: list[_View], prior: PoseEvidence | None
     ) -> tuple[Localization, list[_View]]:
         """Send a query; return its answer and the earlier frames that support it."""
-        known = None if prior is None else _prior_of(prior)
+        expected = None if prior is None else _prior_of(prior)
         if earlier:
             back = inverse(view.T_odom_sensor)  # the query uses poses relative to this frame
             sent = [*earlier, view]
-            metas = [_with_odometry(one.meta, back @ one.T_odom_sensor) for one in sent]
-            frames = [one.data for one in sent]
+            metas = [_with_odometry(item.meta, back @ item.T_odom_sensor) for item in sent]
+            frames = [item.data for item in sent]
             try:
                 answer = self._client.localize_sequence(
-                    self._map, frames, metas, keep=False, prior=known
+                    self._map, frames, metas, keep=False, prior=expected
                 )
             except (errors.FrameError, errors.TooLarge):
                 pass  # a query with only this frame shows whether an earlier frame is the cause
             else:
                 return answer, earlier
-        answer = self._client.localize(self._map, view.data, view.meta, keep=False, prior=known)
+        answer = self._client.localize(self._map, view.data, view.meta, keep=False, prior=expected)
         if earlier:
             with self._lock:
                 self._views.clear()
@@ -228,7 +228,7 @@ class Tracker:
 class AsyncTracker:
     """A tracker that queries in its own thread, so that `submit` does not wait.
 
-    During a query only the latest frame waits; older ones are dropped, but their odometry counts.
+    During a query only the latest frame waits; older frames are dropped, but not their odometry.
     Close it, or use it in `with`.
 
     Parameters
@@ -273,7 +273,7 @@ class AsyncTracker:
         return state
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until no frame waits; return False after a timeout."""
+        """Wait until all frames have been processed; return False after a timeout."""
         with self._changed:
             return self._changed.wait_for(
                 lambda: self._waiting is None and not self._busy, timeout_s
@@ -348,27 +348,27 @@ def _matrix(listed: list[float], size: int = 4) -> NDArray[np.float64]:
 def _observation_json(observation: Observation) -> dict[str, Any]:
     poses = [
         {
-            "parent_frame": one.parent_frame,
-            "matrix": _flat_list(one.T_map_sensor),
-            "weight": one.weight,
-            "covariance": None if one.covariance is None else _flat_list(one.covariance),
+            "parent_frame": evidence.parent_frame,
+            "matrix": _flat_list(evidence.T_map_sensor),
+            "weight": evidence.weight,
+            "covariance": None if evidence.covariance is None else _flat_list(evidence.covariance),
         }
-        for one in observation.poses
+        for evidence in observation.poses
     ]
     return {
         "status": observation.status, "poses": poses, "strong": observation.strong,
         "by_prior": observation.by_prior, "reason": observation.reason,
-        "earlier": [_flat_list(one) for one in observation.earlier],
+        "earlier": [_flat_list(pose) for pose in observation.earlier],
     }  # fmt: skip
 
 
 def _observation_from(line: dict[str, Any]) -> Observation:
     poses = tuple(
         PoseEvidence(
-            one["parent_frame"], _matrix(one["matrix"]), one["weight"],
-            None if one["covariance"] is None else _matrix(one["covariance"], 6),
+            entry["parent_frame"], _matrix(entry["matrix"]), entry["weight"],
+            None if entry["covariance"] is None else _matrix(entry["covariance"], 6),
         )
-        for one in line["poses"]
+        for entry in line["poses"]
     )  # fmt: skip
     earlier = tuple(map(_matrix, line["earlier"]))
     return Observation(

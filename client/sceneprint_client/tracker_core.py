@@ -1,4 +1,4 @@
-"""State of a tracked robot from answers and odometry, computed without a service.
+"""State of a tracked robot, computed from answers and odometry without a service.
 
 answer of the service  --observation_of-->  Observation
 odometry, Observation  --TrackerCore.update-->  State: lost, ambiguous or tracking; T_map_odom
@@ -28,17 +28,17 @@ from sceneprint_client.poses import rigid_transform
 Array = NDArray[np.float64]
 TrackerStatus = Literal["lost", "ambiguous", "tracking"]
 
-#: Lower limits of the filter's standard deviations, and deviation to add to that of any answer.
+#: Lower limits of the filter's standard deviations, and deviations to add to those of an answer.
 _LEAST_M, _LEAST_RAD = 0.01, math.radians(0.3)
 _ANSWER_M, _ANSWER_RAD = 0.03, math.radians(1.0)
-#: Factor of the deviation of repeated answers that the prior decided.
+#: Factor of the deviation of an answer that the prior decided.
 _PRIOR_FACTOR = 2.0
 #: Number of odometry poses stored; limits how late an answer can arrive.
 _MOST_MARKS = 4096
 #: Minimum motion between two views of one query; either value is sufficient.
 _SPACING_M, _SPACING_RAD = 0.1, math.radians(6.0)
-#: Longest path and largest turn back to an earlier view of a query: beyond them odometry may be
-#: off by centimetres, and a larger step is a jump.
+#: Maximum path length and turn from an earlier view of a query to the last view. Beyond these,
+#: odometry may be off by centimetres, or has jumped.
 _LONGEST_WAY_M, _LONGEST_TURN_RAD = 3.0, math.radians(120.0)
 
 
@@ -52,23 +52,23 @@ class TrackerParameters:
     turn_drift : drift of the odometry, as a fraction of the turned angle
     heading_drift_deg : drift of the heading, degrees per travelled metre
     gate_m, gate_deg : maximum difference between two poses of one place, in addition to drift
-    apart_m, apart_deg : smallest motion, of which either is sufficient, between two independent
-        views
+    apart_m, apart_deg : minimum distance, or else minimum angle, between two independent views
     strong_weight, weak_weight : weights of an answer `found` with strong matches from at least two
         viewpoints, and of any other answer `found`
     alternative_weight : total weight of the alternatives of an ambiguous answer
-    need : lead in weight that a place requires for a first fix
-    ratio : smallest ratio of the weight of answers `found` at a place to that of all others, for a
-        first fix
+    need : minimum lead in weight of a place over any other place, for a first fix
+    ratio : minimum ratio of the weight of answers `found` at a place to that at any other place,
+        for a first fix
     most_votes : number of stored answers
     half_life_m, half_life_s : distance and time after which the weight of a vote is halved
-    contradictions : weight of contradictions, from separate places, after which the robot is
-        lost; an answer `found` elsewhere counts 1, an ambiguous one without the tracked place 0.5
+    contradictions : weight of contradictions, from separate viewpoints, after which the robot is
+        lost. An answer `found` elsewhere has weight 1, an ambiguous answer without the tracked
+        place 0.5
     patience_s : longest period of contradictions from one place before the robot is lost
     most_deviation_m : deviation of the position above which the robot is lost
     most_undecided_m : distance after which the state is ambiguous if all answers leave several
         places possible or depend on the prior
-    alone_every : interval of queries without a prior
+    alone_every : interval, in queries, between queries without a prior
     frames : number of latest frames in a query while the robot is lost or ambiguous, 1 to 10
     """
 
@@ -158,10 +158,10 @@ def observation_of(answer: Localization) -> Observation:
         return Observation("not_found", reason="No matching frame has a pose in the map.")
     poses = tuple(
         PoseEvidence(
-            one.pose.parent_frame, rigid_transform(np.array(one.pose.matrix)),
-            max(one.confidence or 0.0, 1e-3),
+            alternative.pose.parent_frame, rigid_transform(np.array(alternative.pose.matrix)),
+            max(alternative.confidence or 0.0, 1e-3),
         )
-        for one in answer.alternatives
+        for alternative in answer.alternatives
     )  # fmt: skip
     return Observation(answer.status, poses, reason=answer.reason)
 
@@ -228,7 +228,7 @@ class _Belief:
     T_map_sensor: Array
     covariance: Array
     confirmed: float  #: stamp of the last answer that confirmed it without a prior
-    undecided: float | None = None  #: distance at the first later answer that did not confirm it
+    undecided: float | None = None  #: distance at the first answer since that did not confirm it
 
 
 class TrackerCore:
@@ -319,23 +319,24 @@ class TrackerCore:
     # Odometry.
 
     def _mark(self, stamp: float, T: Array) -> _Mark:
-        """Return the odometry at a frame; a new pose extends the path."""
+        """Return the mark at a stamp, added if it is new; raise InvalidRequest if it decreases."""
         if self._marks and stamp <= self._marks[-1].stamp:
-            at = bisect_right([one.stamp for one in self._marks], stamp) - 1
-            known = self._marks[max(at, 0)]
-            if known.stamp != stamp or not np.allclose(known.T_odom_sensor, T, atol=1e-6):
+            at = bisect_right([mark.stamp for mark in self._marks], stamp) - 1
+            mark = self._marks[max(at, 0)]
+            if mark.stamp != stamp or not np.allclose(mark.T_odom_sensor, T, atol=1e-6):
                 raise InvalidRequest(
                     f"The stamp {stamp} is not after {self._marks[-1].stamp}, the stamp of the "
                     "last odometry. Pass increasing stamps; after a jump of the clock, reset the "
                     "tracker.",
                     (("stamp", "not after the last"),),
                 )
-            return known
+            return mark
         mark = replace(self._ahead(T), stamp=stamp)
         self._marks.append(mark)
         return mark
 
     def _ahead(self, T: Array) -> _Mark:
+        """Return the mark that a pose after the last mark would have."""
         if not self._marks:
             return _Mark(-math.inf, T, 0.0, 0.0)
         last = self._marks[-1]
@@ -343,14 +344,14 @@ class TrackerCore:
         return _Mark(last.stamp, T, last.distance + step, last.angle + turn)
 
     def _drifts(self, a: _Mark, b: _Mark) -> tuple[float, float]:
-        """Return the deviations of the odometry between two poses, metres and radians."""
+        """Return the expected drift of the odometry between two marks, metres and radians."""
         p, way = self.parameters, abs(a.distance - b.distance)
         turned = math.radians(p.heading_drift_deg) * way + p.turn_drift * abs(a.angle - b.angle)
         return p.drift * way, turned
 
     def _are_independent(self, a: _Mark, b: _Mark) -> bool:
-        """Return whether each view of one answer is independent of each view of the other."""
-        A, B = (np.stack([one.T_odom_sensor, *one.earlier]) for one in (a, b))
+        """Return whether all views of two answers are far enough apart to be independent."""
+        A, B = (np.stack([mark.T_odom_sensor, *mark.earlier]) for mark in (a, b))
         steps = np.linalg.norm(A[:, None, :3, 3] - B[None, :, :3, 3], axis=2)
         # The trace of a rotation is 1 + 2 cos(angle).
         cosines = (np.einsum("aij,bij->ab", A[:, :3, :3], B[:, :3, :3]) - 1) / 2
@@ -360,10 +361,11 @@ class TrackerCore:
     # Votes, and the first fix.
 
     def _vote(self, mark: _Mark, observation: Observation) -> None:
-        p, total = self.parameters, sum(one.weight for one in observation.poses)
+        """Add the poses of an answer as votes, unless the prior decided between them."""
+        p, total = self.parameters, sum(pose.weight for pose in observation.poses)
         found = observation.status == "found"
         if found and observation.by_prior:
-            return  # the prior decided, so the answer is not independent evidence
+            return
         for pose in observation.poses:
             weight = p.alternative_weight * pose.weight / total
             if found:
@@ -384,8 +386,8 @@ class TrackerCore:
         remaining = [old for old, vote in enumerate(self._votes) if condition(vote)]
         place = {old: new for new, old in enumerate(remaining)}
         self._votes = [
-            replace(one, agreeing={place[friend] for friend in one.agreeing if friend in place})
-            for one in map(self._votes.__getitem__, remaining)
+            replace(vote, agreeing={place[friend] for friend in vote.agreeing if friend in place})
+            for vote in map(self._votes.__getitem__, remaining)
         ]
 
     def _votes_agree(self, older: _Vote, newer: _Vote) -> bool:
@@ -402,33 +404,33 @@ class TrackerCore:
     def _weight(
         self, places: Iterable[int], apart: Callable[[_Mark, _Mark], bool], *, found: bool
     ) -> float:
-        """Return the weight of votes that agree; views that are not `apart` count once."""
+        """Return the weight of votes, or only of `found` votes; views not `apart` count once."""
         votes = [self._votes[place] for place in places]
         weighed = sorted(
-            ((self._current_weight(one), one) for one in votes if one.found or not found),
+            ((self._current_weight(vote), vote) for vote in votes if vote.found or not found),
             key=lambda pair: (-pair[0], pair[1].number),
         )
         counted: list[_Mark] = []
         total = 0.0
-        for weight, one in weighed:
-            if all(apart(one.mark, other) for other in counted):
-                counted.append(one.mark)
+        for weight, vote in weighed:
+            if all(apart(vote.mark, other) for other in counted):
+                counted.append(vote.mark)
                 total += weight
         return total
 
     def _current_weight(self, vote: _Vote) -> float:
-        """Return the current weight of a vote."""
+        """Return the weight of a vote after its decay over distance and time."""
         p, now = self.parameters, self._votes[-1].mark
         halves = abs(now.distance - vote.mark.distance) / p.half_life_m
         halves += abs(now.stamp - vote.mark.stamp) / p.half_life_s
         return float(vote.weight * 0.5**halves)
 
     def _first_fix(self, mark: _Mark, observation: Observation) -> tuple[TrackerStatus, str]:
-        """Return the verdict of a first fix; the leading place becomes the belief."""
+        """Return the verdict without a belief; set the belief if a place leads clearly."""
         p = self.parameters
         own = [i for i, vote in enumerate(self._votes) if vote.number == self._answers]
         if not own:
-            disputed = any(len(one.agreeing) < len(self._votes) for one in self._votes)
+            disputed = any(len(vote.agreeing) < len(self._votes) for vote in self._votes)
             waits = "several places are possible; " if disputed else ""
             return "ambiguous" if waits else "lost", waits + observation.reason
         apart = cache(self._are_independent)  # each vote compares the same places
@@ -449,7 +451,7 @@ class TrackerCore:
     def _set_belief(self, mark: _Mark, best: int) -> None:
         """Set the belief to the newest vote `found` at the best place, moved by odometry."""
         supporters = [self._votes[place] for place in self._votes[best].agreeing]
-        vote = max((one for one in supporters if one.found), key=lambda one: one.number)
+        vote = max((vote for vote in supporters if vote.found), key=lambda vote: vote.number)
         pose = vote.evidence
         start = _Belief(
             pose.parent_frame, vote.mark, pose.T_map_sensor, _covariance_of(pose), vote.mark.stamp
@@ -462,7 +464,7 @@ class TrackerCore:
     # The tracked place.
 
     def _predict(self, mark: _Mark) -> tuple[Array, Array]:
-        """Return T_map_sensor and its covariance at a pose of the odometry."""
+        """Return T_map_sensor and its covariance at a mark, from the belief and the odometry."""
         belief = self._belief
         if belief is None:
             raise AssertionError("there is no tracked pose")
@@ -486,28 +488,28 @@ class TrackerCore:
         if belief is None or not observation.poses:
             return
         T, P = self._predict(mark)
-        agreeing = [one for one in observation.poses if self._is_tracked(one, T, P)]
+        agreeing = [pose for pose in observation.poses if self._is_tracked(pose, T, P)]
         if observation.status == "found" and agreeing:
             if observation.by_prior:
                 self._correct(mark, agreeing[0], _PRIOR_FACTOR)
-                self._undecided(mark)
+                self._set_undecided(mark)
             else:
                 self._correct(mark, agreeing[0], 1.0)
                 if self._belief is not None:
                     self._belief = replace(self._belief, confirmed=mark.stamp, undecided=None)
                 self._against.clear()
         elif agreeing:
-            self._undecided(mark)
+            self._set_undecided(mark)
         elif not observation.by_prior:
             weight = 1.0 if observation.status == "found" else 0.5
             self._against.append((self._answers, mark, weight))
 
-    def _undecided(self, mark: _Mark) -> None:
+    def _set_undecided(self, mark: _Mark) -> None:
         if self._belief is not None and self._belief.undecided is None:
             self._belief = replace(self._belief, undecided=mark.distance)
 
     def _correct(self, mark: _Mark, pose: PoseEvidence, factor: float) -> None:
-        """Apply a step of a Kalman filter; a repeated view from one place adds no information."""
+        """Correct the belief by an independent view; `factor` multiplies the view's deviations."""
         belief = self._belief
         if belief is None or not self._are_independent(belief.mark, mark):
             return
@@ -559,9 +561,9 @@ class TrackerCore:
     def _contradiction(self) -> float:
         """Return the weight of contradicting answers; views from one place count once."""
         counted: list[tuple[int, _Mark, float]] = []
-        for one in sorted(self._against, key=lambda one: (-one[2], one[0])):
-            if all(self._are_independent(one[1], other[1]) for other in counted):
-                counted.append(one)
+        for entry in sorted(self._against, key=lambda entry: (-entry[2], entry[0])):
+            if all(self._are_independent(entry[1], other[1]) for other in counted):
+                counted.append(entry)
         return sum(weight for _, _, weight in counted)
 
     def _forget(self) -> None:
@@ -589,8 +591,8 @@ def difference(a: Array, b: Array) -> tuple[float, float]:
 def spaced_views(poses: Sequence[Array], most: int) -> list[int]:
     """Return the indices of the latest views to use in one query.
 
-    Any two differ by 0.1 m or 6 degrees. The path from each to the last view is at most 3 m long
-    and turns by at most 120 degrees.
+    Any two views differ by 0.1 m or 6 degrees. The path from a view to the last view is at most 3 m
+    long and turns by at most 120 degrees.
 
     Parameters
     ----------
@@ -608,7 +610,7 @@ def spaced_views(poses: Sequence[Array], most: int) -> list[int]:
         way, turned = way + step, turned + turn
         if len(chosen) >= most or way > _LONGEST_WAY_M or turned > _LONGEST_TURN_RAD:
             break
-        if all(is_new_view(poses[place], poses[one]) for one in chosen):
+        if all(is_new_view(poses[place], poses[other]) for other in chosen):
             chosen.append(place)
     return chosen[::-1]
 
@@ -621,7 +623,7 @@ def is_new_view(a: Array, b: Array) -> bool:
 
 def rotation_vector(R: Array) -> Array:
     """Return the rotation vector (axis times angle, radians) of a rotation (3, 3)."""
-    # The skew part gives the sine, the trace the cosine; near 180 degrees the symmetric part helps.
+    # Near 180 degrees, the skew part vanishes and the symmetric part contains the axis.
     skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
     sine, cosine = float(np.linalg.norm(skew)), (float(np.trace(R)) - 1) / 2
     angle = math.atan2(sine, cosine)
@@ -645,12 +647,12 @@ def rotation_matrix(vector: Array) -> Array:
 
 
 def shifted_covariance(P: Array, offset: Array) -> Array:
-    """Return the covariance (6, 6) of the pose of a point that moves rigidly with another pose.
+    """Return the covariance (6, 6) of a pose that is rigidly attached to another pose.
 
     Parameters
     ----------
     P : (6, 6) covariance of the other pose, errors (x, y, z, rx, ry, rz) in the parent frame
-    offset : (3,) vector from the other pose to the point in the parent frame, metres
+    offset : (3,) vector from the other pose to the attached pose in the parent frame, metres
     """
     x, y, z = offset
     F = np.eye(6)  # a rotation error e moves the point by e x offset
@@ -664,7 +666,7 @@ def _diagonal_covariance(metres: float, radians: float) -> Array:
 
 
 def _covariance_of(pose: PoseEvidence) -> Array:
-    """Return the covariance of an answer, with the additional deviation of any answer."""
+    """Return the covariance of a pose, plus the deviations that every answer has."""
     least = _diagonal_covariance(_ANSWER_M, _ANSWER_RAD)
     return least if pose.covariance is None else pose.covariance + least
 

@@ -27,7 +27,7 @@ LONGEST_GAP_S = 0.5
 TOLERANCE_S = 0.02
 #: Maximum number of samples of moving transforms: hours of odometry.
 MOST_SAMPLES = 5_000_000
-#: Maximum deviation of the length of a recorded quaternion from 1, without and with normalisation.
+#: Maximum deviation of a quaternion's length from 1 to be used as it is, and to be normalised.
 _UNIT, _NEAR_UNIT = 1e-2, 0.1
 #: Longest plausible translation, metres.
 _FARTHEST_M = 1e7
@@ -37,12 +37,12 @@ BASES = ("base_link", "base_footprint", "base")
 WORLDS = ("map", "odom", "world")
 
 
-#: Speed above which two samples contradict each other, metres (or radians) per second, ...
+#: Speed above which two samples contradict each other, metres or radians per second.
 FASTEST = 50.0
-#: ... with this tolerance, metres or radians.
+#: Tolerance of a distance between two samples, metres or radians.
 _JITTER = 0.1
-#: A jump, metres or radians, and an acceleration, per second^2, that one motion cannot show; a
-#: jump and its reversal within this time, seconds, indicate two publishers.
+#: Jump, metres or radians, and acceleration, per second^2, above which samples belong to different
+#: motions; and time within which a jump and its reversal indicate two publishers, seconds.
 _JUMP, _HARDEST, _BACK_S = 0.5, 10.0, 2.0
 
 
@@ -69,7 +69,7 @@ class _Edge:
 
     @property
     def is_constant(self) -> bool:
-        """Return whether it never moved, like a fixed joint that is published repeatedly."""
+        """Whether the transform never moved, like a fixed joint that is published repeatedly."""
         rows = np.frombuffer(self.samples, np.float64).reshape(-1, 7)
         return self.fixed or bool((np.ptp(rows, axis=0) < 1e-9).all())
 
@@ -81,9 +81,9 @@ class TransformTree:
         self._edges: dict[str, dict[str, _Edge]] = {}  # by child, then by parent
         self._count = 0
         self._origin_ns: int | None = None
-        #: Transforms (parent, child) with ignored samples: the reason and their number.
+        #: Reason and number of ignored samples, by (parent, child).
         self.passed_over: dict[tuple[str, str], tuple[str, int]] = {}
-        #: Transforms with normalised quaternions: the length of the last one.
+        #: Length of the last normalised quaternion, by (parent, child).
         self.normalised: dict[tuple[str, str], float] = {}
 
     def add(
@@ -162,7 +162,7 @@ class TransformTree:
         self._origin_ns = None
 
     def forget(self, span_ns: int) -> None:
-        """Remove samples of moving transforms that are older than a span before the latest."""
+        """Remove samples of moving transforms that are `span_ns` older than the latest sample."""
         for edges in self._edges.values():
             for edge in edges.values():
                 if not edge.fixed:
@@ -171,9 +171,9 @@ class TransformTree:
                     self._count -= old
 
     def sorted_paths(self, *paths: tuple[str, str]) -> TransformTree:
-        """Return a tree of the transforms between pairs (ancestor, child), for `excerpt`.
+        """Return a tree of the transforms on the paths between pairs (ancestor, child).
 
-        The samples of the moving transforms are shared, and sorted by their stamps.
+        Samples of moving transforms are sorted by stamp, as `excerpt` requires, and shared.
         """
         part = TransformTree()
         for ancestor, child in paths:
@@ -190,7 +190,7 @@ class TransformTree:
         return part
 
     def excerpt(self, first_ns: int, last_ns: int) -> TransformTree:
-        """Return a tree for stamps from `first_ns` to `last_ns`, with the samples around them.
+        """Return a tree for `lookup` at stamps from `first_ns` to `last_ns`, with fewer samples.
 
         This tree must be a result of `sorted_paths` or of this function.
         """
@@ -208,7 +208,7 @@ class TransformTree:
 
     def frames(self) -> list[str]:
         """Return the names of all frames."""
-        parents = {one for edges in self._edges.values() for one in edges}
+        parents = {parent for edges in self._edges.values() for parent in edges}
         return sorted(parents | self._edges.keys())
 
     def has_edge(self, parent: str, child: str) -> bool:
@@ -218,24 +218,24 @@ class TransformTree:
     def ancestors(self, child: str, *, constant: bool = False) -> list[str]:
         """Return a frame and its ancestors, nearest first.
 
-        Of several parents, the one with the most samples is used.
+        If a frame has several parents, the parent with the most samples is used.
 
         Parameters
         ----------
         child : name of the frame
         constant : whether to stop before the first moving transform
         """
-        found = [frame_name(child)]
+        chain = [frame_name(child)]
         while True:
-            edges = self._edges.get(found[-1], {})
+            edges = self._edges.get(chain[-1], {})
             parents = {
                 parent: edge
                 for parent, edge in edges.items()
-                if parent not in found and (not constant or self._is_fixed(parent, found[-1]))
+                if parent not in chain and (not constant or self._is_fixed(parent, chain[-1]))
             }
             if not parents:
-                return found
-            found.append(max(parents, key=lambda name: (len(parents[name].samples), name)))
+                return chain
+            chain.append(max(parents, key=lambda name: (len(parents[name].samples), name)))
 
     def path(self, ancestor: str, child: str) -> list[str] | None:
         """Return the frames from a child up to an ancestor, both included; None without a path."""
@@ -257,9 +257,11 @@ class TransformTree:
 
     def leaves(self, frame: str) -> list[str]:
         """Return the descendants of a frame that have no children."""
-        parents = {one for edges in self._edges.values() for one in edges}
+        parents = {parent for edges in self._edges.values() for parent in edges}
         return [
-            one for one in sorted(self._edges.keys() - parents) if self.path(frame, one) is not None
+            leaf
+            for leaf in sorted(self._edges.keys() - parents)
+            if self.path(frame, leaf) is not None
         ]
 
     def moves_below(self, frame: str) -> bool:
@@ -284,12 +286,12 @@ class TransformTree:
         up = self.ancestors(sensor) if world is None else self.path(world, sensor) or []
         up = up if world is None else up[:-1]
         for name in BASES:
-            for one in up:
-                if one.rpartition("/")[2] == name:
-                    return one
+            for ancestor in up:
+                if ancestor.rpartition("/")[2] == name:
+                    return ancestor
         if world is None:
             return None
-        still = [one for one in self.ancestors(sensor, constant=True) if one in up]
+        still = [ancestor for ancestor in self.ancestors(sensor, constant=True) if ancestor in up]
         return still[-1] if still and still[-1] != frame_name(sensor) else None
 
     def world_of(self, sensor: str) -> str | None:
@@ -304,31 +306,31 @@ class TransformTree:
         ]  # fmt: skip
         named: list[str] = []
         for world in WORLDS:
-            for one in self.frames():
-                path = self.path(one, sensor) if one.rpartition("/")[2] == world else None
+            for frame in self.frames():
+                path = self.path(frame, sensor) if frame.rpartition("/")[2] == world else None
                 if path is not None and len(path) > 1:
-                    named.append(one)
+                    named.append(frame)
         if named:
             return named[0]
         return up[-1] if any(moves) else None
 
     def fixed_transform(self, target: str, source: str) -> Floats | None:
         """Return T_target_source (4, 4) if the frames are fixed to each other, else None."""
-        ups = [self.ancestors(one, constant=True) for one in (target, source)]
-        common = next((one for one in ups[1] if one in ups[0]), None)
+        ups = [self.ancestors(frame, constant=True) for frame in (target, source)]
+        common = next((frame for frame in ups[1] if frame in ups[0]), None)
         if common is None:
             return None
         (T_common_target,) = self.poses(common, target, [0])
         (T_common_source,) = self.poses(common, source, [0])
         if T_common_target is None or T_common_source is None:
             return None
-        found: Floats = np.linalg.inv(T_common_target) @ T_common_source
-        return found
+        transform: Floats = np.linalg.inv(T_common_target) @ T_common_source
+        return transform
 
     def poses(self, parent: str, child: str, stamps_ns: Sequence[int]) -> list[Floats | None]:
         """Return the result of `lookup` with None for unknown transforms."""
-        found = self.lookup(parent, child, stamps_ns)
-        return [None if isinstance(one, UnknownTransform) else one for one in found]
+        transforms = self.lookup(parent, child, stamps_ns)
+        return [None if isinstance(T, UnknownTransform) else T for T in transforms]
 
     def lookup(
         self, parent: str, child: str, stamps_ns: Sequence[int]
@@ -343,27 +345,27 @@ class TransformTree:
 
         Returns
         -------
-        transforms : M transforms. Each may instead be the first unknown transform on the path: its
-            neighbouring samples contradict each other, or are more than `LONGEST_GAP_S` apart with
-            none within `TOLERANCE_S`
+        transforms : M transforms, or UnknownTransform for the first transform on the path whose
+            samples around the stamp contradict each other, or are more than `LONGEST_GAP_S` apart
+            with none within `TOLERANCE_S`
         """
         path = self.path(parent, child)
         if path is None:
             nowhere = UnknownTransform(f"{frame_name(parent)} -> {frame_name(child)}", float("inf"))
             return [nowhere] * len(stamps_ns)
-        found: list[Floats | UnknownTransform] = [np.eye(4) for _ in stamps_ns]
+        transforms: list[Floats | UnknownTransform] = [np.eye(4) for _ in stamps_ns]
         for below, above in pairwise(path):
             steps = self._samples_at(above, below, stamps_ns)
-            found = [
+            transforms = [
                 T if isinstance(T, UnknownTransform)
                 else step if isinstance(step, UnknownTransform)
                 else step @ T
-                for T, step in zip(found, steps, strict=True)
+                for T, step in zip(transforms, steps, strict=True)
             ]  # fmt: skip
-        return found
+        return transforms
 
     def _is_fixed(self, parent: str, child: str) -> bool:
-        """Return whether a transform is fixed; a base that never moved may have stood still."""
+        """Return whether a transform is fixed or constant, except that of a base at rest."""
         edge = self._edges[child][parent]
         names = {parent.rpartition("/")[2], child.rpartition("/")[2]}
         is_of_base = not names.isdisjoint(WORLDS) or child.rpartition("/")[2] in BASES
@@ -408,7 +410,7 @@ class TransformTree:
 def contradictions(
     times: Floats, rows: Floats
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
-    """Return which samples of one transform cannot belong to one motion.
+    """Find the samples of a transform that cannot belong to one motion.
 
     Parameters
     ----------
@@ -440,9 +442,9 @@ def contradictions(
 
 
 def motion(rows: Floats, others: Floats) -> Floats:
-    """Return the distances between samples (M, 7), metres; a radian counts as a metre."""
-    found: Floats = np.linalg.norm(_steps(rows, others), axis=1)
-    return found
+    """Return M distances between samples (M, 7), metres; a radian counts as a metre."""
+    distances: Floats = np.linalg.norm(_steps(rows, others), axis=1)
+    return distances
 
 
 def _steps(rows: Floats, others: Floats) -> Floats:
@@ -471,8 +473,8 @@ def _contradict_around(
     """Return whether the samples before and after each of M times contradict each other."""
     low, high = np.minimum(before, after), np.maximum(before, after)
     sums = np.concatenate([[0], np.cumsum(too_fast)])
-    found: NDArray[np.bool_] = (sums[high] > sums[low]) | disputed[low] | disputed[high]
-    return found
+    conflict: NDArray[np.bool_] = (sums[high] > sums[low]) | disputed[low] | disputed[high]
+    return conflict
 
 
 def frame_name(name: str) -> str:

@@ -55,9 +55,9 @@ class UploadMethods(ServiceConnection):
             Open3D's PinholeCameraIntrinsic, or for an array a (3, 3) matrix or (fx, fy, cx, cy)
         wait_s : longest wait until the frame is signed, seconds; default: no wait
         priority : -10 to 10; frames of higher priority are signed first
-        if_novel : distance to the nearest frame of the map from which the frame is kept, as a
-            fraction of the distance between unrelated frames (True: 0.3). A closer frame becomes
-            `redundant`, and `reason` names its neighbour
+        if_novel : minimum distance to the nearest frame of the map, as a share of the distance
+            between unrelated frames (True: 0.25). A closer frame becomes `redundant`, and `reason`
+            names the nearest frame
         up : unit vector in the sensor's axes, from an IMU; default: from `meta` or a sidecar file
 
         Returns
@@ -151,8 +151,8 @@ class UploadMethods(ServiceConnection):
                 "`meta` for all or for each.",
                 (("frames", "too many or too few"),),
             )
-        known = [None] * len(frames) if metas is None else metas
-        request = await self._run(frames_form, frames, known)
+        meta_list = [None] * len(frames) if metas is None else metas
+        request = await self._run(frames_form, frames, meta_list)
         request["data"] |= upload_fields(priority, if_novel)
         batch = await self._call(Batch, "POST", f"{map_path(map_name)}/frames/batch", **request)
         return batch.items
@@ -161,10 +161,10 @@ class UploadMethods(ServiceConnection):
         self, method: str, path: str, frame: FrameInput, meta: MetaInput | None,
         wait_s: float, fields: dict[str, str], up: Sequence[float] | None,
     ) -> tuple[Added, bool]:  # fmt: skip
-        """Send a frame; the service does not wait if the map already has it."""
+        """Send a frame; return the upload, and whether the frame is new to the map."""
         sent = frame_form(*await self._run(frame_bytes, frame, meta, with_pose=True, up=up))
         sent["data"] |= fields
-        # A service in this process has no other worker that could sign the frame in the meantime.
+        # An embedded service has no other worker that could sign the frame during the wait.
         wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)
         response = await self._send(
             method, path, headers={"Prefer": f"wait={wait}"} if wait else {},
@@ -184,7 +184,7 @@ class UploadMethods(ServiceConnection):
 
 
 def upload_fields(priority: int, if_novel: float | bool | None) -> dict[str, str]:
-    """Return the non-default fields of an upload other than the frame."""
+    """Return the non-default form fields of an upload; raise InvalidRequest if out of range."""
     if abs(priority) > MOST_PRIORITY:
         raise InvalidRequest(
             f"The priority is {priority}. Pass a value from {-MOST_PRIORITY} to {MOST_PRIORITY}.",

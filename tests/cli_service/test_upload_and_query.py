@@ -89,8 +89,8 @@ def test_bad_frames_stop_no_others(
     done = sceneprint("upload", "mixed", folder, "--tag", "a", "--tag", "b", expect=2)
     *_, counts, poses = done.stdout.splitlines()
     assert poses.startswith(
-        "poses of 1 of 4 frames; 2 without: not indexed; 1 without: no NAME.pose.txt is beside "
-        "them, nor NAME.txt in a folder pose; depth "
+        "poses of 1 of 4 frames; 2 without: not indexed; 1 without: there is no NAME.pose.txt "
+        "beside them and no NAME.txt in a folder `pose`; depth "
     )
     assert counts.startswith(
         "4 frames: 2 received, 0 already there, 2 refused; 1 indexed, 1 rejected, 0 failed; "

@@ -92,7 +92,7 @@ def test_poses_beside_plain_images(image: str, pose: str, tmp_path: Path) -> Non
     poses = {frame.path.name: frame.pose for frame in sequence.frames}
     np.testing.assert_array_equal(poses[file.name], pose_at(3.0))
     assert poses[other.name] is None
-    assert sequence.unposed.startswith("no NAME.pose.txt is beside them")
+    assert sequence.unposed.startswith("there is no NAME.pose.txt beside them")
     (alone,) = find_sequences(file)  # as when it is named by itself
     np.testing.assert_array_equal(alone.frames[0].pose, pose_at(3.0))
 

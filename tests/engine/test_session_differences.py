@@ -116,5 +116,5 @@ def test_sessions_that_cannot_be_compared_are_refused(compared: Any) -> None:
     ):
         with pytest.raises(InvalidRequest, match=why):
             engine.differences.begin("hall", NewDifference.model_validate(asked))
-    with pytest.raises(ValueError, match="the same session"):
+    with pytest.raises(ValueError, match="must differ from before"):
         NewDifference(before="a", after="a")

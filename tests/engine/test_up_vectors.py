@@ -72,8 +72,8 @@ def test_a_frame_keeps_its_up(empty: Engine, uploads: Any) -> None:
     [
         ([0, 0, 9.81], "the length is 9.81, not 1"),
         ([0, 0, 0], "the length is 0, not 1"),
-        ([0, -1], "neither {x, y, z} nor a list of three numbers"),
-        ("up", "neither {x, y, z} nor a list of three numbers"),
+        ([0, -1], "must be {x, y, z} or a list of three numbers"),
+        ("up", "must be {x, y, z} or a list of three numbers"),
         ({"x": 0, "y": 1}, "Field required"),
         ([math.nan, 0, 1], "finite number"),
     ],

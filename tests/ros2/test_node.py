@@ -179,7 +179,7 @@ def test_a_node_with_scans_of_a_livox(
         writer.transforms(t, {("odom", "base_link"): ros.transform(t, 0, 0)})
     play(node, bus, writer.written)
     assert node._core.counts["frames"] == 3
-    assert node._core.counts["asked"] == 1  # in half a second
+    assert node._core.counts["queried"] == 1  # in half a second
     assert len(node._core._joiner[1]) == 3
     node.destroy_node()
 

@@ -124,7 +124,7 @@ def test_a_drive_is_tracked_as_the_truth_is(
         reports = run(core, arrived)
         assert core.counts == {
             "frames": count,
-            "asked": count,
+            "queried": count,
             "without_transform": 0,
             "unreadable": 0,
         }
@@ -331,7 +331,7 @@ def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros: SimpleNamespace)
         writer.transforms(0.5 * i, {("odom", "base_link"): np.eye(4)})
     with scripted() as (core, _):
         reports = run(core, writer.written)
-        assert core.counts == {"frames": 3, "asked": 1, "without_transform": 0, "unreadable": 2}
+        assert core.counts == {"frames": 3, "queried": 1, "without_transform": 0, "unreadable": 2}
         writer.image(-ros.start, np.full((6, 8), 1000))
         take(core, *writer.written[-1])
         assert core.report((ros.start + 1) * SECOND).message.startswith("A frame has no stamp.")

@@ -13,7 +13,7 @@ from sceneprint_client.api.frames import RecordingOutline
 #: Scopes of a key for a map. Each scope includes the previous ones.
 Scope = Literal["read", "write", "admin"]
 SCOPES: tuple[Scope, ...] = ("read", "write", "admin")
-#: Stands for all maps and for operations that belong to no map.
+#: Map name of a grant for all maps and for operations that belong to no map.
 EVERY = "*"
 
 
@@ -21,16 +21,15 @@ class NewKey(Given):
     """A key to create."""
 
     name: Label = Field(
-        description="Unique name of the key, such as the name of its user; shown in the audit log.",
+        description="Unique name of the key, such as its user's name. The audit log contains it.",
         examples=["robot-7"],
     )
     grants: Annotated[
         dict[Annotated[str, StringConstraints(pattern=MAP_OR_EVERY)], Scope],
         Field(min_length=1, max_length=1000),
     ] = Field(
-        description="Scope for each map, by the name of the map. The map need not exist yet. `*` "
-        "stands for all maps and for operations that belong to no map. `write` includes `read`, "
-        "and `admin` includes both.",
+        description="Scope by map name. The map need not exist yet. `*` stands for all maps and "
+        "for operations that belong to no map. `write` includes `read`, and `admin` includes both.",
         examples=[{"warehouse-2": "write"}],
     )
     expires_at: AwareDatetime | None = Field(
@@ -74,7 +73,7 @@ class MadeKey(Key):
 
 
 class Me(ApiRecord):
-    """The key of a request."""
+    """Name and permissions of the key that authenticated the request."""
 
     name: str | None = Field(description="Name of the key; null if no key is required.")
     grants: dict[str, Scope] = Field(description="Scope for each map; `*` stands for all maps.")
@@ -84,15 +83,15 @@ class Me(ApiRecord):
 
 
 class AuditLine(ApiRecord):
-    """A change and its author, or a refused request."""
+    """An entry of the audit log: a change and its author, or a refused request."""
 
     number: int = Field(description="Number of the line. Numbers increase, possibly with gaps.")
     at: datetime
     actor: str | None = Field(
-        description="Name of the key; null if the service requires no keys; `command` for a change "
-        "by a command on the data folder."
+        description="Name of the key; null if the service requires no keys. `command`: a command "
+        "changed the data folder directly."
     )
-    address: str | None = Field(description="IP address of the caller or of the caller's proxy.")
+    address: str | None = Field(description="IP address of the caller or its proxy.")
     tenant: str = Field(description="Tenant of the key; empty if there is no key.")
     action: str = Field(
         description="Kind of the event, such as `map.deleted`, or name of an action that sends no "
@@ -168,7 +167,7 @@ class IndexState(ApiRecord):
 
 
 class WorkerSeen(ApiRecord):
-    """A worker process that is running."""
+    """A running worker process."""
 
     name: str = Field(description="Host name and process id.")
     job_id: str | None = Field(description="Id of the current job; null if the worker is idle.")
@@ -185,7 +184,7 @@ class Latency(ApiRecord):
 class Counted(ApiRecord):
     """Counts over a period."""
 
-    received: int = Field(description="Number of frames that were stored, or queued again.")
+    received: int = Field(description="Number of frames that were stored or queued again.")
     indexed: int
     rejected: int = Field(description="Number of frames that cannot be signed.")
     redundant: int
@@ -199,12 +198,13 @@ class Counted(ApiRecord):
         description="Latency of answered queries; null if there were no queries."
     )
     requests: int | None = Field(description="Number of requests under /v1, answered or refused.")
-    refused: int | None = Field(description="Number of these requests with a 4xx response.")
+    refused: int | None = Field(description="Number of requests under /v1 with a 4xx response.")
     busy: int | None = Field(
-        description="Number of these requests with a 503 response, after which a client should "
-        "retry."
+        description="Number of requests under /v1 with a 503 response, which clients should retry."
     )
-    broken: int | None = Field(description="Number of these requests with any other 5xx response.")
+    broken: int | None = Field(
+        description="Number of requests under /v1 with another 5xx response."
+    )
 
 
 class Minute(Counted):
@@ -217,15 +217,15 @@ class MapUse(ApiRecord):
     """A map's usage, quota and retention; see Map."""
 
     frames: int = Field(description="Number of frames that count towards the quota.")
-    bytes: int = Field(description="Size of the uploads of these frames as received.")
+    bytes: int = Field(description="Size of the uploads that count towards the quota, as received.")
     quota_frames: int | None = Field(
         description="Maximum number of frames; null if there is no quota."
     )
     quota_bytes: int | None = Field(
-        description="Maximum size of uploads; null if there is no quota."
+        description="Maximum size of the uploads, bytes; null if there is no quota."
     )
     retention_days: float | None = Field(
-        description="Retention time; null if frames do not expire."
+        description="Retention time, days; null if frames do not expire."
     )
 
 
@@ -253,8 +253,8 @@ class Stats(ApiRecord):
     at: datetime
     counted_at: datetime | None = Field(
         default=None,
-        description="Time at which frames, ended jobs, indexes and bytes were counted. If there "
-        "are more than 100,000 frames and jobs, counting takes at most 1 % of the time.",
+        description="Time at which frames, ended jobs, indexes and bytes were counted. Above "
+        "100,000 frames and jobs, the service counts less often, to spend at most 1 % of its time.",
     )
     map: str | None = Field(description="Name of the map; null for all maps.")
     maps: int
@@ -265,7 +265,7 @@ class Stats(ApiRecord):
         description="Age of the oldest waiting job of each kind, seconds."
     )
     indexes: list[IndexState] = Field(
-        description="Indexes of at most 200 recently changed maps, longest tails first."
+        description="Indexes of at most 200 recently changed maps, by decreasing `tail`."
     )
     workers: list[WorkerSeen] | None = Field(
         description="Workers on all hosts that share a PostgreSQL database, or on this machine if "
@@ -288,33 +288,33 @@ class Stats(ApiRecord):
 
 
 class ModelInfo(ApiRecord):
-    """A model, which contains everything that determines signatures."""
+    """A model: all parameters and trained data that determine the signatures of frames."""
 
     model_id: str
-    label: str = Field(description="Name and first digits of the id, as in maps and answers.")
+    label: str = Field(description="Name and first digits of the id; used in maps and answers.")
     name: str
     preset: bool = Field(description="Whether the model is part of this version of the service.")
     components: int = Field(description="G, the number of components of the mixture.")
-    levels: int = Field(description="Number of levels of the hierarchy of patches.")
+    levels: int = Field(description="H, the number of levels of the patch hierarchy.")
     signature_bytes: int = Field(
-        description="Length of a stored signature (d, or 25 G H if psi itself is stored), bytes."
+        description="Length of a stored signature, bytes: d, or 25 G H if psi itself is stored."
     )
     metric: Literal["l1", "l2"] = Field(
         description="Distance metric. `l2`: squared L2. `l1`: L1, if psi itself is stored."
     )
     unrelated_distance: float = Field(
-        description="d0, the median distance between unrelated frames, with similarity = 1 - "
-        "distance / d0."
+        description="d0, the median distance between unrelated frames; similarity = 1 - distance / "
+        "d0."
     )
-    parameters: dict[str, Any] = Field(description="Parameters of every stage.")
-    provenance: dict[str, Any] = Field(description="Training data and method.")
+    parameters: dict[str, Any] = Field(description="Parameters of all stages of signing.")
+    provenance: dict[str, Any] = Field(description="Training data and training method.")
     maps: list[str] = Field(
         description="Maps that you may read and that use the model or are switching to it."
     )
 
 
 class NewModel(Given):
-    """The new model of a map."""
+    """The model with which to sign the frames of a map again."""
 
     model: Label = Field(
         description="`depth`, `lidar`, `paper`, or the id or label of a model in GET /v1/models.",
@@ -322,7 +322,7 @@ class NewModel(Given):
     )
 
 
-#: Results of frames, by the kind of the event.
+#: Kinds of frame events that statistics count.
 Outcome = Literal["received", "indexed", "rejected", "redundant", "failed", "deleted"]
 OUTCOMES: tuple[Outcome, ...] = (
     "received", "indexed", "rejected", "redundant", "failed", "deleted"
@@ -332,12 +332,12 @@ OUTCOMES: tuple[Outcome, ...] = (
 # Jobs.
 
 
-#: Phases of the import of a map, in their order.
+#: Phases of the import of a map, in order.
 ImportPhase = Literal["read", "choose", "render", "sign", "test", "add"]
 
 
 class Progress(ApiRecord):
-    """The progress of a long job."""
+    """Progress of a job with several steps."""
 
     done: int = Field(description="Number of completed steps (frames, or files of an archive).")
     total: int | None = Field(default=None, description="Total number of steps; null if unknown.")
@@ -359,9 +359,9 @@ class Progress(ApiRecord):
 
 
 class Product(ApiRecord):
-    """Result of a job on a map or an answer."""
+    """A job that computes a result from a map or an answer."""
 
-    #: Name of the product, last part of the path that lists it, and class of its request.
+    #: Name of the product, last segment of the path of its list, and class of its request.
     noun: ClassVar[str]
     collection: ClassVar[str]
     request_type: ClassVar[type[Given]]
@@ -387,7 +387,7 @@ class Job(ApiRecord):
         "again, for the map's next model or to replace a damaged signature."
     )
     state: JobState
-    map: str | None = Field(description="Map of the job.")
+    map: str | None = Field(description="Name of the map.")
     frame_id: str | None = Field(description="Frame that the job signs; null for other jobs.")
     priority: int = Field(description="Jobs of higher priority run first.")
     attempts: int
@@ -421,7 +421,7 @@ class RefusedRetry(ApiRecord):
 class RetriedJobs(ApiRecord):
     """The result of retrying a page of dead jobs."""
 
-    retried: list[Job] = Field(description="Jobs that retry the dead jobs.")
+    retried: list[Job] = Field(description="New jobs that retry the dead jobs.")
     refused: list[RefusedRetry]
     next_cursor: str | None = Field(
         description="Cursor of the next page, to send as `cursor`; null on the last page."
@@ -434,18 +434,18 @@ class RetriedJobs(ApiRecord):
 KINDS = {
     "map.created": "A map was created.",
     "map.edited": "The title or another property of a map was changed.",
-    "map.deleted": "A map was deleted with everything in it.",
+    "map.deleted": "A map and its contents were deleted.",
     "map.reencoding": "A map is being signed with another model, `data.model`.",
     "map.reencoding_cancelled": "The change of a map's model was cancelled.",
     "map.reencoded": "A map has switched from `data.before` to `data.model`.",
     "frame.received": "A frame is stored durably and waits for a worker, or is being retried.",
     "frame.indexed": "A frame was signed, and queries find it.",
-    "frame.rejected": "A frame cannot be signed, because it contains too little.",
-    "frame.redundant": "A frame with `if_novel` was not kept: the map already covers its place.",
+    "frame.rejected": "A frame cannot be signed because it contains too little surface.",
+    "frame.redundant": "A frame with `if_novel` was dropped: the map already covers its place.",
     "frame.failed": "Signing a frame failed in every attempt, or was cancelled.",
     "frame.edited": "The metadata of a frame was changed.",
-    "frame.damaged": "Data derived from a frame is damaged, and a worker derives it again from the "
-    "upload. With `data.upload`, the upload is lost or damaged; sending it again repairs it.",
+    "frame.damaged": "Data derived from a frame is damaged; a worker derives it again from the "
+    "upload. With `data.upload`, the upload itself is lost or damaged; upload the frame again.",
     "frame.reencoded": "A frame was signed again, for a new model or to repair a signature.",
     "frame.deleted": (
         "A frame was deleted, and no query finds it. `data.reason` is `retention` if it exceeded "

@@ -32,7 +32,7 @@ else:
     from enum import Enum
 
     class StrEnum(str, Enum):
-        """The class of the same name in Python 3.11."""
+        """Equivalent of `enum.StrEnum` in Python 3.11."""
 
         __str__ = str.__str__
 
@@ -40,7 +40,7 @@ else:
 T = TypeVar("T")
 Record = TypeVar("Record", bound=BaseModel)
 
-#: Rules for names by their patterns. Messages show the rule in place of the pattern.
+#: Description of each name pattern; error messages contain it instead of the pattern.
 NAME_RULES = {
     (ONE_LINE := r"^[^\x00-\x1f\x7f]+$"): "characters of one line, without control characters",
     (_FILE_NAME := r"^[^\x00-\x1f\x7f\\]+$"): "characters of one line, without backslashes",
@@ -204,7 +204,7 @@ def _from_list(value: object) -> object:
         return dict(zip("xyz", value, strict=True))
     if not isinstance(value, GivenDirection | dict):
         raise ValueError(  # noqa: TRY004  (pydantic requires it)
-            "neither {x, y, z} nor a list of three numbers"
+            "must be {x, y, z} or a list of three numbers"
         )
     return value
 
@@ -268,11 +268,11 @@ _FRAME_STATES = {
     FrameState.REJECTED: "The frame cannot be signed; `reason` says why. A retry does not help.",
     FrameState.FAILED: "Signing the frame failed in every attempt; the job has the traceback.",
     FrameState.REDUNDANT: (
-        "The frame was not kept, because of `if_novel`: the map already covers this place; "
-        "`reason` names the frame."
+        "The frame was dropped because of `if_novel`: the map already covers this place; `reason` "
+        "names a similar frame."
     ),
     FrameState.DELETED: (
-        "The frame was deleted on request or by the retention time of its map; no query finds it."
+        "The frame was deleted on request or after its map's retention time; no query finds it."
     ),
 }
 
@@ -287,7 +287,7 @@ _JOB_STATES = {
 
 
 def checked(kind: type[Record], what: str, **fields: Any) -> Record:
-    """Return a record of the API.
+    """Return a validated record of type `kind`; `what` is its name in errors.
 
     Raises
     ------
@@ -297,7 +297,7 @@ def checked(kind: type[Record], what: str, **fields: Any) -> Record:
 
 
 def record_of(kind: type[Record], fields: object, what: str) -> Record:
-    """Return the record of an untrusted mapping; errors are those of `checked`."""
+    """Return a validated record from an untrusted mapping; see `checked`."""
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
@@ -305,23 +305,23 @@ def record_of(kind: type[Record], fields: object, what: str) -> Record:
 
 
 def invalid_record(error: ValidationError, what: str) -> InvalidRequest:
-    """Return the error for a record that pydantic refused."""
+    """Return the error for a record, named `what`, that pydantic rejected."""
     faults = error.errors(include_url=False, include_input=False)
     return invalid_request(faults, what)
 
 
-#: Maximum number of listed fields, and maximum length of their names: clients may invent any.
+#: Maximum number of invalid fields in an error, and maximum length of their names.
 MOST_FIELDS, MOST_OF_FIELD = 20, 80
 
 
 def invalid_request(faults: Sequence[Mapping[str, Any]], what: str) -> InvalidRequest:
-    """Return an error that lists the first invalid fields of pydantic's faults."""
+    """Return the error for `what` that lists the first invalid fields of pydantic's faults."""
     fields = tuple(
         (
-            ".".join(str(part) for part in one["loc"] if part != "query")[:MOST_OF_FIELD],
-            fault_reason(one),
+            ".".join(str(part) for part in fault["loc"] if part != "query")[:MOST_OF_FIELD],
+            fault_reason(fault),
         )
-        for one in faults[:MOST_FIELDS]
+        for fault in faults[:MOST_FIELDS]
     )
     first = "; ".join(f"{place or 'it'}: {reason}" for place, reason in fields[:3])
     more = f" (and {len(faults) - 3} more)" if len(faults) > 3 else ""
@@ -498,8 +498,9 @@ class GivenPose(GivenTransform):
     )
     of: Literal["sensor", "base"] = Field(
         default="sensor",
-        description="Frame whose pose is given. `sensor`: the pose is T_parent_sensor. `base`: the "
-        "pose is T_parent_base, and is converted to that of the sensor; requires `T_base_sensor`.",
+        description="Frame whose pose is specified. `sensor`: the pose is T_parent_sensor. `base`: "
+        "the pose is T_parent_base; the service converts it to the pose of the sensor, which "
+        "requires `T_base_sensor`.",
     )
 
 
@@ -584,10 +585,10 @@ class FrameMeta(Given):
     @classmethod
     def _in_utc(cls, captured_at: datetime | None) -> datetime | None:
         if captured_at is not None:
-            try:  # responses convert it like this
+            try:  # responses use the same conversion
                 datetime.fromtimestamp(captured_at.timestamp(), timezone.utc)
             except (ValueError, OverflowError) as error:
-                raise ValueError("must be within the years 1 to 9999 of UTC") from error
+                raise ValueError("must be between the years 1 and 9999 UTC") from error
         return captured_at
 
     @model_validator(mode="after")
@@ -601,17 +602,17 @@ class FrameMeta(Given):
 
 # The option `if_novel` of an upload.
 
-#: Value of `if_novel` for true. Consecutive frames of a slow Kinect differ by less, mostly by the
-#: noise of their depth, and the remaining frames of a recording answer queries as well.
+#: Value of `if_novel` for true. Consecutive frames of a slow Kinect differ by less, mostly because
+#: of noise; without them, a recording answers queries equally well.
 NOVEL = 0.25
 
 
 def novelty_of(value: bool | float | str | None) -> float | None:
-    """Return the minimum distance of a new place, as a share of the distance of unrelated frames.
+    """Return the minimum distance of a novel frame, as a share of that between unrelated frames.
 
     Parameters
     ----------
-    value : share as number or text; true for the default; false or None keeps every frame
+    value : share as a number or text; true: `NOVEL`; false or None: no minimum, returned as None
 
     Raises
     ------
@@ -628,15 +629,15 @@ def novelty_of(value: bool | float | str | None) -> float | None:
         share = -1.0
     if not 0 < share <= 1:  # true for NaN
         raise InvalidRequest(
-            f"`if_novel` is {value!r:.40}. Specify true, or a share of the distance of unrelated "
-            "frames above 0 and up to 1.",
+            f"`if_novel` is {value!r:.40}. Specify true, or a number above 0 and up to 1, the "
+            "share of the distance between unrelated frames.",
             (("if_novel", "must be true, false, or a number above 0 and up to 1"),),
         )
     return share
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host name or address, without port and brackets, is the loopback."""
+    """Return whether a host name or IP address, without port or brackets, is a loopback address."""
     if host.lower() == "localhost":
         return True
     try:

@@ -1,4 +1,4 @@
-"""Records for copying a map to a robot: a header, and parts of rows named by their digest."""
+"""Records for copying a map to a robot: a header, and parts that are identified by digests."""
 
 from __future__ import annotations
 

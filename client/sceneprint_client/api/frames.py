@@ -41,10 +41,10 @@ MOST_PRIORITY = 10
 Kind = Literal["depth", "cloud"]
 
 
-#: Usual depths of cameras, metres: ranges of the median and the 5th percentile, and maximum of the
-#: 95th. In recordings of two Kinects, an Xtion and a RealSense they are 1.05 to 2.8, .65 to 1.6 and
-#: 2.8 to 6.4; over nine consecutive frames .83 to 3.6, .39 to 2.24, and at most 6.9. Depth in
-#: quarters of a millimetre that is read as millimetres appears four times as far away.
+#: Usual depths of depth cameras, metres: range of the median, range of the 5th percentile, and
+#: maximum of the 95th. In recordings of two Kinects, an Xtion and a RealSense, these are 1.05 to
+#: 2.8, .65 to 1.6 and 2.8 to 6.4; over nine consecutive frames .83 to 3.6, .39 to 2.24, and at most
+#: 6.9. Depth in quarters of a millimetre, read as millimetres, is four times too large.
 _MEDIAN_M, _NEAR_M, _FAR_M = (0.2, 5.0), (0.3, 2.3), 10.0
 
 
@@ -87,18 +87,18 @@ def _percent(share: float) -> str:
 
 
 def pooled_range(ranges: Iterable[SampleRange]) -> SampleRange | None:
-    """Return the range of several frames of one kind: medians of their percentiles, and the sum of
-    their samples; None without frames.
+    """Return the range of several frames of one kind, with the medians of their percentiles and
+    their total count; None without frames.
     """
     all_ranges = list(ranges)
     if not all_ranges:
         return None
-    shares = [one.valid for one in all_ranges if one.valid is not None]
+    shares = [part.valid for part in all_ranges if part.valid is not None]
     return SampleRange(
-        near=median(one.near for one in all_ranges),
-        median=median(one.median for one in all_ranges),
-        far=median(one.far for one in all_ranges),
-        count=sum(one.count for one in all_ranges),
+        near=median(part.near for part in all_ranges),
+        median=median(part.median for part in all_ranges),
+        far=median(part.far for part in all_ranges),
+        count=sum(part.count for part in all_ranges),
         valid=fmean(shares) if shares else None,
     )
 
@@ -107,7 +107,7 @@ class UploadSummary(ApiRecord):
     """Summary of an upload of several frames: poses, omitted data and ranges."""
 
     frames: int = Field(description="Number of frames that were sent or found in an archive.")
-    poses: int = Field(description="Number of these frames with a pose in the map.")
+    poses: int = Field(description="Number of frames with a pose in the map.")
     without_pose: dict[str, int] = Field(description="Number of frames without a pose, by reason.")
     left_out: list[str] = Field(default=[], description="Omitted data, with the reasons.")
     lost: int = Field(
@@ -116,7 +116,7 @@ class UploadSummary(ApiRecord):
         "excluded them.",
     )
     depth: SampleRange | None = Field(
-        default=None, description="Pooled range of all depth images: medians of their ranges."
+        default=None, description="Pooled range of all depth images: medians over the images."
     )
     points: SampleRange | None = Field(default=None, description="Pooled range of all clouds.")
 
@@ -126,7 +126,7 @@ class UploadSummary(ApiRecord):
         """The summary in one line."""
         parts = [f"poses of {self.poses} of {self.frames} frames"]
         parts += [f"{count} without: {why}" for why, count in self.without_pose.items() if why]
-        parts += [*self.left_out, *(str(one) for one in (self.depth, self.points) if one)]
+        parts += [*self.left_out, *(str(pooled) for pooled in (self.depth, self.points) if pooled)]
         return "; ".join(parts)
 
 
@@ -149,8 +149,8 @@ def upload_summary(
         without_pose=dict(without_pose),
         left_out=list(left_out),
         lost=lost,
-        depth=pooled_range(one for one in all_ranges if one.valid is not None),
-        points=pooled_range(one for one in all_ranges if one.valid is None),
+        depth=pooled_range(part for part in all_ranges if part.valid is not None),
+        points=pooled_range(part for part in all_ranges if part.valid is None),
     )
 
 
@@ -163,7 +163,7 @@ class Added(ApiRecord):
     )
     state: FrameState
     reason: str | None = Field(
-        default=None, description="Reason why the frame was rejected, failed or was not kept."
+        default=None, description="Reason why the frame was rejected, failed or is redundant."
     )
     samples: SampleRange | None = Field(
         default=None, description="Range of the frame's samples; see Frame."
@@ -178,7 +178,7 @@ class Frame(ApiRecord):
     map: str
     state: FrameState
     reason: str | None = Field(
-        description="Reason why the frame was rejected, failed or was not kept."
+        description="Reason why the frame was rejected, failed or is redundant."
     )
     job_id: str
     content_id: str | None = Field(
@@ -208,8 +208,7 @@ class Frame(ApiRecord):
     )
     note: str | None = Field(
         default=None,
-        description="Changes that were made to a cloud's points when it was read; null if there "
-        "were none.",
+        description="Changes to the points of a cloud when it was read; null if there were none.",
     )
     robot: str | None
     session: str | None
@@ -363,7 +362,8 @@ class ImportOptions(Given):
     )
     topic: _TopicName | None = Field(
         default=None,
-        description="For a recording: topic of depth images or points; default: the only one.",
+        description="For a recording: topic of depth images or points; default: the only such "
+        "topic.",
     )
     camera_info: _TopicName | None = Field(
         default=None,
@@ -387,8 +387,8 @@ class ImportOptions(Given):
     keyframe_m: float = Field(
         default=0.3,
         ge=0,
-        description="For a recording: minimum distance between frames, metres. A frame is also "
-        "taken after `keyframe_deg`; 0 takes every frame.",
+        description="For a recording: minimum distance between frames, metres; 0 selects every "
+        "frame. A rotation by `keyframe_deg` is also sufficient.",
     )
     keyframe_deg: float = Field(
         default=15, ge=0, description="For a recording: minimum rotation between frames, degrees."
@@ -402,17 +402,17 @@ class ImportOptions(Given):
         default=0, ge=-MOST_PRIORITY, le=MOST_PRIORITY, description="Priority of the frames' jobs."
     )
     if_novel: float | None = Field(
-        default=None, gt=0, le=1, description="See the upload of a frame; applies to each frame."
+        default=None, gt=0, le=1, description="As for the upload of a frame; applies to each frame."
     )
 
     @model_validator(mode="after")
     def _require_matching_options(self) -> ImportOptions:
-        idle = dict.fromkeys(_OF_FRAMES, "does not apply to a map; omit it")
+        unused = dict.fromkeys(_OF_FRAMES, "does not apply to a map; omit it")
         if self.as_ != "map":
-            idle = dict.fromkeys(_OF_MAP, "applies only if `as` is `map`")
+            unused = dict.fromkeys(_OF_MAP, "applies only if `as` is `map`")
         if self.as_ != "recording":
-            idle |= dict.fromkeys(RECORDING_OPTIONS, "applies only if `as` is `recording`")
-        for name, hint in idle.items():
+            unused |= dict.fromkeys(RECORDING_OPTIONS, "applies only if `as` is `recording`")
+        for name, hint in unused.items():
             if getattr(self, name) != type(self).model_fields[name].get_default():
                 raise ValueError(f"{name}: {hint}")
         if self.up is not None and isinstance(self.up, str) != (self.as_ == "map"):
@@ -446,7 +446,7 @@ def offset_fields(text: str) -> dict[str, float]:
 
 
 def _number_fields(what: str, text: str, names: Sequence[str], unit: str) -> dict[str, float]:
-    """Return comma-separated numbers by their names."""
+    """Return comma-separated numbers by name; raise InvalidRequest for other text."""
     try:
         return dict(zip(names, map(float, text.split(",")), strict=True))
     except ValueError as error:
@@ -463,7 +463,9 @@ class WeakArea(ApiRecord):
     centre: Vector = Field(description="Centre on the floor, in the parent frame of the map.")
     width_m: float
     views: int = Field(description="Number of test views in the square.")
-    found: int = Field(description="Number of these views that were found at their poses.")
+    found: int = Field(
+        description="Number of test views in the square that were found at their poses."
+    )
 
 
 class MapImportResult(ApiRecord):
@@ -501,7 +503,7 @@ class MapImportResult(ApiRecord):
     )
 
 
-#: Maximum number of topics in an outline; those that an upload can use come first.
+#: Maximum number of topics in an outline, which lists usable topics first.
 MOST_RECORDING_TOPICS = 200
 
 
@@ -512,8 +514,8 @@ class RecordingTopic(ApiRecord):
     type: str = Field(description="Type of the messages, such as `sensor_msgs/msg/Image`.")
     count: int = Field(description="Number of messages.")
     use: str = Field(
-        description="How the import can use the topic, such as `16UC1`, `points` or `camera`, with "
-        "`, used` if it takes its frames from it; empty if it cannot."
+        description="Content that the import can use, such as `16UC1`, `points` or `camera`, with "
+        "`, used` for the topic of the frames; empty if the import cannot use the topic."
     )
 
 
@@ -524,7 +526,7 @@ class RecordingOutline(ApiRecord):
     seconds: float = Field(description="Duration, seconds.")
     span: str = Field(description="Duration and start, as text.")
     topics: list[RecordingTopic] = Field(
-        description=f"At most {MOST_RECORDING_TOPICS} topics; those of use come first."
+        description=f"At most {MOST_RECORDING_TOPICS} topics, usable topics first."
     )
     findings: list[str] = Field(
         description="Findings on the selected frames, as `sceneprint bag` prints them: omissions "
@@ -558,7 +560,7 @@ class ImportItem(ApiRecord):
 
 
 def problem_of(error: SceneprintError) -> Problem:
-    """Return the problem of a refused frame in a batch, the same as for a single upload."""
+    """Return the problem document for a frame of a batch, the same as for a single upload."""
     name = kebab_case(type(error).__name__)
     fields = error.fields if isinstance(error, InvalidRequest) else ()
     listed = [{"field": place, "reason": reason} for place, reason in fields]

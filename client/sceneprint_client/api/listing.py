@@ -126,14 +126,14 @@ class Session(ApiRecord):
     )
 
 
-#: Meaning of the stamps of poses.
+#: Source of the timestamps in a trajectory.
 Stamp = Literal["captured", "sequence", "received"]
-#: Choice of the stamps of poses.
+#: Requested source of timestamps; see Run.
 Clock = Literal["taken", "captured", "sequence", "received"]
 
 
 class Run(Given):
-    """The run and the poses that a trajectory contains."""
+    """Selection of a run, and of its poses, for a trajectory."""
 
     session: Label = Field(description="Session of the frames.")
     robot: Label | None = Field(
@@ -172,8 +172,8 @@ class Trajectory(ApiRecord):
     )
     child_frame: str = Field(
         default="optical",
-        description="Coordinate frame of each sensor. A camera has x right, y down, z forward; a "
-        "cloud keeps the axes of its sensor.",
+        description="Coordinate frame of each sensor. A camera has x right, y down, z forward. A "
+        "cloud has the axes of its sensor.",
     )
     frame_ids: list[str]
     poses: list[list[float]] = Field(
@@ -199,7 +199,7 @@ class Trajectory(ApiRecord):
 
 
 def parsed(value: object) -> object:
-    """Return the value of a JSON text in a form; other values are returned unchanged.
+    """Parse JSON text from a form; return other values unchanged.
 
     Raises
     ------
@@ -376,8 +376,8 @@ class MapEdit(Given):
     title: Note | None = Field(default=None, description="Human-readable title.")
     quota_frames: Quota | None = Field(
         default=None,
-        description="Maximum number of frames. Existing frames beyond the limit are kept. Changing "
-        "it requires `admin` for `*`.",
+        description="Maximum number of frames. Existing frames are not deleted. Changing the quota "
+        "requires `admin` for `*`.",
     )
     quota_bytes: Quota | None = Field(
         default=None, description="Maximum size of the uploads, bytes; see `quota_frames`."

@@ -70,8 +70,8 @@ class NewMap(Given):
     up: Up | None = Field(
         default=None,
         description="Up direction in the parent frames of the poses, such as (0, 0, 1) if z points "
-        "up. It applies to frames that have a pose but no `up`. If null, it is estimated from the "
-        "frames that have both.",
+        "up. It applies to frames that have a pose but no `up`. If null, the service estimates it "
+        "from frames with both.",
     )
 
 
@@ -135,7 +135,7 @@ class Map(ApiRecord):
         default=None, description="Maximum number of frames; null if there is no quota."
     )
     quota_bytes: int | None = Field(
-        default=None, description="Maximum size of the uploads; null if there is no quota."
+        default=None, description="Maximum size of the uploads, bytes; null if there is no quota."
     )
     retention_days: float | None = Field(
         default=None,

@@ -16,13 +16,13 @@ STAGES: tuple[Stage, ...] = ("retrieve", "diversify", "validate")
 #: Maximum number of maps in one query.
 MOST_MAPS = 64
 
-#: Name of a map or id of a frame in a request, which may not exist.
+#: Name of a map or id of a frame in a request. The map or frame may not exist.
 Named = Annotated[str, StringConstraints(min_length=1, max_length=128)]
 
 #: Share of a whole, 0 to 1.
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
-#: Validator of an object in JSON; forms and query strings have it as text.
+#: Validator that parses the JSON text of an object in a form or query string.
 JsonText = BeforeValidator(parsed)
 
 
@@ -288,7 +288,7 @@ class EvidenceRecord(ApiRecord):
         description="Number of distinct planes of the query that agree with the map."
     )
     frames: int = Field(description="Number of the map's frames that agree.")
-    viewpoints: int = Field(description="Number of different viewpoints of these frames.")
+    viewpoints: int = Field(description="Number of different viewpoints of the agreeing frames.")
     excess: float = Field(
         description="Share of the surface that should be visible in the query or the map but is "
         "missing, in excess of what is missing between the map's own frames."
@@ -309,8 +309,8 @@ class EvidenceRecord(ApiRecord):
         "or not."
     )
     similarity: float = Field(
-        description="Similarity of the signatures of the query and the nearest of these "
-        "candidates, 0 to 1."
+        description="Similarity of the signatures of the query and the most similar candidate that "
+        "suggests the pose, 0 to 1."
     )
     rival: float = Field(
         description="Score of the best pose at another place, divided by `score`; 0 if there is no "
@@ -363,8 +363,8 @@ class Location(ApiRecord):
     )
     guided: int = Field(
         default=0,
-        description="Number of these matches that were guided by other matches. They make the pose "
-        "more precise, but are not independent evidence.",
+        description="Number of agreeing matches that were guided by other matches. Guided matches "
+        "make the pose more precise, but are not independent evidence.",
     )
     votes: int = Field(description="Number of accepted matches, for any pose.")
     strength: Literal["strong", "weak"] = Field(
@@ -396,7 +396,7 @@ Lost = Literal[
 
 
 class Explanation(ApiRecord):
-    """The last stage that a frame of the ranking reached, and why."""
+    """The last stage that a frame of the ranking reached, and the reason."""
 
     frame_id: str
     map: str
@@ -458,8 +458,8 @@ class ExplainedFrame(ApiRecord):
 AnswerStatus = Literal["found", "ambiguous", "not_found", "unvalidated"]
 #: Maximum number of frames of a sequence in one query.
 MOST_OF_SEQUENCE = 10
-#: Minimum and maximum deviations of a prior, metres and radians. Values outside are meaningless or
-#: not computable.
+#: Minimum and maximum deviations of a prior, metres and radians. Other values are meaningless or
+#: cause numerical errors.
 LEAST_DEVIATION, MOST_DEVIATION = 1e-6, 1000.0
 #: Maximum distance of a prior from the origin of its parent frame, metres.
 FARTHEST_PRIOR = 1e9
@@ -540,9 +540,9 @@ class Query(Given):
         default=None,
         ge=1,
         le=200,
-        description="Maximum number of frames of the ranking that are selected and validated, "
-        "approximately 20 ms each; default: 10, or `k` if it is greater. Validation ends when 5 "
-        "frames, or `k` if it is greater, are accepted. Without validation, `k` applies instead.",
+        description="Maximum number of frames of the ranking that are selected and validated, at "
+        "approximately 20 ms per frame; default: 10, or `k` if it is greater. Validation ends when "
+        "5 frames, or `k` if it is greater, are accepted. Without validation, `k` applies instead.",
     )
     diversity: Annotated[Diversity | None, JsonText] = Field(
         default=None, description="Scales of the selection."
@@ -595,10 +595,10 @@ class Query(Given):
     def _from_text(cls, stages: object) -> object:
         """Split the comma-separated stages of a form or a command line."""
         if isinstance(stages, str):
-            return [one.strip() for one in stages.split(",")]
+            return [stage.strip() for stage in stages.split(",")]
         if isinstance(stages, list | tuple):
             return stages
-        # pydantic's own message would be about tuples.
+        # The message of pydantic would mention tuples.
         raise ValueError("must be a list of stages, or a text with stages separated by commas")
 
     @field_validator("filter", mode="before", json_schema_input_type=str | Filter | None)
@@ -638,7 +638,7 @@ class SeveralQuery(Query):
     @classmethod
     def _split(cls, maps: object) -> object:
         if isinstance(maps, str) and maps.strip() != "*":
-            return [one.strip() for one in maps.split(",")]
+            return [name.strip() for name in maps.split(",")]
         return maps.strip() if isinstance(maps, str) else maps
 
 
@@ -647,10 +647,10 @@ class Counts(ApiRecord):
 
     map: int = Field(description="Number of searchable frames in the map.")
     passed: int = Field(
-        description="Number of these frames that match the filter; all of them if there is no "
+        description="Number of searchable frames that match the filter; equals `map` without a "
         "filter."
     )
-    compared: int = Field(description="Number of these frames whose distance was computed.")
+    compared: int = Field(description="Number of frames whose distance was computed.")
     ranked: int
     selected: int
     validated: int

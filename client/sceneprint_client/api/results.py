@@ -121,14 +121,14 @@ VIEWS: tuple[View, ...] = ("depth", "normals", "patches")
 WIDTHS = (64, 1280)
 WIDTH = 320
 
-#: Default number of surface points for drawing.
+#: Default maximum number of surface points in a response.
 MOST_DRAWN = 20_000
 
 Triple = tuple[float, float, float]
 
 
 class PatchLevel(ApiRecord):
-    """Surface patches. Each list has one entry for each patch.
+    """Surface patches of one level. Each list has one entry per patch.
 
     Metres are rounded to a tenth of a millimetre, normals to four digits, areas to a tenth of a
     square centimetre.
@@ -149,7 +149,7 @@ class FramePatches(ApiRecord):
     frame_id: str
     map: str
     frame: str = Field(
-        description="Name of the sensor's frame, in which the coordinates are given."
+        description="Name of the sensor's coordinate frame, to which all coordinates refer."
     )
     model: str
     levels: list[PatchLevel] = Field(
@@ -209,9 +209,7 @@ class Similarities(ApiRecord):
 
 
 class Coincidences(ApiRecord):
-    """Patches of both frames that coincide under the transform, with one entry per pair in each
-    list.
-    """
+    """Pairs of patches that coincide under the transform. Each list has one entry per pair."""
 
     query: list[int] = Field(description="Index of the query's validation patch.")
     match: list[int] = Field(description="Index of the match's validation patch; see `/patches`.")

@@ -55,7 +55,7 @@ class NewAssociation(Given):
         ge=1,
         le=100,
         description="Maximum number of frames of each ranking that are selected and validated, "
-        "approximately 20 ms each. Validation ends when `k` are accepted.",
+        "at approximately 20 ms per frame. Validation ends when `k` frames are accepted.",
     )
     join: bool = Field(
         default=True,
@@ -73,7 +73,7 @@ class NewAssociation(Given):
     @model_validator(mode="after")
     def _reject_conflicts(self) -> NewAssociation:
         if self.robots is not None and len(self.robots) != len(self.sessions):
-            raise ValueError("robots: list one for each session, in the same order")
+            raise ValueError("robots: list one robot for each session, in the same order")
         if len(self.sessions) == 2:
             robots = self.robots or ["", ""]
             if self.sessions[0] == self.sessions[1] and robots[0] == robots[1]:
@@ -93,7 +93,7 @@ class Edge(ApiRecord):
 
     number: int = Field(description="Index in the order of discovery, starting at 0.")
     from_frame: str = Field(description="Frame that was queried.")
-    to_frame: str = Field(description="Frame that was found.")
+    to_frame: str = Field(description="Frame that the query found.")
     from_session: str | None
     to_session: str | None
     from_robot: str | None
@@ -137,9 +137,7 @@ class Edge(ApiRecord):
     loops: int | None = Field(
         description="Number of nearby edges that were compared with this edge."
     )
-    closed: int | None = Field(
-        description="Number of these nearby edges that agree with this edge."
-    )
+    closed: int | None = Field(description="Number of nearby edges that agree with this edge.")
 
 
 class Join(ApiRecord):
@@ -168,7 +166,7 @@ class Join(ApiRecord):
         description="Root mean square deviation of the agreeing edges from the transform, at the "
         "positions of their frames, metres."
     )
-    spread_deg: float | None = Field(description="The same deviation as an angle, degrees.")
+    spread_deg: float | None = Field(description="Root mean square angle between them, degrees.")
     reason: str
     root: str | None = Field(
         default=None,
@@ -262,7 +260,7 @@ class Graph(ApiRecord):
 
 #: Maximum number of frames of each session in a comparison.
 MOST_COMPARED = 500
-#: Classes of the points of a difference, in their patch index.
+#: Classes of the points of a difference, stored as the patch index.
 SAME, GONE, NEW, UNSEEN_AFTER, UNSEEN_BEFORE = 0, 1, 2, 3, 4
 
 
@@ -280,7 +278,7 @@ class NewDifference(Given):
     @model_validator(mode="after")
     def _require_two(self) -> NewDifference:
         if self.before == self.after:
-            raise ValueError("after: the same session as before. Specify two sessions")
+            raise ValueError("after: must differ from before. Specify two sessions")
         return self
 
 

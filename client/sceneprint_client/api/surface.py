@@ -42,7 +42,7 @@ class SurfacePlan(ApiRecord):
     left: float = Field(
         description="Position of the picture's upper left corner along `x_axis`, metres."
     )
-    top: float = Field(description="Position of this corner along `y_axis`, metres.")
+    top: float = Field(description="Position of the same corner along `y_axis`, metres.")
 
 
 class SurfaceParent(ApiRecord):
@@ -65,7 +65,7 @@ class SurfaceParent(ApiRecord):
     low: Vector = Field(
         description="Corner with the minimum coordinates of the box that contains all cells."
     )
-    high: Vector = Field(description="Corner with the maximum coordinates of that box.")
+    high: Vector = Field(description="Corner with the maximum coordinates of the same box.")
     levels: list[SurfaceLevel] = Field(description="Levels, finest first.")
     plan: SurfacePlan
 
@@ -189,9 +189,7 @@ class FusedView(ApiRecord):
 
 
 class LeftOut(ApiRecord):
-    """A match that was not fused. Clouds cannot be fused, because they do not show which space is
-    empty.
-    """
+    """A match that was not fused. Clouds cannot be fused because they lack free space."""
 
     frame_id: str
     map: str
