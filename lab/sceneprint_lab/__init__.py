@@ -1,1 +1,1 @@
-"""Training and evaluation of models: synthetic scenes, training, evaluation."""
+"""Training and evaluation of models, with synthetic scenes."""

@@ -1,4 +1,4 @@
-"""Parameters of the confidence, fitted to answers at synthetic sites.
+"""Fit of the confidence parameters to answers at synthetic sites.
 
 answers at sites  --judged_queries-->  JudgedQuery, ...  --fit-->  ConfidenceParameters
 """
@@ -28,7 +28,7 @@ class JudgedQuery:
 
     Parameters
     ----------
-    site, kind, query : site of the query, its kind, and the number of the query
+    site, kind, query : name and kind of the site, and number of the query
     right : whether each pose is right
     """
 
@@ -40,33 +40,33 @@ class JudgedQuery:
 
 
 def judged_queries(answers: Iterable[SiteAnswer]) -> list[JudgedQuery]:
-    """Return the candidate poses of all answers that have any; `ask_site` returns the answers."""
+    """Return the candidate poses of answers from `ask_site`, without answers that have none."""
     return [
         JudgedQuery(
-            one.site, one.kind, one.query,
-            tuple(place.evidence for place in one.answer.places),
-            tuple(place.right for place in one.answer.places),
+            query.site, query.kind, query.query,
+            tuple(place.evidence for place in query.answer.places),
+            tuple(place.right for place in query.answer.places),
         )
-        for one in answers
-        if one.answer.places
+        for query in answers
+        if query.answer.places
     ]  # fmt: skip
 
 
 def steps_of(evidence: Sequence[PlaceEvidence]) -> Floats:
-    """Return the position of each evidence in the three intervals between its knots, (n, 3 kinds).
+    """Return positions (n, 3 kinds) in the three intervals between the knots of each kind.
 
-    Positions are from 0 to 1. The penalty of a kind is the sum of its steps multiplied by these
-    positions, so it does not decrease with worse evidence if no step is negative.
+    A position increases from 0 to 1 as the evidence becomes worse. The penalty of a kind is the sum
+    of its steps multiplied by the positions, so it never decreases if no step is negative.
     """
     columns = []
     for name, (worst, poor, fair, best) in KNOTS.items():
-        x = np.array([getattr(one, name) for one in evidence], float)
+        x = np.array([getattr(item, name) for item in evidence], float)
         for upper, lower in ((best, fair), (fair, poor), (poor, worst)):
             columns.append(np.clip((upper - x) / (upper - lower), 0.0, 1.0))
     return np.stack(columns, axis=1)
 
 
-#: Default step of a penalty, for evidence that the samples do not contain.
+#: Step of a penalty in intervals without samples.
 USUAL_STEP = 0.3
 
 
@@ -74,27 +74,27 @@ def fit(
     samples: Sequence[JudgedQuery], shares: Mapping[str, float], ridge: float = 1e-5,
     lone: float = 0.0,
 ) -> ConfidenceParameters:  # fmt: skip
-    """Fit a conditional logistic model whose penalties do not decrease with worse evidence.
+    """Fit a conditional logistic model with penalties that never decrease with worse evidence.
 
     Parameters
     ----------
     samples : queries with their candidate poses
-    shares : share of queries at places of each kind: confidences are probabilities for this
-        mixture of queries, regardless of the numbers of samples
+    shares : share of queries at each kind of place; confidences are probabilities for this
+        mixture, regardless of the numbers of samples
     ridge : weight of the squared differences of steps from `USUAL_STEP`
-    lone : minimum step of the penalty of a pose that only one view suggests
+    lone : minimum step between the penalties of two suggesting views and of one
 
     Returns
     -------
     parameters : parameters with the minimum mean logarithmic loss
     """
-    X = steps_of([e for one in samples for e in one.evidence])
-    right = np.array([y for one in samples for y in one.right], bool)
-    counts = np.array([len(one.evidence) for one in samples])
+    X = steps_of([e for sample in samples for e in sample.evidence])
+    right = np.array([y for sample in samples for y in sample.right], bool)
+    counts = np.array([len(sample.evidence) for sample in samples])
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     none = ~np.logical_or.reduceat(right, first)
-    kinds = Counter(one.kind for one in samples)
-    w = np.array([shares[one.kind] / kinds[one.kind] for one in samples])
+    kinds = Counter(sample.kind for sample in samples)
+    w = np.array([shares[sample.kind] / kinds[sample.kind] for sample in samples])
     w /= w.sum()
 
     def loss(theta: Floats) -> tuple[float, Floats]:
@@ -103,7 +103,7 @@ def fit(
         whole = 1.0 + np.add.reduceat(odds, first)
         good = np.where(none, 1.0, np.add.reduceat(np.where(right, odds, 0.0), first))
         value = w @ np.log(whole / good) + ridge * (off @ off)
-        # derivative by each logit: share of all odds minus share of the odds of right poses
+        # derivative for each logit: share of all odds minus share of the odds of right poses
         residuals = odds / np.repeat(whole, counts)
         residuals -= np.where(right, odds / np.repeat(good, counts), 0.0)
         residuals *= np.repeat(w, counts)
@@ -111,10 +111,7 @@ def fit(
         return float(value), slope
 
     bounds = [(None, None), *[(0.0, None)] * X.shape[1]]
-    bounds[1 + 3 * list(KNOTS).index("suggested") + 1] = (
-        lone,
-        None,
-    )  # the step from two views to one
+    bounds[1 + 3 * list(KNOTS).index("suggested") + 1] = (lone, None)  # from two views to one
     result = minimize(
         loss, np.full(1 + X.shape[1], max(0.5, lone)), jac=True, bounds=bounds, method="L-BFGS-B",
         options={"maxiter": 2000},

@@ -2,8 +2,8 @@
 
     rooms or sites, frames  --train-->  Model
 
-The fits (projection, mixture, whitening) are in the modules of their stages in `geometry`. This
-module runs them in order, and derives the quantiser and d0 from the resulting signatures.
+The fits of projection, mixture and whitening are in `geometry`, in the modules of their stages.
+This module runs them, and derives the quantiser step and d0 from the resulting signatures.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ Scenes = Literal["rooms", "sites"]
 
 #: Sizes of the presets: G components, H levels.
 PRESET_SIZES = {"depth": (256, 2), "lidar": (256, 4), "paper": (1250, 4)}
-#: Levels of psi in stored signatures, parameters of the whitening, and number of scenes to which it
-#: is fitted. `paper` stores psi.
+#: Levels of psi in stored signatures, parameters of the whitening, and number of scenes for its
+#: fit. `paper` stores psi.
 PRESET_WHITENINGS = {
     "depth": ((1,), WhiteningParameters(448, exponent=0.75), 500),
     "lidar": ((1, 2, 3), WhiteningParameters(448, exponent=0.75), 400),
@@ -75,8 +75,8 @@ PRESET_WHITENINGS = {
 def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
     """Return the parameters of a preset.
 
-    `depth`, the default, suits depth cameras indoors. `lidar` has longer lengths, for scanners with
-    a range of tens of metres. `paper` has the sizes of Sec. III-F.
+    `depth`, the default, is for depth cameras indoors. `lidar` has greater lengths, for scanners
+    with a range of tens of metres. `paper` has the sizes of Sec. III-F.
 
     Raise TrainingError if the preset does not exist.
     """
@@ -90,9 +90,9 @@ def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
 
 
 def preset_whitening(preset: str) -> tuple[tuple[int, ...], WhiteningParameters, int]:
-    """Return the levels of psi in signatures, the whitening's parameters, and its number of scenes.
+    """Return the levels of psi in signatures, and parameters and number of scenes of the whitening.
 
-    The number of scenes is 0 if psi is stored without a whitening.
+    The number of scenes is 0 if psi is stored without whitening.
     """
     if preset not in PRESET_WHITENINGS:
         return (0,), WhiteningParameters(), 0
@@ -104,8 +104,7 @@ def preset_scenes(preset: str) -> tuple[Scenes, int]:
     return ("sites", 3) if preset == "lidar" else ("rooms", 6)
 
 
-#: Maximum violations by planes of a scan's transform and of a rival: violations that do not refute
-#: the transform do not refute a rival.
+#: Maximum plane violations of an accepted transform of scans, and of a rival that counts.
 _MOST_VIOLATIONS = 0.08
 #: Acceptance for scans. Planes and free space decide, because two scans may share little surface.
 #: Corridors look similar, so six distinct planes must agree, with few violations of free space. In
@@ -122,14 +121,12 @@ _SCAN_NOISE: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_dep
 
 
 def _lidar() -> ModelParameters:
-    """Return the parameters of `paper` with five-fold lengths, and those that scanners require.
+    """Return the default parameters with five-fold lengths, and adapted to scanners.
 
-    The latter are range, noise, angles of samples, numbers of patches and seeds, and thresholds.
-
-    The radius of patches' neighbourhoods and the equal weights of large and small patches were
-    tuned on synthetic halls that are not in the training data (docs/evaluation.md). The noise of a
-    laser does not grow with range, so distant points have full weights; only the distance between
-    samples grows, linearly.
+    The neighbourhood radius and the equal weights of large and small patches were tuned on
+    synthetic halls that are not in the training data (docs/evaluation.md). The noise of a laser
+    does not grow with range, so distant points have full weights; only the distance between samples
+    grows, linearly.
     """
     p = scale_lengths(ModelParameters(), _FACTOR)
     noise = _SCAN_NOISE
@@ -137,12 +134,12 @@ def _lidar() -> ModelParameters:
         p.cloud,
         minimum_range=0.6,
         maximum_range=60.0,
-        voxel_angle=1 / 40,  # rings 1.4 degrees apart must touch
+        voxel_angle=1 / 40,  # connects rings 1.4 degrees apart
         seed_px=4.4,
         maximum_patches=1000,
         validation_seed_px=6.9,
         maximum_validation_patches=500,
-        image_angle=1 / 64,  # a window must contain three rings two degrees apart
+        image_angle=1 / 64,  # a window contains three rings two degrees apart
         noise_gate=0.0015,
     )
     depth = replace(p.depth, minimum_depth=0.6, maximum_depth=60.0)
@@ -171,10 +168,9 @@ def _lidar() -> ModelParameters:
 
 
 def preset_answer(preset: str) -> AnswerParameters:
-    """Return the parameters of a preset, one of PRESETS, by which poses are evaluated.
+    """Return the answer parameters of a preset, one of PRESETS.
 
-    The penalties of the confidence are those of the shipped preset, because they are fitted to
-    answers, which require a model.
+    The confidence is that of the shipped preset, because its fit requires answers of a model.
     """
     confidence = read_model(preset).answer.confidence
     if preset != "lidar":
@@ -190,7 +186,7 @@ Report = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class TrainingParameters:
-    """Parameters of the training, all of which affect the model."""
+    """Parameters of the training; all of them affect the model."""
 
     rooms: int = 100  #: number of synthetic rooms or sites
     views: int = 6  #: number of frames per room or site
@@ -208,12 +204,12 @@ class TrainingParameters:
 
 @dataclass(frozen=True, eq=False)
 class Lesson:
-    """The training data of one frame."""
+    """The training data of a frame."""
 
-    place: str  #: place of the frame; frames of different places are unrelated
+    place: str  #: name of the place; frames of different places are unrelated
     properties: Floats  #: (n, 13) properties of sampled pairs of all levels
     histograms: Floats32  #: (m, D) histograms of the surroundings of sampled patches
-    levels: tuple[Patches, ...]
+    levels: tuple[Patches, ...]  #: patches of each level
 
 
 @dataclass(frozen=True)
@@ -248,17 +244,17 @@ def train(
             f"There is no level {max(p.levels)}: the hierarchy has {n_levels} levels. Select from "
             f"0 to {n_levels - 1}."
         )
-    tell = report or _silent
+    notify = report or _silent
     n_frames = p.rooms * p.views + len(references)
     drawn = Draw(
         math.ceil(p.pairs / max(n_frames * model_p.hierarchy.n_levels, 1)),
         math.ceil(p.histograms / max(n_frames, 1)),
     )
-    lessons = list(_lessons(model_p, p, drawn, references, jobs, tell))
+    lessons = list(_lessons(model_p, p, drawn, references, jobs, notify))
     if len({lesson.place for lesson in lessons}) < 2:
         raise TrainingError(
-            f"The {len(lessons)} usable frames show fewer than two places, but d0, the distance of "
-            "unrelated frames, requires two. Add --rooms or frames of another place."
+            f"The {len(lessons)} usable frames show fewer than two places, but d0, the distance "
+            "between unrelated frames, requires two. Add --rooms or frames of another place."
         )
     properties = np.concatenate([lesson.properties for lesson in lessons])
     histograms = np.concatenate([lesson.histograms for lesson in lessons])
@@ -274,21 +270,21 @@ def train(
         fit = fit_mixture(features, mixture_p, p.seed)
         mixture = next(fit)
         for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last mixture is the result
-            tell("mixture", step, mixture_p.iterations)
-    seen = {
+            notify("mixture", step, mixture_p.iterations)
+    provenance = {
         "training": _written(p),
         "mixture": asdict(mixture_p),
         "own_frames": len(references),
         "frames_used": len(lessons),
         "pairs_used": len(features),
     }
-    fitted = Model(name, model_p, projection, mixture, compression, 1.0, 1.0, seen)
+    fitted = Model(name, model_p, projection, mixture, compression, 1.0, 1.0, provenance)
     model = calibrated(fitted, lessons, p)
-    return whitened(model, p, references, jobs, tell) if p.whitening_rooms else model
+    return whitened(model, p, references, jobs, notify) if p.whitening_rooms else model
 
 
 def _written(p: TrainingParameters) -> dict[str, Any]:
-    """Return the parameters for provenance, without defaults of newer parameters."""
+    """Return the parameters for provenance, without unused parameters of scenes and whitening."""
     written = asdict(p)
     if p.scenes == "rooms":
         del written["scenes"]
@@ -303,7 +299,7 @@ def _silent(stage: str, done: int, total: int) -> None:
 
 
 def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -> Model:
-    """Return the model with quantiser step and d0 computed from one frame per place.
+    """Return the model with a quantiser step and d0, computed from one frame per place.
 
     `lessons`: training data of at least two places.
     """
@@ -314,7 +310,7 @@ def calibrated(model: Model, lessons: Sequence[Lesson], p: TrainingParameters) -
         for lesson in sorted(first.values(), key=lambda lesson: lesson.place)
     ]
     step = float(np.quantile(np.abs(np.stack(psi)), 1.0 - p.clipped_share)) / 127
-    stored = np.stack([quantise(one, step) for one in psi])
+    stored = np.stack([quantise(vector, step) for vector in psi])
     d0 = _median_distance(stored, "l1")
     return replace(model, quantiser_step=step, psi_unrelated_distance=d0)
 
@@ -323,7 +319,7 @@ def whitened(
     model: Model, p: TrainingParameters, references: Sequence[tuple[str, FrameReference]],
     jobs: int, report: Report,
 ) -> Model:  # fmt: skip
-    """Return the model with a whitening that is fitted to further rooms and the user's frames.
+    """Return the model with a whitening, fitted to `p.whitening_rooms` and the user's frames.
 
     Parameters
     ----------
@@ -337,13 +333,13 @@ def whitened(
     psi, places = list[Ints16](), list[str]()
     with _helpers(jobs, _open_signer, model, p.levels) as pool:
         rooms = pool.map(partial(_room_psi, p), range(p.whitening_rooms))
-        for done, (place, found) in enumerate(rooms, 1):
+        for done, (place, vectors) in enumerate(rooms, 1):
             report("whitening", done, p.whitening_rooms)
-            psi += found
-            places += [place] * len(found)
-        for place, found in pool.map(_own_psi, references, chunksize=4):
-            psi += found
-            places += [place] * len(found)
+            psi += vectors
+            places += [place] * len(vectors)
+        for place, vectors in pool.map(_own_psi, references, chunksize=4):
+            psi += vectors
+            places += [place] * len(vectors)
     if len(psi) <= p.whitening.dimension:
         raise TrainingError(
             f"{len(psi)} usable frames are too few for signatures of {p.whitening.dimension} "
@@ -354,12 +350,12 @@ def whitened(
     first = {place: i for i, place in reversed(list(enumerate(places)))}
     stored = np.stack([whiten(psi[i] / UNITS, fit) for _, i in sorted(first.items())])
     own = replace(fit, unrelated_distance=_median_distance(stored, "l2"))
-    # coarser levels were used for the mixture only
+    # Coarser levels were needed only for the mixture.
     h = replace(model.parameters.hierarchy, n_levels=max(p.levels) + 1)
     return replace(model, parameters=replace(model.parameters, hierarchy=h), whitening=own)
 
 
-#: Signer of a process while the whitening is fitted, and the levels of psi.
+#: Signer of this process for the fit of the whitening, and levels of psi.
 _signing: list[tuple[Signer, tuple[int, ...]]] = []
 
 
@@ -368,8 +364,9 @@ def _open_signer(model: Model, levels: tuple[int, ...]) -> None:
 
 
 def _room_psi(p: TrainingParameters, index: int) -> tuple[str, list[Ints16]]:
+    """Return the name of a synthetic scene, and psi of each usable frame."""
     name, frames = _scene(p, index)
-    return name, [one for frame in frames for one in _psi(frame)]
+    return name, [vector for frame in frames for vector in _psi(frame)]
 
 
 def _own_psi(reference: tuple[str, FrameReference]) -> tuple[str, list[Ints16]]:
@@ -381,7 +378,7 @@ def _own_psi(reference: tuple[str, FrameReference]) -> tuple[str, list[Ints16]]:
 
 
 def _psi(frame: AnyFrame) -> list[Ints16]:
-    """Return psi of a frame's levels in a list, which is empty if the frame cannot be signed."""
+    """Return [psi] of a frame, with all levels, or [] if the frame cannot be signed."""
     (signer, levels), p = _signing[0], _signing[0][0].model.parameters
     try:
         patches = hierarchy_of(see(frame, p), p).levels
@@ -397,7 +394,7 @@ def _median_distance(stored: Bytes, metric: Metric) -> float:
 
 
 def _helpers(jobs: int, begin: Callable[..., None] | None = None, *arguments: Any) -> Executor:
-    """Return a pool of processes that start with a call; for one job, a thread of this process."""
+    """Return a pool of `jobs` processes that first call `begin`; for one job, a thread instead."""
     if jobs == 1:
         return ThreadPoolExecutor(1, "training", begin, arguments)
     return ProcessPoolExecutor(jobs, get_context("spawn"), begin, arguments)
@@ -407,6 +404,7 @@ def _lessons(
     model_p: ModelParameters, p: TrainingParameters, draw: Draw,
     references: Sequence[tuple[str, FrameReference]], jobs: int, report: Report,
 ) -> Iterator[Lesson]:  # fmt: skip
+    """Yield the training data of all synthetic scenes, then of the user's frames."""
     room = partial(_room_lessons, model_p, p, draw)
     frame = partial(_own_lesson, model_p, p, draw)
     with _helpers(jobs) as pool:
@@ -453,6 +451,7 @@ def _own_lesson(
 def _lesson(
     frame: AnyFrame, place: str, seed: tuple[int, ...], model_p: ModelParameters, draw: Draw
 ) -> list[Lesson]:
+    """Return the training data of a frame in a list, which is empty if the frame is unusable."""
     rng = np.random.default_rng(seed)
     try:
         seen = see(frame, model_p)
@@ -463,7 +462,7 @@ def _lesson(
     for level in patches.levels:
         pairs = neighbour_pairs(level, model_p.properties)
         if len(pairs):
-            # sample in proportion to the weights in the statistics; duplicates are harmless
+            # Sample in proportion to the weights in the statistics, with replacement.
             share = patch_weights(level, model_p.weights)[pairs].prod(axis=1).cumsum()
             some = np.searchsorted(share, np.sort(rng.random(draw.pairs)) * share[-1], "right")
             drawn.append(pair_properties(level, pairs[some], model_p.properties))

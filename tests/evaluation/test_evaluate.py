@@ -297,7 +297,7 @@ def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_pat
         (["{room}", "--db", "0-4", "--queries", "5:6"], "is not a range of frames"),
         (["{room}", "--db", "0:4", "--queries", "5:99"], "outside the 12 frames"),
         (["{room}", "--db", "0:4", "--queries", "3:6"], "selected twice"),
-        (["{room}@db=0:4,queries=5:6", "--db", "0:4", "--queries", "5:6"], "Omit them"),
+        (["{room}@db=0:4,queries=5:6", "--db", "0:4", "--queries", "5:6"], "Omit --db and"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--levels", "9"], "Choose from 1 to"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--max-overlap", "2"], "--max-overlap"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--metric", "l3"], "--metric"),

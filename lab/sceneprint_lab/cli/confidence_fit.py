@@ -1,9 +1,9 @@
 """Fit the confidence of answers: `python -m sceneprint_lab.cli.confidence_fit --evidence FILE`.
 
-The command generates sites of every kind, most of them with incomplete maps and drifting poses,
-answers all their queries, and fits the penalties to the candidate poses that are correct.
-Recordings are not used. With --views, the frames of each map are fused to a surface and replaced
-by rendered views of it, which fits the confidence in maps that were imported from one file.
+The command generates sites of all kinds, most of them with incomplete maps and drifting poses,
+answers all their queries, and fits the penalties to the candidate poses and their correctness.
+It uses no recordings. With --views, it fuses the frames of each map into a surface and replaces
+them by rendered views, to fit the confidence for maps that were imported as a whole.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from sceneprint_lab.evaluation.measures import calibration
 from sceneprint_lab.evaluation.protocol import map_over
 from sceneprint_lab.evaluation.sites import MapFlaws, SiteAnswer, ask_site
 
-#: Percentage of queries at places of each kind. A confidence is a probability over queries of this
-#: mixture, in which most robots are in ordinary rooms or on the move.
+#: Percentage of queries at each kind of place. Confidences are probabilities for this mixture of
+#: queries, most of which come from ordinary places.
 SHARES: dict[str, dict[str, float]] = {
     "depth": {
         "rooms": 79, "absent": 10, "offices": 4, "opposite": 2, "object": 2, "kitchens": 1,
@@ -37,14 +37,13 @@ SHARES: dict[str, dict[str, float]] = {
         "sites": 70, "absent": 10, "bays": 6, "streets": 6, "halls": 4, "unmapped": 4,
     },
 }  # fmt: skip
-#: Kinds with more sites, since their decisive evidence is rare.
+#: Factors for the number of sites of kinds whose decisive evidence is rare.
 TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
-#: Flaws of two maps in three. Scans are so dense that most may be missing, and their poses already
-#: drift.
+#: Flaws of two maps in three. Scans are dense, so most may be missing; their poses already drift.
 FLAWS = {"depth": MapFlaws(0.5, 0.01, 0.004), "lidar": MapFlaws(0.9, 0.0, 0.0)}
 #: Flaws of maps whose frames are fused to one surface, which has fewer gaps.
 SURFACE_FLAWS = {"depth": MapFlaws(0.3, 0.01, 0.004), "lidar": MapFlaws(0.3, 0.0, 0.0)}
-#: Smallest penalty of a pose that a single view supports. A fit to 1,200 queries without it found
+#: Minimum penalty of a pose that a single view supports. A fit to 1,200 queries without it found
 #: fewer poses in recordings of scanners; neither fit found a wrong one.
 LONE = {"depth": 0.0, "lidar": 2.5}
 
@@ -52,17 +51,16 @@ LONE = {"depth": 0.0, "lidar": 2.5}
 def collect(
     preset: str, sensor: str, seed: int, sites: int, queries: int, jobs: int, views: bool
 ) -> Iterator[list[SiteAnswer]]:
-    """Yield the answers of each site of every kind with a preset.
+    """Yield the answers to the queries of each site, for all kinds of sites of a sensor.
 
-    Every query is answered with the best available pose, so that similar frames elsewhere are
-    always compared, as for a query without a pose.
+    The minimum confidence is 0, so that frames of similar places are always compared.
 
     Parameters
     ----------
     preset, sensor, seed : model, sensor ("depth" or "lidar"), and seed of the sites
-    sites, queries : number of sites of each kind, and of queries of each site
+    sites, queries : number of sites per kind, and of queries per site
     jobs : number of processes
-    views : whether maps are views of the fused surface of their frames
+    views : whether maps consist of views of the surface that is fused from their frames
     """
     work = [
         (kind, index * TIMES.get(kind, 1) + k, queries)
@@ -79,6 +77,7 @@ def collect(
 def _ask(
     signer: Signer, work: tuple[str, int, int], *, seed: int, flaws: MapFlaws, views: bool
 ) -> list[SiteAnswer]:
+    """Return the answers at a site (kind, index, queries); two maps in three have flaws."""
     flawed = flaws if work[1] % 3 else None
     return ask_site(signer, work, seed=seed, flaws=flawed, confidence=0.0, as_surface=views)
 
@@ -89,7 +88,7 @@ def read_samples(path: Path) -> list[JudgedQuery]:
     return [
         JudgedQuery(
             row["site"], row["kind"], row["query"],
-            tuple(PlaceEvidence(**one) for one in row["evidence"]), tuple(row["right"]),
+            tuple(PlaceEvidence(**fields) for fields in row["evidence"]), tuple(row["right"]),
         )
         for row in rows
     ]  # fmt: skip
@@ -116,13 +115,13 @@ def main() -> None:
         for answers in collect(options.preset, sensor, options.seed, options.sites,
                                options.queries, options.jobs, options.views):  # fmt: skip
             with options.evidence.open("a") as file:
-                for one in judged_queries(answers):
-                    file.write(json.dumps(asdict(one)) + "\n")
+                for query in judged_queries(answers):
+                    file.write(json.dumps(asdict(query)) + "\n")
     samples = read_samples(options.evidence)
     parameters = fit(samples, SHARES[sensor], lone=0.0 if options.views else LONE[sensor])
     own = replace(model.answer.confidence, **{"views" if options.views else "frames": parameters})
-    confidences = [c for one in samples for c in compute_confidences(one.evidence, own)]
-    measured = calibration(confidences, [right for one in samples for right in one.right])
+    confidences = [c for query in samples for c in compute_confidences(query.evidence, own)]
+    measured = calibration(confidences, [right for query in samples for right in query.right])
     print(
         f"{len(confidences)} poses; calibration error {measured.error:.3f}, "
         f"Brier {measured.brier:.4f}"

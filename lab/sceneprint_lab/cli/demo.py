@@ -45,8 +45,8 @@ from sceneprint_client.api import Added, Answer, JobState
 from sceneprint_lab.evaluation.report import FramePlace, answer_rows, decimal, judge_answers
 
 SEED = 11
-#: Number of frames of a walk through a room, 3 to 8 cm apart, and the positions in every ten frames
-#: of the map and of the queries. Each query is 10 to 30 cm away from any frame of the map.
+#: Number of frames of a walk through a room, 3 to 8 cm apart, and the indices in each group of ten
+#: frames that belong to the map and to the queries. A query is 10 to 30 cm from the map's frames.
 WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7,)
 DEPTH_SCALE = 1000.0
 
@@ -69,6 +69,7 @@ def write_building(folder: Path, rooms: int) -> Generator[None]:
 
 
 def _write_room(folder: Path, number: int) -> None:
+    """Write a room as a scene with one sequence for the map and one for the queries."""
     from sceneprint_lab.synth import KINECT, take, trajectory
     from sceneprint_lab.synth.dataset import room_and_rng
 
@@ -95,7 +96,7 @@ MOST_DATABASE, MOST_QUERIES = 300, 180
 
 @dataclass(frozen=True, eq=False)
 class DemoFrame:
-    """A frame of the demo, the parent frame of its pose, and its sequence."""
+    """A frame of the demo, with the parent frame of its pose and the name of its sequence."""
 
     parent: str
     session: str
@@ -111,7 +112,7 @@ class Choice:
 
 
 def choose_frames(path: Path) -> Choice:
-    """Return database and query frames, by the split files of the scene if it has them.
+    """Return database and query frames, as the scene's split files specify if there are any.
 
     Raise DatasetError if there is no sequence, or too few frames for both.
     """
@@ -119,24 +120,25 @@ def choose_frames(path: Path) -> Choice:
     queries: list[DemoFrame] = []
     sequences = find_sequences(path)
     split = any(sequence.split for sequence in sequences)
-    for one in sequences:
-        frames = [DemoFrame(one.parent_frame, one.name, reference) for reference in one.frames]
+    for sequence in sequences:
+        frames = [DemoFrame(sequence.parent_frame, sequence.name, f) for f in sequence.frames]
         n = len(frames)
         if split:
-            database += frames if one.split == "train" else []
-            queries += frames if one.split == "test" else []
+            database += frames if sequence.split == "train" else []
+            queries += frames if sequence.split == "test" else []
         else:
             database += frames[: round(DATABASE_SHARE * n)]
             queries += frames[round((DATABASE_SHARE + GAP_SHARE) * n) :]
     if not database or not queries:
         raise DatasetError(
-            f"{path}: There are {len(database)} frames for the map and {len(queries)} to query; "
-            "the demo needs both. Use a longer sequence."
+            f"{path}: There are {len(database)} frames for the map and {len(queries)} queries; the "
+            "demo requires both. Use a longer sequence."
         )
     return Choice(_thinned(database, MOST_DATABASE), _thinned(queries, MOST_QUERIES))
 
 
 def _thinned(frames: Sequence[DemoFrame], most: int) -> list[DemoFrame]:
+    """Return at most `most` evenly spaced frames."""
     return list(frames[:: max(-(-len(frames) // most), 1)])
 
 
@@ -160,8 +162,8 @@ def add_demo(command: argparse.ArgumentParser) -> None:
 
 def run_demo(options: argparse.Namespace) -> int:
     """Start a service with an empty folder, upload the frames of a small synthetic building (or
-    of --dataset) to a map, query it with other frames, print the rows of the paper with true
-    pose errors, and draw a match. The service and its data are removed at the end.
+    of --dataset) to a map, query it with other frames, print the paper's table with true pose
+    errors, and draw a match. The service and its data are removed at the end.
     """
     from sceneprint.cli.preparation import prepare_presets
     from sceneprint_client import Client
@@ -189,8 +191,9 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 def _building(folder: Path, rooms: int) -> Path:
+    """Write a synthetic building with a progress bar, and return its folder."""
     start = time.perf_counter()
-    # The generator is closed before the folder is removed, since its processes write there.
+    # Close the generator before the folder is removed, since its processes write there.
     with closing(write_building(folder, rooms)) as written:
         for _ in tqdm(written, total=rooms, desc="synthetic building", unit="room", disable=None):
             pass
@@ -207,7 +210,7 @@ _OF_FRAME = (FrameError, FrameConflict)
 
 @dataclass(frozen=True, eq=False)
 class DemoQuery:
-    """A query, its answers with VR and with VDR, and the time of the latter, seconds."""
+    """A query, its answers without and with diversification, and the time of the latter, s."""
 
     chosen: DemoFrame
     ranked: Answer
@@ -231,16 +234,16 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
     start = time.perf_counter()
     pool = ThreadPoolExecutor(PARALLEL)
     try:
-        uploads = [(one, pool.submit(_upload, client, one)) for one in choice.database]
-        for one, upload in tqdm(uploads, desc="upload", unit="frame", disable=None):
+        uploads = [(frame, pool.submit(_upload, client, frame)) for frame in choice.database]
+        for frame, upload in tqdm(uploads, desc="upload", unit="frame", disable=None):
             try:
                 added = upload.result()
             except _OF_FRAME as error:
-                tqdm.write(f"skipped: {one.reference.name}: {error}")
+                tqdm.write(f"skipped: {frame.reference.name}: {error}")
                 continue
-            indexed[added.frame_id] = one
+            indexed[added.frame_id] = frame
             jobs.append(added.job_id)
-    finally:  # after an error, no further upload starts
+    finally:  # after an error, cancel pending uploads
         pool.shutdown(cancel_futures=True)
     with tqdm(total=len(jobs), desc="sign", unit="frame", disable=None) as bar:
 
@@ -249,7 +252,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
         done = client.wait(jobs, progress=progress)
     late = sum(not job.state.over for job in done)
-    if late:  # queries would match these frames, whose ids are not in `indexed`
+    if late:  # queries could match these frames, which are not in `indexed`
         raise ServiceError(
             f"{late} of {len(done)} map frames were not signed in time. Run the demo with more "
             "--workers or a shorter --dataset."
@@ -268,29 +271,29 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
 
 def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
-    """Query every frame, without and with diversification."""
+    """Query each query frame, without and with diversification; skip frames that are refused."""
     answered, begun = [], time.perf_counter()
-    for one in tqdm(choice.queries, desc="query", unit="frame", disable=None):
-        meta = meta_of(one.reference, with_pose=False)  # a lost robot has no pose
-        path = one.reference.path
+    for frame in tqdm(choice.queries, desc="query", unit="frame", disable=None):
+        meta = meta_of(frame.reference, with_pose=False)  # a lost robot has no pose
+        path = frame.reference.path
         try:
-            # `sceneprint evaluate` validates this many frames too
+            # the same number of candidates as in `sceneprint evaluate`
             ranked = client.query(
                 DEMO_MAP, path, meta, k=CANDIDATES, stages=("retrieve", "validate")
             )
             start = time.perf_counter()
             diverse = client.query(DEMO_MAP, path, meta, k=CANDIDATES)
         except FrameError as error:
-            tqdm.write(f"skipped: {one.reference.name}: {error}")
+            tqdm.write(f"skipped: {frame.reference.name}: {error}")
             continue
-        answered.append(DemoQuery(one, ranked, diverse, time.perf_counter() - start))
+        answered.append(DemoQuery(frame, ranked, diverse, time.perf_counter() - start))
     print(f"sent: {2 * len(answered)} queries over HTTP in {time.perf_counter() - begun:.1f} s")
     return answered
 
 
-def _upload(client: Client, one: DemoFrame) -> Added:
-    meta = meta_of(one.reference, session=one.session, parent_frame=one.parent)
-    return client.upload(DEMO_MAP, one.reference.path, meta)
+def _upload(client: Client, frame: DemoFrame) -> Added:
+    meta = meta_of(frame.reference, session=frame.session, parent_frame=frame.parent)
+    return client.upload(DEMO_MAP, frame.reference.path, meta)
 
 
 _NAMES = {
@@ -304,12 +307,12 @@ _NAMES = {
 
 def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> None:
     """Print the table if true poses are known, and the duration of a query."""
-    counts = Counter(one.diverse.status for one in queries)
+    counts = Counter(query.diverse.status for query in queries)
     states = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     print(f"queries: {len(queries)}: {states or 'none could be sent'}")
-    truths = [(one, place_of(one.chosen)) for one in queries]
-    places = {key: place for key, one in indexed.items() if (place := place_of(one)) is not None}
-    judged = [judge_answers(t, one.ranked, one.diverse, places) for one, t in truths
+    truths = [(query, place_of(query.chosen)) for query in queries]
+    places = {key: place for key, f in indexed.items() if (place := place_of(f)) is not None}
+    judged = [judge_answers(t, query.ranked, query.diverse, places) for query, t in truths
               if t is not None and len(places) == len(indexed)]  # fmt: skip
     if judged and len(judged) == len(queries):
         print(*table(answer_rows(judged)), sep="\n")
@@ -321,7 +324,7 @@ def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> No
             for stage in queries[0].diverse.milliseconds
             if stage != "total"
         ]
-        whole = 1e3 * statistics.median(one.seconds for one in queries)
+        whole = 1e3 * statistics.median(query.seconds for query in queries)
         print(f"a query over HTTP: {whole:.0f} ms (median; {', '.join(medians)})")
 
 
@@ -353,19 +356,19 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def draw(
     indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery], preset: str, out: Path
 ) -> None:
-    """Draw the accepted match with the largest rotation, which shows the alignment best."""
+    """Draw the accepted first match with the largest rotation to OUT/overlay.png."""
     accepted = [
-        (one, match, np.array(match.transform.matrix))
-        for one in queries
-        for match in one.diverse.matches[:1]
+        (query, match, np.array(match.transform.matrix))
+        for query in queries
+        for match in query.diverse.matches[:1]
         if match.validation.status == "accepted" and match.transform is not None
     ]
     if not accepted:
         print("no picture: no match was accepted")
         return
-    one, match, transform = min(accepted, key=lambda each: each[2][:3, :3].trace())
+    best, match, transform = min(accepted, key=lambda entry: entry[2][:3, :3].trace())
     parameters = read_model(preset).parameters
-    query, database = one.chosen.reference, indexed[match.frame_id].reference
+    query, database = best.chosen.reference, indexed[match.frame_id].reference
     title = f"{query.name} in {database.name}: {match.validation.overlap:.0%} of the surfaces agree"
     picture = overlay_picture(
         see(query.read(), parameters), see(database.read(), parameters), transform,
@@ -375,13 +378,13 @@ def draw(
     print(f"picture: {out / 'overlay.png'}")
 
 
-def place_of(one: DemoFrame) -> FramePlace | None:
+def place_of(frame: DemoFrame) -> FramePlace | None:
     """Return the true pose of a frame, or None if it is unknown."""
-    pose = one.reference.pose
-    return None if pose is None else FramePlace(one.parent, pose)
+    pose = frame.reference.pose
+    return None if pose is None else FramePlace(frame.parent, pose)
 
 
-#: Time limits of the service to start, including a compilation, and to stop, seconds.
+#: Time limits for the start of the service, with a compilation, and for its end, seconds.
 START_S, STOP_S = 120.0, 30.0
 _READY = "sceneprint: serving "
 
@@ -430,7 +433,7 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 
 
 def _first_line(pipe: IO[bytes]) -> str:
-    """Return the first line, or its beginning if the other end is closed.
+    """Return the first line of a pipe, or its beginning if the other end closes.
 
     Raise Unreachable if no line arrived in time.
     """

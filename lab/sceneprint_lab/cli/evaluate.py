@@ -51,8 +51,8 @@ def add_evaluate(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--7scenes", type=Path, dest="seven_scenes", metavar="DIR",
-        help="evaluate the scenes of 7-Scenes in this folder by their official splits, and print "
-        "the paper's table beside its figures; without intrinsics.json, use the Kinect's camera "
+        help="evaluate the scenes of 7-Scenes in this folder with their official splits, and print "
+        "the figures beside those of the paper; without intrinsics.json, use the Kinect's camera "
         "(585 pixels, centre 320, 240)",
     )  # fmt: skip
     add_model_options(command)
@@ -73,7 +73,7 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
         )  # fmt: skip
     command.add_argument(
         "--max-overlap", type=_share, metavar="X",
-        help="hide from a query the frames that overlap it by more than this, 0 to 1",
+        help="exclude frames that overlap the query by more than this share, 0 to 1",
     )  # fmt: skip
     command.add_argument(
         "--distractors", type=Path, nargs="+", default=[], metavar="PATH",
@@ -82,13 +82,13 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--gap-m", type=positive_number, metavar="METRES",
         help="use each frame as query and as database frame (--db and --queries may overlap, "
-        "and default to all frames); a query finds only frames taken more than this distance of "
-        "travel before it",
+        "and default to all frames); a query finds only frames that are more than this distance "
+        "of travel before it",
     )  # fmt: skip
     command.add_argument(
         "--within", type=positive_number, metavar="METRES",
-        help="recall: count a frame as the query's place if its pose is this near (default: if "
-        "the two overlap by half)",
+        help="recall: maximum distance of a frame that shows the query's place (default: an "
+        "overlap of half is required instead)",
     )  # fmt: skip
     command.add_argument(
         "--absent",
@@ -185,38 +185,35 @@ def run_evaluate(options: argparse.Namespace) -> int:
             "levels", "mode", "matching", "candidates", "seed", "seven_scenes", "distractors",
         )  # fmt: skip
         written["metric"] = options.metric or signer.model.metric
-        found = figures(evaluation, lambda match: store.frame(database[match]), written)
+        report = figures(evaluation, lambda match: store.frame(database[match]), written)
         if options.json is not None:
-            write_whole(options.json, to_json(found))
-        counts = found["counts"]
+            write_whole(options.json, to_json(report))
+        counts = report["counts"]
         print(
             f"model {signer.model.label}: {counts['queries']} queries, {counts['database']} "
             f"database frames{_skipped(counts['left_out'])}"
         )
-        print("\n".join(table(found)))
+        print("\n".join(table(report)))
         if options.seven_scenes is not None:
-            print("\n".join(["", *seven_scenes_table(found, evaluation.outcomes[0].scene)]))
+            print("\n".join(["", *seven_scenes_table(report, evaluation.outcomes[0].scene)]))
     return 0
 
 
 def _check_writable(file: Path | None) -> None:
-    """Create the folder of the figures, and check that they can be written.
-
-    The check precedes the evaluation, which may take an hour.
-    """
+    """Create the folder of the figures, and check before a long evaluation that it is writable."""
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         check_writable(file)
 
 
 def _settings_of(options: argparse.Namespace, model_id: str, *keys: str) -> dict[str, Any]:
-    """Return the options and versions with which the evaluation can be repeated."""
+    """Return version, model and the options `keys`, with which the evaluation can be repeated."""
     from sceneprint import __version__
 
     def plain(value: Any) -> Any:
         if isinstance(value, Path):
             return str(value)
-        return [plain(one) for one in value] if isinstance(value, list) else value
+        return [plain(item) for item in value] if isinstance(value, list) else value
 
     own = {key: plain(getattr(options, key)) for key in keys}
     return {"version": __version__, "model_id": model_id, **own}
@@ -227,6 +224,7 @@ def _skipped(number: int) -> str:
 
 
 def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
+    """Return the frames of the options; raise DatasetError for contradictory options."""
     from sceneprint_lab.evaluation.protocol import PathRanges, choose, parse_part, parse_ranges
 
     if options.seven_scenes is not None:
@@ -245,12 +243,12 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
     ranged = [part for part in parts if part.database is None and part.queries is None]
     elsewhere = options.distractors or any(part.database for part in parts)
     if any(both) and not all(both) and not (both[1] and elsewhere):
-        one, other = ("--db", "--queries") if both[0] else ("--queries", "--db")
-        raise DatasetError(f"{one} requires {other}. Specify both or neither.")
+        option, other = ("--db", "--queries") if both[0] else ("--queries", "--db")
+        raise DatasetError(f"{option} requires {other}. Specify both or neither.")
     if any(both) and not ranged:
         raise DatasetError(
-            "--db and --queries apply only to a PATH without its own ranges, and every PATH has "
-            "some. Omit them."
+            "--db and --queries apply only to a PATH without its own ranges, but every PATH has "
+            "ranges. Omit --db and --queries."
         )
     return choose(
         parts, options.distractors, database=parse_ranges(options.db) if both[0] else None,
@@ -261,7 +259,7 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
 
 
 def _seven_scenes(options: argparse.Namespace) -> list[Path]:
-    """Return the folders of the scenes; list missing ones on standard error."""
+    """Return the folders of the scenes; print the names of missing scenes to standard error."""
     from sceneprint_lab.evaluation.report import PAPER
 
     for value, name in (
@@ -275,17 +273,17 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
             )
     folder: Path = options.seven_scenes
     names = list(PAPER)
-    found = [folder / name for name in names if (folder / name).is_dir()]
-    missing = [name for name in names if folder / name not in found]
-    if not found:
+    folders = [folder / name for name in names if (folder / name).is_dir()]
+    missing = [name for name in names if folder / name not in folders]
+    if not folders:
         raise DatasetError(
             f"{folder}: There is no folder {', '.join(names[:-1])} or {names[-1]} here. Download "
-            "7-Scenes, unpack the archive of each scene and those of its sequences, and specify "
-            "the folder that holds them."
+            "7-Scenes, unpack the archives of its scenes and sequences, and specify the folder "
+            "that contains the scenes."
         )
     if missing:
         print(f"not in {folder}: {', '.join(missing)}", file=sys.stderr)
-    return found
+    return folders
 
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
@@ -297,14 +295,15 @@ def _baselines(names: list[str] | None) -> tuple[str, ...]:
             f"--baselines {unknown[0]}: There is no such baseline. Choose from "
             f"{', '.join(BASELINES)}; put the PATHs first."
         )
-    return () if names is None else tuple(one for one in BASELINES if one in names or not names)
+    return () if names is None else tuple(name for name in BASELINES if name in names or not names)
 
 
 def _watch(items: Iterable[T], stage: str, total: int) -> Iterable[T]:
+    """Return the items with a progress bar."""
     return tqdm(items, desc=stage, total=total, disable=None)
 
 
-#: Maximum number of frames of a scene, since the overlap of all pairs is computed.
+#: Maximum number of frames of a scene; the overlaps of all pairs are computed.
 _MOST = 2000
 _PAIR_EXAMPLES = """\
 pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes are
@@ -393,10 +392,10 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
             options, signer.model.id, "paths", "pairs", "negatives", "apart", "frames", "seed",
             "mode", "matching", "right", "baselines",
         )  # fmt: skip
-        found = pair_figures(evaluation, written)
+        report = pair_figures(evaluation, written)
         if options.json is not None:
-            write_whole(options.json, to_json(found))
-        counts = found["counts"]
+            write_whole(options.json, to_json(report))
+        counts = report["counts"]
         frames = ", ".join(
             f"{n} frames of {scene} ({counts['planar'][scene]} planar)"
             for scene, n in counts["frames"].items()
@@ -405,5 +404,5 @@ def run_evaluate_pairs(options: argparse.Namespace) -> int:
             f"model {signer.model.label}: {counts['pairs']} pairs of {frames}"
             f"{_skipped(counts['left_out'])}"
         )
-        print("\n".join(pair_table(found)))
+        print("\n".join(pair_table(report)))
     return 0

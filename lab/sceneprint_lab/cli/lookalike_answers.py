@@ -27,7 +27,7 @@ from sceneprint_lab.evaluation.sites import SiteAnswer, ask_site, kinds_of
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
-#: Number of queries per site of the kind "absent" for --absent, which needs thousands.
+#: Number of queries per site for --absent, which requires thousands of queries.
 ABSENT_BLOCK = 100
 #: Columns of the table, and the names of their values in `measures.answers`.
 SHARES = {
@@ -39,18 +39,18 @@ SHARES = {
 
 
 def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
-    """Return the fractions by kind and in total as lines of Markdown."""
+    """Return a table of SHARES by kind and in total, as lines of Markdown."""
     lines = [
         f"| kind | queries | answerable | {' | '.join(SHARES)} | ms |",
         f"|---|{'--:|' * (len(SHARES) + 3)}",
     ]
-    groups = {one.kind: [two for two in site_answers if two.kind == one.kind]
-              for one in site_answers}  # fmt: skip
+    groups = {answer.kind: [other for other in site_answers if other.kind == answer.kind]
+              for answer in site_answers}  # fmt: skip
     for name, own in {**groups, "all": list(site_answers)}.items():
-        figures = answers([one.answer for one in own])
+        figures = answers([answered.answer for answered in own])
         shares = " | ".join(f"{figures[key] or 0.0:.3f}" for key in SHARES.values())
-        able = sum(one.answerable for one in own)
-        ms = float(np.median([one.answer.milliseconds for one in own]))
+        able = sum(answered.answerable for answered in own)
+        ms = float(np.median([answered.answer.milliseconds for answered in own]))
         lines.append(f"| {name} | {len(own)} | {able} | {shares} | {ms:.0f} |")
     return lines
 
@@ -72,7 +72,7 @@ def main() -> None:
                         help="query N frames of other places instead")  # fmt: skip
     parser.add_argument(
         "--prior", nargs=2, type=float, metavar=("LEAST", "MOST"),
-        help="error of the robot's prior in metres, as 0 0.3 or 1.5 4 (default: no prior)",
+        help="range of the error of the robot's prior, metres (default: no prior)",
     )  # fmt: skip
     parser.add_argument("--candidates", type=int, default=10, help="size of C (default: 10)")
     parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
@@ -101,7 +101,7 @@ def main() -> None:
     print("\n".join(table(site_answers)))
     print(f"seed {options.seed}, {len(work)} sites, {time.monotonic() - start:.0f} s")
     if options.json is not None:
-        options.json.write_text(json.dumps([asdict(one) for one in site_answers], indent=1))
+        options.json.write_text(json.dumps([asdict(answer) for answer in site_answers], indent=1))
 
 
 if __name__ == "__main__":

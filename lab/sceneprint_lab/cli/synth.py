@@ -42,13 +42,13 @@ def add_synth(command: argparse.ArgumentParser) -> None:
         choices=sorted({kind for kinds in LOOKALIKES.values() for kind in kinds}),
         metavar="KIND",
         help="object: a circle around a symmetric object on a bare floor; offices: a row of equal "
-        "rooms, or a hall of equal bays; unmapped: such a row, with queries from a room that the "
-        "map lacks; kitchens: queries from another kitchen with the same furniture; opposite: "
+        "rooms, or a hall of equal bays; unmapped: such a row, with queries from an unmapped "
+        "room; kitchens: queries from another kitchen with the same furniture; opposite: "
         "furniture in a room, with queries from its other side; absent: queries from other rooms. "
         "With --sensor lidar: bays: a hall of equal bays; streets: a street of equal blocks; "
         "halls: a hall with a symmetry of half a turn; unmapped: equal halls or streets, with "
-        "queries from one that the map lacks; absent: queries from other halls and streets; "
-        "sites: ordinary halls, storeys and blocks, which do not repeat",
+        "queries from an unmapped hall or street; absent: queries from other halls and streets; "
+        "sites: ordinary halls, storeys and blocks without repetition",
     )
     command.add_argument(
         "--rooms", type=positive, default=4, metavar="N",
@@ -73,11 +73,11 @@ def add_synth(command: argparse.ArgumentParser) -> None:
 
 
 def run_synth(options: argparse.Namespace) -> int:
-    """Render furnished rooms as a Kinect sees them, in 7-Scenes layout:
-    OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: halls, storeys
-    and blocks as a spinning laser sees them, OUT/site-000/scan-000000.ply and .pose.txt.
-    With --lookalikes: ambiguous sites as scenes whose TrainSplit.txt and TestSplit.txt separate
-    map and queries, so that `sceneprint evaluate OUT` measures wrong answers.
+    """Render Kinect frames of furnished rooms in 7-Scenes layout:
+    OUT/room-000/seq-01/frame-000000.depth.png and .pose.txt. With --sensor lidar: laser scans of
+    halls, storeys and blocks, OUT/site-000/scan-000000.ply and .pose.txt. With --lookalikes:
+    ambiguous sites as scenes whose TrainSplit.txt and TestSplit.txt separate map and queries, so
+    that `sceneprint evaluate OUT` measures wrong answers.
     """
     if options.lookalikes and options.path:
         raise DatasetError(
@@ -91,8 +91,7 @@ def run_synth(options: argparse.Namespace) -> int:
         )
     if options.out.exists() and any(options.out.iterdir()):
         raise DatasetError(
-            f"{options.out}: The folder is not empty; frames of two runs must not be mixed. Use a "
-            "new folder, or empty this one."
+            f"{options.out}: The folder is not empty. Use a new folder, or empty this one."
         )
     options.out.mkdir(parents=True, exist_ok=True)
     with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:
@@ -105,10 +104,11 @@ def run_synth(options: argparse.Namespace) -> int:
 
 
 def _rooms(options: argparse.Namespace) -> Iterator[None]:
-    where = options.out, options.seed, options.views, options.sensor == "lidar", options.perfect
-    write: Callable[[int], None] = partial(_write_room, *where, options.path)
+    """Write all rooms or sites, and yield after each of them."""
+    common = options.out, options.seed, options.views, options.sensor == "lidar", options.perfect
+    write: Callable[[int], None] = partial(_write_room, *common, options.path)
     if options.lookalikes:
-        write = partial(_write_lookalike, *where, options.lookalikes)
+        write = partial(_write_lookalike, *common, options.lookalikes)
     jobs = min(options.jobs, options.rooms)
     if jobs == 1:  # a child process would import all modules again
         yield from map(write, range(options.rooms))
@@ -120,6 +120,7 @@ def _rooms(options: argparse.Namespace) -> Iterator[None]:
 def _write_room(
     out: Path, seed: int, views: int, lidar: bool, perfect: bool, along_path: bool, index: int
 ) -> None:
+    """Write the frames of room `index`, or the scans of site `index`, to a folder of `out`."""
     from sceneprint_lab.synth import KinectNoise, synthesise_room, synthesise_survey
 
     if lidar:
@@ -134,7 +135,7 @@ def _write_room(
 def _write_lookalike(
     out: Path, seed: int, queries: int, lidar: bool, perfect: bool, kind: str, index: int
 ) -> None:
-    """Write a scene with two sequences, or two scenes if the map lacks the queries' place."""
+    """Write map and queries of a site, in two scenes if their poses are not comparable."""
     from sceneprint_lab.synth import KinectNoise, synthesise_lookalike, synthesise_lookalike_survey
 
     noise = None if perfect else KinectNoise()
@@ -152,7 +153,7 @@ def _write_lookalike(
 
 
 def _write_sequence(folder: Path, frames: Sequence[AnyFrame]) -> None:
-    """Write scans with their poses, or depth images with their poses and camera."""
+    """Write scans, or depth images and their camera, with poses to a new folder."""
     folder.mkdir(parents=True)
     for number, frame in enumerate(frames):
         if isinstance(frame, Cloud):

@@ -105,7 +105,7 @@ def run_train(options: argparse.Namespace) -> int:
 
 
 def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
-    """Return the parameters with another range of the sensor, for depth images and clouds."""
+    """Return the parameters with a range from `least` to `most`, for depth images and clouds."""
     if least >= most:
         raise TrainingError(f"--range {least:g} {most:g}: Put the smaller distance first.")
     return replace(
@@ -116,7 +116,7 @@ def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
 
 
 class _Bars:
-    """Progress bars of stages, one after the other."""
+    """Progress bars of successive stages."""
 
     def __init__(self) -> None:
         self.stage = ""
@@ -130,7 +130,7 @@ class _Bars:
             self.bar.close()
 
     def report(self, stage: str, done: int, total: int) -> None:
-        """Advance the bar of a stage, and close the bar of the stage before."""
+        """Advance the bar of a stage; close the bar of the previous stage."""
         if stage != self.stage:
             self.__exit__()
             self.stage, self.bar = stage, tqdm(desc=stage, total=total, disable=None)

@@ -1,14 +1,14 @@
-"""Baselines of retrieval, which are measured in the same run as the signature.
+"""Baselines of retrieval, measured in the same run as the signature.
 
 Thumbnails are small inverse depth images, compared by L1 or ZNCC.
 
 FPFH are local features of Open3D (Rusu et al., ICRA 2009), aggregated by VLAD (Jegou et al., CVPR
-2010). The vocabulary is fitted to the searched database, which favours this baseline: models were
-not trained on its frames.
+2010). The vocabulary is fitted to the searched database, which favours this baseline, because the
+models are not trained on these frames.
 
-Rings are heights around a scanner, as in Scan Context (Kim and Kim, IROS 2018). The ground around
-the sensor is divided into rings and sectors; each cell has the height of its highest point. A
-rotation of the sensor by a sector shifts the columns by one, so two scans are compared at all
+Rings are heights around a scanner, as in Scan Context (Kim and Kim, IROS 2018). Rings and sectors
+divide the ground around the sensor into cells; the value of a cell is its maximum height. A
+rotation of the sensor by one sector shifts the columns by one, so two scans are compared at all
 shifts.
 """
 
@@ -42,7 +42,7 @@ from sceneprint_lab.evaluation.protocol import (
 
 
 class Baseline:
-    """A method that compares frames without signatures."""
+    """Base class of retrieval methods that do not use signatures."""
 
     name: str
 
@@ -54,14 +54,14 @@ class Baseline:
         return True
 
     def read(self, frame: AnyFrame) -> Floats32:
-        """Return the features for the descriptor; raise UselessFrame if there are none."""
+        """Return the features of a frame; raise UselessFrame if there are none."""
         raise NotImplementedError
 
     def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """Fit the baseline to the results of `read` for the `count` frames of the database."""
+        """Fit the baseline to the features of the `count` frames of the database."""
 
     def finish(self, features: Floats32) -> Floats32:
-        """Return the descriptor of a result of `read`; it has the same shape for all frames."""
+        """Return the descriptor for the features of a frame; all descriptors have one shape."""
         return features
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
@@ -99,10 +99,10 @@ def thumbnail(depth: Floats32, rows: int = ROWS, columns: int = COLUMNS) -> Floa
 
 
 class Thumbnails(Baseline):
-    """Small inverse depth images, by mean absolute difference or by correlation.
+    """Baseline that compares small inverse depth images.
 
-    `comparison`: "l1", the mean absolute difference over cells that are filled in both, or "zncc",
-    1 - zero-mean normalised cross-correlation, with the mean in empty cells.
+    `comparison`: "l1", the mean absolute difference over cells with samples in both, or
+    "zncc", 1 - zero-mean normalised cross-correlation, with the mean in empty cells.
     """
 
     def __init__(self, comparison: Comparison) -> None:
@@ -144,8 +144,8 @@ class Thumbnails(Baseline):
 
 # FPFH and VLAD.
 
-#: Voxel of the points, radius of normals and of features, metres, for a sensor with a range of
-#: RANGE metres; they are proportional to the range.
+#: Edge of voxels, and radii of normals and features, for a sensor with the range RANGE, metres.
+#: These lengths are proportional to the range.
 VOXEL, NORMALS, FEATURES, RANGE = 0.05, 0.10, 0.25, 9.0
 _WHAT = "The baseline fpfh_vlad"
 #: Number of words in the vocabulary, and of features to which it is fitted.
@@ -153,7 +153,7 @@ WORDS, LEARNT_FROM = 64, 20_000
 
 
 def features(points: Floats, scale: float = 1.0) -> Floats32:
-    """Return the FPFH of a cloud's voxels.
+    """Return the FPFH features of a cloud after voxel downsampling.
 
     Parameters
     ----------
@@ -162,8 +162,8 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
 
     Returns
     -------
-    (n, 33) float32, roots of the shares in each of the three histograms, so that L2 is the
-    Hellinger distance
+    (n, 33) float32, square roots of the three normalised histograms, so that L2 is the Hellinger
+    distance
     """
     o3d = open3d(_WHAT)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, np.float64)))
@@ -174,15 +174,15 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
     fpfh = o3d.pipelines.registration.compute_fpfh_feature(
         cloud, search(radius=FEATURES * scale, max_nn=100)
     )
-    found = np.maximum(np.asarray(fpfh.data).T, 0.0).reshape(-1, 3, 11)
-    total = found.sum(axis=2, keepdims=True)  # the sum is 0 without neighbours
-    shares = np.divide(found, total, out=np.zeros_like(found), where=total > 0)
+    histograms = np.maximum(np.asarray(fpfh.data).T, 0.0).reshape(-1, 3, 11)
+    total = histograms.sum(axis=2, keepdims=True)  # the sum is 0 without neighbours
+    shares = np.divide(histograms, total, out=np.zeros_like(histograms), where=total > 0)
     rooted: Floats32 = np.sqrt(shares).reshape(-1, 33).astype(np.float32)
     return rooted
 
 
 def vlad(local: Floats32, words: Floats) -> Floats32:
-    """Return the VLAD descriptor: intra-normalised sums of features minus their nearest words.
+    """Return the VLAD descriptor: intra-normalised sums of differences to the nearest words.
 
     Parameters
     ----------
@@ -245,8 +245,8 @@ class FpfhVlad(Baseline):
 
         rng, share = np.random.default_rng(seed), -(-LEARNT_FROM // max(count, 1))
         drawn = [
-            one[np.sort(rng.choice(len(one), min(share, len(one)), replace=False))]
-            for one in database
+            local[np.sort(rng.choice(len(local), min(share, len(local)), replace=False))]
+            for local in database
         ]
         sample = np.concatenate(drawn).astype(np.float64)
         distinct = len(np.unique(sample, axis=0))  # k-means would warn about equal words
@@ -261,8 +261,8 @@ class FpfhVlad(Baseline):
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
         """Return the Euclidean distances (N,) from a descriptor to N descriptors."""
-        found: Floats = np.linalg.norm(database.astype(np.float64) - query, axis=1)
-        return found
+        distances: Floats = np.linalg.norm(database.astype(np.float64) - query, axis=1)
+        return distances
 
 
 # Rings.
@@ -295,6 +295,7 @@ def ring_descriptor(points: Floats32 | Floats) -> Floats32:
 
 @kernel
 def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -> None:
+    """Write the normalised columns (sectors, rings) to `unit`, and a mask of non-zero columns."""
     rings, sectors = descriptor.shape
     for s in range(sectors):
         square = 0.0
@@ -309,7 +310,7 @@ def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -
 def _best_shift(
     a: Floats, a_filled: NDArray[np.bool_], b: Floats, b_filled: NDArray[np.bool_]
 ) -> tuple[float, int]:
-    """Return the minimum distance over all shifts of the columns of `b`, and its shift."""
+    """Return the minimum mean of 1 - cosine over all column shifts of `b`, and the shift."""
     sectors, rings = a.shape
     best, at = 2.0, 0
     for shift in range(sectors):
@@ -335,11 +336,11 @@ def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def ring_distance(a: Floats32, b: Floats32) -> tuple[float, int]:
-    """Return the distance between two scans, which does not depend on their yaw.
+    """Return the distance between two scans independently of their yaw.
 
     Returns
     -------
-    distance : mean of 1 - cosine over columns that are filled in both, at the best shift; 0 to 2
+    distance : mean of 1 - cosine over columns that are not empty in both, at the best shift; 0 to 2
     shift : number of sectors by which the columns of `a` are shifted in `b`
 
     `a`, `b`: (rings, sectors) descriptors.
@@ -373,7 +374,7 @@ class Rings(Baseline):
         return ring_distances(query, database)
 
 
-#: Constructors of the baselines, which take the range of the sensor in metres.
+#: Constructors of the baselines; their argument is the range of the sensor, metres.
 BASELINES: dict[str, Callable[[float], Baseline]] = {
     "thumbnail_l1": lambda _: Thumbnails("l1"),
     "thumbnail_zncc": lambda _: Thumbnails("zncc"),
@@ -383,7 +384,7 @@ BASELINES: dict[str, Callable[[float], Baseline]] = {
 
 
 def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
-    """Return baselines by their names, after a check of their libraries.
+    """Return baselines by name, and check that their libraries are installed.
 
     Parameters
     ----------
@@ -393,12 +394,12 @@ def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
     Raise MissingDependency if a library is absent.
     """
     opened = [BASELINES[name](maximum) for name in names]
-    for one in opened:
-        one.check()
+    for baseline in opened:
+        baseline.check()
     return opened
 
 
-#: Number of queries with which the times of a baseline and of the signature are measured.
+#: Number of queries for measuring the times of a baseline and of the signature.
 TIMED = 10
 
 
@@ -409,9 +410,9 @@ class Compared:
     Parameters
     ----------
     reason : reason why the baseline cannot be used; empty if it can
-    rankings : indices of the database for each query, nearest first
+    rankings : database indices for each query, nearest first
     first : validated pair of each query with its nearest frame; None without a ranking
-    milliseconds : median processor times to `describe` a query, to `sign` it, and to `rank` the
+    milliseconds : median processor times per query to `describe` it, `sign` it and `rank` the
         database
     """
 
@@ -426,13 +427,11 @@ def compare(
     baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
     signer: Signer, seed: int, watch: Watch = unwatched,
 ) -> Compared:  # fmt: skip
-    """Rank the database for every query by a baseline.
-
-    The computation uses one thread of this process, in which the signature is timed too.
+    """Rank the database for every query by a baseline, and measure its time in one thread.
 
     Parameters
     ----------
-    baseline : baseline that is measured
+    baseline : the baseline
     prepared, store : frames of the evaluation
     allowed : (Q, N) mask of the frames that a query may find
     watch : callback for progress
@@ -447,9 +446,9 @@ def compare(
             return refused(f"it does not support frames such as {member.name}")
     with threadpool_limits(1):
         try:
-            found = _compared(baseline, prepared, store, allowed, seed, watch)
+            result = _compared(baseline, prepared, store, allowed, seed, watch)
             spent = timed(baseline, prepared, store, signer)
-            return replace(found, milliseconds=found.milliseconds | spent)
+            return replace(result, milliseconds=result.milliseconds | spent)
         except FrameError as error:
             return refused(str(error))
 
@@ -458,6 +457,8 @@ def _compared(
     baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
     seed: int, watch: Watch,
 ) -> Compared:  # fmt: skip
+    """Return the rankings, without `first`; the features are stored in the folder of the store."""
+
     def file(member: SignedFrame) -> Path:
         return store.folder / f"{member.number}.{baseline.name}.npy"
 
@@ -469,7 +470,7 @@ def _compared(
         return (np.load(file(m)) for m in prepared.database)
 
     baseline.learn(database(), len(prepared.database), seed)
-    stack = np.stack([baseline.finish(one) for one in database()])
+    stack = np.stack([baseline.finish(local) for local in database()])
     rankings, ranking_ms = [], []
     for i, member in enumerate(prepared.queries):
         descriptor = baseline.finish(np.load(file(member)))
@@ -485,19 +486,19 @@ def registered(
     judge: Judge, rankings: Sequence[Sequence[int]], prepared: Prepared,
     overlap_mean: NDArray[np.float64], overlap_least: NDArray[np.float64],
 ) -> list[ValidatedPair | None]:  # fmt: skip
-    """Return the validated pair of each query with the nearest frame of its ranking."""
-    found: list[ValidatedPair | None] = []
+    """Validate each query with the first frame of its ranking; None without a ranking."""
+    pairs: list[ValidatedPair | None] = []
     for i, (query, ranking) in enumerate(zip(prepared.queries, rankings, strict=True)):
         if not ranking:
-            found.append(None)
+            pairs.append(None)
             continue
         j = ranking[0]
         candidate = Candidate.of(
             prepared.database[j], j, float(overlap_mean[i, j]), float(overlap_least[i, j])
         )
         task = QueryTask(query.number, query.scene, query.pose, [j], [], (candidate,))
-        found.append(validated(judge, task, candidate))
-    return found
+        pairs.append(validated(judge, task, candidate))
+    return pairs
 
 
 def timed(
@@ -505,7 +506,7 @@ def timed(
 ) -> dict[str, float]:
     """Return the median processor times to describe and to sign a query, milliseconds.
 
-    Evenly spaced queries are described and signed alternately, so that conditions are equal.
+    Evenly spaced queries are described and signed alternately, under equal conditions.
     """
     n = len(prepared.queries)
     chosen = sorted({round(i) for i in np.linspace(0, n - 1, min(TIMED, n))})

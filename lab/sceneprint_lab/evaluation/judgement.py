@@ -1,4 +1,4 @@
-"""Validation of queries against candidates, and errors of the results by the reference poses."""
+"""Rankings, validations and answers of queries, and their errors by the reference poses."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class QueryTask:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """The result of a task; for its fields see QueryOutcome."""
+    """The result of a QueryTask; see QueryOutcome for the fields."""
 
     pairs: dict[int, ValidatedPair]
     average: Error
@@ -114,7 +114,7 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """The data and parameters with which a process validates.
+    """Data and parameters for validating and answering queries.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def open_judge(
     matching: Matching = "histograms", database: Sequence[SignedFrame] = (),
     answer: AnswerParameters | None = None, unrelated_distance: float = math.inf,
 ) -> Judge:  # fmt: skip
-    """Return a judge of the frames of a store."""
+    """Return a Judge for the frames of a store, with a cache of geometries."""
     geometry = lru_cache(128)(store.geometry)  # successive queries share candidates
     return Judge(
         geometry, mode, seed, p, matching, database, answer or AnswerParameters(),
@@ -153,10 +153,10 @@ def open_judge(
 
 
 def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
-    """Return the first accepted views of one scene, strong views first.
+    """Return at most VIEWS accepted views of the scene with the most strong views, strong first.
 
-    Poses are comparable within one scene only. The selected scene has the most strong matches; ties
-    are resolved by the number of matches, then by the rank of the first match.
+    Poses are comparable only within a scene. Ties between scenes are resolved by the number of
+    accepted views, then by the rank of the first.
 
     `pairs`: pairs of a query, in the order of R.
     """
@@ -164,16 +164,16 @@ def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
     scenes = [pair.scene for pair in accepted]
     strong = Counter(pair.scene for pair in accepted if pair.validation.strength == "strong")
     winner = max(
-        dict.fromkeys(scenes), key=lambda one: (strong[one], scenes.count(one)), default=""
+        dict.fromkeys(scenes), key=lambda scene: (strong[scene], scenes.count(scene)), default=""
     )
     return [pair for pair in accepted if pair.scene == winner][:VIEWS]
 
 
 def judge(judging: Judge, task: QueryTask) -> Judged:
-    """Validate a query against each candidate, average its pose, and compute all errors.
+    """Validate a query against all candidates, average and answer its pose, and compute errors.
 
-    The bound of registration, which is the refinement from the reference pose, is computed for the
-    first answer and for the averaged views of C.
+    The bound of registration, the error after refinement from the reference pose, is computed for
+    the first match of VDR and for the averaged views of C.
     """
     of = {c.match: c for c in task.candidates}
     pairs = {c.match: validated(judging, task, c) for c in task.candidates}
@@ -199,9 +199,7 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
 
 
 def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -> JudgedAnswer:
-    """Return the answer from the candidates of C, with its error.
-
-    A service returns the same answer, because it uses the same functions.
+    """Return the answer that a service returns for the candidates of C, with its error.
 
     Parameters
     ----------
@@ -219,13 +217,13 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
 
 
 class _Recording:
-    """The frames of an evaluation that one query searches."""
+    """The frames that a query may find, in the interface that `localization.decide` requires."""
 
     def __init__(self, judging: Judge, task: QueryTask, prior: PosePrior | None) -> None:
         self._judging, self._task, self._prior = judging, task, prior
         self._allowed = set(task.allowed.tolist())
         self._poses = [frame.pose for frame in judging.database]
-        # frames that the query may not find get a separate scene, so that they do not vote either
+        # Frames that the query may not find get a separate scene, so that they do not vote.
         self._scenes = [
             frame.scene if row in self._allowed else ""
             for row, frame in enumerate(judging.database)
@@ -237,16 +235,14 @@ class _Recording:
         self.selected = _ranking_of(judging, task, sorted(task.selection, key=self._is_far))
 
     def first_matches(self) -> list[PairMatch]:
-        """Return the matches of C, some of which may be guided."""
+        """Return the matches of C, including guided matches."""
         return self._validated(
             self.selected, pose_of=lambda row: (self._scenes[row], self._poses[row])
         )
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         p, agreement = self.p, self._judging.p.agreement
-        ahead = [looks_ahead(self.query)] * len(
-            self._poses
-        )  # all frames of a recording have one sensor
+        ahead = [looks_ahead(self.query)] * len(self._poses)  # the frames have one sensor
         views_of = views_of_rows(
             frames[-1].matches, self._poses, self._geometry, self._scenes, p.map, agreement, ahead,
             [self._judging.rendered] * len(self._poses),
@@ -280,7 +276,7 @@ class _Recording:
         return self._judging.geometry(self._judging.database[row].number)
 
     def _is_far(self, row: int) -> bool:
-        """Return whether a frame is too far from the prior to show the same surfaces."""
+        """Return whether there is a prior, and the frame is too far away to show its surfaces."""
         prior = self._prior
         return prior is not None and not (
             self._scenes[row] == prior.parent and prior.reaches(self._poses[row], self.p.map)
@@ -290,47 +286,47 @@ class _Recording:
 def _judged_answer(
     estimate: PoseEstimate, task: QueryTask, p: LocalizationParameters, spent: float
 ) -> JudgedAnswer:
-    """Return an answer with its candidate places and their errors."""
+    """Return an estimate as an answer, with the errors of its pose and of its candidate places."""
 
     def error_of(T: Floats) -> Error:
         return pose_error(T, task.pose) if estimate.parent == task.scene else Error()
 
-    known = [(one, one.evidence) for one in estimate.places if one.evidence is not None]
-    confidences = compute_confidences([evidence for _, evidence in known], p.judgement)
+    supported = [(place, place.evidence) for place in estimate.places if place.evidence is not None]
+    confidences = compute_confidences([evidence for _, evidence in supported], p.judgement)
     places = []
-    for i in sorted(range(len(known)), key=lambda i: -confidences[i]):
-        place, evidence = known[i]
+    for i in sorted(range(len(supported)), key=lambda i: -confidences[i]):
+        place, evidence = supported[i]
         error = error_of(place.T)
         right = error.within(p.map.place_m, PLACE_DEG)
         places.append(JudgedPlace(evidence, confidences[i], error, right))
-    # the limit is proportional to the distance of places, so it is larger for scans
+    # The limit of the error is proportional to `place_m`, so it is larger for scans.
     limits = RIGHT[0] * p.map.place_m / MapParameters.place_m, RIGHT[1]
     error = Error() if estimate.average is None else error_of(estimate.average.T)
     return JudgedAnswer(estimate.status, estimate.strength, error, spent, tuple(places), limits)
 
 
 def _ranking_of(judging: Judge, task: QueryTask, rows: Sequence[int]) -> Ranking:
-    """Return rows as a ranking with the distances of R; without R, distances are d0."""
+    """Return database rows as a ranking, with their distances in R or else d0."""
     index = np.array(rows, np.intp)
     distances = np.full(len(index), judging.unrelated_distance)
     if task.retrieved is not None:
-        known = dict(
+        distance_of = dict(
             zip(task.retrieved.indices.tolist(), task.retrieved.distances.tolist(), strict=True)
         )
-        distances = np.array([known.get(row, judging.unrelated_distance) for row in rows])
+        distances = np.array([distance_of.get(row, judging.unrelated_distance) for row in rows])
     similarities = np.clip(1.0 - distances / judging.unrelated_distance, 0.0, 1.0)
     whole = np.where(np.isfinite(distances), distances, 0.0).astype(np.int64)
     return Ranking(index, whole, np.nan_to_num(similarities))
 
 
 def true_transform(task: QueryTask, candidate: Candidate) -> Floats:
-    """Return T_match_query by the reference poses."""
+    """Return T_match_query (4, 4) according to the reference poses."""
     T: Floats = inverse(candidate.pose) @ task.pose
     return T
 
 
 def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> ValidatedPair:
-    """Return the validation of a query and one candidate, with its error."""
+    """Validate a query against a candidate; return the result with its error."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
     start = time.perf_counter()
     validation = validate(query, match, judging.seed, judging.p, judging.mode, judging.matching)
@@ -345,7 +341,7 @@ def validated(judging: Judge, task: QueryTask, candidate: Candidate) -> Validate
 
 
 def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) -> Floats | None:
-    """Return the transform that refinement reaches from the reference pose."""
+    """Return T_match_query (4, 4) after refinement from the reference pose; None if it fails."""
     query, match = judging.geometry(task.number), judging.geometry(candidate.number)
     return refine_transform(query, match, true_transform(task, candidate), judging.p.alignment.fine)
 
@@ -353,7 +349,7 @@ def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) ->
 def _average(
     task: QueryTask, of: dict[int, Candidate], transforms: dict[int, Floats | None]
 ) -> Error:
-    """Return the error of the pose averaged over views of one scene; infinite without views."""
+    """Return the error of the pose averaged over transforms by match; infinite without views."""
     poses = [of[match].pose @ T for match, T in transforms.items() if T is not None]
     if not poses or any(of[match].scene != task.scene for match in transforms):
         return Error()
@@ -362,9 +358,9 @@ def _average(
 
 # R and C of all queries, by stored signatures.
 
-#: Number of queries per scan of the database.
+#: Number of queries whose distances are computed together.
 BLOCK = 64
-#: Number of queries whose distances within R are computed again to measure the time.
+#: Number of queries whose distances within R are computed separately to measure the time.
 TIMED = 3
 
 
@@ -412,7 +408,7 @@ def rank(
     ranked : results of the Q queries; their lists are empty if no frame is allowed
     """
     size = max((ranking_size(int(n)) for n in allowed.sum(axis=1)), default=0)
-    # compute all pairs of the database once if they are fewer than the pairs of all rankings
+    # Compute all pairs of the database once if they are fewer than the pairs of all rankings.
     whole = len(database) ** 2 <= len(queries) * size**2
     among = pairwise_distances(database, metric) if whole and len(queries) else None
     rows = _rows(queries, database, metric)
@@ -438,7 +434,7 @@ def rank(
 
 
 def _rows(queries: Bytes, database: Bytes, metric: Metric) -> Iterable[tuple[Ints64, float]]:
-    """Yield the distances of each query to the database, and the time for them, milliseconds."""
+    """Yield the distances (N,) of each query to the database, and the time, milliseconds."""
     for begin in range(0, len(queries), BLOCK):
         start = time.perf_counter()
         block = cross_distances(queries[begin : begin + BLOCK], database, metric)

@@ -26,7 +26,7 @@ from sceneprint_lab.evaluation.protocol import (
 
 #: Values of k for recall@k.
 FIRST = (1, 5, 10)
-#: Minimum overlap, by the definition of retrieval, of a frame that shows the query's place.
+#: Minimum overlap (`Overlaps.mean`) of a frame that shows the query's place.
 OVERLAP = 0.5
 
 
@@ -42,18 +42,18 @@ def metres_apart(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]
 def recall(
     relevant: NDArray[np.bool_], allowed: NDArray[np.bool_], rankings: Sequence[Sequence[int]]
 ) -> dict[str, float | int | None]:
-    """Return recall@k: the share of queries with a relevant frame among the first k.
+    """Return recall@k, the share of queries with a relevant frame among the first k.
 
     Parameters
     ----------
     relevant : (Q, N) mask of the database frames that show the query's place
     allowed : (Q, N) mask of the database frames that the query may find
-    rankings : database indices for each query, nearest first, all of which are allowed
+    rankings : indices of allowed database frames for each query, nearest first
 
     Returns
     -------
-    figures : number of `queries` that may find a relevant frame, and the recall for each k of
-        FIRST among them; null without such queries
+    figures : number of `queries` that may find a relevant frame, and their recall for each k of
+        FIRST; null without such queries
     """
     able = np.flatnonzero((relevant & allowed).any(axis=1)).tolist()
     figures: dict[str, float | int | None] = {"queries": len(able)}
@@ -77,7 +77,7 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
     """Return the one-sided Clopper-Pearson upper bound of a rate.
 
     For 0 events, it is 1 - (1 - confidence)^(1 / of), which for 95 % is about 3 / of (the rule of
-    three). It applies to independent trials; for pairs that share frames, the true bound is higher.
+    three). It assumes independent trials; for pairs that share frames, the true bound is higher.
 
     Parameters
     ----------
@@ -87,6 +87,10 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
     Returns
     -------
     rate : upper bound; None without trials
+
+    Raises
+    ------
+    ValueError : If an argument is out of range.
     """
     if not 0 <= seen <= of or not 0 < confidence < 1:
         raise ValueError(
@@ -96,10 +100,7 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
     if of == 0:
         return None
     low, high = seen / of, 1.0
-    while (middle := (low + high) / 2) not in (
-        low,
-        high,
-    ):  # until the interval contains no other number
+    while (middle := (low + high) / 2) not in (low, high):  # until no number lies between
         low, high = (middle, high) if _at_most(seen, of, middle) > 1 - confidence else (low, middle)
     return high
 
@@ -122,9 +123,9 @@ class Roc:
 
     Parameters
     ----------
-    area : area under the curve: probability that a right item has a higher score than a wrong item;
-        ties count half
-    false, true : (n,) share of the wrong and of the right items that reach the threshold, 0 to 1
+    area : area under the curve, the probability that a right item has a higher score than a wrong
+        item; ties count half
+    false, true : (n,) shares of wrong and of right items that reach the threshold, 0 to 1
     thresholds : (n,) descending thresholds of the score, starting with infinity
     """
 
@@ -134,7 +135,7 @@ class Roc:
     thresholds: Floats
 
     def true_at(self, false: float) -> float:
-        """Return the maximum true rate at a false rate of at most `false`."""
+        """Return the maximum true rate for a false rate of at most `false`."""
         return float(self.true[self.false <= false].max())
 
     def thinned(self, most: int = CURVE) -> list[list[float]]:
@@ -142,25 +143,25 @@ class Roc:
         n = len(self.true)
         selected = np.arange(n)
         if n > most:
-            selected = self._kept(most)
+            selected = self._spaced_indices(most)
         columns = zip(
             self.false[selected], self.true[selected], self.thresholds[selected], strict=True
         )
-        return [[float(one) for one in row] for row in columns]
+        return [[float(value) for value in row] for row in columns]
 
-    def _kept(self, most: int) -> NDArray[np.intp]:
+    def _spaced_indices(self, most: int) -> NDArray[np.intp]:
         n = len(self.true)
-        # even steps along both rates represent both ends of the curve
+        # Even steps in the sum of both rates represent both ends of the curve.
         at = np.linspace(0, 2, most - 1)
         return np.unique(np.append(np.searchsorted(self.false + self.true, at).clip(0, n - 1), 0))
 
 
 def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
-    """Return the curve of a score that is high for right items.
+    """Return the receiver operating characteristic of a score.
 
     Parameters
     ----------
-    scores : (n,) scores; -infinity if there is no evidence
+    scores : (n,) scores, higher for right items; -infinity without evidence
     right : (n,) mask of the right items
 
     Returns
@@ -179,7 +180,7 @@ def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
     return Roc(area, false, true, np.concatenate([[np.inf], -values]))
 
 
-# The rows of the table: errors of the answers, and correctness of their acceptance.
+# The rows of the table: errors of answers, and correctness of acceptance.
 #
 # Outcome, ...  --rows, validation, oracle_and_random-->  figures
 
@@ -195,8 +196,7 @@ def rows(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
     R: the first member of the ranking after registration, accepted or not. VR: the first accepted
     match among the first members of R, strong before weak. DR, VDR: the same for C.
     `pose_average`: average of up to five accepted views of C; `pose_average_vr`: the same for R.
-    `bound`: refinement from the reference pose, for the pair of VDR (`first`) and for the averaged
-    views. A query without an accepted match, or with a match of another scene, is a failure.
+    A query without an accepted match, or with a match of another scene, is a failure.
     """
     here = [o for o in outcomes if o.present]
     return {
@@ -210,10 +210,10 @@ def rows(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def bound(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """Return the bounds of registration, by refinement from the reference poses.
+    """Return the bounds of registration: errors after refinement from the reference poses.
 
-    `VDR` is the bound of the first pair of VDR, `pose_average` that of the averaged views. A query
-    without such a pair is a failure.
+    `VDR` is the bound for the first pair of VDR, `pose_average` for the averaged views. A query
+    without an accepted pair is a failure.
     """
     here = [o for o in outcomes if o.present]
     return {
@@ -223,7 +223,7 @@ def bound(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def bound_of(outcome: QueryOutcome) -> Error:
-    """Return the error of refinement from the reference pose, for the first pair of VDR."""
+    """Return the error of VDR's first pair after refinement from the reference pose."""
     first = outcome.views("VDR")[:1]
     return first[0].bound or Error() if first else Error()
 
@@ -247,7 +247,7 @@ def accuracy(errors: Sequence[Error]) -> Figures:
 def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
     """Return figures of the overlap of the first match, and of the first five, with the query.
 
-    `five`: overlaps, by the definition of retrieval, of the first five matches of each query.
+    `five`: overlaps (`Overlaps.mean`) of the first five matches of each query.
     """
     first = [overlaps[0] for overlaps in five]
     return {
@@ -259,7 +259,7 @@ def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
 
 
 def retrieval(outcomes: Sequence[QueryOutcome], of: str) -> Figures:
-    """Return `overlap_figures` of a row, and the share of first matches of the query's scene."""
+    """Return `overlap_figures` of a row, and the share of first matches in the query's scene."""
     figures = overlap_figures([[p.overlap_mean for p in o.views(of)[:5]] for o in outcomes])
     return figures | {"right_scene": _share([o.views(of)[0].same_scene for o in outcomes])}
 
@@ -278,7 +278,7 @@ def oracle_and_random(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
 
 
 def _any_of_five(outcome: QueryOutcome) -> float:
-    """Return the probability that one of five random frames has an overlap of at least a half."""
+    """Return the probability that one of five random frames overlaps by at least a half."""
     n, good = len(outcome.overlap_mean), int((outcome.overlap_mean >= 0.5).sum())
     return 1.0 - math.comb(n - good, 5) / math.comb(n, 5) if n >= 5 else float(good > 0)
 
@@ -286,12 +286,10 @@ def _any_of_five(outcome: QueryOutcome) -> float:
 def validation(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
     """Return precision and recall of acceptance, over all validated pairs.
 
-    `precision`: share of the accepted pairs whose transform is right within 10 cm and 10 degrees.
-    `recall`: share of the right transforms that are accepted. `recall_overlap_30`: the same for
-    pairs whose overlap (smaller direction) is 30 % or more. Counts: `pairs`, `accepted`,
-    `accepted_strong`; for right transforms `right_but_rejected` and `right_but_ambiguous`; for
-    other scenes `pairs_of_other_scenes`, `accepted_of_other_scenes`,
-    `accepted_strong_of_other_scenes`.
+    `precision`: share of accepted pairs whose transform is right within 10 cm and 10 degrees.
+    `recall`: share of right transforms that are accepted. `recall_overlap_30`: the same for pairs
+    with an overlap (smaller direction) of at least 30 %. `precision_strong`: precision of strong
+    pairs. The other figures are counts; `right_but_...` count right transforms.
     """
     return validation_of([p for o in outcomes for p in o.pairs.values()])
 
@@ -321,10 +319,9 @@ def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | Non
 
 
 def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
-    """Return the shares of queries that are accepted although their scene is not in the database.
+    """Return the shares of queries without their scene in the database that are accepted.
 
-    `accepted_strong` and `accepted_weak` are the shares by the strength of VDR's answer; null
-    without such queries.
+    `accepted_strong` and `accepted_weak` refer to VDR's first match; null without such queries.
     """
     away = [o for o in outcomes if not o.present]
     answers = [o.views("VDR")[0].validation.strength if o.views("VDR") else None for o in away]
@@ -340,30 +337,30 @@ def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
 def answers(judged: Sequence[JudgedAnswer]) -> dict[str, Any]:
     """Return the answers of robots as shares of all queries; the first four have the sum 1.
 
-    `found_right`: found within 10 cm and 10 degrees, or within the limits of the answers.
-    `found_wrong`: found, but not right; always the case for absent scenes. `grossly_wrong`: wrong
-    by more than 50 cm or 15 degrees; the upper bound of this rate is `grossly_wrong_at_most` (95 %,
-    one-sided). `found_strong_wrong`: strong, but wrong. `wrong_of_found`: share of the found
-    answers that are wrong. `calibration_error`: mean difference between the confidence of the most
-    likely pose and the share of such poses that are right. `reliability`: number, mean confidence
-    and share of right poses for each tenth of confidences. Figures are null without queries.
+    `found_right`: found with an error within the limits of the answer. `found_wrong`: found with a
+    larger error, or in an absent scene. `grossly_wrong`: found with an error beyond GROSS;
+    `grossly_wrong_at_most` is the upper bound of this rate (95 %, one-sided). `found_strong_wrong`:
+    strong, but wrong. `wrong_of_found`: share of found answers that are wrong.
+    `calibration_error`: mean difference between the confidence of the most likely pose and the
+    share of such poses that are right. `reliability`: see Calibration.bins. Figures are null
+    without queries.
     """
     figures = _calibration(judged)
-    wrong = [one.status == "found" and not one.right for one in judged]
-    gross = [one.grossly_wrong for one in judged]
+    wrong = [answer.status == "found" and not answer.right for answer in judged]
+    gross = [answer.grossly_wrong for answer in judged]
     return {
         "queries": len(judged),
-        "found_right": _share([one.right for one in judged]),
+        "found_right": _share([answer.right for answer in judged]),
         "found_wrong": _share(wrong),
-        "ambiguous": _share([one.status == "ambiguous" for one in judged]),
-        "not_found": _share([one.status == "not_found" for one in judged]),
+        "ambiguous": _share([answer.status == "ambiguous" for answer in judged]),
+        "not_found": _share([answer.status == "not_found" for answer in judged]),
         "grossly_wrong": _share(gross),
         "grossly_wrong_at_most": upper_bound(sum(gross), len(judged)),
         "found_strong_wrong": _share(
-            [one.strength == "strong" and w for one, w in zip(judged, wrong, strict=True)]
+            [answer.strength == "strong" and w for answer, w in zip(judged, wrong, strict=True)]
         ),
         "wrong_of_found": _share(
-            [w for one, w in zip(judged, wrong, strict=True) if one.status == "found"]
+            [w for answer, w in zip(judged, wrong, strict=True) if answer.status == "found"]
         ),
         "calibration_error": None if figures is None else figures.error,
         "reliability": None if figures is None else figures.bins,
@@ -371,11 +368,11 @@ def answers(judged: Sequence[JudgedAnswer]) -> dict[str, Any]:
 
 
 def _calibration(judged: Sequence[JudgedAnswer]) -> Calibration | None:
-    """Return the calibration of the most likely poses; None without poses."""
-    best = [one.places[0] for one in judged if one.places]
+    """Return the calibration of each query's most likely pose; None without poses."""
+    best = [answer.places[0] for answer in judged if answer.places]
     if not best:
         return None
-    return calibration([one.confidence for one in best], [one.right for one in best])
+    return calibration([place.confidence for place in best], [place.right for place in best])
 
 
 @dataclass(frozen=True)
@@ -386,7 +383,7 @@ class Calibration:
     ----------
     error : expected calibration error over ten bins of equal width
     brier : mean square of confidence minus outcome
-    bins : number of poses, mean confidence, and share of right poses of each non-empty bin
+    bins : (number of poses, mean confidence, share of right poses) for each non-empty bin
     """
 
     error: float
@@ -439,11 +436,11 @@ def _median(values: Sequence[float]) -> float | None:
     return middle if math.isfinite(middle) else None
 
 
-# The stage at which queries are lost between the database and an accepted match.
+# Stages at which queries fail.
 #
 # Outcome, ...  --lost-->  counts
 
-#: Outcomes of queries, exactly one of which applies to each query.
+#: Outcomes of queries; see `place_of`.
 PLACES = (
     "found", "near", "wrongly_accepted", "nothing_overlaps", "not_in_r", "not_in_c", "ambiguous",
     "rejected",
@@ -496,12 +493,12 @@ def diversity(
 ) -> dict[str, Any]:
     """Return the distances of the first five matches, and the volume that they cover.
 
-    `translation` contains, for R, DR, VR and VDR, the mean and the standard deviation (within the
-    five) of the distance between query and match, metres, by reference poses, averaged over
-    queries. `coverage` contains the number of 2 cm voxels that the first validated views observe
-    (reference poses, depth below 4 m), for VR and VDR, averaged over queries. VR and VDR are
-    compared with equal numbers of views, on queries for which both have two or more views; null
-    without such queries.
+    `translation` contains, for R, DR, VR and VDR, the mean and the standard deviation of the
+    distances between the query and its five matches, metres, averaged over queries. `coverage`
+    contains, for VR and VDR, the number of 2 cm voxels that the validated views observe up to a
+    depth of 4 m, averaged over queries. Positions are those of the reference poses. VR and VDR are
+    compared with equal numbers of views, on queries with at least two views of each; null without
+    such queries.
 
     Parameters
     ----------
@@ -519,7 +516,7 @@ def diversity(
         "VDR": _translation([(o, d) for o, _, d in compared], poses),
     }
     covered = coverage(outcomes, database)
-    # queries whose views show no surface within FARTHEST cannot be compared
+    # Omit queries whose views show no surface within FARTHEST.
     both = [pair for pair in covered if pair is not None and pair[0] > 0]
     ranked_mean, diverse_mean = np.mean(both, axis=0).tolist() if both else (0.0, 0.0)
     return {
@@ -547,7 +544,7 @@ def coverage(
 ) -> list[tuple[int, int] | None]:
     """Return the numbers of voxels that the views of VR and VDR cover, for each query.
 
-    The result is None for queries with fewer than two views.
+    Queries with fewer than two views have None.
     """
 
     @lru_cache(256)
@@ -565,13 +562,12 @@ def coverage(
 
 
 def voxels(frame: AnyFrame) -> Voxels:
-    """Return the keys of the voxels that a frame observes, which are equal for all frames."""
+    """Return the keys of the voxels that a frame observes, in the grid of its parent frame."""
     points = points_of(frame, PIXELS, FARTHEST)
     if frame.pose is None:
         raise ValueError(f"{frame.name} has no pose. Pass frames with poses.")
     cells = np.floor(transform_points(frame.pose, points) / VOXEL).astype(np.int64)
-    # 21 bits per axis suffice for 20 km in each direction
-    half = 1 << 20
+    half = 1 << 20  # 21 bits per axis: 20 km in each direction
     x, y, z = (cells + half).T
     return np.unique((x << 42) | (y << 21) | z)
 
@@ -598,13 +594,14 @@ def _of_scene(outcome: QueryOutcome, of: str) -> list[ValidatedPair]:
 def _translation(
     rows: Sequence[tuple[QueryOutcome, list[ValidatedPair]]], poses: Sequence[Floats]
 ) -> dict[str, float | None]:
+    """Return mean and deviation of the distances between queries and views; see `diversity`."""
     if not rows:
         return {"mean_m": None, "std_m": None}
-    each = [
+    distances = [
         np.array([np.linalg.norm(poses[p.match][:3, 3] - o.pose[:3, 3]) for p in views])
         for o, views in rows
     ]
     return {
-        "mean_m": float(np.mean([d.mean() for d in each])),
-        "std_m": float(np.mean([d.std() for d in each])),
+        "mean_m": float(np.mean([d.mean() for d in distances])),
+        "std_m": float(np.mean([d.std() for d in distances])),
     }

@@ -33,34 +33,34 @@ _LIMITS = "within 5 cm / right"
 _HEAD = f"{'':24}" + "".join(f"{name + ' %':>16}" for name in BINS)
 
 
-def pair_table(found: dict[str, Any]) -> list[str]:
-    """Return the figures of `pair_figures` as lines of text."""
+def pair_table(report: dict[str, Any]) -> list[str]:
+    """Return the result of `pair_figures` as lines of text."""
     lines: list[str] = []
-    for scene, own in found.get("scenes", {}).items():
+    for scene, own in report.get("scenes", {}).items():
         lines += [f"{scene}, alone", *_bins(own), ""]
     if lines:
         lines.append("all scenes")
-    lines += [*_bins(found), ""]
-    if "baselines" in found:
-        lines += [*_baselines(found), ""]
-    lines += [*_negatives(found["negatives"]), "", *_statistics(found["roc"]), ""]
-    v = found["validation"]
+    lines += [*_bins(report), ""]
+    if "baselines" in report:
+        lines += [*_baselines(report), ""]
+    lines += [*_negatives(report["negatives"]), "", *_statistics(report["roc"]), ""]
+    v = report["validation"]
     lines.append(
         f"acceptance    precision {decimal(v['precision'])}, recall {decimal(v['recall'])}, where "
         f"overlap is 30 % {decimal(v['recall_overlap_30'])}; {v['accepted']} of {v['pairs']} pairs "
         f"accepted, {v['accepted_strong']} strong"
     )
-    s = found["support"]
+    s = report["support"]
     lines.append(
-        f"second pair   {s['supported']} accepted pairs have one that agrees: precision "
-        f"{decimal(s['precision'])}; {s['contradicted']} have only others that disagree: "
-        f"{decimal(s['precision_contradicted'])}; {s['alone']} have no other: "
+        f"second pair   {s['supported']} accepted pairs agree with a second pair: precision "
+        f"{decimal(s['precision'])}; {s['contradicted']} disagree with all others: "
+        f"{decimal(s['precision_contradicted'])}; {s['alone']} have no second pair: "
         f"{decimal(s['precision_alone'])}"
     )
-    kinds = [one["what"] for one in found["failures"]]
+    kinds = [failure["what"] for failure in report["failures"]]
     counts = [f"{kinds.count(kind)} {kind.replace('_', ' ')}" for kind in dict.fromkeys(kinds)]
     lines.append(f"failures      {', '.join(counts) or 'none'}")
-    times = found["milliseconds"]
+    times = report["milliseconds"]
     lines.append(
         f"milliseconds  prepare {decimal(times['prepare'], 1)}, validate "
         f"{decimal(times['validate'], 1)} (medians)"
@@ -71,14 +71,14 @@ def pair_table(found: dict[str, Any]) -> list[str]:
 def _bins(report: dict[str, Any]) -> list[str]:
     of = report["bins"]
     rows: list[tuple[str, Callable[[dict[str, Any]], str]]] = [
-        ("pairs", lambda one: str(one["pairs"])),
-        (_LIMITS, lambda one: _two(one["success"])),
-        ("  from the true pose", lambda one: _two(one["bound"])),
-        ("accepted", lambda one: str(one["validation"]["accepted"])),
-        ("  precision", lambda one: decimal(one["validation"]["precision"])),
-        ("  recall", lambda one: decimal(one["validation"]["recall"])),
-        ("with a second pair", lambda one: str(one["support"]["supported"])),
-        ("  precision", lambda one: decimal(one["support"]["precision"])),
+        ("pairs", lambda figures: str(figures["pairs"])),
+        (_LIMITS, lambda figures: _two(figures["success"])),
+        ("  from the true pose", lambda figures: _two(figures["bound"])),
+        ("accepted", lambda figures: str(figures["validation"]["accepted"])),
+        ("  precision", lambda figures: decimal(figures["validation"]["precision"])),
+        ("  recall", lambda figures: decimal(figures["validation"]["recall"])),
+        ("with a second pair", lambda figures: str(figures["support"]["supported"])),
+        ("  precision", lambda figures: decimal(figures["support"]["precision"])),
     ]
     lines = [_HEAD]
     for name, cell in rows:
@@ -87,7 +87,7 @@ def _bins(report: dict[str, Any]) -> list[str]:
     if "same_scene" in report:
         same = report["same_scene"]
         lines.append(
-            f"with {same['pairs']} pairs of it that see nothing of each other: precision "
+            f"including {same['pairs']} pairs of the scene without overlap: precision "
             f"{decimal(v['precision'])}, recall {decimal(v['recall'])}, where overlap is 30 % "
             f"{decimal(v['recall_overlap_30'])}"
         )
@@ -154,17 +154,17 @@ FALSE_RATES = (0.0, 0.01, 0.05)
 
 
 def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
-    """Return the evidence by which acceptance decides, without the stiffness."""
+    """Return the evidence for acceptance, with an unlimited stiffness."""
     e = Evidence(v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf)
     return e.total(p)
 
 
 def residual(v: PairValidation, p: AcceptanceParameters) -> float:
-    """Return the residual of the two directions, as a multiple of its limit."""
+    """Return the residual of the two search directions as a multiple of its limit."""
     return max(v.residual_m / p.residual_m, v.residual_rad / p.residual_rad)
 
 
-#: Statistics of a transform, whose higher values are evidence for it; None if unknown.
+#: Statistics of a transform that are higher for right transforms; None if unknown.
 STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | None]] = {
     "residual": lambda v, p: -residual(v, p),
     "overlap": lambda v, _: v.overlap,
@@ -179,17 +179,17 @@ STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | N
 def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str, Any]:
     """Return the receiver operating characteristic of each statistic as the only criterion.
 
-    A pair is right if its transform is right, whatever the decision. A pair without a transform or
-    the statistic has no evidence. For `ambiguity`, only pairs with a search for rivals count.
-    `curve` contains (false rate, true rate, threshold); thresholds of statistics whose small values
-    are evidence are negative.
+    A pair is right if its transform is right, accepted or not. A pair without a transform or
+    without the statistic has no evidence. For `ambiguity`, only pairs with a search for rivals
+    count. `curve` contains (false rate, true rate, threshold); thresholds of statistics that are
+    lower for right transforms are negated.
     """
     report = {}
     for name, statistic in STATISTICS.items():
         own = [pair for pair in pairs if name != "ambiguity" or _ambiguity_was_tested(pair)]
         values = [
-            statistic(one.validation, p) if one.validation.T_match_query is not None else None
-            for one in own
+            statistic(pair.validation, p) if pair.validation.T_match_query is not None else None
+            for pair in own
         ]
         right = np.array([pair.right for pair in own], bool)
         curve = roc(np.array([-math.inf if v is None else v for v in values], float), right)
@@ -240,26 +240,26 @@ def pair_figures(evaluation: PairEvaluation, settings: dict[str, Any]) -> dict[s
     seconds = second_pairs(evaluation)
     report["bins"] = bins(tried, seconds, limits)
     report["negatives"] = negatives(evaluation)
-    report["validation"] = validation_of([one.pair for one in tried])
+    report["validation"] = validation_of([trial.pair for trial in tried])
     report["support"] = support(tried, seconds)
 
     def within(scene: str) -> list[int]:
         return [
             i
-            for i, one in enumerate(tried)
-            if scene_of[one.drawn.query] == scene_of[one.drawn.match] == scene
+            for i, trial in enumerate(tried)
+            if scene_of[trial.drawn.query] == scene_of[trial.drawn.match] == scene
         ]
 
     if len(scenes) > 1:
         report["scenes"] = {
             scene: _of_scene(within(scene), tried, seconds, limits) for scene in scenes
         }
-    report["roc"] = curves([one.pair for one in tried], evaluation.acceptance)
+    report["roc"] = curves([trial.pair for trial in tried], evaluation.acceptance)
     report["milliseconds"] = {
         "prepare": evaluation.prepare_ms,
-        "validate": _median([one.pair.milliseconds for one in tried]),
+        "validate": _median([trial.pair.milliseconds for trial in tried]),
     }
-    if any(one.others is not None for one in tried):
+    if any(trial.others is not None for trial in tried):
         report["baselines"] = baselines(tried, limits)
     report["failures"] = failures(evaluation)
     cleaned: dict[str, Any] = without_infinities(report)
@@ -274,8 +274,8 @@ def _of_scene(
     pairs, theirs = [tried[i] for i in own], [seconds[i] for i in own]
     return {
         "bins": bins(pairs, theirs, limits),
-        "same_scene": rate([one for one in pairs if one.drawn.kind == "same_scene"]),
-        "validation": validation_of([one.pair for one in pairs]),
+        "same_scene": rate([trial for trial in pairs if trial.drawn.kind == "same_scene"]),
+        "validation": validation_of([trial.pair for trial in pairs]),
         "support": support(pairs, theirs),
     }
 
@@ -285,21 +285,21 @@ Second = Literal["supported", "contradicted", "alone"]
 
 
 def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
-    """Return the relation of each accepted pair to other pairs; None for other pairs.
+    """Return the relation of each accepted pair to other pairs; None for pairs not accepted.
 
-    An accepted pair implies a pose of its query by the reference pose of its match. A pair is
-    supported if another accepted pair of the same query, whose match has a different viewpoint,
-    implies a pose at the same place. It is contradicted if all other pairs imply poses at other
+    An accepted pair implies a pose of its query, given the reference pose of its match. A pair is
+    supported if another accepted pair of the same query, with a match from a different viewpoint,
+    implies a pose at the same place. It is contradicted if all such pairs imply poses at other
     places.
     """
     members, p = evaluation.members, evaluation.map
     of_query: dict[int, list[int]] = {}
     poses: dict[int, Floats] = {}
-    for i, one in enumerate(evaluation.tried):
-        T = one.pair.validation.T_match_query
-        if one.pair.accepted and T is not None:
-            of_query.setdefault(one.drawn.query, []).append(i)
-            poses[i] = members[one.drawn.match].pose @ T
+    for i, trial in enumerate(evaluation.tried):
+        T = trial.pair.validation.T_match_query
+        if trial.pair.accepted and T is not None:
+            of_query.setdefault(trial.drawn.query, []).append(i)
+            poses[i] = members[trial.drawn.match].pose @ T
     relations: list[Second | None] = [None] * len(evaluation.tried)
     for own in of_query.values():
         for i in own:
@@ -317,7 +317,7 @@ def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
 
 
 def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[str, Any]:
-    """Return the number of accepted pairs by relation to a second pair, and their precision."""
+    """Return the number and the precision of accepted pairs for each relation of Second."""
     report: dict[str, Any] = {}
     kinds: tuple[Second, ...] = get_args(Second)
     for kind in kinds:
@@ -331,15 +331,15 @@ def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[st
 def bins(
     tried: Sequence[Tried], seconds: Sequence[Second | None], limits: tuple[float, float]
 ) -> dict[str, dict[str, Any]]:
-    """Return the rates of right and of accepted transforms, by true overlap.
+    """Return the rates of right and of accepted transforms for each bin of true overlap.
 
-    `success`: shares of right transforms; `right` refers to the limits of the evaluation. `bound`:
-    the same for refinement from the reference pose. A pair without a transform is a failure.
+    `success`: shares of right transforms; `right` uses the limits of the evaluation. `bound`: the
+    same after refinement from the reference pose. A pair without a transform is a failure.
     `validation`: see `measures.validation`. `support`: see `support`.
     """
     report = {}
     for name in BINS:
-        chosen = [i for i, one in enumerate(tried) if one.drawn.bin == name]
+        chosen = [i for i, trial in enumerate(tried) if trial.drawn.bin == name]
         own = [tried[i].pair for i in chosen]
         report[name] = {
             "pairs": len(own),
@@ -352,6 +352,7 @@ def bins(
 
 
 def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
+    """Return the shares of errors within 5 cm and 5 deg, 10 cm and 10 deg, and `limits`."""
     figures = accuracy(errors)
     right = sum(e.within(*limits) for e in errors) / len(errors) if errors else None
     return {
@@ -364,30 +365,30 @@ def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
 def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
     """Return the rates of accepted pairs without overlap, and their upper bounds.
 
-    `planar`: pairs of two scenes with a planar frame. `by_scenes`: rates for each pair of scenes.
+    `cross_scene_planar`: pairs with a planar frame. `by_scenes`: rates for each pair of scenes.
     """
     tried, members = evaluation.tried, evaluation.members
-    same = [one for one in tried if one.drawn.kind == "same_scene"]
-    cross = [one for one in tried if one.drawn.kind == "cross_scene"]
+    same = [trial for trial in tried if trial.drawn.kind == "same_scene"]
+    cross = [trial for trial in tried if trial.drawn.kind == "cross_scene"]
     couples: dict[str, list[Tried]] = {}
-    for one in cross:
-        a, b = members[one.drawn.query].scene, members[one.drawn.match].scene
-        couples.setdefault(f"{a} | {b}", []).append(one)
+    for trial in cross:
+        a, b = members[trial.drawn.query].scene, members[trial.drawn.match].scene
+        couples.setdefault(f"{a} | {b}", []).append(trial)
     return {
         "same_scene": rate(same),
         "cross_scene": rate(cross),
-        "cross_scene_planar": rate([one for one in cross if one.drawn.planar]),
+        "cross_scene_planar": rate([trial for trial in cross if trial.drawn.planar]),
         "by_scenes": {name: rate(own) for name, own in couples.items()},
         "confidence": CONFIDENCE,
     }
 
 
 def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
-    """Return the rate of accepted pairs among wrong pairs; `upper` is the `upper_bound`."""
-    accepted = [one.pair for one in tried if one.pair.accepted]
+    """Return counts of accepted pairs without overlap; `upper` is the `upper_bound` of the rate."""
+    accepted = [trial.pair for trial in tried if trial.pair.accepted]
     return {
         "pairs": len(tried),
-        "planar": sum(one.drawn.planar for one in tried),
+        "planar": sum(trial.drawn.planar for trial in tried),
         "accepted": len(accepted),
         "accepted_strong": sum(pair.validation.strength == "strong" for pair in accepted),
         "upper": upper_bound(len(accepted), len(tried)),
@@ -397,25 +398,25 @@ def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
 def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
     """Return the success of the baselines by bin on the same pairs, and the ratio of times.
 
-    `start`: before refinement; `icp`: after their ICP; `ours`: after our refinement instead.
-    `time_ratio`: median over pairs of our time divided by theirs, including features.
+    `start`: before refinement; `icp`: after the baseline's ICP; `ours`: after our refinement
+    instead. `time_ratio`: median over pairs of our time divided by the baseline's, with features.
     """
-    beside = [one for one in tried if one.others is not None]
+    beside = [trial for trial in tried if trial.others is not None]
     report: dict[str, Any] = {"pairs": len(beside), "methods": {}}
-    report["milliseconds"] = _median([one.milliseconds for one in beside if one.milliseconds])
+    report["milliseconds"] = _median([trial.milliseconds for trial in beside if trial.milliseconds])
     for method in METHODS:
         by_bin = {}
         for name in BINS:
-            own = [(one.others or {}).get(method) for one in beside if one.drawn.bin == name]
+            own = [(trial.others or {}).get(method) for trial in beside if trial.drawn.bin == name]
             by_bin[name] = {
-                "start": _shares([one.start if one else Error() for one in own], limits),
-                "icp": _shares([one.icp if one else Error() for one in own], limits),
-                "ours": _shares([one.ours if one else Error() for one in own], limits),
+                "start": _shares([trial.start if trial else Error() for trial in own], limits),
+                "icp": _shares([trial.icp if trial else Error() for trial in own], limits),
+                "ours": _shares([trial.ours if trial else Error() for trial in own], limits),
             }
         both = [
-            (one.milliseconds, one.others[method].milliseconds)
-            for one in beside
-            if one.milliseconds and one.others and method in one.others
+            (trial.milliseconds, trial.others[method].milliseconds)
+            for trial in beside
+            if trial.milliseconds and trial.others and method in trial.others
         ]
         report["methods"][method] = {
             "bins": by_bin,
@@ -425,43 +426,43 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
     return report
 
 
-def why(one: Tried) -> str | None:
+def why(trial: Tried) -> str | None:
     """Return the kind of failure of a pair; None without a failure.
 
-    `wrongly_accepted`; `not_believed`: a right transform that is not accepted; `near`: an error of
-    up to twice the limits, not accepted; `not_found`: a larger error or no transform, although the
-    frames overlap.
+    `wrongly_accepted`: a wrong transform that is accepted. Not accepted: `not_believed`, a right
+    transform; `near`, an error of up to twice the limits; `not_found`, a larger error or no
+    transform although the frames overlap.
     """
-    pair = one.pair
+    pair = trial.pair
     if pair.accepted:
         return None if pair.right else "wrongly_accepted"
     if pair.right:
         return "not_believed"
-    if one.drawn.kind != "overlapping":
+    if trial.drawn.kind != "overlapping":
         return None
     metres, degrees = pair.limits
     return "near" if pair.error.within(2 * metres, 2 * degrees) else "not_found"
 
 
 def failures(evaluation: PairEvaluation) -> list[dict[str, Any]]:
-    """Return all failed pairs with their validations, the worst kind first."""
+    """Return all failed pairs with their validations, worst kind first."""
     order = ("wrongly_accepted", "not_believed", "near", "not_found")
-    listed = [(why(one), number, one) for number, one in enumerate(evaluation.tried)]
-    wrong = [(kind, number, one) for kind, number, one in listed if kind is not None]
+    listed = [(why(trial), number, trial) for number, trial in enumerate(evaluation.tried)]
+    wrong = [(kind, number, trial) for kind, number, trial in listed if kind is not None]
     wrong.sort(key=lambda entry: (order.index(entry[0]), entry[1]))
     return [
         {
             "number": number,
             "what": kind,
-            "query": evaluation.members[one.drawn.query].name,
-            "match": evaluation.members[one.drawn.match].name,
-            "kind": one.drawn.kind,
-            "planar": one.drawn.planar,
-            "true_overlap": one.drawn.overlap_least,
-            **_pair_record(one.pair, evaluation.acceptance),
-            "bound": None if one.pair.bound is None else error_figures(one.pair.bound),
+            "query": evaluation.members[trial.drawn.query].name,
+            "match": evaluation.members[trial.drawn.match].name,
+            "kind": trial.drawn.kind,
+            "planar": trial.drawn.planar,
+            "true_overlap": trial.drawn.overlap_least,
+            **_pair_record(trial.pair, evaluation.acceptance),
+            "bound": None if trial.pair.bound is None else error_figures(trial.pair.bound),
         }
-        for kind, number, one in wrong
+        for kind, number, trial in wrong
     ]
 
 

@@ -1,4 +1,4 @@
-"""Evaluation of pairs of frames: samples, registration, by Open3D too, and errors.
+"""Evaluation of pairs of frames: sampling, validation, baselines of Open3D, and errors.
 
 PATH...  --evaluate_pairs-->  PairEvaluation
 """
@@ -64,7 +64,7 @@ EDGES = (0.1, 0.3, 0.5, 0.7, 1.0)
 BINS = tuple(f"{round(100 * low)}-{round(100 * high)}" for low, high in pairwise(EDGES))
 #: Maximum overlap (mean of both directions) of two frames of a scene that count as negatives.
 NOTHING = 0.01
-#: Share of planar pairs in the sample of pairs of two scenes.
+#: Minimum share of pairs with a planar frame in the sample of pairs of two scenes.
 PLANAR_SHARE = 0.25
 
 Kind = Literal["overlapping", "same_scene", "cross_scene"]
@@ -130,8 +130,8 @@ def draw(
 ) -> list[Drawn]:
     """Return a sample of pairs of all bins and of both kinds of negatives.
 
-    Each pair occurs once, and its later frame is the query. All pairs of scenes have equal numbers
-    of pairs, a quarter of which have a planar frame. Samples are smaller if fewer pairs exist.
+    Each pair occurs once, with its later frame as the query. All couples of scenes have equally
+    many pairs, a quarter of which have a planar frame. Samples are smaller if fewer pairs exist.
 
     Parameters
     ----------
@@ -164,7 +164,7 @@ def _of_one_scene(
     near = (runs[later] == runs[earlier]) & (np.abs(numbers[later] - numbers[earlier]) < p.apart)
     later, earlier = later[~near], earlier[~near]
     least, mean = truth.least[later, earlier], truth.mean[later, earlier]
-    found = []
+    pairs = []
     choices: list[tuple[Kind, str | None, NDArray[np.bool_]]] = [
         ("overlapping", name, inside(least, name)) for name in BINS
     ]
@@ -174,8 +174,8 @@ def _of_one_scene(
         for k in _some(np.flatnonzero(good), p.pairs, rng):
             i, j = int(later[k]), int(earlier[k])
             flat = bool(planar[i] or planar[j])
-            found.append(Drawn(i, j, kind, name, float(mean[k]), float(least[k]), flat))
-    return found
+            pairs.append(Drawn(i, j, kind, name, float(mean[k]), float(least[k]), flat))
+    return pairs
 
 
 def inside(least: Floats, name: str) -> NDArray[np.bool_]:
@@ -199,13 +199,13 @@ def _of_two_scenes(
 
 
 def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return a random sample of at most n numbers without duplicates, in ascending order."""
+    """Return at most n different random members of `of`, in ascending order."""
     return np.sort(rng.choice(of, min(n, len(of)), replace=False))
 
 
-# Registration by Open3D: FPFH with RANSAC or FGR, then ICP. Each method has one standard
-# configuration, which is not tuned, and works in one direction. It always returns a transform,
-# without a decision on acceptance. Times include the features of both frames.
+# Registration by Open3D: FPFH with RANSAC or FGR, then ICP. Each method has a standard
+# configuration without tuning, works in one direction, and always returns a transform without a
+# decision on acceptance. Times include the features of both frames.
 
 T = TypeVar("T")
 
@@ -215,20 +215,20 @@ VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
 #: hypothesis, minimum ratio of edge lengths, maximum number of hypotheses, and confidence.
 CORRESPONDENCE, POINTS, BASELINE_EDGES = 0.075, 3, 0.9
 HYPOTHESES, CONFIDENCE = 100_000, 0.999
-#: Parameter of FGR: maximum distance of a correspondence, half a voxel as in its authors' example,
-#: metres.
+#: Parameter of FGR: maximum distance of a correspondence, metres; half a voxel as in the example of
+#: its authors.
 FGR_CORRESPONDENCE = 0.025
 #: Parameters of point-to-plane ICP: voxel of both clouds, and maximum distance of a correspondence,
 #: metres.
 ICP_VOXEL, ICP_CORRESPONDENCE = 0.02, 0.05
 #: The methods in the order of the tables.
 METHODS = ("FPFH + RANSAC", "FPFH + FGR")
-#: Minimum number of points of a thinned cloud that is registered.
+#: Minimum number of points of a cloud after downsampling.
 _FEWEST = 10
 
 
 class Clock:
-    """A clock of milliseconds by stage."""
+    """Stopwatch with the milliseconds of each stage."""
 
     def __init__(self) -> None:
         self.stages: dict[str, float] = {}
@@ -258,7 +258,7 @@ class Attempt:
 
     @property
     def milliseconds(self) -> float:
-        """Return the total of all stages."""
+        """Total time of all stages."""
         return sum(self.stages.values())
 
 
@@ -271,14 +271,14 @@ def register(
     query: Floats, match: Floats, o3d: Any, methods: Sequence[str] = METHODS, *, seed: int = 0,
     scale: float = 1.0,
 ) -> dict[str, Attempt]:  # fmt: skip
-    """Register a pair of clouds by each method; return {} if one of them is almost empty.
+    """Register two clouds by each method; return {} if a cloud has too few points.
 
-    Features are computed once, but count for each method.
+    Features are computed once; their time counts for each method.
 
     Parameters
     ----------
     query, match : (N, 3) metres
-    o3d : result of `open3d`
+    o3d : module of Open3D
     methods : members of METHODS
     scale : factor of all lengths; 1 for rooms
     """
@@ -316,7 +316,7 @@ def register(
         return o3r.registration_fgr_based_on_feature_matching(*thin, *features, option)
 
     def icp(start: Floats) -> Any:
-        # ICP uses finer clouds and other normals than the features
+        # ICP uses finer clouds than the features, with their own normals.
         fine = [c.voxel_down_sample(scale * ICP_VOXEL) for c in clouds]
         fine[1].estimate_normals(search(*NORMALS))
         return o3r.registration_icp(
@@ -372,7 +372,7 @@ class Tried:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The data and parameters with which a process evaluates pairs.
+    """Data and parameters for evaluating pairs.
 
     Parameters
     ----------
@@ -392,14 +392,14 @@ def open_bench(
     store: FrameStore, model: Model, mode: Mode, seed: int, limits: tuple[float, float], *,
     baselines: bool, matching: Matching = "histograms",
 ) -> Bench:  # fmt: skip
-    """Return a bench for pairs of the frames of a store."""
+    """Return a Bench for pairs of frames of a store; raise MissingDependency without Open3D."""
     o3d = open3d("A baseline of registration") if baselines else None
     judging = open_judge(store, mode, seed, model.parameters.validation, matching)
     return Bench(judging, store, model, limits, o3d)
 
 
 def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried:
-    """Validate a pair; if the frames overlap, compute the bound and run the baselines too."""
+    """Validate a pair; if its frames overlap, also compute the bound and run the baselines."""
     drawn, query, match = task
     candidate = Candidate.of(match, drawn.match, drawn.overlap_mean, drawn.overlap_least)
     query_task = QueryTask(query.number, query.scene, query.pose, [], [], (candidate,))
@@ -418,32 +418,32 @@ def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried
 def _others(
     bench: Bench, query: AnyFrame, match: AnyFrame, true: Floats
 ) -> tuple[dict[str, Other], float]:
-    """Return the results of the baselines, and the time for our geometry of both frames."""
+    """Return the errors of the baselines, and the time for our geometry of both frames, ms."""
     p = bench.model.parameters
     start = time.perf_counter()
     ours, its = (geometry_of(see(frame, p), bench.model) for frame in (query, match))
     spent = 1e3 * (time.perf_counter() - start)
-    found = register(
+    attempts = register(
         peer_points(query, bench.model), peer_points(match, bench.model), bench.o3d,
         seed=bench.judging.seed, scale=scale_of(p),
     )  # fmt: skip
     others = {}
-    for name, one in found.items():
-        refined = refined_by_us(ours, its, one.start, bench.judging.p.alignment)
+    for name, result in attempts.items():
+        refined = refined_by_us(ours, its, result.start, bench.judging.p.alignment)
         others[name] = Other(
-            _error(one.start, true), _error(one.refined, true), _error(refined, true),
-            one.milliseconds,
+            _error(result.start, true), _error(result.refined, true), _error(refined, true),
+            result.milliseconds,
         )  # fmt: skip
     return others, spent
 
 
 def scale_of(p: ModelParameters) -> float:
-    """Return the ratio of a model's radius to the radius for rooms."""
+    """Return the ratio of a model's neighbourhood radius to the radius for rooms."""
     return p.properties.radius / PropertyParameters().radius
 
 
 def peer_points(frame: AnyFrame, model: Model) -> Floats:
-    """Return the points for baselines: all points, or those of a depth image within the range."""
+    """Return the points (N, 3) of a cloud, or the points of a depth image within the range."""
     if isinstance(frame, Cloud):
         return frame.points.astype(np.float64)
     p = model.parameters.depth
@@ -453,7 +453,7 @@ def peer_points(frame: AnyFrame, model: Model) -> Floats:
 def refined_by_us(
     query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
 ) -> Floats | None:
-    """Return our refinement of a baseline's transform, which starts with wide gates."""
+    """Refine a baseline's transform by our method with coarse, then fine gates; None on failure."""
     coarse = refine_all(query.surface, match.surface, T[None], p.coarse)
     return refine_transform(query, match, coarse[0] if len(coarse) else T, p.fine)
 
@@ -497,7 +497,7 @@ class PairEvaluation:
     members : N usable frames, without their signatures
     limits : maximum error of a right transform, metres and degrees
     acceptance, map : parameters of the model
-    planes : (N,) share of each frame's samples in its largest plane
+    planes : (N,) shares of the frames' samples in their largest planes
     tried : results in the order of the sample
     left_out : (name, reason) of unusable frames
     prepare_ms : median time to sign a frame and compute its geometry, milliseconds
@@ -530,10 +530,9 @@ def evaluate_pairs(
     baselines need Open3D, which cannot be imported.
     """
     if settings.baselines:
-        # detect a missing library before frames are read
-        open3d("A baseline of registration")
+        open3d("A baseline of registration")  # detects a missing library before frames are read
     placed = spread(every_frame(paths), settings.frames)
-    chosen = tuple(one for one, _ in placed)
+    chosen = tuple(frame for frame, _ in placed)
     prepared = prepare_all(
         chosen, signer, store, jobs=settings.jobs, cache_dir=settings.cache_dir, watch=watch,
     )  # fmt: skip
@@ -549,11 +548,11 @@ def evaluate_pairs(
     drawn = draw(places, truth, planes >= PLANAR, settings.drawing)
     if not drawn:
         raise DatasetError(
-            f"The {len(members)} frames contain no pairs at least {settings.drawing.apart} frames "
-            "apart that overlap either by a tenth or more, or not at all. Specify more recordings "
+            f"No two of the {len(members)} frames are at least {settings.drawing.apart} frames "
+            "apart and overlap either by a tenth or more, or not at all. Specify more recordings "
             "or a smaller --apart."
         )
-    tasks = [(one, members[one.query], members[one.match]) for one in drawn]
+    tasks = [(pair, members[pair.query], members[pair.match]) for pair in drawn]
     opening = partial(
         open_bench, store, signer.model, settings.mode, settings.seed, settings.limits,
         baselines=settings.baselines, matching=settings.matching,
@@ -570,11 +569,11 @@ def spread(chosen: Sequence[ProtocolFrame], most: int) -> list[tuple[ProtocolFra
     """Return at most `most` evenly spaced frames of each scene, and their origins."""
     counts: Counter[tuple[str, str]] = Counter()
     of: dict[str, list[tuple[ProtocolFrame, FrameOrigin]]] = {}
-    for one in chosen:
-        run = str(one.reference.path.parent)
-        place = FrameOrigin(one.scene, run, counts[one.scene, run])
-        counts[one.scene, run] += 1
-        of.setdefault(one.scene, []).append((one, place))
+    for frame in chosen:
+        run = str(frame.reference.path.parent)
+        place = FrameOrigin(frame.scene, run, counts[frame.scene, run])
+        counts[frame.scene, run] += 1
+        of.setdefault(frame.scene, []).append((frame, place))
     return [
         own[i]
         for own in of.values()
@@ -594,6 +593,7 @@ def _too_few(prepared: Prepared) -> str:
 
 
 def _plane_share(opened: tuple[FrameStore, float], member: SignedFrame) -> float:
+    """Return the `plane_share` of a stored frame, with the maximum distance from the plane."""
     store, off = opened
     return plane_share(view_of(store.frame(member)).samples, off)
 
@@ -609,7 +609,7 @@ def _overlaps(members: Sequence[SignedFrame], store: FrameStore, watch: Watch) -
     for scene in dict.fromkeys(member.scene for member in members):
         own = [i for i, member in enumerate(members) if member.scene == scene]
         of_scene = [members[i] for i in own]
-        found = overlaps_of(Prepared(of_scene, of_scene, [], None), store, watch)
+        overlaps = overlaps_of(Prepared(of_scene, of_scene, [], None), store, watch)
         at = np.ix_(own, own)
-        mean[at], least[at] = found.mean, found.least
+        mean[at], least[at] = overlaps.mean, overlaps.least
     return Overlaps(mean, least)

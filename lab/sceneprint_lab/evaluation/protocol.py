@@ -1,4 +1,4 @@
-"""The frames of an evaluation: selection, signatures, stored data, and overlaps.
+"""Frames of an evaluation: selection, signatures, storage, and overlaps.
 
 Protocol  --prepare_all-->  Prepared; depth and geometry in a FrameStore
 """
@@ -59,9 +59,9 @@ VIEWS = 5
 #: Maximum error of a right transform between frames of rooms, metres and degrees.
 RIGHT = (0.10, 10.0)
 #: Maximum rotational error of a pose at the right place, degrees. The maximum translational error
-#: is the model's distance between places.
+#: is the parameter `place_m` of the model.
 PLACE_DEG = 10.0
-#: Errors above which an answer is another place, metres and degrees.
+#: Errors above which an answer is grossly wrong, metres and degrees.
 GROSS = (0.50, 15.0)
 
 
@@ -92,7 +92,7 @@ class Error:
     radians: float = math.inf
 
     def within(self, metres: float, degrees: float) -> bool:
-        """Return whether both parts are within limits."""
+        """Return whether translation and rotation are within limits."""
         return self.metres <= metres and self.radians <= math.radians(degrees)
 
 
@@ -125,12 +125,12 @@ class ValidatedPair:
 
     @property
     def accepted(self) -> bool:
-        """Return whether the match was accepted, strong or weak."""
+        """Whether the match was accepted, strong or weak."""
         return self.validation.status == "accepted"
 
     @property
     def right(self) -> bool:
-        """Return whether the transform is right within `limits`, accepted or not."""
+        """Whether the error is within `limits`, accepted or not."""
         return self.error.within(*self.limits)
 
 
@@ -159,9 +159,9 @@ class JudgedAnswer:
     status : "found", "ambiguous" or "not_found"
     strength : "strong" or "weak"; None unless found
     error : error of the pose in the map; infinite without a pose or in another parent frame
-    milliseconds : time of the answer, after R
-    places : candidate places, the most likely first
-    limits : maximum error of a right pose, metres and degrees; by default that of a depth camera
+    milliseconds : time of the answer without the ranking
+    places : candidate places, most likely first
+    limits : maximum error of a right pose, metres and degrees; default: for a depth camera
     """
 
     status: LocalizationStatus = "not_found"
@@ -173,12 +173,12 @@ class JudgedAnswer:
 
     @property
     def right(self) -> bool:
-        """Return whether the pose is found within `limits`."""
+        """Whether the status is `found` and the error is within `limits`."""
         return self.status == "found" and self.error.within(*self.limits)
 
     @property
     def grossly_wrong(self) -> bool:
-        """Return whether the pose is found, but the error exceeds GROSS, scaled as `limits`."""
+        """Whether the status is `found`, but the error exceeds GROSS, scaled like `limits`."""
         gross = [g * limit / r for g, limit, r in zip(GROSS, self.limits, RIGHT, strict=True)]
         return self.status == "found" and not self.error.within(*gross)
 
@@ -191,8 +191,8 @@ class QueryOutcome:
     ----------
     name, scene, pose : name, scene and pose of the query
     allowed : (A,) ascending indices of the database frames that the query may find
-    present : whether one of them is in the query's scene
-    overlap_mean, overlap_least : (A,) overlaps with these frames; see Overlaps
+    present : whether an allowed frame is in the query's scene
+    overlap_mean, overlap_least : (A,) overlaps with the allowed frames; see Overlaps
     ranking : R, indices of database frames, nearest first
     distances : (|R|,) distances of R; see `cross_distances`
     selection : C, in the order of R
@@ -223,11 +223,11 @@ class QueryOutcome:
     answer: JudgedAnswer = JudgedAnswer()
 
     def overlap_of(self, match: int) -> float:
-        """Return the overlap with a database frame, by the definition of retrieval."""
+        """Return the overlap (`Overlaps.mean`) with an allowed database frame."""
         return float(self.overlap_mean[np.searchsorted(self.allowed, match)])
 
     def views(self, of: str) -> list[ValidatedPair]:
-        """Return the pairs of a row of the table in its order.
+        """Return the pairs of a row of the table, in the order of the row.
 
         `of`: "R" and "DR" for all pairs in the order of R; "VR" and "VDR" for accepted pairs,
         strong before weak.
@@ -256,19 +256,19 @@ def pose_error(T: Floats, truth: Floats) -> Error:
 #
 # Frame or Cloud  --view_of-->  AnyView        queries, database  --overlaps-->  Overlaps
 
-#: Spacing of the samples that are looked up in the other frame, pixels.
+#: Spacing of the samples that are compared with the other frame, pixels.
 GRID = 20
-#: Tolerance of depths for retrieval, metres plus a share of the depth.
+#: Tolerance of depths for `Overlaps.mean`, metres plus a share of the depth.
 TOLERANCE, RELATIVE_TOLERANCE = 0.05, 0.03
-#: Tolerance of depths for pairs, metres, by which they are sorted into bins.
+#: Tolerance of depths for `Overlaps.least`, metres.
 PAIR_TOLERANCE = 0.10
-#: Maximum numbers of points of a cloud that are looked up, and among which points are looked up.
+#: Maximum number of samples of a cloud, and of points with which samples are compared.
 SAMPLES, POINTS = 2_000, 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class OverlapView:
-    """The data of a depth image from which overlaps are computed.
+    """A depth image in the form in which overlaps are computed.
 
     Parameters
     ----------
@@ -285,12 +285,12 @@ class OverlapView:
 
 @dataclass(frozen=True, eq=False)
 class CloudView:
-    """The data of a cloud from which overlaps are computed.
+    """A cloud in the form in which overlaps are computed.
 
     Parameters
     ----------
-    samples : (N, 3) points that are looked up, in the parent frame, metres
-    points : (M, 3) points among which points are looked up, in the parent frame, metres
+    samples : (N, 3) points to compare with the other frame, in the parent frame, metres
+    points : tree of the points (M, 3) with which samples are compared, in the parent frame, metres
     viewpoint : (3,) viewpoint in the parent frame; None without a viewpoint
     """
 
@@ -310,10 +310,10 @@ class Overlaps:
     ----------
     mean : (Q, N) for retrieval: share of samples that the other frame sees within 5 cm + 3 % of the
         depth, averaged over both directions
-    least : (Q, N) for pairs: the same share within 10 cm, in the smaller direction
+    least : (Q, N) for pairs: the same share within 10 cm, in the direction with the smaller share
 
-    A cloud sees a sample if one of its points is within the tolerance, which is 10 cm + 3 % of the
-    range for retrieval, because the distance between points grows with range.
+    A cloud sees a sample if one of its points is within the tolerance. For clouds, both tolerances
+    include 3 % of the range, because the distance between points grows with range.
     """
 
     mean: Floats
@@ -328,7 +328,7 @@ def points_at(frame: DepthFrame, y: NDArray[np.intp], x: NDArray[np.intp]) -> Fl
 
 
 def view_of(frame: AnyFrame) -> AnyView:
-    """Return the data of a frame from which overlaps are computed."""
+    """Return a frame in the form for computing overlaps; raise ValueError without a pose."""
     if frame.pose is None:
         raise ValueError(f"{frame.name} has no pose. Pass frames with poses.")
     if isinstance(frame, Cloud):
@@ -352,7 +352,7 @@ def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
 
 @kernel
 def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int, int]:
-    """Return the numbers of points that a depth image sees, by both tolerances."""
+    """Return the numbers of points (N, 3) that a depth image sees, for both tolerances."""
     height, width = depth.shape
     loose = strict = 0
     for i in range(len(points)):
@@ -372,7 +372,7 @@ def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int
 
 
 def _near(points: Floats, cloud: CloudView) -> tuple[int, int]:
-    """Return the numbers of points that a cloud sees, by both tolerances."""
+    """Return the numbers of points (N, 3) that a cloud sees, for both tolerances."""
     wide = np.zeros(len(points))
     if cloud.viewpoint is not None:
         wide = RELATIVE_TOLERANCE * np.linalg.norm(points - cloud.viewpoint, axis=1)
@@ -381,6 +381,7 @@ def _near(points: Floats, cloud: CloudView) -> tuple[int, int]:
 
 
 def _shares(points: Floats, view: AnyView) -> tuple[float, float]:
+    """Return the shares of points (N, 3) that a frame sees, for both tolerances."""
     if not len(points):
         return 0.0, 0.0
     if isinstance(view, CloudView):
@@ -405,16 +406,17 @@ def overlaps(queries: Sequence[AnyView], database: Sequence[AnyView]) -> Overlap
     return Overlaps(shares[..., 0], shares[..., 1])
 
 
-# The distance that a sensor travelled between two frames of a run.
+# The path of a sensor between two frames of a run.
 #
-# Member, ...  --travelled-->  metres of travel between each query and each database frame
+# SignedFrame, ...  --travelled-->  length of the path between each query and each database frame
 
 
 def travelled(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -> Floats:
     """Return the length of the path from each database frame to each query.
 
-    The path consists of straight lines between the frames of the evaluation, so it is slightly too
-    short if they are sparse.
+    The path consists of straight lines between the frames of the evaluation, so it is too short if
+    the frames are sparse. Frames of one run have the same name up to the last slash, and the order
+    of their names is the order of time.
 
     Returns
     -------
@@ -435,7 +437,7 @@ def _run(member: SignedFrame) -> str:
 
 
 def _runs(members: Sequence[SignedFrame]) -> list[dict[str, float]]:
-    """Return, for each run, the path length from the first frame to each frame, metres."""
+    """Return, for each run, the path length from its first frame by name of frame, metres."""
     runs: dict[str, dict[str, SignedFrame]] = {}
     for member in members:
         runs.setdefault(_run(member), {})[member.name] = member
@@ -448,7 +450,7 @@ def _runs(members: Sequence[SignedFrame]) -> list[dict[str, float]]:
     return placed
 
 
-# A map over tasks in one or several processes, with equal results.
+# Computations in one or several processes, with equal results.
 #
 # tasks  --map_over-->  results, in order
 
@@ -458,7 +460,7 @@ R = TypeVar("R")
 
 
 class Watch(Protocol):
-    """A callback for progress, which iterates over the items of a stage."""
+    """Protocol of a function that shows progress during an iteration."""
 
     def __call__(self, items: Iterable[T], stage: str, total: int) -> Iterable[T]:
         """Return an iterable of the items that shows progress."""
@@ -473,10 +475,10 @@ def unwatched(items: Iterable[T], stage: str, total: int) -> Iterable[T]:  # noq
 def map_over(
     tasks: Sequence[T], do: Callable[[S, T], R], opening: Callable[[], S], jobs: int,
 ) -> Iterator[R]:  # fmt: skip
-    """Call `do` for all tasks with the result of `opening`, which each process calls once.
+    """Yield `do(opened, task)` for all tasks; each process computes `opened = opening()` once.
 
-    Libraries are limited to one thread per process, so that the order of sums is fixed and
-    processes do not compete.
+    Libraries use one thread per process, so that the order of sums is fixed and processes do not
+    compete.
 
     Parameters
     ----------
@@ -533,7 +535,7 @@ _OWN_RANGES = re.compile(r"(.+)@((?:db|queries)=[^@]*)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Range:
-    """The frames start, start + step, ... before stop; None means first, last and default."""
+    """Frames start, start + step, ... before stop; None: from the first, to the last, default."""
 
     start: int | None
     stop: int | None
@@ -567,7 +569,7 @@ class ProtocolFrame:
     ----------
     name : name, unique in the protocol
     scene : parent frame; poses of one scene are comparable
-    use : database, query, or both, in which case the distance travelled limits the allowed matches
+    use : database, query, or both, for evaluations that exclude frames by distance of travel
     reference : location of the frame
     """
 
@@ -577,7 +579,7 @@ class ProtocolFrame:
     reference: FrameReference
 
     def is_for(self, use: Use) -> bool:
-        """Return whether the frame has a use."""
+        """Return whether the frame is a query or a database frame, as `use` specifies."""
         return self.use in (use, "both")
 
 
@@ -601,8 +603,8 @@ def parse_ranges(text: str) -> Ranges:
     Raise DatasetError if the text does not consist of ranges, a range is empty, or its step is 0.
     """
     ranges = []
-    for one in text.split("+"):
-        match = _RANGE.fullmatch(one.strip())
+    for part in text.split("+"):
+        match = _RANGE.fullmatch(part.strip())
         if match is None:
             raise DatasetError(
                 f"{text!r} is not a range of frames. Write START:STOP or START:STOP:STEP, such as "
@@ -618,7 +620,7 @@ def parse_ranges(text: str) -> Ranges:
 
 
 def parse_part(text: str) -> PathRanges:
-    """Parse PATH, or PATH@db=RANGES,queries=RANGES, in which one of the two is optional.
+    """Parse PATH, PATH@db=RANGES, PATH@queries=RANGES or PATH@db=RANGES,queries=RANGES.
 
     Raise DatasetError if the part after the @ does not have this form.
     """
@@ -626,11 +628,11 @@ def parse_part(text: str) -> PathRanges:
     if match is None:
         return PathRanges(Path(text))
     own: dict[str, Ranges] = {}
-    for one in match[2].split(","):
-        key, _, ranges = one.partition("=")
+    for part in match[2].split(","):
+        key, _, ranges = part.partition("=")
         if key not in ("db", "queries") or key in own:
             raise DatasetError(
-                f"{text}: {one!r} is invalid. Write PATH@db=0:600:2,queries=650:1000:2."
+                f"{text}: {part!r} is invalid. Write PATH@db=0:600:2,queries=650:1000:2."
             )
         own[key] = parse_ranges(ranges)
     return PathRanges(Path(match[1]), own.get("db"), own.get("queries"))
@@ -653,7 +655,7 @@ def choose(
     distractors : paths whose frames all belong to the database
     database, queries : ranges for paths without ranges
     database_step, query_step : steps for ranges without a step
-    shared : whether frames may have both uses, which frames of paths without ranges then have
+    shared : whether frames may have both uses; frames of paths without ranges then have both
     find : function that returns the sequences of a path; it is called once per path
 
     Raise DatasetError if the use of a path's frames is unspecified, a range lies outside its path,
@@ -709,7 +711,7 @@ def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
 
 
 class _Gathered:
-    """The selected frames, by file."""
+    """Collection of the selected frames by file."""
 
     def __init__(
         self, *, shared: bool = False,
@@ -722,6 +724,7 @@ class _Gathered:
         self._places: dict[str, Path] = {}
 
     def add_split(self, path: Path, database_step: int, query_step: int) -> None:
+        """Add the frames of a path by split files; raise DatasetError if there are none."""
         sequences = self._find(path)
         if not any(s.split for s in sequences):
             raise DatasetError(
@@ -737,16 +740,18 @@ class _Gathered:
             self._add(path, test[::query_step], "query")
 
     def add_ranges(self, path: Path, ranges: Iterable[Range], use: Use, step: int) -> None:
+        """Add the frames of a path in ranges; raise DatasetError if a range lies outside."""
         every = [(s, f) for s in self._find(path) for f in s.frames]
-        for one in ranges:
-            if (one.start or 0) >= len(every) or (one.stop or 0) > len(every):
+        for part in ranges:
+            if (part.start or 0) >= len(every) or (part.stop or 0) > len(every):
                 raise DatasetError(
-                    f"{path}: the range {one} lies outside the {len(every)} frames. Select a range "
-                    f"within 0:{len(every)}."
+                    f"{path}: the range {part} lies outside the {len(every)} frames. Select a "
+                    f"range within 0:{len(every)}."
                 )
-            self._add(path, every[one.start : one.stop : one.step or step], use)
+            self._add(path, every[part.start : part.stop : part.step or step], use)
 
     def _add(self, path: Path, new: list[tuple[Run, FrameReference]], use: Use) -> None:
+        """Add frames; raise DatasetError for duplicates of frames or of names."""
         for run, reference in new:
             scene, file, place = run.parent_frame, reference.path.resolve(), run.place
             if self._places.setdefault(scene, place.resolve()) != place.resolve():
@@ -754,14 +759,14 @@ class _Gathered:
                     f"{path}: another scene, {self._places[scene]}, also has the name {scene}. "
                     "Rename one of the folders."
                 )
-            known = self.frames.get(file)
-            if known is not None and self._shared and known.use != use:
-                self.frames[file] = replace(known, use="both")
+            earlier = self.frames.get(file)
+            if earlier is not None and self._shared and earlier.use != use:
+                self.frames[file] = replace(earlier, use="both")
                 continue
-            if known is not None:
+            if earlier is not None:
                 raise DatasetError(
-                    f"{path}: {reference.name} is selected twice, as {known.use} and as {use}, but "
-                    "a query must not find itself. Specify ranges that do not overlap."
+                    f"{path}: {reference.name} is selected twice, as {earlier.use} and as {use}, "
+                    "but a query must not find itself. Specify ranges that do not overlap."
                 )
             own = reference.name.startswith(f"{scene}/")
             name = reference.name if own else f"{scene}/{reference.name}"
@@ -773,15 +778,15 @@ class _Gathered:
 
 @dataclass(frozen=True)
 class FrameStore:
-    """A folder with depth and geometry of frames by number, which would exceed the memory.
+    """A folder with depth and geometry of frames by number; they would exceed the memory.
 
-    `folder`: folder of the files, which the caller removes.
+    `folder`: folder of the files; the caller removes it.
     """
 
     folder: Path
 
     def keep(self, number: int, frame: AnyFrame, geometry: Geometry) -> None:
-        """Store a frame."""
+        """Store the depth or the points of a frame, and its geometry."""
         (self.folder / f"{number}.geometry").write_bytes(write_geometry(geometry))
         if isinstance(frame, Cloud):
             seen = "seen" if frame.has_viewpoint else "fused"
@@ -803,13 +808,13 @@ class FrameStore:
         return DepthFrame(depth, camera, member.name, member.pose)
 
     def geometry(self, number: int) -> Geometry:
-        """Read the geometry of a frame as a service does."""
+        """Read the geometry of a frame by its number."""
         return read_geometry((self.folder / f"{number}.geometry").read_bytes())
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """The usable frames, and the reasons why others are unusable.
+    """Signed frames of an evaluation, and the reasons why other frames are unusable.
 
     Parameters
     ----------
@@ -851,8 +856,8 @@ def prepare_all(
 ) -> Prepared:  # fmt: skip
     """Read, sign and store all frames.
 
-    Frames without a pose are omitted, because their errors are unknown, except database frames of
-    scenes without queries, which are always wrong.
+    Frames without a pose are omitted because their errors are unknown, except database frames of
+    scenes without queries, which are wrong for any query.
 
     Parameters
     ----------
@@ -864,20 +869,20 @@ def prepare_all(
     cache_dir : folder of derived files of the model
     watch : callback for progress
     """
-    scenes = {one.scene for one in chosen if one.is_for("query")}
+    scenes = {frame.scene for frame in chosen if frame.is_for("query")}
     length = signer.model.level_length * levels if levels else None
-    tasks = [_Task(i, one, one.scene in scenes, length) for i, one in enumerate(chosen)]
-    # other processes open the model, because its table is too large to send
+    tasks = [_Task(i, frame, frame.scene in scenes, length) for i, frame in enumerate(chosen)]
+    # The table of the signer is too large to send, so other processes open the model.
     own = signer if jobs == 1 else signer.model
     results = map_over(tasks, _prepare, partial(_open, own, cache_dir, store), jobs)
     by_use: dict[str, list[SignedFrame]] = {"query": [], "database": []}
     left_out, spent = [], []
-    for one, done in zip(chosen, watch(results, "read and sign", len(tasks)), strict=True):
+    for frame, done in zip(chosen, watch(results, "read and sign", len(tasks)), strict=True):
         if done.member is None:
-            left_out.append((one.name, done.reason))
+            left_out.append((frame.name, done.reason))
         else:
             for use in ("query", "database"):
-                if one.is_for(use):
+                if frame.is_for(use):
                     by_use[use].append(done.member)
             spent.append(done.milliseconds)
     median = float(np.median(spent)) if spent else None
@@ -891,10 +896,12 @@ def prepare_all(
 def _open(
     model: Signer | Model, cache_dir: Path | None, store: FrameStore
 ) -> tuple[Signer, FrameStore]:
+    """Return a signer with the model, and the store."""
     return (model if isinstance(model, Signer) else open_signer(model, cache_dir)), store
 
 
 def _prepare(opened: tuple[Signer, FrameStore], task: _Task) -> _Done:
+    """Read, sign and store a frame; return the reason if it is unusable."""
     signer, store = opened
     try:
         frame = task.chosen.reference.read()
@@ -907,7 +914,7 @@ def _prepare(opened: tuple[Signer, FrameStore], task: _Task) -> _Done:
         return _Done(None, str(error), 0.0)
     store.keep(task.number, frame, geometry)
     vector: Bytes = signature.vector[: task.length]
-    # a distractor without a pose gets a separate scene
+    # A distractor without a pose gets a separate scene.
     scene = task.chosen.name if frame.pose is None else task.chosen.scene
     pose = np.eye(4) if frame.pose is None else frame.pose
     return _Done(SignedFrame(task.number, task.chosen.name, scene, pose, vector), "", spent)

@@ -39,8 +39,8 @@ from sceneprint_lab.evaluation.run import Evaluation
 def recalls(evaluation: Evaluation) -> dict[str, Any]:
     """Return the recall of R, of C, and of a random frame; see `recall`.
 
-    `within_m` is the maximum distance in metres of a frame that shows the query's place; null
-    means that such frames overlap the query by half.
+    `within_m` is the maximum distance of a frame that shows the query's place, metres; null: an
+    overlap of half is required instead.
     """
     relevant, allowed = evaluation.relevant, evaluation.allowed
     good, n = (relevant & allowed).sum(axis=1), allowed.sum(axis=1)
@@ -54,29 +54,29 @@ def recalls(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
-    """Return the figures of each baseline by name: the figures of R for its ranking.
+    """Return the figures of each baseline by name, the same as those of R.
 
     `milliseconds`: see Compared. `ratio`: time to describe a query and to rank the database,
-    divided by the same time for the signature. `reason`: reason why the baseline cannot be used and
-    has no figures.
+    divided by the same time for the signature. `reason`: reason why a baseline has no figures.
     """
     outcomes = evaluation.outcomes
     ours = float(np.median([o.milliseconds["rank"] for o in outcomes]))
     here = [i for i, o in enumerate(outcomes) if o.present]
     report: dict[str, dict[str, Any]] = {}
-    for one in evaluation.compared:
-        if one.reason:
-            report[one.name] = {"reason": one.reason}
+    for baseline in evaluation.compared:
+        if baseline.reason:
+            report[baseline.name] = {"reason": baseline.reason}
             continue
-        firsts = [one.first[i] for i in here]
+        firsts = [baseline.first[i] for i in here]
         five = [
-            [outcomes[i].overlap_of(match) for match in one.rankings[i][: FIRST[1]]] for i in here
+            [outcomes[i].overlap_of(match) for match in baseline.rankings[i][: FIRST[1]]]
+            for i in here
         ]
-        ms = one.milliseconds
-        report[one.name] = {
+        ms = baseline.milliseconds
+        report[baseline.name] = {
             **accuracy([Error() if pair is None else pair.error for pair in firsts]),
             **overlap_figures(five),
-            "recall": recall(evaluation.relevant, evaluation.allowed, one.rankings),
+            "recall": recall(evaluation.relevant, evaluation.allowed, baseline.rankings),
             "milliseconds": ms,
             "ratio": (ms["describe"] + ms["rank"]) / (ms["sign"] + ours),
         }
@@ -85,7 +85,7 @@ def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
 
 @dataclass(frozen=True, eq=False)
 class FramePlace:
-    """The pose T_parent_sensor (4, 4) of a frame, and its parent frame."""
+    """The parent frame and the pose T_parent_sensor (4, 4) of a frame."""
 
     parent: str
     pose: Floats
@@ -97,9 +97,9 @@ class Judgement:
 
     Parameters
     ----------
-    first : error of the first answer of each row; infinite without an answer
+    first : error of the first match of each row, and of `pose_average`; infinite without a pose
     spread : mean and standard deviation of the distance between the query and the first five
-        frames of each row, metres; None with fewer than two frames in its parent frame
+        frames of each row, metres; None with fewer than two frames in the query's parent frame
     """
 
     first: Mapping[str, Error]
@@ -132,21 +132,21 @@ def judge_answers(
 
 
 def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
-    """Return the figures of each row over queries, as `measures.rows` defines them.
+    """Return the figures of each row over queries; see `measures.rows`.
 
-    `spread_mean_m` and `spread_std_m`: the spread of Judgement, averaged over the queries with one.
+    `spread_mean_m` and `spread_std_m`: mean of `Judgement.spread` over queries with a spread.
     """
     rows: dict[str, Figures] = {}
     for row in ("R", "VR", "DR", "VDR", "pose_average"):
-        spreads = [spread for one in judged if (spread := one.spread.get(row)) is not None]
+        spreads = [spread for j in judged if (spread := j.spread.get(row)) is not None]
         mean = np.mean(spreads, axis=0).tolist() if spreads else (None, None)
-        rows[row] = accuracy([one.first[row] for one in judged])
+        rows[row] = accuracy([judgement.first[row] for judgement in judged])
         rows[row] |= {"spread_mean_m": mean[0], "spread_std_m": mean[1]}
     return rows
 
 
 def _first(matches: Sequence[Match], truth: FramePlace, places: Mapping[str, FramePlace]) -> Error:
-    """Return the error of the first match."""
+    """Return the error of the first match; infinite without a match in the query's parent frame."""
     for match in matches[:1]:
         place = places[match.frame_id]
         if match.transform is not None and place.parent == truth.parent:
@@ -157,6 +157,7 @@ def _first(matches: Sequence[Match], truth: FramePlace, places: Mapping[str, Fra
 def _spread(
     matches: Sequence[Match], truth: FramePlace, places: Mapping[str, FramePlace]
 ) -> tuple[float, float] | None:
+    """Return mean and standard deviation of distances to the first matches; see Judgement."""
     near = [places[match.frame_id] for match in matches[:VIEWS]]
     metres = [
         float(np.linalg.norm(place.pose[:3, 3] - truth.pose[:3, 3]))
@@ -177,10 +178,10 @@ def figures(
 ) -> dict[str, Any]:
     """Return all figures of an evaluation as JSON values.
 
-    The figures at the top are for all queries and the whole database (`Combine` in the paper).
-    `by_scene` contains the figures for the queries of each scene if there are several. For a
-    7-Scenes table, `scenes` contains each scene with a separate database, and `average` the mean of
-    their rows. For `recall` and `baselines`, see `recalls` and `baseline_rows`.
+    The top level contains the figures for all queries and the whole database (`Combine` in the
+    paper). `by_scene` contains those for the queries of each of several scenes. For a 7-Scenes
+    table, `scenes` contains each scene with a separate database, and `average` the mean of their
+    rows. For `recall` and `baselines`, see `recalls` and `baseline_rows`.
 
     Parameters
     ----------
@@ -206,7 +207,7 @@ def figures(
         report["baselines"] = baseline_rows(evaluation)
     scenes = list(dict.fromkeys(o.scene for o in outcomes))
     if len(scenes) > 1:
-        report["by_scene"] = {one: of([o for o in outcomes if o.scene == one]) for one in scenes}
+        report["by_scene"] = {s: of([o for o in outcomes if o.scene == s]) for s in scenes}
     if evaluation.alone:
         report["scenes"] = {scene: of(some) for scene, some in evaluation.alone.items()}
         report["average"] = average(list(report["scenes"].values()))
@@ -220,7 +221,7 @@ def figures(
 def measured(
     outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
-    """Return all figures of a set of queries."""
+    """Return all figures of a set of queries; see `diversity` for the parameters."""
     return {
         **rows(outcomes), "bound": bound(outcomes), **oracle_and_random(outcomes),
         "validation": validation(outcomes), "diversity": diversity(outcomes, poses, database),
@@ -252,10 +253,10 @@ def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
 
 
 def per_query(outcome: QueryOutcome, names: Sequence[str]) -> dict[str, Any]:
-    """Return the results of one query, for comparison with other answers.
+    """Return the results of a query for the JSON report.
 
-    `ranking` contains the first members of R, `selection` all of C, and `matches` all pairs of C in
-    the order of `associate`.
+    `ranking` contains the first members of R, `selection` all of C, and `matches` all pairs of C,
+    accepted pairs first.
     """
     answers = outcome.views("VDR")
     overlaps = outcome.overlap_mean
@@ -292,7 +293,7 @@ def _matches(outcome: QueryOutcome, names: Sequence[str]) -> list[dict[str, Any]
 
 
 def mistakes(outcomes: Sequence[QueryOutcome], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return accepted pairs with wrong transforms, and other pairs with right transforms."""
+    """Return the accepted pairs with wrong transforms and the refused pairs with right ones."""
     return [
         {
             "query": outcome.name,
@@ -336,17 +337,17 @@ def error_figures(error: Error) -> dict[str, float]:
 
 
 def without_infinities(value: Any) -> Any:
-    """Return the value with None in place of infinite numbers, which JSON lacks."""
+    """Return a JSON value with None in place of infinite numbers and NaN."""
     if isinstance(value, dict):
-        return {key: without_infinities(one) for key, one in value.items()}
+        return {key: without_infinities(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [without_infinities(one) for one in value]
+        return [without_infinities(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def to_json(found: dict[str, Any]) -> bytes:
+def to_json(report: dict[str, Any]) -> bytes:
     """Return the bytes of a JSON file."""
-    return (json.dumps(found, indent=1, allow_nan=False) + "\n").encode()
+    return (json.dumps(report, indent=1, allow_nan=False) + "\n").encode()
 
 
 _NAMES = {"pose_average": "pose average", "pose_average_vr": "  of VR's views"}
@@ -354,26 +355,26 @@ _HEAD = f"{'':18}{'5cm/5deg':>10}{'10cm/10deg':>12}{'median cm':>11}{'deg':>7}"
 _OVERLAP_HEAD = f"{'overlap':>10}{'top1 @.5':>10}{'top5 @.5':>10}{'top1 @.3':>10}{'scene':>8}"
 
 
-def table(found: dict[str, Any]) -> list[str]:
+def table(report: dict[str, Any]) -> list[str]:
     """Return the result of `figures` as lines of text."""
     lines = []
-    for scene, figures in found.get("scenes", {}).items():
+    for scene, figures in report.get("scenes", {}).items():
         lines += [f"{scene}, alone", *_rows(figures), ""]
-    if "average" in found:
-        lines += ["Average", *_rows(found["average"]), "", "Combine"]
-    lines += _rows(found)
-    lines += [_chance(found[name], name) for name in ("oracle", "random")]
-    baselines = found.get("baselines", {})
+    if "average" in report:
+        lines += ["Average", *_rows(report["average"]), "", "Combine"]
+    lines += _rows(report)
+    lines += [_chance(report[name], name) for name in ("oracle", "random")]
+    baselines = report.get("baselines", {})
     lines += [_accuracy(n, row) + _overlap(row) for n, row in baselines.items() if "recall" in row]
-    lines += ["", *_recalls(found), "", *_answers(found), "", *_sentences(found), ""]
-    for scene, figures in found.get("by_scene", {}).items():
+    lines += ["", *_recalls(report), "", *_answers(report), "", *_sentences(report), ""]
+    for scene, figures in report.get("by_scene", {}).items():
         lines += [
             f"queries of {scene}, among all", *_rows(figures), *_answers(figures), _lost(figures),
             "",
         ]  # fmt: skip
-    if found["left_out"]:
-        lines.append(_left_out(found))
-    return [*lines, _times(found)]
+    if report["left_out"]:
+        lines.append(_left_out(report))
+    return [*lines, _times(report)]
 
 
 #: Percentages of queries within 5 cm and 5 degrees for R and VDR, from the table of the paper.
@@ -384,11 +385,11 @@ PAPER = {
 PAPER_OVERALL = {"average": (84.8, 90.3), "combine": (84.8, 90.4)}
 
 
-def seven_scenes_table(found: dict[str, Any], scene: str) -> list[str]:
+def seven_scenes_table(report: dict[str, Any], scene: str) -> list[str]:
     """Return a table of the percentages of queries within 5 cm and 5 degrees, with the paper's.
 
-    Average and Combine cover the scenes of the evaluation. The paper omits DR, whose first match
-    is that of R.
+    Average and Combine cover the scenes of the evaluation. The paper has no figures for DR, because
+    R has the same first match.
 
     Parameters
     ----------
@@ -400,8 +401,8 @@ def seven_scenes_table(found: dict[str, Any], scene: str) -> list[str]:
         "7-Scenes, queries within 5 cm and 5 deg, %",
         f"{'':12}{'R':>7}{'DR':>7}{'VDR':>7}{'average':>9}{'R, paper':>10}{'VDR, paper':>12}",
     ]
-    alone = found.get("scenes", {scene: found})
-    several = {"average": found["average"], "combine": found} if "average" in found else {}
+    alone = report.get("scenes", {scene: report})
+    several = {"average": report["average"], "combine": report} if "average" in report else {}
     for name, figures in {**alone, **several}.items():
         own = [_percent(figures[row]["within_5cm_5deg"]) for row in rows]
         r, vdr = (PAPER | PAPER_OVERALL)[name]
@@ -440,7 +441,7 @@ def _overlap(row: dict[str, Any]) -> str:
 
 
 def _recalls(report: dict[str, Any]) -> list[str]:
-    """Return lines on the recall of all rankings, and their times relative to the signature."""
+    """Return lines of text on the recall of all rankings and on their times."""
     if "recall" not in report:  # figures of an older version
         return []
     within = report["recall"]["within_m"]
@@ -478,7 +479,7 @@ _ANSWERS = {
 
 
 def _answers(report: dict[str, Any]) -> list[str]:
-    """Return lines on the answers of robots."""
+    """Return lines of text on the answers."""
     if "answers" not in report:  # figures of an older version
         return []
     shares = report["answers"]

@@ -1,4 +1,4 @@
-"""Evaluation of a recording: signatures of all frames, answers to all queries, and their errors.
+"""Evaluation on recordings: signatures of frames, answers to queries, and their errors.
 
 EvaluationProtocol, Signer  --evaluate-->  Evaluation
 """
@@ -52,15 +52,14 @@ from sceneprint_lab.evaluation.protocol import (
 OFF_PLANE = 0.05
 #: Minimum share of samples in one plane of a planar frame.
 PLANAR = 0.6
-#: Number of planes that are tested, each through three samples.
+#: Number of tested planes through three random samples.
 _TRIES = 200
 
 
 def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
     """Return the share of samples in the largest plane; the result is deterministic.
 
-    The function uses neither normals nor patches, so that the selection of frames does not depend
-    on the evaluated method.
+    Normals and patches are not used, so that the result does not depend on the evaluated method.
 
     Parameters
     ----------
@@ -74,14 +73,14 @@ def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
     corners = samples[rng.integers(0, n, (_TRIES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
-    fixed = length > off * off  # else the three samples lie on a line
+    fixed = length > off * off  # exclude samples on a line
     if not fixed.any():
         return 0.0
     normals = normals[fixed] / length[fixed, None]
     offsets = (corners[fixed, 0] * normals).sum(axis=1)
     inside = np.abs(samples @ normals.T - offsets) < off
     best = samples[inside[:, inside.sum(axis=0).argmax()]]
-    centre = best.mean(axis=0)  # refit by least squares, since three noisy samples tilt a plane
+    centre = best.mean(axis=0)  # refit by least squares, because three noisy samples tilt a plane
     normal = np.linalg.svd(best - centre, full_matrices=False)[2][2]
     fitted = np.abs((samples - centre) @ normal) < off
     return float(max(fitted.mean(), inside.mean(axis=0).max()))
@@ -97,17 +96,17 @@ class EvaluationSettings:
 
     Parameters
     ----------
-    metric : metric of signatures; None selects the model's
-    levels : number of levels of psi, finest first; None selects all
+    metric : metric of signatures; None selects the metric of the model
+    levels : number of levels of psi, finest first; None selects all levels
     mode, matching : arguments of `validate`
     candidates : size of C, and number of validated members of R
-    max_overlap : maximum overlap (smaller direction, within 10 cm) of the database frames that a
-        query may find; None allows all
+    max_overlap : maximum overlap (`Overlaps.least`) of the database frames that a query may find;
+        None: no limit
     absent : whether a query may find only frames of other scenes
-    gap_m : minimum distance travelled since a database frame of the same run that a query may find,
-        metres; None allows all
+    gap_m : minimum distance of travel from a database frame of the same run to a query that may
+        find it, metres; None: no limit
     within_m : maximum distance of a frame that shows the query's place, metres; None requires an
-        overlap by half instead
+        overlap of half instead
     baselines : names of baselines; see BASELINES
     jobs : number of processes, on which no figure depends
     cache_dir : folder of derived files of the model; None selects the user's cache folder
@@ -166,9 +165,8 @@ def evaluate(
     Raise DatasetError if no query or no database frame is usable. Raise MissingDependency if the
     library of a baseline is missing.
     """
-    baselines = open_baselines(
-        settings.baselines, signer.model.parameters.depth.maximum_depth
-    )  # detect a missing library before the work
+    # This detects missing libraries before the work.
+    baselines = open_baselines(settings.baselines, signer.model.parameters.depth.maximum_depth)
     prepared = prepare_all(
         protocol.frames, signer, store, levels=settings.levels, jobs=settings.jobs,
         cache_dir=settings.cache_dir, watch=watch,
@@ -191,9 +189,9 @@ def evaluate(
     )
     compared = []
     for baseline in baselines:
-        one = compare(baseline, prepared, store, allowed, signer, settings.seed, watch)
-        first = registered(opening(), one.rankings, prepared, truth.mean, truth.least)
-        compared.append(replace(one, first=first))
+        comparison = compare(baseline, prepared, store, allowed, signer, settings.seed, watch)
+        first = registered(opening(), comparison.rankings, prepared, truth.mean, truth.least)
+        compared.append(replace(comparison, first=first))
     return Evaluation(
         prepared, outcomes, alone, allowed, relevant, settings.within_m, tuple(compared)
     )
@@ -204,7 +202,7 @@ def _check_used(protocol: EvaluationProtocol, prepared: Prepared) -> None:
     used: dict[Use, list[SignedFrame]] = {"query": prepared.queries, "database": prepared.database}
     for use, members in used.items():
         if not members:
-            own = {one.name for one in protocol.frames if one.is_for(use)}
+            own = {frame.name for frame in protocol.frames if frame.is_for(use)}
             name, reason = next(left for left in prepared.left_out if left[0] in own)
             raise DatasetError(
                 f"No {use} frame is usable. The first omitted frame is {name}: "
@@ -215,7 +213,7 @@ def _check_used(protocol: EvaluationProtocol, prepared: Prepared) -> None:
 def _scenes(
     protocol: EvaluationProtocol, prepared: Prepared, settings: EvaluationSettings
 ) -> Iterator[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield the scenes with separate databases, and the indices of their queries and frames."""
+    """Yield name, query indices and database indices of each scene with a separate database."""
     scenes = list(dict.fromkeys(q.scene for q in prepared.queries))
     if not protocol.split or len(scenes) < 2 or settings.absent:
         return
@@ -256,7 +254,10 @@ def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched)
 def _steps(
     prepared: Prepared, store: FrameStore
 ) -> Iterator[tuple[int, AnyView, int, list[AnyView]]]:
-    """Yield each query with each block of the database; at most two blocks are in memory."""
+    """Yield query index and view, and first index and views of a block of the database.
+
+    All pairs of queries and blocks occur; at most two blocks of views are in memory.
+    """
     for first in range(0, len(prepared.queries), BLOCK):
         own = [view_of(store.frame(m)) for m in prepared.queries[first : first + BLOCK]]
         for begin in range(0, len(prepared.database), BLOCK):
@@ -269,7 +270,7 @@ def _evaluate_slice(
     prepared: Prepared, truth: Overlaps, may: NDArray[np.bool_], of_queries: NDArray[np.intp],
     of_database: NDArray[np.intp], store: FrameStore, settings: EvaluationSettings, watch: Watch,
 ) -> list[QueryOutcome]:  # fmt: skip
-    """Return the outcomes of queries with a part of the database."""
+    """Return the outcomes of the queries `of_queries` on the database frames `of_database`."""
     queries, database = [prepared.queries[i] for i in of_queries], prepared.database
     same = np.array([q.scene for q in queries])[:, None] == np.array([d.scene for d in database])
     allowed = np.zeros(same.shape, np.bool_)
@@ -302,10 +303,10 @@ def _evaluate_slice(
             of.milliseconds | spent, judged.answer,
         )  # fmt: skip
 
-    tasks = [task(i, one) for i, one in enumerate(ranked)]
+    tasks = [task(i, ranking) for i, ranking in enumerate(ranked)]
     opening = partial(
         open_judge, store, settings.mode, settings.seed, prepared.validation, settings.matching,
         database, prepared.answer, prepared.unrelated_distance,
     )  # fmt: skip
     judged = watch(map_over(tasks, judge, opening, settings.jobs), "validate", len(tasks))
-    return [outcome(i, ranked[i], one) for i, one in enumerate(judged)]
+    return [outcome(i, ranked[i], result) for i, result in enumerate(judged)]

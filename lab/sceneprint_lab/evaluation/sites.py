@@ -1,4 +1,4 @@
-"""Answers to queries at synthetic sites, by the functions of a service.
+"""Answers to queries at synthetic sites, computed by the functions of the service.
 
 kind, seed, index  --ask_site-->  SiteAnswer, ...
 """
@@ -25,11 +25,11 @@ from sceneprint_lab.synth import synthesise_lookalike, synthesise_lookalike_surv
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
 
-#: Minimum overlap (smaller direction) of a frame by which a query can be answered.
+#: Minimum overlap (`Overlaps.least`) with a frame for a query to be answerable.
 ANSWERABLE = 0.3
-#: Maximum distance to a scan that can answer a scanner's query, metres.
+#: Maximum distance to a scan for a scanner's query to be answerable, metres.
 ANSWERABLE_M = 10.0
-#: Standard deviations of a prior, metres and degrees; the latter is its maximum rotation too.
+#: Standard deviations of a prior, metres and degrees; PRIOR_DEG is also its maximum rotation.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0
 #: Minimum and maximum side of the voxels of a surface that represents a site's map, metres.
 CLOUD_VOXEL_M, MESH_VOXEL_M = (0.05, 0.2), (0.015, 0.03)
@@ -44,7 +44,8 @@ class SiteAnswer:
     Parameters
     ----------
     site, kind, query : site of the query, its kind, and the number of the query
-    answerable : whether a frame of the map overlaps the query enough, or a scan is near enough
+    answerable : whether a frame of the map overlaps the query by ANSWERABLE, or a scan is within
+        ANSWERABLE_M
     """
 
     site: str
@@ -56,13 +57,13 @@ class SiteAnswer:
 
 @dataclass(frozen=True)
 class MapFlaws:
-    """The flaws of a map: frames that are missing, and poses that drift.
+    """The flaws of a map: missing frames, and drifting poses.
 
     Parameters
     ----------
     missing : maximum share of missing frames
-    drift_m, drift_rad : standard deviation of the change of the error between successive poses, per
-        direction; errors decay, so that they stay within about twice this deviation
+    drift_m, drift_rad : maximum standard deviation of the change of the error between successive
+        poses, per direction; errors decay and remain within about twice this deviation
     """
 
     missing: float = 0.5
@@ -77,9 +78,7 @@ def with_flaws(
 
     Parameters
     ----------
-    flaws : maximum share of missing frames and standard deviation of the steps of the error; those
-        of a site are random shares of them
-    rng : random generator for missing frames and drift
+    flaws : maximum flaws; the flaws of this map are random shares of them
     """
     share = rng.uniform(0.0, 1.0, 3) * (flaws.missing, flaws.drift_m, flaws.drift_rad)
     in_map = rng.uniform(size=len(frames)) >= share[0]
@@ -98,7 +97,10 @@ def with_flaws(
 def signed(
     frames: Sequence[AnyFrame], scene: str, signer: Signer, first: int
 ) -> tuple[list[AnyFrame], list[SignedFrame], list[Geometry]]:
-    """Return the usable frames, their signed frames and their geometries."""
+    """Sign frames of a scene; return the usable frames, their signatures and their geometries.
+
+    The signed frames have consecutive numbers from `first`.
+    """
     usable: list[AnyFrame] = []
     members: list[SignedFrame] = []
     geometries: list[Geometry] = []
@@ -118,9 +120,9 @@ def signed(
 def prior_about(
     pose: Floats, parent: str, least: float, most: float, rng: np.random.Generator
 ) -> PosePrior:
-    """Return a prior with a random error of `least` to `most` metres and up to 10 degrees.
+    """Return a prior for a pose, with a random error of `least` to `most` metres and 0 to 10 deg.
 
-    Its standard deviations are 30 cm and 10 degrees, whatever its error.
+    Its standard deviations are always 30 cm and 10 degrees.
     """
     directions = rng.standard_normal((2, 3))
     shift, axis = directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -170,7 +172,7 @@ def ask_site(
     if as_surface:
         frames = _views_of(frames, signer.model, rng)
     shown, database, of_map = signed(frames, site.name, signer, 0)
-    # queries of another place have a separate scene, in which no pose is right
+    # Queries at another place have a separate scene, in which no pose is right.
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
     sent, queries_signed, of_queries = signed(site.queries, scene, signer, len(database))
     if not database:
@@ -244,7 +246,7 @@ def answers_of(
 def _answerable(
     site: LookalikeSite[AnyFrame], shown: Sequence[AnyFrame], sent: Sequence[AnyFrame]
 ) -> list[bool]:
-    """Return whether each query can be answered; see SiteAnswer."""
+    """Return whether each query is answerable; see SiteAnswer."""
     if not site.present:
         return [False] * len(sent)
     if isinstance(sent[0], Cloud):

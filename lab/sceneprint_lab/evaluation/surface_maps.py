@@ -1,4 +1,4 @@
-"""Fusion of a map's frames to one surface, and views of that surface.
+"""Fusion of the frames of a map into a surface, and views of this surface.
 
 frames  --join_frames-->  ReferenceSurface  --render_views-->  views, frames with poses
 """
@@ -20,21 +20,21 @@ _FUSION = FusionParameters(most_blocks=400_000, farthest_m=4.0)
 
 
 def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> ReferenceSurface:
-    """Return the surface that is fused from frames with poses.
+    """Fuse frames with poses into a surface.
 
     Parameters
     ----------
-    frames : clouds, which give a cloud with one point per voxel, or depth images, which give a mesh
+    frames : clouds, for a cloud with one point per voxel, or depth images, for a mesh
     voxel_m : side of the voxels, metres
     up : (3,) unit vector in the parent frame
 
     Raises
     ------
-    MissingDependency, UselessFrame, InvalidRequest : If `fuse` raises them
+    MissingDependency, UselessFrame, InvalidRequest : See `fuse`.
     """
-    clouds = [(one.points, one.pose) for one in frames if isinstance(one, Cloud)]
+    clouds = [(frame.points, frame.pose) for frame in frames if isinstance(frame, Cloud)]
     if not clouds:
-        depth = [one for one in frames if isinstance(one, DepthFrame)]
+        depth = [frame for frame in frames if isinstance(frame, DepthFrame)]
         mesh, _ = fuse(depth, replace(_FUSION, voxel_m=voxel_m))
         return ReferenceSurface(mesh.points.astype(np.float32), mesh.triangles, np.zeros(3), up)
     points = np.concatenate(
@@ -52,7 +52,7 @@ def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> Refer
 def render_views(
     surface: ReferenceSurface, p: ViewParameters
 ) -> tuple[ViewPlan, list[AnyFrame]]:  # fmt: skip
-    """Return the plan and the views of a surface, as frames with poses; see `choose_views`."""
+    """Return the viewpoints for a surface (see `choose_views`), and their views as frames."""
     plan, renderer = choose_views(surface, p), Renderer(surface, p)
     frames: list[AnyFrame] = []
     for number, pose in enumerate(plan.poses):

@@ -26,7 +26,7 @@ from sceneprint_lab.synth.sensors import (
 )
 from sceneprint_lab.synth.trajectories import scattered, scattered_poses, trajectory, walk
 
-LEAST_VALID = 0.45  #: smallest valid fraction of an independent view; others are taken again
+LEAST_VALID = 0.45  #: minimum share of valid pixels in an independent view
 
 #: The camera of 7-Scenes.
 KINECT = Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)
@@ -39,8 +39,8 @@ class SynthRoom:
     Parameters
     ----------
     name : name such as "room-000"
-    seed, index : arguments that the room was generated from
-    frames : frames with T_world_camera; depth is in whole millimetres with sensor noise
+    seed, index : arguments from which the room was generated
+    frames : frames with T_world_camera; depth has sensor noise and steps of a millimetre
     """
 
     name: str
@@ -53,17 +53,18 @@ def synthesise_room(
     seed: int, index: int, views: int, *, along_path: bool = False, step: int = 1,
     noise: KinectNoise | None = KINECT_V1, intrinsics: Intrinsics = KINECT,
 ) -> SynthRoom:  # fmt: skip
-    """Furnish a room and take depth frames in it.
+    """Generate a furnished room and render depth frames in it.
 
     The result depends only on the arguments, so rooms can be generated in any order and process.
 
     Parameters
     ----------
-    seed, index : the room is number `index` of the collection `seed`
+    seed, index : seed of the collection, and index of the room in it
     views : number of frames
     along_path : whether the frames follow a hand-held path; else they are independent
-    step : interval of frames along the path
+    step : use every n-th frame along the path
     noise : sensor noise; None for ideal depth
+    intrinsics : camera
 
     Raise MissingDependency if Embree cannot be imported.
     """
@@ -76,23 +77,23 @@ def synthesise_room(
         return [(take(room, T, intrinsics, rng, sensor), T) for T in poses]
 
     if along_path:
-        taken = shots(trajectory(room, views, rng)[::step])
+        images = shots(trajectory(room, views, rng)[::step])
     else:
-        taken, least = [], LEAST_VALID
-        while len(taken) < views:
-            new = shots(scattered_poses(room, views - len(taken), rng))
-            taken += [(depth, T) for depth, T in new if np.mean(depth > 0) >= least]
-            least *= 0.98  # the limit falls, so the loop ends
+        images, least = [], LEAST_VALID
+        while len(images) < views:
+            new = shots(scattered_poses(room, views - len(images), rng))
+            images += [(depth, T) for depth, T in new if np.mean(depth > 0) >= least]
+            least *= 0.98  # lower the limit, so that the loop ends
     name = f"room-{index:03d}"
     frames = (
         DepthFrame(depth, intrinsics, f"{name}/frame-{k:06d}", T)
-        for k, (depth, T) in enumerate(taken)
+        for k, (depth, T) in enumerate(images)
     )
     return SynthRoom(name, seed, index, tuple(frames))
 
 
 def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
-    """Return room number `index` of collection `seed`, and the generator in its state after it."""
+    """Return room `index` of the collection `seed`, and the generator to continue with."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     return make_room(rng), rng
 
@@ -108,7 +109,7 @@ def take(
     scene: Room | SyntheticMesh | Caster, T_world_camera: Floats, intrinsics: Intrinsics,
     rng: np.random.Generator, noise: KinectNoise = KINECT_V1,
 ) -> Floats32:  # fmt: skip
-    """Return depth (H, W) float32 of a Kinect: whole millimetres, in metres, 0 if missing."""
+    """Return Kinect depth (H, W) float32, metres in steps of a millimetre, 0 if missing."""
     caster = _caster(scene)
     depth, cosine, face = cast_faces(caster, T_world_camera, intrinsics)
     loss = np.append(caster.mesh.loss, np.float32(0))[face]
@@ -123,7 +124,7 @@ def _caster(scene: Room | SyntheticMesh | Caster) -> Caster:
 
 
 def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Generator) -> KinectNoise:
-    """Return the sensor of one room, with parameters that vary slightly between rooms."""
+    """Return a random variation of a sensor: factors of its errors, and a missing border."""
     s = rng.uniform(0.8, 1.4)
     most = intrinsics.width // 18 if rng.random() < 0.4 else 0
     left, right, top, bottom = rng.integers(0, most + 1, 4).tolist()
@@ -137,11 +138,11 @@ def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Genera
 #
 # seed, index  --synthesise_survey-->  Survey: clouds with poses
 
-LEAST_POINTS = 2000  #: smallest number of points of an independent scan; others are taken again
+LEAST_POINTS = 2000  #: minimum number of points of an independent scan, in at most _TRIES tries
 _TRIES = 5
 
 _MAKERS = {"hall": make_hall, "storey": make_storey, "block": make_block}
-#: Kinds in the order of indices: of five sites two are halls, two are storeys and one is a block.
+#: Kinds of sites by index modulo 5.
 _ORDER = ("hall", "storey", "hall", "block", "storey")
 
 
@@ -167,18 +168,18 @@ def synthesise_survey(
     seed: int, index: int, views: int, *, along_path: bool = False, kind: str | None = None,
     sensor: Spinning | None = None, perfect: bool = False,
 ) -> Survey:  # fmt: skip
-    """Build a site and scan it.
+    """Generate a site and scan it.
 
     The result depends only on the arguments, so sites can be generated in any order and process.
 
     Parameters
     ----------
-    seed, index : the site is number `index` of the collection `seed`
+    seed, index : seed of the collection, and index of the site in it
     views : number of scans
     along_path : whether the scans follow a walk, 1.5 m apart; else they are independent
     kind : "hall", "storey" or "block"; default: depends on the index
     sensor : scanner; default: a random scanner for each site
-    perfect : whether the scanner has no errors and loses no returns
+    perfect : whether to disable errors and losses of the scanner
 
     Raise MissingDependency if Embree cannot be imported.
     """
@@ -202,6 +203,6 @@ def synthesise_survey(
 def premises_and_rng(
     seed: int, index: int, kind: str | None = None
 ) -> tuple[Premises, np.random.Generator]:
-    """Return site number `index` of collection `seed`, and the generator in its state after it."""
+    """Return site `index` of the collection `seed`, and the generator to continue with."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
     return _MAKERS[kind or _ORDER[index % len(_ORDER)]](rng), rng

@@ -35,9 +35,9 @@ from sceneprint_lab.synth.mesh import (
     tube,
 )
 
-# Small objects: each builder returns one object that rests on z = 0.
+# Small objects on z = 0.
 #
-# rng  --small_thing-->  SyntheticMesh, 5 to 60 cm; the caller turns it
+# rng  --small_thing-->  SyntheticMesh, 5 to 60 cm
 
 Builder = Callable[[np.random.Generator], SyntheticMesh]
 
@@ -53,7 +53,7 @@ def flat_thing(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def stack(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a stack of books or boxes, each turned slightly."""
+    """Return a stack of slightly rotated books or boxes."""
     parts, z = [], 0.0
     w, d = rng.uniform((0.15, 0.12), (0.4, 0.3))
     for _ in range(rng.integers(2, 7)):
@@ -203,7 +203,7 @@ _WEIGHTS = np.array([w for _, w in SMALL]) / sum(w for _, w in SMALL)
 
 
 def small_thing(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a random small object; one in eight is dark or shiny and loses samples."""
+    """Return a random small object; 12 % are dark or shiny and lose samples."""
     builder = SMALL[int(rng.choice(len(SMALL), p=_WEIGHTS))][0]
     thing = builder(rng)
     return thing.with_loss(rng.uniform(0.2, 0.95)) if rng.random() < 0.12 else thing
@@ -237,10 +237,10 @@ class Piece:
 
     Parameters
     ----------
-    mesh : standing on z = 0, back towards +y
+    mesh : mesh on z = 0, with its back towards +y
     width, depth : footprint along x and y, metres
     surfaces : surfaces that carry objects
-    seats : 1 for a chair at its front; -n for n chairs, each at a random side; 0 for none
+    seats : 1 for a chair at the front; -n for n chairs at random sides; 0 for no chairs
     """
 
     mesh: SyntheticMesh
@@ -251,7 +251,7 @@ class Piece:
 
 
 def scatter(surface: Shelf, rng: np.random.Generator) -> SyntheticMesh:
-    """Return small objects on a surface, without overlaps, mostly aligned with it."""
+    """Return small objects on a surface without overlaps; half of them are aligned with it."""
     wanted = rng.poisson(surface.density * surface.width * surface.depth)
     placed: list[tuple[float, float, float]] = []
     parts: list[SyntheticMesh] = []
@@ -275,7 +275,7 @@ def scatter(surface: Shelf, rng: np.random.Generator) -> SyntheticMesh:
 
 
 def with_objects(piece: Piece, rng: np.random.Generator) -> SyntheticMesh:
-    """Return a piece with objects on all its surfaces; the number varies between pieces."""
+    """Return a piece with a random density of objects on its surfaces."""
     fullness = float(np.clip(rng.lognormal(0.1, 0.7), 0.1, 3.0))
     loads = [
         scatter(Shelf(**{**vars(s), "density": s.density * fullness}), rng) for s in piece.surfaces
@@ -372,7 +372,7 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def bed(rng: np.random.Generator) -> Piece:
-    """Return a bed with a mattress, a quilt and pillows; its head is at the back."""
+    """Return a bed with a mattress, a quilt and pillows, its head at the back."""
     w, d, h = rng.choice((0.9, 1.4, 1.7)) + rng.uniform(0, 0.1), 2.05, rng.uniform(0.3, 0.5)
     parts = [box(w, d, h - 0.18, (0, 0, 0.08)), _pillow(w, d, 0.25, 0.15).moved((0, 0, h - 0.2))]
     if rng.random() < 0.7:
@@ -407,7 +407,7 @@ def _pillow(w: float, d: float, h: float, soft: float) -> SyntheticMesh:
 
 
 def _leaning(mesh: SyntheticMesh, slope: float, at: tuple[float, float, float]) -> SyntheticMesh:
-    """Lean a mesh backwards (+y) about its foot by `slope` radians, then move it to a point."""
+    """Lean a mesh backwards (+y) about z = 0 by `slope` radians, then move it by `at`."""
     return mesh.turned(rotation_x(-slope), at)
 
 
@@ -467,7 +467,7 @@ def desk(rng: np.random.Generator) -> Piece:
 
 
 def monitor(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a flat screen on a foot, facing -y; its glass often loses samples."""
+    """Return a flat screen on a foot, facing -y; 30 % of the screens lose samples."""
     w = rng.uniform(0.4, 0.72)
     h = w * rng.uniform(0.56, 0.75)
     rise = rng.uniform(0.08, 0.2)
@@ -559,7 +559,7 @@ def shelf(rng: np.random.Generator) -> Piece:
 
 
 def books(rng: np.random.Generator, width: float, depth: float, headroom: float) -> SyntheticMesh:
-    """Return a row of books or binders with gaps; some of them lean."""
+    """Return a row of books or binders with gaps."""
     parts: list[SyntheticMesh] = []
     x, end = -width / 2, width / 2
     size = rng.uniform(0.5, 0.95) * headroom
@@ -662,7 +662,7 @@ def stairs(rng: np.random.Generator) -> Piece:
 
 
 def _fronts(rng: np.random.Generator, w: float, h: float, z: float) -> SyntheticMesh:
-    """Return doors or drawers of a body in the plane y = 0, above the height `z`."""
+    """Return doors or drawers with handles in the plane y = 0, from the height `z` upwards."""
     columns = max(1, round(w / rng.uniform(0.4, 0.7)))
     rows = int(rng.choice((1, 1, 2, 3, 4)))
     a, b, gap = w / columns, h / rows, 0.006
@@ -682,7 +682,7 @@ def _slab(x0: float, x1: float, d: float, z: float, t: float) -> SyntheticMesh:
 def _sink(
     rng: np.random.Generator, x0: float, x1: float, d: float, h: float, t: float
 ) -> list[SyntheticMesh]:
-    """Return a worktop with a basin between x0 and x1, and a tap."""
+    """Return the rims of a worktop around a basin between x0 and x1, and a tap."""
     x, w, wide = (x0 + x1) / 2, x1 - x0, rng.uniform(0.09, 0.14)
     rims = [box(w, wide, t, (x, s * (d / 2 - wide / 2 + 0.01) - 0.01, h - t)) for s in (-1, 1)]
     back = d / 2 - 0.06
@@ -694,11 +694,11 @@ def _sink(
 #
 # Wall, rng  --with_openings-->  Wall with openings  --fittings-->  Mesh
 
-DOOR_TOP = 2.03  #: height of door openings, metres, below every ceiling
+DOOR_TOP = 2.03  #: height of door openings, metres
 
 
 def with_openings(wall: Wall, rng: np.random.Generator, deepest: float) -> Wall:
-    """Return a wall with doors, windows and niches side by side, at most `deepest` metres deep."""
+    """Return a wall with random doors, windows and niches of at most `deepest` metres depth."""
     openings: list[Opening] = []
     u = rng.uniform(0.1, 0.8)
     while u < wall.length - 0.6:
@@ -745,7 +745,7 @@ def fittings(wall: Wall, top: Ceiling, rng: np.random.Generator) -> SyntheticMes
 
 
 def overhead(outline: Floats, top: Ceiling, rng: np.random.Generator) -> SyntheticMesh:
-    """Return beams, lamps and pipes below a ceiling; `outline` (n, 2) of the room, metres."""
+    """Return beams and lamps below the ceiling of a room with the outline (n, 2), metres."""
     parts: list[SyntheticMesh] = []
     low, high = outline.min(axis=0), outline.max(axis=0)
     middle, span = (low + high) / 2, high - low
@@ -816,7 +816,7 @@ def _around(o: Opening, rng: np.random.Generator) -> list[SyntheticMesh]:
 
 
 def _gaps(wall: Wall) -> list[tuple[float, float]]:
-    """Return (start, width) of each stretch between openings that is wider than 0.5 m."""
+    """Return (start, width) of each stretch between openings of more than 0.5 m, with margins."""
     edges = [0.0, *(u for o in wall.openings for u in (o.start, o.end)), wall.length]
     spans = zip(edges[::2], edges[1::2], strict=True)
     return [(a + 0.1, b - a - 0.2) for a, b in spans if b - a > 0.5]

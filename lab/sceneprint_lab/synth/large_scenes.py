@@ -68,8 +68,8 @@ from sceneprint_lab.synth.rooms import (
 )
 from sceneprint_lab.synth.sensors import Caster
 
-CELL = 0.2  #: side of a cell of the ground's grid, metres
-CLEARANCE = 0.45  #: smallest distance of a scanner from objects, metres
+CELL = 0.2  #: edge of a cell of the floor's grid, metres
+CLEARANCE = 0.45  #: minimum distance of a scanner from objects, metres
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,12 +89,12 @@ class Premises:
 
     @cached_property
     def caster(self) -> Caster:
-        """Return the ray caster of the mesh, which the first use builds."""
+        """Ray caster of the mesh, built at the first use."""
         return Caster(self.mesh)
 
     @cached_property
     def walkable(self) -> NDArray[np.bool_]:
-        """Return (nx, ny) whether cells of the floor's grid are clear and connected."""
+        """Mask (nx, ny) of the largest connected area of the floor with CLEARANCE."""
         clear = ndimage.distance_transform_edt(np.pad(~self.floor.claimed, 1))[1:-1, 1:-1]
         parts, n = ndimage.label(clear * self.floor.cell >= CLEARANCE)
         if n == 0:
@@ -121,7 +121,7 @@ _KINDS: tuple[tuple[Menu, Menu], ...] = (
 
 
 def make_hall(rng: np.random.Generator) -> Premises:
-    """Return a hall with columns, girders, galleries, doors and objects."""
+    """Return a random hall with columns, girders, galleries, doors and objects."""
     outline = floor_plan(rng) * rng.uniform(4.5, 9.0)
     top = Ceiling(float(rng.uniform(3.5, 12.0)), np.zeros(2))
     walls = [hall_wall(wall, top, rng) for wall in walls_of(outline)]
@@ -142,7 +142,7 @@ def make_hall(rng: np.random.Generator) -> Premises:
 
 
 def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
-    """Return a wall with gates, doors and a row of windows that do not overlap horizontally."""
+    """Return a wall with random gates, doors and windows side by side."""
     openings, u = [], float(rng.uniform(0.5, 4.0))
     high = min(top.height - 0.5, rng.uniform(3.0, 4.5))
     sill = rng.uniform(0.9, max(1.0, top.height - 2.2))
@@ -168,7 +168,7 @@ def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
 
 
 def _columns(site: Site, outline: Floats) -> list[SyntheticMesh]:
-    """Return a grid of columns with gaps."""
+    """Return columns on a grid with gaps, and occupy their floor."""
     rng = site.rng
     if rng.random() < 0.2:
         return []
@@ -208,7 +208,7 @@ def _girders(site: Site, outline: Floats) -> list[SyntheticMesh]:
 
 
 def _gallery(wall: Wall, site: Site) -> list[SyntheticMesh]:
-    """Return a gallery along part of a wall at half height, on posts, with a railing."""
+    """Return a gallery along part of a wall, on posts and with a railing."""
     rng = site.rng
     start = rng.uniform(0.0, 0.4) * wall.length
     long = rng.uniform(0.4, 0.9) * (wall.length - start)
@@ -294,7 +294,7 @@ def make_storey(rng: np.random.Generator) -> Premises:
 
 @contextmanager
 def _reserved(floor: Floor, place: PiecePose, width: float, depth: float) -> Iterator[None]:
-    """Reserve a rectangle of the floor until the context ends."""
+    """Occupy a rectangle of the floor until the context ends."""
     before = floor.claimed.copy()
     floor.take(place, width, depth)
     reserved = floor.claimed & ~before
@@ -309,7 +309,10 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:
 def _room(
     extent: tuple[float, float, float, float], side: float, site: Site
 ) -> list[SyntheticMesh]:
-    """Return a room with walls to the next room and the corridor, a door and furniture."""
+    """Return walls, a door and furniture of a room.
+
+    `extent` is (x0, x1, y0, y1), metres; `side` is the y of the wall to the corridor.
+    """
     x0, x1, y0, y1 = extent
     rng, t = site.rng, float(site.rng.uniform(0.1, 0.3))
     parts = _partition((x1, y0), (x1, y1), t, (), site)
@@ -336,7 +339,7 @@ def _partition(
     a: tuple[float, float], b: tuple[float, float], thick: float,
     gaps: tuple[tuple[float, float], ...], site: Site,
 ) -> list[SyntheticMesh]:  # fmt: skip
-    """Return a wall from a to b up to the ceiling, with lintels over its gaps."""
+    """Return a wall from a to b up to the ceiling, with lintels over `gaps` (start, end)."""
     length, yaw = math.dist(a, b), math.atan2(b[1] - a[1], b[0] - a[0])
     along, height = np.array([math.cos(yaw), math.sin(yaw)]), site.top.height
     parts, at = [], 0.0
@@ -397,7 +400,7 @@ def _ground(half: Floats, rng: np.random.Generator) -> SyntheticMesh:
 
 
 def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
-    """Return a building with recessed windows and doors, or nothing if there is no room."""
+    """Return a building with recessed windows and doors, or [] if its place is occupied."""
     rng = site.rng
     w, d, h = rng.uniform((6.0, 5.0, 3.0), (32.0, 16.0, 15.0))
     yaw = main + int(rng.integers(0, 2)) * math.pi / 2 + float(rng.normal(0, 0.02))
@@ -426,7 +429,7 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Generator) -> Wall:
-    """Return a wall with rows of windows, some of them missing, and doors below."""
+    """Return a wall with rows of windows, some of which are missing, and doors."""
     wide, gap = rng.uniform(0.8, 2.2), rng.uniform(0.6, 3.0)
     high, share = rng.uniform(1.0, 1.8), rng.uniform(0.3, 1.0)
     glass = float(rng.choice((0.3, 0.9)))
@@ -471,10 +474,10 @@ def _garden_wall(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
-    """Return a cube in the centre of an empty square hall, with the origin under it.
+    """Return a cube in the centre of an empty square hall, which is the origin.
 
-    A turn of 90 degrees about z maps the scene onto itself, so a view does not determine which
-    side of the cube it shows.
+    The scene is symmetric under rotations of 90 degrees about z, so a view does not determine
+    which side of the cube it shows.
 
     Parameters
     ----------
@@ -488,11 +491,11 @@ def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
 
 
 def symmetric_hall(rng: np.random.Generator) -> Premises:
-    """Return a hall and its contents with a symmetry of 180 degrees about z, around the origin.
+    """Return a hall that is symmetric under a rotation of 180 degrees about the origin.
 
-    The half with x > 0 is built like `make_hall`; the other half is its copy.
+    The half with x > 0 is built like `make_hall`; the other half is a rotated copy.
     """
-    # Whole cells of the floor's grid, reduced by more than the rounding errors.
+    # The sides are multiples of a cell, reduced by more than the rounding errors.
     a, b = (CELL * np.round(rng.uniform((8.0, 5.0), (20.0, 13.0)) / CELL) - 1e-9).tolist()
     outline = _rectangle(-a, a, -b, b)
     top = Ceiling(float(rng.uniform(3.5, 10.0)), np.zeros(2))
@@ -523,8 +526,8 @@ def symmetric_hall(rng: np.random.Generator) -> Premises:
 def corridor(doors: int, pitch: float = 2.0, width: float = 1.8, height: float = 2.5) -> Room:
     """Return a corridor along +x with identical doors in both long walls.
 
-    Views that differ by a pitch see the same doors; only the ends resolve the position. A wide
-    and high corridor is a hall of equal bays.
+    Views at a distance of one pitch look the same; only the ends determine the position. A wide
+    and high corridor is a hall of equal bays. Raise ValueError without doors.
 
     Parameters
     ----------

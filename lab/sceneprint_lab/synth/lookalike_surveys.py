@@ -1,22 +1,22 @@
-"""Laser scans of ambiguous sites: bays, streets and halls that resemble themselves or each other.
+"""Laser scans of ambiguous sites: repetitive, symmetric or similar halls and streets.
 
 kind, seed, index  --synthesise_lookalike_survey-->  LookalikeSite: scans of a map, and queries
 
 bays      map: scans along a hall of equal bays; queries: other scans from its aisle
 streets   map: scans along a street of equal blocks; queries: other scans from its carriageway
 halls     map: a walk in a hall with a symmetry of 180 degrees, except for one to three details;
-          queries: other scans (of every four sites, two map one half and query the other, with
-          enough details to distinguish the halves)
-unmapped  map: all halls of a row of equal halls except one (of every four sites, two use two equal
-          streets); queries: scans of the omitted one
+          queries: other scans (in half of the sites, the map covers one half of the hall and the
+          queries the other, with enough details to distinguish the halves)
+unmapped  map: all but one of several equal halls or, in half of the sites, of two equal streets;
+          queries: scans of the omitted hall or street
 absent    map: an ordinary hall and ordinary blocks; queries: other halls, storeys and blocks
 sites     map: every second to fourth scan of a walk in an ordinary hall, storey or block;
           queries: other scans, every third of them some metres beside the walk
 
-A `Rosette` with a view of 60 to 80 degrees scans every third site (indices 2, 5, ...), a `Spinning`
-the others. Odd sites have maps with drifting poses: a random walk, 1 to 5 cm and .02 to .1 degrees
-per scan. Every third map (indices 1, 4, ...) lacks one stretch of a sixth of its scans, and one in
-ten of the other scans.
+The scanner of sites 2, 5, 8, ... is a `Rosette` with a view of 60 to 80 degrees, of other sites a
+`Spinning`. Odd sites have maps with drifting poses: a random walk, 1 to 5 cm and .02 to .1 degrees
+per scan. The maps of sites 1, 4, 7, ... lack one stretch of a sixth of their scans, and one in ten
+of the other scans.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class SurveyPlan(NamedTuple):
 def synthesise_lookalike_survey(
     kind: str, seed: int, index: int, *, queries: int = 12, perfect: bool = False
 ) -> LookalikeSite[Cloud]:
-    """Build an ambiguous site and scan it.
+    """Generate an ambiguous site and scan it.
 
     The result depends only on the arguments. If the poses of the map drift, the pose of a query
     has the drift of the nearest scan of the map.
@@ -127,16 +127,16 @@ def synthesise_lookalike_survey(
     Parameters
     ----------
     kind : one of SURVEYED_KINDS
-    seed, index : the site is number `index` of its kind in the collection `seed`
+    seed, index : seed of the collection, and index of the site among those of its kind
     queries : number of queries
-    perfect : whether the scanner has no errors and loses no returns, and the map's poses are exact
+    perfect : whether to disable errors and losses of the scanner, and drift
 
     Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
     exist.
     """
     if kind not in SURVEYED_KINDS:
-        known = ", ".join(SURVEYED_KINDS)
-        raise ValueError(f"There is no kind {kind!r} of look-alike surveys. Choose from {known}.")
+        kinds = ", ".join(SURVEYED_KINDS)
+        raise ValueError(f"There is no kind {kind!r} of look-alike surveys. Choose from {kinds}.")
     own = SURVEYED_KINDS.index(kind)
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 32 + own)))
     sensor: Scanner = own_rosette(rng) if index % 3 == 2 else own_scanner(rng)
@@ -181,18 +181,18 @@ def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
 def with_drift(poses: Floats, rng: np.random.Generator) -> Floats:
     """Return the poses (n, 4, 4) of a walk with the drift of odometry.
 
-    The first pose is exact. Each step has a normal error. Its standard deviation, 1 to 5 cm and .02
-    to .1 degrees along and about each axis, is the same for the whole walk.
+    The first pose is exact. Each step has a random error, with a standard deviation of 1 to 5 cm
+    and .02 to .1 degrees that is constant during the walk.
     """
     metres, radians = rng.uniform(0.01, 0.05), math.radians(rng.uniform(0.02, 0.1))
-    found = [poses[0]]
+    drifted = [poses[0]]
     for before, after in pairwise(poses):
         error = np.eye(4)
         about = rng.normal(0, radians, 2)
         error[:3, :3] = rotation_z(float(about[0])) @ rotation_x(float(about[1]))
         error[:3, 3] = rng.normal(0, metres, 3)
-        found.append(found[-1] @ inverse(before) @ after @ error)
-    return np.stack(found)
+        drifted.append(drifted[-1] @ inverse(before) @ after @ error)
+    return np.stack(drifted)
 
 
 def _drifted_pose(T: Floats, true: Floats, recorded: Floats) -> Floats:
@@ -203,14 +203,14 @@ def _drifted_pose(T: Floats, true: Floats, recorded: Floats) -> Floats:
 
 
 def distinct_fraction(here: Stop, other: Premises, T: Floats, sensor: Scanner) -> float:
-    """Return the fraction of a scan that differs at another place from an equal pose.
+    """Return the share of a scan that differs from a scan at a pose in another place.
 
-    About a thousand rays within 40 m are compared; a difference of ranges counts above 30 cm + 2 %.
+    About a thousand rays within 40 m are compared; ranges differ if they are 30 cm + 2 % apart.
 
     Parameters
     ----------
     here : location of the scan
-    other, T : other place, and the pose there
+    other, T : the other place, and the pose (4, 4) in it
     sensor : scanner
     """
     rays = sensor.rays(np.random.default_rng(0))
@@ -229,12 +229,12 @@ def _most_different(
     stops: Sequence[Stop], rivals: Callable[[Stop], list[tuple[Premises, Floats]]], n: int,
     sensor: Scanner,
 ) -> tuple[list[Stop], float]:  # fmt: skip
-    """Return the n stops that differ most, or n that each differ from all rivals by DISTINCT_SHARE.
+    """Return n stops that differ from all rivals by DISTINCT_SHARE, or else those that differ most.
 
     Returns
     -------
     stops : n stops
-    least : smallest fraction of their scans that differs from a rival
+    least : minimum share of their scans that differs from a rival
     """
     shares = [
         min(distinct_fraction(stop, *rival, sensor) for rival in rivals(stop)) for stop in stops
@@ -263,7 +263,7 @@ _LOOSE = (vehicle, pile, person)
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """A unit that repeats along +x, on both sides of a clear path along y = 0.
+    """A unit for repetition along +x, with a clear path along y = 0.
 
     Parameters
     ----------
@@ -272,7 +272,7 @@ class Unit:
     half_way : half the width of the path, metres
     built : surfaces that all copies share, with x from 0 to pitch
     things : objects of a copy
-    around : function that returns the surroundings of a number of copies: floor and end walls
+    around : function that returns floor and outer walls for a number of copies
     """
 
     kind: str
@@ -284,7 +284,7 @@ class Unit:
 
 
 def bay(rng: np.random.Generator) -> Unit:
-    """Return a bay of a hall with pillars, a girder, walls or none, and racks, machines or cars."""
+    """Return a random bay of a hall with pillars, a girder and racks, machines or cars."""
     pitch, half_way, side = rng.uniform((4.5, 1.5, 4.0), (10.0, 3.5, 12.0)).tolist()
     half, size = half_way + side, float(rng.uniform(0.25, 0.8))
     top = Ceiling(float(rng.uniform(3.0, 9.0)), np.zeros(2))
@@ -298,8 +298,10 @@ def bay(rng: np.random.Generator) -> Unit:
             parts.append(box(0.2, across, top.height, (0.0, s * (half - across / 2), 0.0)))
     menu = _BAYS[int(rng.integers(0, len(_BAYS)))]
     sides = [_strip(0.2, pitch - 0.2, s, half_way + size, half - 0.1) for s in (-1, 1)]
-    things = [one for outline in sides for one in stand_about(menu, Floor(outline, CELL), rng, 12)]
-    # Openings of the walls along the bays and at both ends, in the order of `walls_of`.
+    things = [
+        piece for outline in sides for piece in stand_about(menu, Floor(outline, CELL), rng, 12)
+    ]
+    # Openings of the four outer walls, in the order of `walls_of`; those of long walls repeat.
     with_openings = [
         hall_wall(Wall(np.zeros(2), np.array([1.0, 0.0]), length), top, rng).openings
         for length in (pitch, 2 * half, pitch, 2 * half)
@@ -357,7 +359,7 @@ def _house(w: float, d: float, rng: np.random.Generator) -> SyntheticMesh:
 def stand_about(
     menu: Menu, floor: Floor, rng: np.random.Generator, tries: int
 ) -> list[PlacedPiece]:
-    """Return pieces aligned with the floor on free places, which they then occupy."""
+    """Place pieces, almost aligned with the axes, at free places in at most `tries` tries."""
     makers, weights = list(menu), np.array(list(menu.values()), float)
     placed = []
     for _ in range(tries):
@@ -375,7 +377,7 @@ def stand_about(
 
 
 def row_of(unit: Unit, count: int, likeness: Likeness, rng: np.random.Generator) -> Premises:
-    """Return copies of a unit along +x from the origin; their path is the walkable floor."""
+    """Return `count` copies of a unit along +x from the origin; the path is the walkable floor."""
     parts = [unit.around(count)]
     for k in range(count):
         things = furnish(unit.things, 0, likeness, rng)
@@ -385,6 +387,7 @@ def row_of(unit: Unit, count: int, likeness: Likeness, rng: np.random.Generator)
 
 
 def _repeated(openings: Sequence[Opening], pitch: float, copies: range) -> tuple[Opening, ...]:
+    """Return the openings, shifted by a multiple of the pitch for each copy."""
     return tuple(
         replace(o, start=o.start + k * pitch, end=o.end + k * pitch)
         for k in copies
@@ -407,20 +410,20 @@ def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
 
 
 def _likeness(rng: np.random.Generator) -> Likeness:
-    """Return the differences between copies: a few centimetres, and moved or removed objects."""
+    """Return random differences between copies: shifts of centimetres, and missing objects."""
     shift, missing = rng.uniform((0.0, 0.0), (0.1, 0.2)).tolist()
     return Likeness(shift, 0.02, float(rng.uniform(0.1, 0.6)), missing=missing)
 
 
 class _Carrier:
-    """Height and mounting of a scanner that is carried along a row."""
+    """Generator of poses of a scanner along a row, with a constant height and mounting."""
 
     def __init__(self, unit: Unit, count: int, sensor: Scanner, rng: np.random.Generator) -> None:
         self.length, self.rng = unit.pitch * count, rng
         self.reach = unit.half_way - 0.5  # distance from the centre line of the path
         self.height = float(rng.uniform(0.5, 1.9))
         self.sees_back = not isinstance(sensor, Rosette)
-        # A scanner with a full view has any heading, one with a partial view looks ahead.
+        # A scanner with a full view may have any heading; a Rosette looks ahead.
         self.mounted = float(
             rng.uniform(-math.pi, math.pi) if self.sees_back else rng.normal(0, 0.3)
         )
@@ -476,9 +479,9 @@ def _is_second_variant(index: int) -> bool:
 
 
 def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
-    """Map all but one of some similar rows of street blocks or bays, and take queries in the last.
+    """Map all but one of several similar rows of street blocks or bays; query the last row.
 
-    The queries are those stops, of three times as many, that differ most from the mapped rows.
+    The queries are selected from three times as many stops; see `_most_different`.
     """
     street = _is_second_variant(index)
     unit = block(rng) if street else bay(rng)
@@ -487,21 +490,21 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
     *mapped, last = (row_of(unit, count, likeness, rng) for _ in range(rows))
     carrier = _Carrier(unit, count, sensor, rng)
     origins = [(0.0, 120.0 * k, 0.0) for k in range(rows)]
-    each = MAP_SCANS // len(mapped)
+    per_row = MAP_SCANS // len(mapped)
     stops = [
         Stop(row, T, origin)
         for row, origin in zip(mapped, origins, strict=False)
-        for T in carrier.along(each)
+        for T in carrier.along(per_row)
     ]
 
     def rivals(stop: Stop) -> list[tuple[Premises, Floats]]:
-        found = []
+        similar = []
         for k in range(1 - count, count):
             T = stop.T.copy()
             T[0, 3] += k * unit.pitch
             if 0.0 < T[0, 3] < carrier.length:
-                found += [(row, T) for row in mapped]
-        return found
+                similar += [(row, T) for row in mapped]
+        return similar
 
     query_stops = [Stop(last, T, origins[-1]) for T in carrier.anywhere(3 * queries)]
     return SurveyPlan(stops, _most_different(query_stops, rivals, queries, sensor)[0])
@@ -531,7 +534,7 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
-    """Return the hall with up to three more objects, whose places are occupied in both halves."""
+    """Add up to three objects to a hall, and occupy their places in both halves."""
     menu: Menu = {pile: 2, person: 1, cabin: 2, screen: 2, tank: 1, machine: 1}
     things = furnish(stand_about(menu, hall.floor, rng, 3), 0, Likeness(), rng)
     # A walkable place must remain walkable after half a turn.
@@ -540,7 +543,7 @@ def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
 
 
 def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> SurveyPlan:
-    """Map every second to fourth scan of a walk; query others, or some beside it."""
+    """Map every second to fourth scan of a walk; query other scans, every third beside the walk."""
     step = int(rng.integers(2, 5))
     poses = walk(premises, step * MAP_SCANS, rng)
     others = [k for k in range(len(poses)) if k % step]
@@ -553,7 +556,7 @@ def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> Su
 
 
 def _pose_beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
-    """Return a walkable pose 1 to 4 m beside another, turned by up to about 20 degrees."""
+    """Return a walkable pose 1 to 4 m from another pose, rotated by some degrees."""
     spots = premises.floor.points[premises.walkable]
     away = np.linalg.norm(spots - T[:2, 3], axis=1)
     spots = spots[(away > 1.0) & (away < 4.0)]
@@ -570,7 +573,7 @@ def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:  # noqa: ARG001
-    """Return sites without common content, 200 m apart."""
+    """Map a hall and a block, 200 m apart; query other sites."""
     places = [(make(rng), (200.0 * k, 0.0, 0.0)) for k, make in enumerate((make_hall, make_block))]
     of_map = [
         Stop(premises, T, origin)
@@ -579,8 +582,8 @@ def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner)
     ]
     makers = (make_hall, make_block, make_storey)
     others = [makers[int(rng.integers(0, 3))](rng) for _ in range(max(2, queries // 8))]
-    each = -(-queries // len(others))
-    query_stops = [Stop(site, T) for site in others for T in walk(site, each, rng, 4.0)]
+    per_site = -(-queries // len(others))
+    query_stops = [Stop(site, T) for site in others for T in walk(site, per_site, rng, 4.0)]
     return SurveyPlan(of_map, query_stops[:queries])
 
 

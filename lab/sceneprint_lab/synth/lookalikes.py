@@ -85,8 +85,8 @@ class LookalikeSite(Generic[F_co]):
     ----------
     name : name such as "object-000"
     kind : one of KINDS, or of `lookalike_surveys.SURVEYED_KINDS`
-    seed, index : arguments that the site was generated from
-    map, queries : depth frames with T_world_camera, in whole millimetres with noise; or clouds
+    seed, index : arguments from which the site was generated
+    map, queries : depth frames with T_world_camera, or clouds with T_world_sensor
     present : whether the queries show places of the map
     """
 
@@ -100,13 +100,13 @@ class LookalikeSite(Generic[F_co]):
 
     @property
     def same_frame(self) -> bool:
-        """Return whether map and queries have the same parent frame, so poses are comparable."""
+        """Whether map and queries have the same parent frame, so that poses are comparable."""
         return self.kind not in APART
 
 
 @dataclass(frozen=True, eq=False)
 class FramePlan:
-    """Scenes and T_world_camera of a site's frames, in order."""
+    """Scenes and poses of a site's frames, and the offset of each scene in the world."""
 
     map: Sequence[tuple[Room, Floats]]
     queries: Sequence[tuple[Room, Floats]]
@@ -117,16 +117,17 @@ def synthesise_lookalike(
     kind: str, seed: int, index: int, *, queries: int = 12, noise: KinectNoise | None = KINECT_V1,
     intrinsics: Intrinsics = KINECT,
 ) -> LookalikeSite[DepthFrame]:  # fmt: skip
-    """Build an ambiguous site and take depth frames of it.
+    """Generate an ambiguous site and render depth frames of it.
 
     The result depends only on the arguments.
 
     Parameters
     ----------
-    kind : one of KINDS
-    seed, index : the site is number `index` of its kind in the collection `seed`
+    kind : one of KINDS or ORDINARY
+    seed, index : seed of the collection, and index of the site among those of its kind
     queries : number of queries
     noise : sensor noise; None for ideal depth
+    intrinsics : camera
 
     Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
     exist.
@@ -163,7 +164,7 @@ def synthesise_lookalike(
 
 
 def worse_sensor(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
-    """Return a worse sensor with a shorter range, like depth cameras of other makes."""
+    """Return a sensor with more noise and a shorter range."""
     s = float(rng.uniform(1.0, 2.0))
     return replace(
         sensor, disparity_sigma=sensor.disparity_sigma * s, warp=sensor.warp * s * 1.5,
@@ -183,8 +184,8 @@ class SymmetricObject:
 
     Parameters
     ----------
-    body : mesh that is invariant to a turn of 2 pi / order about z
-    details : mesh of a few centimetres or less that breaks the symmetry
+    body : mesh that is invariant to rotations by 2 pi / order about z
+    details : small parts that break the symmetry
     order : order of the symmetry
     """
 
@@ -194,14 +195,14 @@ class SymmetricObject:
 
     @property
     def mesh(self) -> SyntheticMesh:
-        """Return body and details as a single mesh."""
+        """Body and details as a single mesh."""
         return join([self.body, self.details])
 
 
 def cabinet(rng: np.random.Generator) -> SymmetricObject:
-    """Return a cabinet with the same doors on both long sides and details on one of them.
+    """Return a cabinet with the same doors on both long sides, and details on one side.
 
-    It stands on a plinth or on legs; most have a narrower upper part.
+    It stands on a plinth or on legs; 70 % of the cabinets have a narrower upper part.
     """
     w, d, h = rng.uniform((0.6, 0.35, 0.5), (1.3, 0.65, 1.1))
     foot, over = rng.uniform(0.03, 0.16), rng.uniform(0.0, 0.03)
@@ -227,22 +228,22 @@ def cabinet(rng: np.random.Generator) -> SymmetricObject:
 
 
 def four_legs(rng: np.random.Generator) -> SymmetricObject:
-    """Return a table with four legs and an apron; a cable or a left object breaks its symmetry."""
+    """Return a table with four legs; a cable duct and sometimes a book break its symmetry."""
     w, h = rng.uniform(0.6, 1.3), rng.uniform(0.45, 0.78)
     d = w if rng.random() < 0.5 else w * rng.uniform(0.5, 0.8)
     t, inset = rng.uniform(0.04, 0.09), rng.uniform(0.0, 0.05)
     x, y = (w - t) / 2 - inset, (d - t) / 2 - inset
     parts = [box(t, t, h - 0.03, (a * x, b * y, 0)) for a in (-1, 1) for b in (-1, 1)]
     parts += [box(w, d, 0.03, (0, 0, h - 0.03)), box(2 * x, 2 * y, 0.07, (0, 0, h - 0.1))]
-    found = [box(0.02, 0.02, h - 0.05, (x + t / 2, y, 0.0))]  # a cable duct along one leg
+    details = [box(0.02, 0.02, h - 0.05, (x + t / 2, y, 0.0))]  # a cable duct along one leg
     if rng.random() < 0.5:
         at = rng.uniform(-0.3, 0.3, 2) * (w, d)
-        found.append(small_flat(rng).moved((*at, h), rng.uniform(0, 3)))
-    return SymmetricObject(join(parts), join(found), 4 if d == w else 2)
+        details.append(small_flat(rng).moved((*at, h), rng.uniform(0, 3)))
+    return SymmetricObject(join(parts), join(details), 4 if d == w else 2)
 
 
 def column(rng: np.random.Generator) -> SymmetricObject:
-    """Return a round or square column on a wider foot, with a duct, a socket or a dent."""
+    """Return a round or square column on a wider foot, with a duct and a socket."""
     size, h, foot = rng.uniform(0.3, 0.65), 2.6, rng.uniform(0.05, 0.3)
     is_round, wider = rng.random() < 0.4, rng.uniform(0.02, 0.08)
     if is_round:
@@ -250,9 +251,10 @@ def column(rng: np.random.Generator) -> SymmetricObject:
     else:
         parts = [box(size, size, h), box(size + 2 * wider, size + 2 * wider, foot)]
     a = size / 2
-    found = [box(0.04, 0.025, h - foot, (rng.uniform(-0.3, 0.3) * size * (not is_round), -a, foot))]
-    found += [box(0.08, 0.02, 0.08, (0.3 * a, a - 0.01 * is_round, rng.uniform(0.4, 1.2)))]
-    return SymmetricObject(join(parts), join(found), 36 if is_round else 4)
+    x = rng.uniform(-0.3, 0.3) * size * (not is_round)
+    details = [box(0.04, 0.025, h - foot, (x, -a, foot))]
+    details += [box(0.08, 0.02, 0.08, (0.3 * a, a - 0.01 * is_round, rng.uniform(0.4, 1.2)))]
+    return SymmetricObject(join(parts), join(details), 36 if is_round else 4)
 
 
 def double_sofa(rng: np.random.Generator) -> SymmetricObject:
@@ -276,7 +278,7 @@ def small_flat(rng: np.random.Generator) -> SyntheticMesh:
 
 
 def _details(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticMesh:
-    """Return one to four details on the side y = -d / 2 or the top of a cabinet."""
+    """Return one to three details on the side y = -d / 2 or the top of a cabinet."""
     makers: list[Callable[[], SyntheticMesh]] = [
         lambda: box(0.14, 0.025, 0.02, (rng.uniform(-0.4, 0.4) * w, -d / 2, h * 0.6)),
         lambda: box(0.02, 0.006, h * 0.8, (rng.uniform(-0.4, 0.4) * w, -d / 2, h * 0.1)),
@@ -295,7 +297,7 @@ def _cable(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticM
 
 
 def _bump(rng: np.random.Generator, w: float, d: float, h: float) -> SyntheticMesh:
-    """Return a bump in sheet metal: a flat cap of 4 to 10 mm."""
+    """Return a bump of 4 to 10 mm in sheet metal."""
     out = rng.uniform(0.004, 0.01)
     cap = ellipsoid((rng.uniform(0.03, 0.1), out, rng.uniform(0.03, 0.1)), 1.0, 12)
     return cap.moved((rng.uniform(-0.3, 0.3) * w, -d / 2, h * rng.uniform(0.2, 0.7)))
@@ -311,7 +313,7 @@ def symmetric_object(rng: np.random.Generator) -> SymmetricObject:
 
 
 def bare_floor(thing: SyntheticMesh, rng: np.random.Generator, half: float = 8.0) -> Room:
-    """Return an object in the middle of a dull or shiny floor, without anything else."""
+    """Return an object in the middle of an empty floor that loses up to 20 % of samples."""
     outline = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     floor = mesh_of(np.c_[outline, np.zeros(4)], [(0, 1, 2), (0, 2, 3)])
     mesh = join([floor.with_loss(float(rng.uniform(0.0, 0.2))), thing])
@@ -332,20 +334,20 @@ def _circled_object(rng: np.random.Generator, index: int, queries: int) -> Frame
 def _every_fourth(
     room: Room, poses: Sequence[Floats], queries: int, rng: np.random.Generator
 ) -> FramePlan:
-    """Use every fourth pose for the map, and a number of the other poses as queries."""
+    """Use every fourth pose for the map, and `queries` of the other poses as queries."""
     others = [k for k in range(len(poses)) if k % 4]
     chosen = sorted(rng.choice(others, min(queries, len(others)), replace=False).tolist())
     return FramePlan([(room, T) for T in poses[::4]], [(room, poses[k]) for k in chosen])
 
 
-# Rooms with the same furniture at almost the same places.
+# Rooms with the same furniture in almost the same places.
 #
 # rng, Likeness  --equal_offices | equal_bays-->  rooms
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedPiece:
-    """A piece at a place; occupants of the room move `loose` ones."""
+    """A piece at a place; `loose` pieces are at different places in each copy of a room."""
 
     piece: Piece
     place: PiecePose
@@ -358,9 +360,9 @@ class Likeness:
 
     Parameters
     ----------
-    shift, turn : standard deviation of the place of pieces, metres and radians
-    loose_shift : standard deviation of the place of chairs and boxes, metres
-    same_load : probability that copies have the same objects on a piece
+    shift, turn : standard deviations of position and yaw of pieces, metres and radians
+    loose_shift : standard deviation of the position of loose pieces, metres
+    same_load : probability that a piece carries the same objects as in other copies
     missing : probability that a piece is missing
     """
 
@@ -380,9 +382,9 @@ def arrange(
     walls: Sequence[Wall], floor: Floor, pieces: Sequence[Piece], middle: Piece | None,
     rng: np.random.Generator,
 ) -> list[PlacedPiece]:  # fmt: skip
-    """Place pieces side by side along walls, one in the middle, and chairs and boxes around them.
+    """Place pieces side by side along walls, `middle` in the centre, and chairs and boxes.
 
-    The walls form a rectangle, counter-clockwise; pieces that do not fit are omitted.
+    The walls are those of a counter-clockwise rectangle. Pieces that do not fit are omitted.
     """
     placed: list[PlacedPiece] = []
     ends = [0.15] * len(walls)
@@ -422,7 +424,7 @@ def _loose(piece: Piece, at: Floats, yaw: float, floor: Floor) -> list[PlacedPie
 def furnish(
     placed: Sequence[PlacedPiece], seed: int, likeness: Likeness, rng: np.random.Generator
 ) -> SyntheticMesh:
-    """Return the pieces of one copy, each slightly displaced, with the objects on them.
+    """Return the slightly displaced pieces of a copy, with objects on them.
 
     Parameters
     ----------
@@ -432,17 +434,17 @@ def furnish(
     rng : generator of this copy
     """
     parts = []
-    for number, one in enumerate(placed):
+    for number, item in enumerate(placed):
         if likeness.missing and rng.random() < likeness.missing:
             continue
-        shift = likeness.loose_shift if one.loose else likeness.shift
-        turn = 2 * likeness.loose_shift if one.loose else likeness.turn
+        shift = likeness.loose_shift if item.loose else likeness.shift
+        turn = 2 * likeness.loose_shift if item.loose else likeness.turn
         dx, dy = rng.normal(0, 1, 2) * shift
         own = rng if rng.random() > likeness.same_load else np.random.default_rng((seed, number))
-        loads = [scatter(surface, own) for surface in one.piece.surfaces]
-        mesh = join([one.piece.mesh, *loads])
-        yaw = one.place.yaw + rng.normal() * turn
-        parts.append(mesh.moved((one.place.x + dx, one.place.y + dy, 0.0), yaw))
+        loads = [scatter(surface, own) for surface in item.piece.surfaces]
+        mesh = join([item.piece.mesh, *loads])
+        yaw = item.place.yaw + rng.normal() * turn
+        parts.append(mesh.moved((item.place.x + dx, item.place.y + dy, 0.0), yaw))
     return join(parts)
 
 
@@ -452,7 +454,7 @@ def rectangle(width: float, depth: float) -> Floats:
 
 
 def _shell(outline: Floats, rng: np.random.Generator, height: float) -> tuple[SyntheticMesh, ...]:
-    """Return the shell, the fittings and the objects on the ceiling."""
+    """Return the shell of a room, the objects on its ceiling and the fittings of each wall."""
     top = Ceiling(height, np.zeros(2))
     walls = [with_openings(wall, rng, 0.3) for wall in walls_of(outline)]
     fitted = [fittings(wall, top, rng) for wall in walls]
@@ -460,7 +462,7 @@ def _shell(outline: Floats, rng: np.random.Generator, height: float) -> tuple[Sy
 
 
 def equal_offices(count: int, likeness: Likeness, rng: np.random.Generator) -> list[Room]:
-    """Return rooms with the same plan and furniture whose movable objects differ."""
+    """Return rooms with the same plan and furniture and the differences of `likeness`."""
     outline, height = rectangle(*rng.uniform((3.2, 3.6), (4.8, 5.2))), float(rng.uniform(2.4, 3.0))
     built = _shell(outline, rng, height)
     makers = [_OFFICE[k] for k in rng.permutation(len(_OFFICE))]
@@ -490,7 +492,7 @@ def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tupl
 
 
 def _row(rng: np.random.Generator, index: int, queries: int) -> FramePlan:
-    """Map all rooms of a row, or all bays of a hall."""
+    """Map and query all rooms of a row or, for odd indices, all bays of a hall."""
     likeness = Likeness(float(rng.uniform(0.0, 0.03)), float(rng.uniform(0.0, 0.02)))
     if index % 2:
         hall, _ = equal_bays(int(rng.integers(4, 7)), likeness, rng)
@@ -503,16 +505,17 @@ def _row(rng: np.random.Generator, index: int, queries: int) -> FramePlan:
 
 
 def _offsets(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
-    """Return a function with the offset of each room: side by side, with walls of 0.2 m."""
+    """Return a function for the offset (3,) of each room: side by side, with walls of 0.2 m."""
 
     def shift(room: Room) -> Floats:
-        k = next(i for i, one in enumerate(rooms) if one is room)
+        k = next(i for i, other in enumerate(rooms) if other is room)
         return np.array([k * (room.size[0] + 0.2), 0.0, 0.0])
 
     return shift
 
 
-#: Fraction of a view, difference in metres, and range in metres that make two views distinct.
+#: Views are distinct if at least this share of pixels within the range REACH_M, metres, differs by
+#: more than DISTINCT_M, metres.
 DISTINCT_SHARE, DISTINCT_M, REACH_M = 0.10, 0.10, 3.5
 _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 
@@ -520,7 +523,10 @@ _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 def difference_share(
     a: Room, b: Room, T_room_camera: Floats, T_other: Floats | None = None
 ) -> float:
-    """Return the fraction of a view that differs in another room from `T_other`."""
+    """Return the share of a view in room `a` that differs from a view in room `b`.
+
+    The view in `b` has the pose `T_other`; default: the same pose.
+    """
     here = render(a, T_room_camera, _COARSE)
     there = render(b, T_room_camera if T_other is None else T_other, _COARSE)
     nearer = np.minimum(here, there)
@@ -530,10 +536,10 @@ def difference_share(
 
 
 def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Omit the last room of a row from the map; the queries visibly differ from all other rooms.
+    """Map all rooms of a row except the last, and query the last.
 
-    They must differ by more than a moved chair, since no method distinguishes an equal room from
-    a mapped room with a moved chair.
+    The queries differ from views of the mapped rooms by DISTINCT_SHARE, because no method can
+    distinguish an equal room from a mapped room with a moved chair.
     """
     likeness = Likeness(float(rng.uniform(0.02, 0.08)), float(rng.uniform(0.0, 0.04)), 0.3, 0.5)
     rooms = equal_offices(int(rng.integers(2, 4)), likeness, rng)
@@ -546,12 +552,12 @@ def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> FrameP
             difference = min(difference_share(last, room, T) for room in mapped)
             if difference >= least and len(query_poses) < queries:
                 query_poses.append(T)
-        least *= 0.9  # rooms that are too similar are queried all the same
+        least *= 0.9  # lower the limit, so that the loop ends
     return FramePlan(map_of, [(last, T) for T in query_poses], _offsets(rooms))
 
 
 def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Return two rooms of different plans with the same furniture in one corner."""
+    """Map a kitchen, and query a larger kitchen with the same furniture in the same order."""
     pieces = [make(rng) for make in _KITCHEN]
     pieces += [pieces[2], kitchen_row(rng)][: int(rng.integers(1, 3))]
     middle = table(rng) if rng.random() < 0.7 else counter(rng)
@@ -559,7 +565,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Frame
     likeness = Likeness(float(rng.uniform(0.03, 0.1)), float(rng.uniform(0.01, 0.05)), 0.3, 0.0)
     placed = arrange(walls_of(rectangle(*small)), Floor(rectangle(*small)), pieces, middle, rng)
     rooms = []
-    for k in range(2):  # the second is larger, so its far walls are at other places
+    for k in range(2):  # the second kitchen is larger, so its far walls are elsewhere
         outline, height = rectangle(*(small + k * rng.uniform(0.3, 1.5, 2))), rng.uniform(2.4, 3.0)
         mesh = join([*_shell(outline, rng, float(height)), furnish(placed, 0, likeness, rng)])
         rooms.append(Room(mesh, outline, Ceiling(float(height), np.zeros(2))))
@@ -569,7 +575,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Frame
 
 
 def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Put two equal pieces back to back, with other objects around; the map shows one side."""
+    """Map one side of two equal pieces back to back, with different objects; query the other."""
     make = (desk, shelf, counter, table, cupboard)[int(rng.integers(0, 5))]
     piece = make(rng)
     w, d = piece.width, piece.depth
@@ -594,7 +600,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Frame
     middle = (0.0, 0.0, 0.5 * min(float(piece.mesh.vertices[:, 2].max()), 1.2))
     sweep = math.radians(140)
     seen = orbit(middle, radius, 20, rng, first=-math.pi / 2 - sweep / 2, sweep=sweep)
-    # Only views in which the two sides differ, since others have no correct answer.
+    # Use only views in which the two sides differ, because others have no correct answer.
     views = orbit(middle, radius, 6 * queries, rng, first=math.pi / 2 - sweep / 2, sweep=sweep)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     differences = [difference_share(room, room, T, half_turn @ T) for T in views]
@@ -606,35 +612,35 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Frame
 
 
 def _absent_places(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Return rooms and objects without common content."""
+    """Map and query different rooms and objects."""
 
-    def views(rooms: int, each: int, around: int) -> list[tuple[Room, Floats]]:
-        found = []
+    def views(rooms: int, per_room: int, around: int) -> list[tuple[Room, Floats]]:
+        poses = []
         for _ in range(rooms):
             room = make_room(rng)
-            found += [(room, T) for T in scattered_poses(room, each, rng)]
+            poses += [(room, T) for T in scattered_poses(room, per_room, rng)]
         if around:
             circled = _circled_object(rng, 0, around)
-            found += list(circled.map if around > len(circled.queries) else circled.queries)
-        return found
+            poses += list(circled.map if around > len(circled.queries) else circled.queries)
+        return poses
 
     alone = max(1, queries // 4)
     rooms = max(3, queries // 12)
-    each = -(-(queries - alone) // rooms)
-    return FramePlan(views(4, 10, 20), views(rooms, each, alone)[-queries:])
+    per_room = -(-(queries - alone) // rooms)
+    return FramePlan(views(4, 10, 20), views(rooms, per_room, alone)[-queries:])
 
 
 def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Return different rooms side by side, with views from a few places or from many.
+    """Map three rooms side by side with 8 to 25 views each, and query them.
 
-    The queries see objects that were elsewhere or absent when the map was recorded.
+    The queries show objects that were elsewhere or absent when the map was recorded.
     """
     rooms = [make_room(rng) for _ in range(3)]
     most = int(rng.integers(0, 5))
     before = [with_things(room, int(rng.integers(0, most + 1)), rng) for room in rooms]
     after = [with_things(room, int(rng.integers(0, most + 1)), rng) for room in rooms]
-    each = int(rng.integers(8, 26))
-    map_of = [(room, T) for room in before for T in scattered_poses(room, each, rng)]
+    per_room = int(rng.integers(8, 26))
+    map_of = [(room, T) for room in before for T in scattered_poses(room, per_room, rng)]
     targets = [after[k % len(after)] for k in range(queries)]
     starts = np.cumsum([0.0, *(room.size[0] + 0.2 for room in rooms)])
 

@@ -21,14 +21,14 @@ from sceneprint.types import Floats, Floats32, Ints32
 
 @dataclass(frozen=True, eq=False)
 class SyntheticMesh:
-    """Triangles with outward normals.
+    """A triangle mesh with outward normals.
 
     Parameters
     ----------
     vertices : (V, 3) float64, metres, z up
     faces : (F, 3) int32, indices into vertices, counter-clockwise from outside
-    loss : (F,) float32, fraction of samples on the face that a depth camera loses, [0, 1];
-        positive for dark, shiny or transparent surfaces
+    loss : (F,) float32, share of samples on each face that a depth camera loses, [0, 1]; positive
+        for dark, shiny or transparent surfaces
     """
 
     vertices: Floats
@@ -36,15 +36,15 @@ class SyntheticMesh:
     loss: Floats32
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0) -> SyntheticMesh:
-        """Return the mesh turned about z by yaw (radians), then shifted by offset (3, metres)."""
+        """Return the mesh, rotated about z by yaw, radians, then shifted by offset (3,), metres."""
         return self.turned(rotation_z(yaw), offset) if yaw else self._shifted(offset)
 
     def turned(self, rotation: Floats, offset: ArrayLike = (0.0, 0.0, 0.0)) -> SyntheticMesh:
-        """Return the mesh after x -> rotation x + offset; rotation (3, 3), offset (3,) metres."""
+        """Return the mesh transformed by rotation @ x + offset, (3, 3) and (3,) metres."""
         return replace(self, vertices=self.vertices @ rotation.T + np.asarray(offset, float))
 
     def with_loss(self, share: float) -> SyntheticMesh:
-        """Return the same mesh with an equal loss on all faces."""
+        """Return the mesh with the loss `share` on all faces."""
         return replace(self, loss=np.full(len(self.faces), share, np.float32))
 
     def _shifted(self, offset: ArrayLike) -> SyntheticMesh:
@@ -95,7 +95,7 @@ def rotation_x(angle: float) -> Floats:
 
 
 def face_normals(mesh: SyntheticMesh) -> Floats:
-    """Return the normals (F, 3) of the faces, with lengths of twice the area of a face, m^2."""
+    """Return the normals (F, 3) of the faces; their length is twice the area of the face, m^2."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return np.asarray(np.cross(b - a, c - a))
 
@@ -123,7 +123,7 @@ _BOX_FACES = np.array(
 def box(
     width: float, depth: float, height: float, at: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0
 ) -> SyntheticMesh:
-    """Return a cuboid of width, depth and height along x, y, z; `at` is its base's centre."""
+    """Return a cuboid with extents along x, y and z, metres; `at` is the centre of its base."""
     m = SyntheticMesh(_CORNERS * (width, depth, height), _BOX_FACES, np.zeros(12, np.float32))
     return m.moved(at, yaw)
 
@@ -142,8 +142,8 @@ def revolve(profile: ArrayLike, segments: int = 16) -> SyntheticMesh:
 
     Parameters
     ----------
-    profile : (n, 2) radius and height, metres, along the outside from the bottom to the top;
-        a disc closes an end away from the axis
+    profile : (n, 2) radius and height, metres, along the outside from the bottom to the top; discs
+        close ends that are not on the axis
     segments : number of sides
     """
     p = np.asarray(profile, float)
@@ -168,16 +168,16 @@ def cone(lower: float, upper: float, height: float, segments: int = 16) -> Synth
 
 
 def ellipsoid(radii: ArrayLike, power: float = 1.0, segments: int = 16) -> SyntheticMesh:
-    """Return a superellipsoid on z = 0; `power` 1 is an ellipsoid, values towards 0 a box."""
+    """Return a superellipsoid on z = 0: an ellipsoid for `power` 1, almost a box near 0."""
     directions = _sphere(segments)
     shaped = np.sign(directions) * np.abs(directions) ** power
-    # Points of the level set |x|^(2/power) + ... = 1 along each direction.
+    # Scale each direction to the level set |x|^(2/power) + ... = 1.
     level = (np.abs(shaped) ** (2 / power)).sum(axis=-1, keepdims=True) ** (-power / 2)
     return _on_sphere(shaped * level * np.asarray(radii, float), segments)
 
 
 def blob(rng: np.random.Generator, radii: ArrayLike, roughness: float = 0.12) -> SyntheticMesh:
-    """Return a sphere deformed by a few low-frequency waves, such as a bag or a cushion."""
+    """Return a superellipsoid with random low-frequency waves, such as a bag or a cushion."""
     directions = _sphere(26)
     waves = rng.normal(size=(4, 3)) * 2.2
     swell = np.cos(directions @ waves.T + rng.uniform(0, 2 * math.pi, 4)) @ rng.normal(size=4)
@@ -222,7 +222,7 @@ def ribbon(path: ArrayLike, thickness: float, height: float) -> SyntheticMesh:
 
 
 def tube(points: Sequence[ArrayLike], radius: float, segments: int = 8) -> SyntheticMesh:
-    """Return a round rod along a path (n, 3), such as a pipe, a chair frame or a handle."""
+    """Return a round rod along a path of n points (3,), such as a pipe or a handle."""
     p = np.asarray(points, float)
     along = np.gradient(p, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -356,7 +356,7 @@ class Ceiling:
 
 
 def floor_plan(rng: np.random.Generator) -> Floats:
-    """Return an outline (n, 2), counter-clockwise: a rectangle, an L, an alcove or a cut corner."""
+    """Return a random counter-clockwise outline (n, 2): a rectangle, L, alcove or cut corner."""
     w, d = rng.uniform(2.6, 8.0), rng.uniform(2.5, 6.5)
     kind = rng.choice(4, p=(0.4, 0.25, 0.2, 0.15))
     a, b = w * rng.uniform(0.4, 0.7), d * rng.uniform(0.4, 0.7)
@@ -375,7 +375,7 @@ def floor_plan(rng: np.random.Generator) -> Floats:
 
 
 def ceiling(rng: np.random.Generator, outline: Floats) -> Ceiling:
-    """Return a ceiling; three in four are flat, the others slope along x or y."""
+    """Return a random ceiling: flat in 75 % of rooms, otherwise sloping along x or y."""
     height = rng.uniform(2.3, 3.2)
     if rng.random() > 0.25:
         return Ceiling(height, np.zeros(2))
@@ -405,7 +405,7 @@ def shell(outline: Floats, walls: list[Wall], top: Ceiling) -> SyntheticMesh:
 
 
 def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
-    """Return a wall up to the ceiling, with its openings cut out and lined."""
+    """Return the mesh of a wall up to the ceiling, with its openings as recesses."""
     us = sorted({0.0, wall.length, *(u for o in wall.openings for u in (o.start, o.end))})
     vs = sorted({0.0, *(v for o in wall.openings for v in (o.low, o.high))})
     grid = np.array([[(u, 0.0, v) for u in us] for v in [*vs, math.inf]])
@@ -425,7 +425,7 @@ def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
 
 
 def _lining(o: Opening) -> SyntheticMesh:
-    """Return the sides and back of a recess in the wall's frame (along, inward, up)."""
+    """Return the sides and the back of a recess, in the frame (along, inward, up) of the wall."""
     ring = ((o.start, o.low), (o.end, o.low), (o.end, o.high), (o.start, o.high))
     front = np.array([(u, 0.0, v) for u, v in ring])
     back = front - (0.0, o.deep, 0.0)
@@ -437,5 +437,5 @@ def _quads(corners: list[Floats]) -> SyntheticMesh:
     """Return quadrilaterals in the plane (along, up) that face inward."""
     v = np.concatenate(corners)
     first = np.arange(0, len(v), 4)[:, None]
-    # (along, inward, up) is right-handed, so along x up is -inward and the order is reversed.
+    # (along, inward, up) is right-handed, so along x up = -inward; the order is reversed.
     return mesh_of(v, first + np.array([0, 2, 1, 0, 3, 2]))

@@ -51,11 +51,11 @@ from sceneprint_lab.synth.mesh import (
 )
 from sceneprint_lab.synth.sensors import Caster
 
-# A grid of the floor that keeps pieces inside the room and apart.
+# The grid of occupied cells of a floor, which prevents overlaps of pieces.
 #
 # PiecePose  --Floor.claim-->  whether the place was free
 
-CELL = 0.05  #: side of a cell of a room's grid, metres
+CELL = 0.05  #: edge of a cell of a room's grid, metres
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Floor:
     Parameters
     ----------
     outline : corners, counter-clockwise, metres
-    cell : side of the grid's cells, metres
+    cell : edge of the grid's cells, metres
     """
 
     def __init__(self, outline: Floats, cell: float = CELL) -> None:
@@ -87,20 +87,20 @@ class Floor:
         self.claimed = ~self.inside
 
     def claim(self, place: PiecePose, width: float, depth: float, overlap: float = 0.0) -> bool:
-        """Occupy a rotated rectangle of the floor if it is free; return whether it was.
+        """Occupy a rotated rectangle of the floor if it is free; return whether it was free.
 
         Parameters
         ----------
         place : centre and yaw of the rectangle
         width, depth : extents, metres
-        overlap : fraction of the rectangle that may already be occupied, [0, 1]; all of it must
-            lie inside the room
+        overlap : share of the rectangle that may already be occupied, [0, 1]; the whole rectangle
+            must lie inside the room
         """
         part, cells = self._cells(place, width, depth)
         total = width * depth / self.cell**2
         within = np.count_nonzero(cells & self.inside[part])
         free = np.count_nonzero(cells & ~self.claimed[part])
-        # Rounding may remove a strip of half a cell along the walls.
+        # Rounding may lose a strip of half a cell along the walls.
         slack = (width + depth) / self.cell + 2
         if within < total - slack or free < within * (1 - overlap) - 1e-9:
             return False
@@ -108,14 +108,14 @@ class Floor:
         return True
 
     def take(self, place: PiecePose, width: float, depth: float) -> None:
-        """Occupy a rotated rectangle without any check, inside the outline or not."""
+        """Occupy a rotated rectangle without checking that it is free and inside the outline."""
         part, cells = self._cells(place, width, depth)
         self.claimed[part] |= cells
 
     def _cells(
         self, place: PiecePose, width: float, depth: float
     ) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-        """Return the part of the grid around a rectangle, and which of its cells it covers."""
+        """Return slices of the grid around a rectangle, and a mask of the cells that it covers."""
         reach = math.hypot(width, depth) / 2 + self.cell
         middle = np.array([place.x, place.y])
         first = np.floor((middle - reach - self._low) / self.cell).astype(int).clip(0)
@@ -129,7 +129,7 @@ class Floor:
 
 
 def inside(outline: Floats, points: Floats) -> NDArray[np.bool_]:
-    """Return (...,) whether floor points (..., 2) lie in an outline (n, 2), by ray crossings."""
+    """Return a mask (...,) of the floor points (..., 2) inside an outline (n, 2)."""
     x, y = points[..., 0], points[..., 1]
     result = np.zeros(x.shape, bool)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -146,7 +146,7 @@ Menu = Mapping[Maker, float]  #: builders of objects, with weights
 
 @dataclass(frozen=True, eq=False)
 class Site:
-    """A room under construction: its pieces, its free floor, and the random generator."""
+    """A room under construction: its walls, ceiling and floor, and the random generator."""
 
     walls: list[Wall]
     top: Ceiling
@@ -164,7 +164,7 @@ def keep_doors_free(site: Site) -> None:
 
 
 def along_wall(wall: Wall, menu: Menu, site: Site) -> list[SyntheticMesh]:
-    """Return pieces side by side along a wall; their density varies between walls."""
+    """Return random pieces side by side along a wall, with a random density."""
     rng = site.rng
     parts: list[SyntheticMesh] = []
     u, density = rng.uniform(0.0, 0.5), rng.uniform(0.5, 1.0)
@@ -182,7 +182,7 @@ def along_wall(wall: Wall, menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
-    """Return pieces in the middle of the room, aligned with it or at a random yaw."""
+    """Return random pieces at free places, aligned with the axes or at a random yaw."""
     rng = site.rng
     parts: list[SyntheticMesh] = []
     spots = site.floor.points[~site.floor.claimed]
@@ -198,7 +198,7 @@ def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def partitions(site: Site) -> list[SyntheticMesh]:
-    """Return a free-standing wall or screen in some of the rooms."""
+    """Return free-standing partitions, perpendicular to some of the walls."""
     rng, floor = site.rng, site.floor
     lowest = float(site.top.at(floor.points[floor.inside]).min())
     parts = []
@@ -241,7 +241,7 @@ def _pick(menu: Menu, rng: np.random.Generator) -> Piece:
 
 
 def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
-    """Return the piece with its load and its chairs at a place, or nothing if there is no room."""
+    """Return a piece with objects and chairs at a place, or [] if it does not fit."""
     rng = site.rng
     mesh = with_objects(piece, rng).moved((place.x, place.y, 0.0), place.yaw)
     if (mesh.vertices[:, 2] > site.top.at(mesh.vertices[:, :2]) - 0.02).any():
@@ -263,7 +263,9 @@ def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
 def _seat(
     seat: Piece, side: int, piece: Piece, place: PiecePose, site: Site
 ) -> list[SyntheticMesh]:
-    """Return a chair at one side of a table (0 is its front), pushed in by a random amount."""
+    """Return a chair at a side of a table (0: front), at a random distance, or [] if it does not
+    fit.
+    """
     rng = site.rng
     yaw = place.yaw + side * math.pi / 2
     half, span = (piece.depth, piece.width) if side % 2 == 0 else (piece.width, piece.depth)
@@ -307,7 +309,7 @@ class Room:
     ----------
     mesh : all surfaces; normals of solids face outward, those of the shell inward
     outline : (n, 2) floor plan, counter-clockwise, metres
-    ceiling : ceiling, with a height for each floor point
+    ceiling : ceiling
     """
 
     mesh: SyntheticMesh
@@ -316,22 +318,22 @@ class Room:
 
     @property
     def vertices(self) -> Floats32:
-        """Return the vertices (V, 3), metres, z up."""
+        """Vertices (V, 3), metres, z up."""
         return self.mesh.vertices.astype(np.float32)
 
     @property
     def faces(self) -> Ints32:
-        """Return the indices (F, 3) of the vertices of each face."""
+        """Indices (F, 3) of the vertices of each face."""
         return self.mesh.faces
 
     @property
     def size(self) -> Floats:
-        """Return the extents (3,) of the room along x, y, z, metres."""
+        """Extents (3,) of the room along x, y, z, metres."""
         return np.array([*np.ptp(self.outline, axis=0), self.ceiling.at(self.outline).max()])
 
     @cached_property
     def caster(self) -> Caster:
-        """Return the ray caster of the mesh, which the first use builds."""
+        """Ray caster of the mesh, built at the first use."""
         return Caster(self.mesh)
 
 
@@ -354,11 +356,11 @@ def make_room(rng: np.random.Generator) -> Room:
 
 
 def _depth_behind(wall: Wall, outline: Floats) -> float:
-    """Return the greatest depth of a recess, metres, that does not meet the room or a recess."""
+    """Return the maximum depth of recesses in a wall, metres, so that they do not meet the room."""
     along = np.linspace(-0.3, wall.length + 0.3, 15)
     for depth in (2.0, 1.0, 0.5, 0.25):
         behind = np.linspace(0.01, depth + 0.1, 12)
         probes = np.array([wall.at(u, -out) for u in along for out in behind])
         if not inside(outline, probes).any():
             return depth
-    return 0.08  # at a re-entrant corner, two walls share the space behind them
+    return 0.08  # two walls share the space behind a re-entrant corner

@@ -2,8 +2,8 @@
 
     depth (H, W), cosine (H, W)  --kinect_noise-->  depth (H, W), 0 missing
 
-A Kinect matches a projected pattern by its disparity d = f b / z. Errors and steps are uniform in
-disparity, so they grow with z^2 in depth. Samples are missing in the projector's shadow, at grazing
+A Kinect measures the disparity d = f b / z of a projected pattern. Errors and steps are uniform in
+disparity, so in depth they grow with z^2. Samples are missing in the projector's shadow, at grazing
 incidence and on surfaces that do not reflect.
 """
 
@@ -45,7 +45,7 @@ class RayHits:
 
 
 class Caster:
-    """A mesh prepared for ray casting; build it once and cast many rays."""
+    """Ray caster of a mesh; raises MissingDependency if Embree cannot be imported."""
 
     def __init__(self, mesh: SyntheticMesh) -> None:
         self.mesh = mesh
@@ -61,13 +61,13 @@ class Caster:
 
         `origins`, `directions`: (R, 3) float32, metres; directions may have any length.
         """
-        found = self._scene.run(
+        hits = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
             np.ascontiguousarray(directions, np.float32),
             output=True,
         )
-        face = np.asarray(found["primID"], np.int32)
-        distance = np.where(face >= 0, found["tfar"], np.float32(np.inf)).astype(np.float32)
+        face = np.asarray(hits["primID"], np.int32)
+        distance = np.where(face >= 0, hits["tfar"], np.float32(np.inf)).astype(np.float32)
         return RayHits(distance, face, self._normals[face])  # face -1 selects the zero row
 
 
@@ -96,7 +96,7 @@ def cast_depth(
 def cast_faces(
     caster: Caster, T_world_camera: Floats, intrinsics: Intrinsics
 ) -> tuple[Floats32, Floats32, Ints32]:
-    """Return the result of `cast_depth`, and the index of the face (H, W) int32, -1 for none."""
+    """Return the result of `cast_depth`, and the indices of the faces (H, W), -1 without a hit."""
     shape = (intrinsics.height, intrinsics.width)
     rays = pixel_rays(intrinsics) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
@@ -168,8 +168,10 @@ def kinect_noise(
     ----------
     depth : (H, W) ideal depth, metres, 0 if missing
     cosine : (H, W) |cos| of incidence, [0, 1]
+    intrinsics : camera
     rng : source of all noise
-    loss : (H, W) fraction of samples that are lost on the visible surface, [0, 1]; None for 0
+    parameters : parameters of the noise
+    loss : (H, W) share of samples that are lost on the visible surface, [0, 1]; None for 0
 
     Returns
     -------
@@ -183,7 +185,7 @@ def kinect_noise(
     disparity = np.divide(gain, np.where(seen, z, 1), dtype=np.float32)
     seen &= ~_shadow_mask(depth, gain, p)[rows, columns]
     lost = _loss_probability(cos, None if loss is None else loss[rows, columns], p)
-    # A threshold on one smooth field groups losses in patches.
+    # A threshold on a smooth field groups losses in patches.
     hole = _field(depth.shape, p.patch, rng) * np.float32(0.9)
     hole += np.float32(math.sqrt(1 - 0.81)) * rng.standard_normal(depth.shape, np.float32)
     seen &= hole > special.ndtri(lost)
@@ -198,7 +200,7 @@ def kinect_noise(
 def _displaced_pixels(
     depth: Floats32, rng: np.random.Generator, p: KinectNoise
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return displaced rows and columns of samples; near edges of depth, blocks move together."""
+    """Return rows and columns (H, W) of samples; blocks near edges of depth are displaced."""
     height, width = depth.shape
     small = (-(-height // p.edge_block), -(-width // p.edge_block))
     stray = np.round(rng.normal(0, p.edge_jitter, (2, *small))).astype(np.intp)
@@ -211,7 +213,7 @@ def _displaced_pixels(
 
 
 def _inside_border(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
-    """Return (H, W) whether a pixel lies inside the border."""
+    """Return a mask (H, W) of the pixels inside the border."""
     left, right, top, bottom = p.border
     within = np.zeros(shape, bool)
     within[top : shape[0] - bottom, left : shape[1] - right] = True
@@ -219,10 +221,10 @@ def _inside_border(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
 
 
 def _shadow_mask(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.bool_]:
-    """Return the samples that the projector, to the right of the camera, does not reach.
+    """Return a mask (H, W) of the samples in the shadow of the projector, right of the camera.
 
-    The projector lights column u - d. Of two samples with the same column, the nearer one, whose u
-    is greater, is lit.
+    A sample in column u is lit by column u - d of the projector. If two samples have the same
+    column of the projector, the farther sample, with the smaller u, is in the shadow.
     """
     far = np.where(depth > 0, depth, np.float32(1e3))
     column = np.arange(depth.shape[1], dtype=np.float32) - gain / far
@@ -232,7 +234,7 @@ def _shadow_mask(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[n
 
 
 def _loss_probability(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floats32:
-    """Return the probability (H, W) that a sample is lost, without shadows and the border."""
+    """Return the probability (H, W) of losing a sample outside of shadows and the border."""
     steep = (math.cos(p.grazing_start) - cosine) / (
         math.cos(p.grazing_start) - math.cos(p.grazing_end)
     )
@@ -243,9 +245,9 @@ def _loss_probability(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -
 
 
 def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Floats32:
-    """Return normal noise (H, W) of unit variance with a grain of about `size` pixels.
+    """Return normal noise (H, W) of unit variance with a correlation length of `size` pixels.
 
-    Coarse grain is drawn on a coarse grid and enlarged, at a tenth of the cost of a blur.
+    Coarse noise is generated on a coarse grid and enlarged, at a tenth of the cost of a blur.
     """
     step = max(1, int(size / 1.5))
     small = (shape[0] // step + 4, shape[1] // step + 4)
@@ -275,7 +277,7 @@ def _enlarge(coarse: Floats32, step: int) -> Floats32:
 
 @dataclass(frozen=True)
 class Spinning:
-    """Parameters of a scanner that rotates about its z axis, with its errors.
+    """A scanner that rotates about its z axis, and its errors.
 
     Parameters
     ----------
@@ -287,8 +289,8 @@ class Spinning:
     ring_sigma : standard deviation of the offset of all ranges of a ring, metres
     loss : fraction of returns that are lost at random
     grazing : cosine of incidence at which half of the returns at the maximum range are lost
-    blind_middle, blind_width : azimuths that the carrier hides, rad
-    blind_below : elevation below which the carrier hides them, rad
+    blind_middle, blind_width : centre and width of the azimuths that the carrier hides, rad
+    blind_below : elevation below which the carrier hides these azimuths, rad
     """
 
     rings: int = 64
@@ -307,12 +309,12 @@ class Spinning:
 
     @property
     def elevations(self) -> Floats:
-        """Return the elevations (rings,), rad, in increasing order."""
+        """Elevations (rings,), rad, in increasing order."""
         return np.linspace(self.lowest, self.highest, self.rings)
 
     @property
     def azimuths(self) -> Floats32:
-        """Return the azimuths (firings,), rad, from -pi."""
+        """Azimuths (firings,), rad, from -pi."""
         n = round(2 * math.pi / self.azimuth_step)
         return (np.arange(n) * (2 * math.pi / n) - math.pi).astype(np.float32)
 
@@ -332,7 +334,7 @@ class Spinning:
         return np.repeat(own, len(self.azimuths))
 
     def hidden(self) -> NDArray[np.bool_]:
-        """Return (rings x firings,) whether the carrier blocks the ray."""
+        """Return a mask (rings x firings,) of the rays that the carrier blocks."""
         away = np.abs((self.azimuths - self.blind_middle + math.pi) % (2 * math.pi) - math.pi)
         below = (self.elevations < self.blind_below)[:, None]
         return np.asarray(((away < self.blind_width / 2) & below).ravel())
@@ -344,9 +346,9 @@ class Spinning:
 
 @dataclass(frozen=True)
 class Rosette:
-    """Parameters of a scanner with a narrow view about its x axis and a non-repeating pattern.
+    """A scanner with a narrow view about its x axis and a non-repeating pattern.
 
-    Two prisms of equal deflection turn the beams of a few lasers at different speeds, like a
+    Two prisms of equal deflection rotate at different speeds in the beams of a few lasers, as in a
     Livox Avia (70 degrees, about 24,000 firings in 0.1 s). Each scan starts at random angles of
     the prisms.
 
@@ -405,7 +407,7 @@ def own_scanner(rng: np.random.Generator) -> Spinning:
     low, high = np.radians(rng.uniform((-45.0, 8.0), (-14.0, 45.0)))
     if rings < 64:  # a sensor with few rings has a narrow vertical field of view
         low, high = max(low, -rings * 0.018), min(high, rings * 0.018)
-    # Many rings have coarser azimuths, since such scanners also return tens of thousands of points.
+    # Scanners with many rings have coarser azimuths, so they return a similar number of points.
     step = math.radians(rng.uniform(0.18, 0.4)) * (1.0 if rings <= 64 else 1.6)
     return Spinning(
         rings=rings, lowest=float(low), highest=float(high), azimuth_step=step,

@@ -22,14 +22,14 @@ from sceneprint_lab.synth.mesh import rotation_x, rotation_z
 from sceneprint_lab.synth.rooms import Room, inside
 from sceneprint_lab.synth.sensors import pixel_rays
 
-CLEARANCE = 0.35  #: smallest distance from the camera to a surface, metres
+CLEARANCE = 0.35  #: minimum distance from the camera to a surface, metres
 HEIGHTS = (0.8, 1.9)  #: range of heights above the floor, metres
-_GOOD_SHARE = 0.75  #: fraction of a view that should lie within 0.5 to 5 m
-_COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: view of a Kinect with few rays
+_GOOD_SHARE = 0.75  #: initial minimum share of a view within 0.5 to 5 m
+_COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: Kinect camera with few pixels
 
 
 def pose(view: Floats) -> Floats:
-    """Return T_world_camera (4, 4) of a view (6,), for the optical frame."""
+    """Return T_world_camera (4, 4), the pose of the optical frame, for a view (6,)."""
     x, y, z, yaw, pitch, roll = view
     forward = np.array(
         [math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)]
@@ -44,7 +44,7 @@ def pose(view: Floats) -> Floats:
 
 
 def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np.bool_]:
-    """Return (n,) whether points (n, 3) are in free space at a distance from all surfaces.
+    """Return a mask (n,) of points (n, 3) in free space at a distance from all surfaces, metres.
 
     Rays are cast in 128 directions. A ray that hits the back of a face starts inside a solid or
     outside the room.
@@ -61,9 +61,9 @@ def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np
 
 
 def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
-    """Return independent views; each sees a large part of the room within 0.5 to 5 m.
+    """Return independent views that contain a large part of the room within 0.5 to 5 m.
 
-    Half of them look at an object from 0.7 to 3 m, the others in a random direction.
+    Half of the candidates look at an object from 0.7 to 3 m, the others in a random direction.
 
     Parameters
     ----------
@@ -74,28 +74,28 @@ def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats
     -------
     poses : n T_world_camera, (4, 4)
     """
-    found: list[Floats] = []
+    poses: list[Floats] = []
     least = _GOOD_SHARE
-    while len(found) < n:
+    while len(poses) < n:
         views = np.concatenate([looking_about(room, 8, rng), looking_at(room, 8, rng)])
         views = views[clear(room, views[:, :3])]
         for view in rng.permutation(views):
             T = pose(view)
-            if len(found) < n and worth_seeing(room, T, least):
-                found.append(T)
-        least *= 0.98  # a crowded room has few good views, so the limit falls
-    return found
+            if len(poses) < n and worth_seeing(room, T, least):
+                poses.append(T)
+        least *= 0.98  # lower the limit, because a crowded room has few good views
+    return poses
 
 
 def looking_about(room: Room, n: int, rng: np.random.Generator) -> Floats:
-    """Return views (n, 6) from random positions, slightly downward."""
+    """Return views (n, 6) from random positions in random, slightly downward directions."""
     yaw = rng.uniform(-math.pi, math.pi, n)
     pitch = np.clip(np.radians(rng.normal(-15, 15, n)), -1.3, 0.6)
     return np.column_stack([_positions(room, n, rng), yaw, pitch, _rolls(n, rng)])
 
 
 def looking_at(room: Room, n: int, rng: np.random.Generator) -> Floats:
-    """Return views (n, 6) centred on a random surface point between knee and head height."""
+    """Return views (n, 6) of random surface points between knee and head height."""
     a, b, c = (room.mesh.vertices[room.mesh.faces[:, k]] for k in range(3))
     middle = (a + b + c) / 3
     weight = np.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1))  # favours small objects
@@ -130,10 +130,10 @@ def _rolls(n: int, rng: np.random.Generator) -> Floats:
 
 
 def worth_seeing(room: Room, T_world_camera: Floats, least: float) -> bool:
-    """Return whether a fraction `least` of the view lies within 0.5 to 5 m, on several surfaces.
+    """Return whether a share `least` of the view is within 0.5 to 5 m and shows several surfaces.
 
     In a coarse grid of rays, a tenth of the neighbours must differ in depth or normal, and the
-    normals must span more than one direction. These limits fall with `least`.
+    normals must span more than one direction. These limits are proportional to `least`.
     """
     rays = pixel_rays(_COARSE) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
@@ -168,16 +168,16 @@ def orbit(
     middle: tuple[float, float, float], radius: float, n: int, rng: np.random.Generator, *,
     first: float | None = None, sweep: float = 2 * math.pi,
 ) -> list[Floats]:  # fmt: skip
-    """Return hand-held views from a circle around the vertical axis of `middle`, aimed near it.
+    """Return hand-held views of a point from a circle around it.
 
-    The eye is 1.05 to 1.65 m above z = 0. Distance, height, aim and roll vary slowly, by about
-    0.1 m and a few degrees; each aim also has a jitter of 15 mm.
+    The camera is 1.05 to 1.65 m above z = 0. Distance, height, aim and roll vary slowly, by about
+    0.1 m and a few degrees; the aim also has a jitter of 15 mm.
 
     Parameters
     ----------
     middle : point at which the views are aimed, metres
     radius : radius of the circle, metres
-    n : number of views, `sweep` / n apart; there is none at the end of the sweep
+    n : number of views, at intervals of `sweep` / n from the start of the sweep
     first : azimuth of the first view, rad; default: random
     sweep : angle that the views cover, rad
 
@@ -199,11 +199,9 @@ def orbit(
     return [pose(view) for view in np.column_stack([eye, yaw, pitch, roll])]
 
 
-# Hand-held paths that return to places.
+# Hand-held paths that return to earlier places: random walks in a network of viewpoints.
 #
 #     Room, n, rng  --trajectory-->  n x T_world_camera (4, 4), in order
-#
-# Straight clear segments join viewpoints to a network, over which the path wanders.
 
 
 def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
@@ -238,7 +236,10 @@ def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
 
 
 def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, list[list[int]]]:
-    """Return viewpoints (k, 6) and, for each, those at the end of a clear line."""
+    """Return at most `count` viewpoints (k, 6) and, for each, the indices of its neighbours.
+
+    Neighbours are connected by a clear straight line; an isolated viewpoint is its own neighbour.
+    """
     anchors: list[Floats] = []
     ways: list[list[int]] = []
     for attempt in range(400):
@@ -255,19 +256,20 @@ def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, 
             ways.append(reached)
             if len(anchors) == count:
                 return np.array(anchors), ways
-    for k, near in enumerate(ways):  # an isolated viewpoint only turns on the spot
+    for k, near in enumerate(ways):
         near.append(k)
     return np.array(anchors), ways
 
 
 def _way(room: Room, a: Floats, b: Floats) -> bool:
+    """Return whether the straight line between two views is clear."""
     steps = max(2, int(np.linalg.norm(a[:3] - b[:3]) / 0.15))
     points = a[:3] + np.linspace(0, 1, steps)[:, None] * (b[:3] - a[:3])
     return bool(clear(room, points, CLEARANCE + 0.05).all())
 
 
 def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
-    """Return views from a (excluded) to b; yaw takes the shorter direction."""
+    """Return views from a (excluded) to b, with yaw in the shorter direction."""
     change = b - a
     change[3] = (change[3] + math.pi) % (2 * math.pi) - math.pi
     walked = np.linalg.norm(change[:3]) / rng.uniform(0.03, 0.08)
@@ -277,7 +279,7 @@ def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _smoothed(values: Floats, radius: int) -> Floats:
-    """Return columns after a triangular moving mean over 2 radius + 1 rows, with constant ends."""
+    """Return the columns, smoothed by a triangular moving mean over 2 radius + 1 rows."""
     kernel = np.bartlett(2 * radius + 3)[1:-1]
     kernel /= kernel.sum()
     padded = np.pad(values, ((radius, radius), (0, 0)), mode="edge")
@@ -289,7 +291,7 @@ def _smoothed(values: Floats, radius: int) -> Floats:
 # Premises, n, rng  --walk, scattered-->  n x T_world_sensor (4, 4)
 
 STEP = 1.5  #: distance between scans on a walk, metres
-COARSE = 3  #: number of cells of the floor's grid in a cell of the grid for walks
+COARSE = 3  #: edge of a cell of the grid for walks, in cells of the floor's grid
 
 
 def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floats]:
@@ -301,15 +303,10 @@ def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floa
 
 
 def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STEP) -> list[Floats]:
-    """Return poses of a scanner every `step` metres on a walk that often returns.
+    """Return n poses of a scanner, `step` metres apart, on a walk that often returns.
 
-    Its height and its yaw to the direction of travel are random, but constant during the walk.
-
-    Parameters
-    ----------
-    n : number of poses
-    rng : generator of places, height, mounting and wobble
-    step : distance between poses, metres
+    The height of the scanner, and its yaw relative to the direction of travel, are random but
+    constant during the walk.
     """
     spots, graph = _ways(premises)
     path = [spots[0][None]]
@@ -325,7 +322,7 @@ def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STE
         length += max(float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()), 1e-3)
         path.append(line)
         at = leg[-1]
-        if len(path) > 50 * n:  # the premises have a single walkable cell
+        if len(path) > 50 * n:  # there is only one walkable cell
             break
     line = np.concatenate(path[1:])
     line = ndimage.gaussian_filter1d(line, 1.5, axis=0, mode="nearest")
@@ -352,7 +349,7 @@ def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Genera
 
 
 def _ways(premises: Premises) -> tuple[Floats, csr_array]:
-    """Return walkable spots (n, 2), and the distances between neighbours."""
+    """Return walkable spots (n, 2), metres, and the sparse matrix of distances of neighbours."""
     free = premises.walkable[::COARSE, ::COARSE]
     parts, count = ndimage.label(free, np.ones((3, 3)))
     if count:
