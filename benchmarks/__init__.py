@@ -1,1 +1,1 @@
-"""Benchmarks of speed and cost beside references that run in the same process."""
+"""Benchmarks of speed and cost, with references measured in the same process."""

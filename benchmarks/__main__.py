@@ -1,4 +1,4 @@
-"""Measure the cost of each part beside references in the same run, and print tables.
+"""Measure the cost of each part and of references in the same run, and print tables.
 
 `make bench` measures all parts.
 `python -m benchmarks --only service --map-frames 10000` measures one part.
@@ -33,14 +33,14 @@ RECORDINGS = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "da
 
 
 def thin(frames: list[FrameReference], most: int) -> list[FrameReference]:
-    """Return at most `most` frames, evenly spread."""
+    """Return at most `most` evenly spaced frames."""
     return frames[:: max(len(frames) // most, 1)][:most]
 
 
 def frames_to_sign(n: int) -> list[DepthFrame]:
-    """Return `n` frames spread over the recordings, or of synthetic rooms."""
+    """Return `n` frames of the recordings, evenly spaced, or of synthetic rooms."""
     scenes = [RECORDINGS / name for name in ("7scenes", "tum", "sun3d")]
-    sequences = [one for scene in scenes if scene.is_dir() for one in find_sequences(scene)]
+    sequences = [run for scene in scenes if scene.is_dir() for run in find_sequences(scene)]
     if sequences:
         every = [frame for sequence in sequences for frame in sequence.frames]
         return [frame.read_depth() for frame in thin(every, n)]
@@ -50,7 +50,7 @@ def frames_to_sign(n: int) -> list[DepthFrame]:
 
 @contextmanager
 def frames_to_serve(dataset: Path) -> Iterator[list[FrameReference]]:
-    """Yield up to 320 frames of a data set, or of a synthetic building if it does not exist."""
+    """Yield up to 320 frames of a data set or, if it does not exist, of a synthetic building."""
     with TemporaryDirectory(prefix="sceneprint-bench-") as temporary:
         if not dataset.is_dir():
             dataset = Path(temporary) / "building"
@@ -60,7 +60,7 @@ def frames_to_serve(dataset: Path) -> Iterator[list[FrameReference]]:
 
 
 def parts(options: argparse.Namespace) -> dict[str, Callable[[], list[str]]]:
-    """Return the function that measures each part; from `signing` on, all use one processor."""
+    """Return a measuring function for each part; those from `signing` on run on one processor."""
 
     def serve(measure: Callable[[list[FrameReference]], list[str]]) -> list[str]:
         with frames_to_serve(options.dataset) as frames:
@@ -72,7 +72,7 @@ def parts(options: argparse.Namespace) -> dict[str, Callable[[], list[str]]]:
 
     def sign() -> list[str]:
         frames = frames_to_sign(options.frames)
-        return [line for one in PRESETS for line in encode.measure(frames, one)]
+        return [line for preset in PRESETS for line in encode.measure(frames, preset)]
 
     return {
         "dashboard": dashboard.measure,

@@ -1,4 +1,4 @@
-"""A headless Chromium that uses the dashboard like a person."""
+"""Headless Chromium for measurements and screenshots of the dashboard."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-#: Records the time since navigation at which the main part of the page last became ready.
+#: Script that records the time since navigation at which the main part of the page became ready.
 _WATCH = """new MutationObserver(() => {
   const main = document.getElementById("main");
   window.settledAt = main?.getAttribute("aria-busy") === "false" ? performance.now() : undefined;
@@ -43,20 +43,20 @@ def chromium(path: str) -> Iterator[Browser]:
 
 
 def watch_page(page: Page) -> Page:
-    """Make a page record the time at which it settles, for `settled`."""
+    """Make a page record when its main part is ready, for `settled`; return the page."""
     page.add_init_script(_WATCH)
     return page
 
 
 def settled(page: Page) -> float:
-    """Return the milliseconds from the start of a page until its main part was ready."""
+    """Wait until the main part of a page is ready; return the time since navigation, ms."""
     return float(until(page, "window.settledAt"))
 
 
 def until(page: Page, expression: str) -> Any:
-    """Return the first value of an expression that is neither null nor false.
+    """Wait until a JavaScript expression is neither null nor false, and return its value.
 
-    Playwright's own wait evaluates code in the page, which the policy of the dashboard forbids.
+    The wait of Playwright uses `eval`, which the policy of the dashboard forbids.
     """
 
     def values() -> list[Any]:

@@ -1,4 +1,4 @@
-"""Measure how soon the dashboard shows its content in a browser with an empty cache."""
+"""Measure page loads and drawings of the dashboard in a browser with an empty cache."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAP, LARGE = "building", "large"
 RUNS, FRAMES = 5, 100_000
 #: Slow network: bytes per second in either direction, and latency in milliseconds.
 SLOW = {"downloadThroughput": 1.25e6, "uploadThroughput": 1.25e6, "latency": 40}
-#: Size of the canvas whose drawing is timed, CSS pixels, and number of drawings.
+#: Size of the measured canvas, CSS pixels, and number of measured drawings.
 CANVAS, DRAWN = (900, 600), 20
 _DRAW = """async ([width, height, times, of]) => {
   const canvas = document.querySelector(of), viewer = canvas.viewer;
@@ -63,8 +63,8 @@ _POINTS = """(async () => { const {parsePoints} = await import("/dashboard/viewe
 
 @dataclass(frozen=True)
 class Load:
-    """A page load: seconds until it was ready, transferred bytes of code and in total, and messages
-    of the console with requests to other hosts.
+    """A page load: seconds until it was ready, bytes of code and in total, console messages, and
+    requests to other hosts.
     """
 
     seconds: float
@@ -105,12 +105,12 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
         with serving(data, workers=0) as url:
             address = f"{url}/dashboard#/maps/{LARGE}"
             gallery = [_load(browser, address, _has_pictures) for _ in range(runs)]
-    faults = sum(len(one.faults) for one in (*first, *slow, *both, *places, *gallery))
+    faults = sum(len(load.faults) for load in (*first, *slow, *both, *places, *gallery))
     rows = {
         "first page usable, loopback": (_seconds(first), "1.0 s"),
         "first page usable, 10 Mbit/s and 40 ms": (_seconds(slow), "2.0 s"),
         "code of the first page, compressed": (
-            f"{max(one.code for one in first) / 1000:.1f} kB", "35 kB"
+            f"{max(load.code for load in first) / 1000:.1f} kB", "35 kB"
         ),
         f"overlay of {clouds['size']:,} points ready": (_seconds(both), "1.2 s"),
         "total transfer for the overlay": (_size(both), "700 kB"),
@@ -134,18 +134,18 @@ def measure(frames: int = FRAMES, runs: int = RUNS) -> list[str]:
 
 
 def _overlay(client: httpx.Client, views: list[Shot]) -> str:
-    """Query a frame near a stored one; return the address of their overlay."""
+    """Query a frame near a stored frame; return the address of the overlay of both."""
     camera = {"intrinsics": views[3].meta["intrinsics"]}
     files = {"frame": (views[3].name, views[3].data, "image/png")}
     answer = client.post(
         f"/v1/maps/{MAP}/queries", data={"meta": json.dumps(camera), "k": "2"}, files=files
     )
-    found = answer.raise_for_status().json()
-    match = found["matches"][-1]["frame_id"]
-    return f"#/queries/{found['query_id']}/matches/{match}?map={MAP}"
+    answered = answer.raise_for_status().json()
+    match = answered["matches"][-1]["frame_id"]
+    return f"#/queries/{answered['query_id']}/matches/{match}?map={MAP}"
 
 
-# Times at which pages are ready, milliseconds after navigation.
+# Waits for pages, which return the time since navigation, milliseconds.
 
 
 def _is_usable(page: Page) -> float:
@@ -177,9 +177,9 @@ def _load(
         page = watch_page(context.new_page())
         faults: list[str] = []
         came: list[Any] = []
-        page.on("console", lambda one: _record_message(faults, one))
-        page.on("pageerror", lambda one: faults.append(str(one)))
-        page.on("requestfinished", lambda one: came.append(one))
+        page.on("console", lambda message: _record_message(faults, message))
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("requestfinished", lambda request: came.append(request))
         if slow:
             network = context.new_cdp_session(page)
             network.send("Network.enable")
@@ -187,9 +187,9 @@ def _load(
         page.goto(address)
         seconds = ready(page) / 1000
         home = urlsplit(address)
-        faults += [one.url for one in came if urlsplit(one.url).netloc != home.netloc]
-        sizes = [(urlsplit(one.url).path, one.sizes()["responseBodySize"]) for one in list(came)]
-        # The browser fetches the tab's icon at a random time, so it does not count.
+        faults += [request.url for request in came if urlsplit(request.url).netloc != home.netloc]
+        sizes = [(urlsplit(r.url).path, r.sizes()["responseBodySize"]) for r in list(came)]
+        # Exclude the icon, which the browser fetches at a random time.
         code = sum(n for p, n in sizes if p.startswith(home.path) and not p.endswith(".svg"))
         return Load(seconds, code, sum(n for _, n in sizes), list(faults))
     finally:
@@ -197,7 +197,7 @@ def _load(
 
 
 def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> dict[str, Any]:
-    """Draw a canvas repeatedly; `size` is an expression for the number of drawn points or cells."""
+    """Measure drawings of a canvas; `size` is an expression for the number of points or cells."""
     context = browser.new_context(viewport={"width": 1280, "height": 800})
     try:
         page = watch_page(context.new_page())
@@ -214,17 +214,17 @@ def _draw(browser: Browser, address: str, mark: str, canvas: str, size: str) -> 
 
 
 def _record_message(faults: list[str], message: Any) -> None:
-    # Without a graphics card, Chromium itself warns that reading drawn pixels is slow.
+    # Without a graphics card, Chromium warns that reading pixels is slow.
     if message.type in ("error", "warning") and "GL Driver Message" not in message.text:
         faults.append(message.text)
 
 
 def _seconds(loads: Sequence[Load]) -> str:
-    return f"{statistics.median(one.seconds for one in loads):.2f} s"
+    return f"{statistics.median(load.seconds for load in loads):.2f} s"
 
 
 def _size(loads: Sequence[Load]) -> str:
-    return f"{statistics.median(one.bytes for one in loads) / 1000:.0f} kB"
+    return f"{statistics.median(load.bytes for load in loads) / 1000:.0f} kB"
 
 
 def _draw_time(drawn: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Measure signing by stages, beside Open3D's FPFH of the same frames in the same run."""
+"""Measure the stages of signing, and Open3D's FPFH of the same frames in the same run."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def fpfh_stages(points: Floats, o3d: Any) -> dict[str, float]:
 
 
 def measure(frames: Sequence[DepthFrame], preset: str, warm_up: int = 3) -> list[str]:
-    """Sign every frame and compute its FPFH, in turn; return the table.
+    """Alternately sign frames and compute their FPFH; return the table.
 
     `warm_up`: number of frames that are signed first without timing.
     """

@@ -1,4 +1,4 @@
-"""Fill maps with many frames at once, with the rows that workers would write."""
+"""Fill maps with many frames by writing the rows that workers would write."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ def fill(
     Parameters
     ----------
     vectors : (n, D) signatures
-    blob : digest of the upload and the artifact of each frame
-    columns : other values of the columns of each frame
-    signed : other values of the columns of all signatures
+    blob : digest of the upload and the artifact of all frames
+    columns : other column values of each frame
+    signed : other column values of all signatures
     """
     for start in range(0, len(vectors), BLOCK):
         block = slice(start, start + BLOCK)
@@ -76,7 +76,7 @@ def fill(
 
 
 def _map_number(connection: Connection, name: str, model: Model) -> int:
-    """Return the number of a map, which is created if it does not exist."""
+    """Return the number of a map; create the map if it does not exist."""
     number = connection.execute(select(maps.c.number).where(maps.c.name == name)).scalar()
     if number is None:
         store_model(connection, model.id, model.name, write_model(model))

@@ -1,4 +1,4 @@
-"""Answers of the library alone, for comparison with the service."""
+"""Queries by the library without a service, for comparison."""
 
 from __future__ import annotations
 
@@ -53,12 +53,11 @@ class Library:
             "retrieve", lambda: retrieve(signature, self._signatures, self._signer.model)
         )
         selection = clock.run("diversify", lambda: diversify(ranking, self._signatures))
-        geometry = read_geometry(write_geometry(seen))  # the service uses decoded artifacts too
+        geometry = read_geometry(write_geometry(seen))  # like the service
         validate = partial(associate, geometry, ranking, selection.indices.tolist(), self._geometry)
         matches = clock.run("validate", lambda: validate(pose_of=self._pose))
         estimate = clock.run("locate", lambda: self._locate(geometry, matches))
         before = unguided_validations(matches)
-        # The service does the same.
         if before is not None and estimate is not None and estimate.status != "found":
             matches = validate(known=before)
         return clock.stages, [
@@ -92,12 +91,12 @@ def accepted(answer: Answer, names: Mapping[str, int]) -> Matches:
 
 
 def are_same(some: Matches, others: Matches) -> bool:
-    """Return whether matches are equal to 0.01 mm.
+    """Return whether matches are equal, with a tolerance of 0.01 mm.
 
-    A service rounds stored poses differently. If this adds or removes a point in the last step of a
-    refinement, the transform changes by some micrometres.
+    A service rounds stored poses, which may change the points in the last step of a refinement and
+    thus the transform by some micrometres.
     """
     return [i for i, _ in some] == [i for i, _ in others] and all(
-        np.allclose(one, other, rtol=0, atol=1e-5)
-        for (_, one), (_, other) in zip(some, others, strict=True)
+        np.allclose(transform, other, rtol=0, atol=1e-5)
+        for (_, transform), (_, other) in zip(some, others, strict=True)
     )

@@ -44,7 +44,7 @@ def memory_gib() -> float:
 
 
 def seconds_to_import(runs: int = 5) -> float:
-    """Return the median wall time that `import sceneprint` adds to an interpreter's start."""
+    """Return the median wall time of `import sceneprint` beyond the start of Python, seconds."""
 
     def start(code: str) -> float:
         begin = time.perf_counter()
@@ -55,7 +55,7 @@ def seconds_to_import(runs: int = 5) -> float:
 
 
 def peak_megabytes_of_signing(folder: Path, preset: str) -> float:
-    """Return the peak resident memory of a process that signs the frames of a folder."""
+    """Return the peak resident memory of a process that signs the frames of a folder, MB."""
     code = (
         "import sys\n"
         "from sceneprint.cli import main\n"
@@ -71,14 +71,14 @@ def peak_megabytes_of_signing(folder: Path, preset: str) -> float:
 
 
 def read_process(pid: int, name: str) -> bytes:
-    """Return a file of a process under /proc, which is empty once the process has ended."""
+    """Return the content of /proc/PID/NAME; empty if the process has ended."""
     with suppress(OSError):
         return Path(f"/proc/{pid}/{name}").read_bytes()
     return b""
 
 
 def running_processes() -> Iterator[tuple[int, int, int]]:
-    """Yield number, group and parent of each running process."""
+    """Yield process id, process group and parent id of each running process."""
     for path in Path("/proc").glob("[0-9]*"):
         fields = read_process(int(path.name), "stat").rpartition(b")")[2].split()
         if fields and fields[0] != b"Z":
@@ -87,18 +87,18 @@ def running_processes() -> Iterator[tuple[int, int, int]]:
 
 def peak_bytes(pid: int) -> int:
     """Return the peak memory of a process, bytes."""
-    found = re.search(rb"^VmHWM:\s+(\d+) kB", read_process(pid, "status"), re.MULTILINE)
-    return 1024 * int(found[1]) if found else 0
+    peak = re.search(rb"^VmHWM:\s+(\d+) kB", read_process(pid, "status"), re.MULTILINE)
+    return 1024 * int(peak[1]) if peak else 0
 
 
 def own_bytes(process: Path) -> int:
-    """Return the memory, bytes, that a process (a folder under /proc) does not share."""
+    """Return the private memory of a process, given its folder under /proc, bytes."""
     lines = (process / "smaps_rollup").read_text().splitlines()
     return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Private_"))
 
 
 def processor_ns(process: Path) -> int:
-    """Return the processor time of a process and its running children, nanoseconds."""
+    """Return the processor time of a process (folder under /proc) and its children, ns."""
     total = 0
     for task in process.glob("task/*"):
         total += int((task / "schedstat").read_text().split()[0])
@@ -109,7 +109,7 @@ def processor_ns(process: Path) -> int:
 
 
 def sum_over_processes(figure: Callable[[Path], int], data: Path, command: str) -> int:
-    """Return the sum of a figure over all processes that run a command on a data folder."""
+    """Return the sum of `figure` over all processes that run a command on a data folder."""
     total = 0
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):  # the process has ended

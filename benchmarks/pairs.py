@@ -14,7 +14,7 @@ from sceneprint.types import DepthFrame, Floats
 from sceneprint_lab.evaluation.protocol import overlap, view_of
 from sceneprint_lab.synth import synthesise_room
 
-#: Smallest overlap of a pair, in the direction with less overlap.
+#: Minimum overlap of a pair, in the direction with less overlap.
 LEAST_OVERLAP = 0.3
 
 
@@ -25,7 +25,7 @@ class FramePair:
     Parameters
     ----------
     query, match : frames with poses
-    overlap : smaller overlap of the two directions, [0, 1]
+    overlap : overlap in the direction with less overlap, [0, 1]
     T_match_query : (4, 4) true transform from the poses
     """
 
@@ -36,8 +36,8 @@ class FramePair:
 
 
 def pairs_among(frames: Sequence[DepthFrame], apart: int = 1) -> list[FramePair]:
-    """Return all pairs that overlap enough and are at least `apart` frames apart."""
-    views, found = [view_of(frame) for frame in frames], []
+    """Return all pairs with LEAST_OVERLAP that are at least `apart` frames apart."""
+    views, pairs = [view_of(frame) for frame in frames], []
     for i, query in enumerate(frames):
         for j, match in enumerate(frames[: max(i + 1 - apart, 0)]):
             _, least = overlap(views[i], views[j])
@@ -45,12 +45,12 @@ def pairs_among(frames: Sequence[DepthFrame], apart: int = 1) -> list[FramePair]
                 assert query.pose is not None
                 assert match.pose is not None
                 truth = inverse(match.pose) @ query.pose
-                found.append(FramePair(query, match, least, truth))
-    return found
+                pairs.append(FramePair(query, match, least, truth))
+    return pairs
 
 
 def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
-    """Return `n` pairs of the first 7-Scenes sequence, at least two steps apart, or none."""
+    """Return `n` pairs of the first 7-Scenes sequence, at least 2 `step` frames apart, or []."""
     scenes = recordings / "7scenes"
     if not scenes.is_dir():
         return []
@@ -59,13 +59,13 @@ def real_pairs(recordings: Path, n: int, step: int = 25) -> list[FramePair]:
 
 
 def synthetic_pairs(n: int) -> list[FramePair]:
-    """Return `n` pairs of views of synthetic rooms, a few per room."""
-    found: list[FramePair] = []
+    """Return `n` pairs of views of synthetic rooms, at most three per room."""
+    pairs: list[FramePair] = []
     number = 0
-    while len(found) < n:
-        found += pairs_among(synthesise_room(3, number, 5).frames)[:3]
+    while len(pairs) < n:
+        pairs += pairs_among(synthesise_room(3, number, 5).frames)[:3]
         number += 1
-    return found[:n]
+    return pairs[:n]
 
 
 def _spread(pairs: list[FramePair], n: int) -> list[FramePair]:

@@ -131,7 +131,7 @@ class Server:
             raise NoServer(f"PostgreSQL in {self.folder} does not start:\n{end}")
 
     def stop(self, mode: str = "fast") -> None:
-        """Stop the server as an administrator would: "smart", "fast" or "immediate"."""
+        """Stop the server in a mode of PostgreSQL: "smart", "fast" or "immediate"."""
         if self._process is not None:
             signals = {"smart": signal.SIGTERM, "fast": signal.SIGINT, "immediate": signal.SIGQUIT}
             self._process.send_signal(signals[mode])
@@ -142,9 +142,9 @@ class Server:
         self._forget()
 
     def kill(self) -> None:
-        """Send SIGKILL to all its processes at once, like a failure of the machine."""
+        """Kill all processes of the server at once, as in a machine failure."""
         if self._process is not None and self.is_running:
-            # A stopped main process starts no other while its children are listed.
+            # Stop the main process, so that it starts no other process meanwhile.
             self._process.send_signal(signal.SIGSTOP)
             children = self._children()
             self._process.kill()
@@ -157,7 +157,7 @@ class Server:
         self._forget()
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal to all its processes, first to the main process."""
+        """Send a signal to all processes of the server, first to the main process."""
         if self._process is not None and self.is_running:
             self._process.send_signal(number)
             for child in self._children():
@@ -165,7 +165,7 @@ class Server:
                     os.kill(child, number)
 
     def create(self, database: str, template: str | None = None) -> str:
-        """Create a database, empty or as a copy of one without connections; return its URL."""
+        """Create a database, empty or as a copy of an unused database; return its URL."""
         copied = "" if template is None else f' TEMPLATE "{template}"'
         self.execute(f'CREATE DATABASE "{database}"{copied}')
         return self.url(database)
@@ -184,12 +184,12 @@ class Server:
             return cursor.fetchall() if cursor.description else []
 
     def standby(self, folder: Path, *, synchronous: bool, port: int | None = None) -> Server:
-        """Start a server that replicates this one, and return it.
+        """Start a server that replicates this server, and return it.
 
         Parameters
         ----------
         synchronous : whether commits wait for the standby
-        port : port of the standby; default: a free one
+        port : port of the standby; default: a free port
         """
         _create_folder(folder)
         self._run(
@@ -219,7 +219,7 @@ class Server:
         return follower
 
     def promote(self) -> None:
-        """Make a standby a primary; return when it accepts writes."""
+        """Promote this standby to primary; return when it accepts writes."""
         self.execute(f"SELECT pg_promote(true, {int(PATIENCE_S)})")
 
     def _answers(self) -> bool:
@@ -233,7 +233,7 @@ class Server:
         return {pid for pid, _, parent in running_processes() if parent == self._process.pid}
 
     def _remove_segment(self) -> None:
-        """Remove the shared memory that marks the folder as used; it outlives a killed server."""
+        """Remove the shared memory of a killed server, which marks its folder as used."""
         with suppress(OSError, IndexError, ValueError):
             line = (self.data / "postmaster.pid").read_text().splitlines()[6]
             ctypes.CDLL(None).shmctl(int(line.split()[1]), 0, None)  # IPC_RMID

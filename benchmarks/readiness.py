@@ -1,4 +1,4 @@
-"""Measure start and first answer with a large map, the speedup of a second worker, and disk use."""
+"""Measure the start with a large map, the speedup by a second worker, and the disk use."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FRAMES = 10_000
 
 
 def fill_map(data: Path, frames: int, model: Preset) -> None:
-    """Create a map whose signatures form groups like those of places."""
+    """Create a map of `frames` frames, with clustered signatures as in real places."""
     with open_context(Settings(data_dir=data)) as context:
         store = context.store
         create_map(store, NewMap(name=MAP, model=model))
@@ -78,7 +78,7 @@ def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[st
 
 
 def _start_times(data: Path, frame: FrameReference) -> tuple[float, float, float]:
-    """Return the seconds until the service is ready and has answered a query, and its memory."""
+    """Return the times until a service is ready and answers a query, s, and its memory, MB."""
     begun = time.perf_counter()
     with serving(data, workers=0) as url, Client(url) as client:
         while not client.healthy():
@@ -90,7 +90,7 @@ def _start_times(data: Path, frame: FrameReference) -> tuple[float, float, float
 
 
 def _signing_rate(data: Path, frames: Sequence[FrameReference], n: int) -> float:
-    """Return the frames per second that `n` workers sign once all of them have started."""
+    """Return the frames per second that `n` running workers sign; ValueError for few frames."""
     if len(frames) <= 16:
         raise ValueError(f"{len(frames)} frames are too few to time two workers.")
     with Client.embedded(data) as client:
@@ -108,7 +108,7 @@ def _signing_rate(data: Path, frames: Sequence[FrameReference], n: int) -> float
 
 
 def _await_signed(client: Client, signed: int) -> tuple[int, float]:
-    """Return the number of signed frames, once it reaches `signed`, and the time."""
+    """Wait until at least `signed` frames are signed; return their number and the time."""
     while (done := (client.status().jobs or {}).get("succeeded", 0)) < signed:
         time.sleep(0.05)
     return done, time.perf_counter()
@@ -135,9 +135,9 @@ def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
                 with Client.embedded(folder) as client:
                     client.create_map("disk", model=model)
                     added = [client.upload("disk", frame) for frame in some]
-                    client.wait([one.job_id for one in added])
+                    client.wait([upload.job_id for upload in added])
                 blobs = [
-                    one.stat().st_size for one in (folder / "blobs").rglob("*") if one.is_file()
+                    path.stat().st_size for path in (folder / "blobs").rglob("*") if path.is_file()
                 ]
                 sizes.append((_used_bytes(folder / "sceneprint.db"), sum(blobs)))
         rows, written = np.subtract(sizes[1], sizes[0])
@@ -149,10 +149,10 @@ def measure_disk(frames: Sequence[FrameReference]) -> list[str]:
 
 
 def _used_bytes(database: Path) -> int:
-    """Return the bytes of the used pages of a database, in its file or its log."""
+    """Return the size of the used pages of a database, including its log, bytes."""
     with closing(sqlite3.connect(database)) as connection:
         count, free, size = (
-            connection.execute(f"PRAGMA {one}").fetchone()[0]
-            for one in ("page_count", "freelist_count", "page_size")
+            connection.execute(f"PRAGMA {name}").fetchone()[0]
+            for name in ("page_count", "freelist_count", "page_size")
         )
     return int((count - free) * size)

@@ -1,4 +1,4 @@
-"""Measure the validation of two frames beside Open3D's FPFH + RANSAC + ICP.
+"""Measure the validation of two frames, and Open3D's FPFH + RANSAC + ICP.
 
 Our validation works in both directions, accepts or rejects the result, and searches for rivals.
 Open3D works in one direction and never rejects. Both timings include the features of both frames.
@@ -22,7 +22,7 @@ from sceneprint_lab.evaluation.pair_run import METHODS, Clock, points_of, regist
 
 #: The timed method of Open3D; `sceneprint evaluate-pairs` measures the others.
 METHOD = METHODS[0]
-#: Greatest errors of a correct transform, metres and radians.
+#: Maximum errors of a correct transform, metres and radians.
 RIGHT = (0.10, float(np.radians(10.0)))
 
 
@@ -34,8 +34,8 @@ def register_by_us(
         "geometry of both frames",
         lambda: [geometry_of(see(frame, model.parameters), model) for frame in (query, match)],
     )
-    found = clock.run("validation", lambda: validate(of_query, of_match, seed=0))
-    return found.T_match_query if found.status == "accepted" else None
+    result = clock.run("validation", lambda: validate(of_query, of_match, seed=0))
+    return result.T_match_query if result.status == "accepted" else None
 
 
 def is_right(T_match_query: Floats | None, truth: Floats) -> bool:
@@ -47,7 +47,7 @@ def is_right(T_match_query: Floats | None, truth: Floats) -> bool:
 
 
 def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> list[str]:
-    """Validate every pair and register it with Open3D, in turn; return the table.
+    """Alternately validate pairs and register them with Open3D; return the table.
 
     Parameters
     ----------
@@ -63,9 +63,9 @@ def measure(pairs: Sequence[FramePair], model: Model, warm_up: int = 1) -> list[
     open3d_right: list[bool] = []
     for pair in tqdm(pairs, desc="registration", unit="pair", disable=None):
         clock = Clock()
-        found = register_by_us(pair.query, pair.match, model, clock)
+        transform = register_by_us(pair.query, pair.match, model, clock)
         ours.append(clock.stages)
-        right.append(is_right(found, pair.T_match_query))
+        right.append(is_right(transform, pair.T_match_query))
         if o3d is not None:
             clouds = [
                 points_of(frame, p.minimum_depth, p.maximum_depth)

@@ -1,4 +1,4 @@
-"""Synthetic rooms in a running service, for the dashboard."""
+"""Synthetic frames for a running service, for measurements and screenshots of the dashboard."""
 
 from __future__ import annotations
 
@@ -57,15 +57,15 @@ def pose_in(parent: str, T: Floats | None) -> dict[str, Any]:
 
 
 def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
-    """Return views along a path through each room, taken by two robots in turn every second.
+    """Return views along a path through each room, one per second, alternately of two robots.
 
     Parameters
     ----------
     rooms : numbers of the rooms
     views : number of views of each room
-    step : interval of views along the path, in steps of about 5 cm or 2 degrees
+    step : distance between views along the path, in steps of about 5 cm or 2 degrees
     """
-    found = []
+    uploads = []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "frame.png"
         for room, number in enumerate(rooms):
@@ -80,25 +80,25 @@ def shots(rooms: Sequence[int], views: int, step: int = 1) -> list[Shot]:
                     "pose": pose_in(f"room-{room}", frame.pose),
                     "tags": ["door"] if view == 0 else [],
                 }  # fmt: skip
-                found.append(Shot(path.read_bytes(), meta))
-    return found
+                uploads.append(Shot(path.read_bytes(), meta))
+    return uploads
 
 
 def scans(views: int) -> list[Shot]:
     """Return scans of a spinning LiDAR on a walk through a hall."""
     clouds = synthesise_survey(SEED, 0, views, along_path=True, kind="hall").clouds
-    found = []
+    uploads = []
     for view, cloud in enumerate(clouds):
         meta = {
             "robot": "cart", "session": "hall-3/cart", "pose": pose_in("hall-3", cloud.pose),
             "captured_at": f"2026-11-20T10:00:{view:02d}Z",
         }  # fmt: skip
-        found.append(Shot(write_ply(cloud.points), meta, f"scan-{view:06d}.ply"))
-    return found
+        uploads.append(Shot(write_ply(cloud.points), meta, f"scan-{view:06d}.ply"))
+    return uploads
 
 
 def box(ahead: float) -> Shot:
-    """Return a view of an empty room, moved by `ahead` metres; upside down it looks the same."""
+    """Return a view of an empty room, `ahead` metres further; it looks the same upside down."""
     v, u = np.mgrid[:240, :320].astype(float)
     x, y = abs(u - 159.5) / 292.5, abs(v - 119.5) / 292.5
     depth = np.minimum.reduce([1.5 / np.maximum(x, 1e-6), 1.1 / y, np.full(x.shape, 3.2 - ahead)])
@@ -109,11 +109,11 @@ def box(ahead: float) -> Shot:
 
 
 def circled(azimuths: Sequence[float]) -> list[Shot]:
-    """Return views of a cube in an empty hall, 1.8 m away; its four sides look the same.
+    """Return views of a cube with four equal sides in an empty hall, from 1.8 m.
 
-    `azimuths`: azimuths of the camera seen from the cube, degrees.
+    `azimuths`: azimuths of the camera around the cube, degrees.
     """
-    room, rng, found = symmetric_box(), np.random.default_rng(SEED), []
+    room, rng, uploads = symmetric_box(), np.random.default_rng(SEED), []
     for view, azimuth in enumerate(azimuths):
         a = math.radians(azimuth)
         eye = (1.8 * math.cos(a), 1.8 * math.sin(a), 1.2)
@@ -124,8 +124,8 @@ def circled(azimuths: Sequence[float]) -> list[Shot]:
             "intrinsics": camera_of(KINECT), "session": "round", "pose": pose_in("hall", T),
             "captured_at": f"2026-11-20T11:00:{view:02d}Z",
         }  # fmt: skip
-        found.append(Shot(file.getvalue(), meta, "frame.npy"))
-    return found
+        uploads.append(Shot(file.getvalue(), meta, "frame.npy"))
+    return uploads
 
 
 def send(client: httpx.Client, name: str, of: list[Shot]) -> list[str]:
@@ -153,9 +153,9 @@ def fuse(client: httpx.Client, name: str) -> None:
 
 
 def multiply(data: Path, source: str, name: str, count: int) -> None:
-    """Create a map with many copies of one frame of another map, as content for lists.
+    """Create a map with many copies of a frame of another map, as content for lists.
 
-    They share its blobs. Their signatures have one byte, since no query searches this map.
+    The copies share its blobs. Their signatures have one byte, because no query searches this map.
 
     Parameters
     ----------

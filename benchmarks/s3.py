@@ -1,4 +1,4 @@
-"""A server of the S3 protocol in its own process: moto, which stores objects in memory."""
+"""S3 server in its own process: moto, which stores objects in memory."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _MAIN = "import sys; from moto.server import main; main(sys.argv[1:])"
 
 
 class ObjectServer:
-    """An S3 server that starts when the context is entered; it checks no signatures.
+    """An S3 server that runs within the context; it does not check signatures.
 
     Parameters
     ----------
-    port : port to listen on; 0 for a free one
+    port : port to listen on; 0 for a free port
     log : file that receives a line per request, which `requests` counts
     """
 

@@ -26,15 +26,15 @@ if TYPE_CHECKING:
     from playwright.sync_api import FilePayload
 
 MAP, HALL, BOXES, SIDES = "building", "hall-3", "boxes", "four-sides"
-#: Rooms, number of views of each, and number of steps of the path between two views.
+#: Rooms, number of views of each room, and number of path steps between two views.
 ROOMS, VIEWS, STEP = (3, 0), 12, 4
-#: Width, and smallest and greatest height of a screenshot.
+#: Width, and minimum and maximum height of a screenshot, pixels.
 WIDTH, LOW, HIGH = 1280, 800, 2400
 #: Width and height of a tablet in portrait orientation, and of a phone.
 TABLET, PHONE = (768, 1024), (390, 844)
-#: Seconds for drawing after the main part of a page is ready.
+#: Time for drawing after the main part of a page is ready, seconds.
 LINGER_S = 2.0
-#: Upload speed, bytes per second, low enough for a screenshot of the progress.
+#: Upload speed that is low enough for a screenshot of the progress, bytes per second.
 SLOW_UPLOADS = 20_000
 #: Expression that waits until all pictures of a page are drawn.
 _PICTURES = """Promise.all([...document.querySelectorAll("canvas.picture")].map((one) =>
@@ -87,7 +87,7 @@ def take_all(path: str, out: Path) -> int:
 
 
 def fill(client: httpx.Client, data: Path, frames: list[Shot]) -> None:
-    """Upload all frames while no worker runs, and damage one of them on disk."""
+    """Create maps, upload all frames without a worker, and damage one upload on disk."""
     for name, title, model in (
         (MAP, "Two rooms, two robots", "depth"), (HALL, "Hall 3", "lidar"),
         (BOXES, "Rooms without furniture", "depth"), (SIDES, "A cube in a hall", "depth"),
@@ -101,13 +101,13 @@ def fill(client: httpx.Client, data: Path, frames: list[Shot]) -> None:
     send(client, HALL, walk[:-1])
     before = set((data / "blobs").rglob("*"))
     send(client, HALL, walk[-1:])
-    (blob,) = (one for one in set((data / "blobs").rglob("*")) - before if one.is_file())
+    (blob,) = (path for path in set((data / "blobs").rglob("*")) - before if path.is_file())
     blob.chmod(0o644)
     blob.write_bytes(blob.read_bytes()[:-1])
 
 
 def views(client: httpx.Client, frames: list[Shot]) -> Iterator[View]:
-    """Let the workers sign, query and associate frames, create keys, and yield all pages."""
+    """Wait for the workers, query and associate frames, create keys, and yield all pages."""
     for name in (MAP, BOXES, SIDES, HALL):
         wait(client, f"/v1/maps/{name}", {"indexed", "failed"} if name == HALL else {"indexed"})
     _post(client, "keys", {"name": "operator", "grants": {"*": "admin"}})
@@ -121,8 +121,8 @@ def views(client: httpx.Client, frames: list[Shot]) -> Iterator[View]:
     ids = _frame_ids(client, MAP)
     query = {"frame_id": ids[3], "k": 4, "explain": True, "explain_frame": ids[-1]}
     answer = _post(client, f"maps/{MAP}/queries", query)
-    for one in (frames[5], frames[8], frames[-2]):
-        _query(client, MAP, one)
+    for frame in (frames[5], frames[8], frames[-2]):
+        _query(client, MAP, frame)
     boxed = _query(client, BOXES, box(0.3))
     sides = str(_query(client, SIDES, circled([40])[0])["query_id"])
     absent = str(_query(client, SIDES, frames[0])["query_id"])
@@ -142,8 +142,8 @@ def views(client: httpx.Client, frames: list[Shot]) -> Iterator[View]:
         View("coverage", f"#/maps/{SIDES}/coverage?cell=6,-4", tall=True),
     ):
         yield from (view, replace(view, name=f"{view.name}-phone", size=PHONE))
-    # This page comes last, since it fills the empty map.
-    sent = [(f"frame-{i:06d}.depth.png", one.data) for i, one in enumerate(frames[:6])]
+    # This page is the last one, because it fills the empty map.
+    sent = [(f"frame-{i:06d}.depth.png", frame.data) for i, frame in enumerate(frames[:6])]
     lens = json.dumps({**frames[0].meta["intrinsics"], "depth_scale": 1000}).encode()
     files = (("torn.ply", b"ply\nformat ascii 1.0\n"), *sent, ("intrinsics.json", lens))
     yield View("uploading", "#/maps/empty/upload", files=files, press=("Upload 7 files",))
@@ -161,8 +161,8 @@ def _pages(answer: dict[str, Any], boxed: dict[str, Any], frame: str, scan: str)
         View("place-query", f"#/maps/{MAP}/place?view=3d&query={query}", tall=True),
         View("operations", "#/operations", tall=True),
     )  # fmt: skip
-    for one in on_tablets:
-        yield from (one, replace(one, name=f"{one.name}-tablet", size=TABLET))
+    for view in on_tablets:
+        yield from (view, replace(view, name=f"{view.name}-tablet", size=TABLET))
     yield replace(place, name="place-phone", size=PHONE, tall=True)
     yield from (queries, replace(queries, name="queries-phone", size=PHONE))
     for name, address in {
@@ -188,15 +188,15 @@ def _pages(answer: dict[str, Any], boxed: dict[str, Any], frame: str, scan: str)
 
 
 def _post(client: httpx.Client, path: str, body: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = client.post(f"/v1/{path}", json=body).raise_for_status().json()
-    return found
+    record: dict[str, Any] = client.post(f"/v1/{path}", json=body).raise_for_status().json()
+    return record
 
 
 def _frame_ids(client: httpx.Client, name: str, **params: str) -> list[str]:
     """Return the ids of the frames of a map in order of capture."""
     answer = client.get(f"/v1/maps/{name}/frames", params={"limit": "100", **params})
     items = answer.raise_for_status().json()["items"]
-    return [one["frame_id"] for one in sorted(items, key=lambda one: str(one["captured_at"]))]
+    return [f["frame_id"] for f in sorted(items, key=lambda f: str(f["captured_at"]))]
 
 
 def _await_job(client: httpx.Client, job: str) -> None:
@@ -209,16 +209,16 @@ def _query(client: httpx.Client, name: str, shot: Shot) -> dict[str, Any]:
     fields = {"meta": json.dumps({key: shot.meta[key] for key in names if key in shot.meta})}
     files = {"frame": (shot.name, shot.data, "image/png")}
     answer = client.post(f"/v1/maps/{name}/queries", data=fields, files=files)
-    found: dict[str, Any] = answer.raise_for_status().json()
-    return found
+    record: dict[str, Any] = answer.raise_for_status().json()
+    return record
 
 
 def _farthest(answer: dict[str, Any]) -> str:
-    """Return the strong match with the greatest distance from the query."""
-    strong = [one for one in answer["matches"] if one["validation"]["strength"] == "strong"]
+    """Return the id of the strong match with the greatest distance from the query."""
+    strong = [match for match in answer["matches"] if match["validation"]["strength"] == "strong"]
 
-    def distance(one: dict[str, Any]) -> float:
-        return sum(float(row[3]) ** 2 for row in one["transform"]["matrix"][:3])
+    def distance(match: dict[str, Any]) -> float:
+        return sum(float(row[3]) ** 2 for row in match["transform"]["matrix"][:3])
 
     return str(max(strong, key=distance)["frame_id"])
 

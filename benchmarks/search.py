@@ -1,7 +1,7 @@
-"""Measure searches by the number of frames in a map, exhaustively and with sketches.
+"""Measure exhaustive searches and searches with sketches, by number of frames in a map.
 
-Signatures are clustered like those of a building: random places, with fifty frames each. Times are
-of one thread, warm. Memory is that of a separate process that opens the index and searches.
+Signatures are clustered like those of a building: random places, with fifty frames each. Times
+refer to one warm thread, memory to a separate process that opens the index and searches.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from sceneprint.models import PRESETS, read_model
 from sceneprint.types import Bytes
 from sceneprint_lab.evaluation.pair_run import Clock
 
-#: Number of hits of a search, the length of the longest ranking.
+#: Number of hits of a search, the maximum length of a ranking.
 SIZE = 200
 #: Number of frames of a place, and of a block.
 PLACE, BLOCK = 50, 1 << 16
 #: Numbers of frames of the maps.
 FRAMES = (10_000, 100_000, 1_000_000)
-#: Sizes in bytes from which sketches are built: never, and always.
+#: Sizes from which sketches are built, bytes: never, and always.
 FLAT, SKETCHES = 1 << 62, 0
 
 #: Script that opens an index, searches, and prints milliseconds and bytes.
@@ -54,7 +54,7 @@ print(1e3 * opened, *(held() - before))
 
 
 def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
-    """Return the signatures (n, length) of frames with the given numbers, fifty per place."""
+    """Return the signatures (n, length) of the frames with the numbers `keys`, fifty per place."""
     places, frame = np.divmod(keys, PLACE)
     rows = np.empty((len(keys), length))
     for place in np.unique(places):
@@ -68,7 +68,7 @@ def signatures(keys: NDArray[np.int64], length: int) -> Bytes:
 
 
 def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
-    """Search a map like a service and exhaustively, in turn; return a table row.
+    """Alternately search a map as a service does and exhaustively; return a table row.
 
     Parameters
     ----------
@@ -112,14 +112,14 @@ def measure(frames: int, flat_bytes: int = FLAT, runs: int = 15) -> str:
             "search": lambda query: search(query, version, tail, SIZE, metric="l2"),
             "exact": lambda query: search(query, version, tail, SIZE, metric="l2", exact=True),
         }
-        times: dict[str, list[float]] = {one: [] for one in rows}
+        times: dict[str, list[float]] = {name: [] for name in rows}
         for run, query in enumerate(queries, -1):  # the first query warms up
             clock = Clock()
-            for one, call in rows.items():
-                clock.run(one, partial(call, query))
+            for name, call in rows.items():
+                clock.run(name, partial(call, query))
                 if run >= 0:
-                    times[one].append(clock.stages[one])
-    searched, every = (np.array(times[one]) for one in rows)
+                    times[name].append(clock.stages[name])
+    searched, every = (np.array(times[name]) for name in rows)
     recall, stages = version.manifest.recall, whole.stages
     return (
         f"| {len(version):,} | {length} | {'by sketches' if recall.probes else 'all'} "

@@ -1,4 +1,4 @@
-"""Measure the overhead of HTTP and the store in a query, and concurrent queries."""
+"""Measure the overhead of a service in a query, and concurrent queries."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ def measure(
 
     Parameters
     ----------
-    map_frames : number of frames of the map; random frames are added if `frames` are fewer, and the
-        answers are then not compared with the library's, since R grows with the map
+    map_frames : number of frames of the map; if `frames` are fewer, random frames are added and
+        answers are not compared with those of the library, because R grows with the map
     n_queries : number of queries
 
     Raise AssertionError if the answers of service and library differ, so the times are not
@@ -53,14 +53,14 @@ def measure(
         fill_map(folder, max(map_frames - len(database), 0), "depth")
         url = stack.enter_context(serving(folder, workers=1))
         client = stack.enter_context(Client(url))
-        added = [client.upload(MAP, one) for one in tqdm(database, "upload", disable=None)]
+        added = [client.upload(MAP, frame) for frame in tqdm(database, "upload", disable=None)]
         library = Library(database)
-        client.wait([one.job_id for one in added])
-        names = {one.frame_id: i for i, one in enumerate(added)}
+        client.wait([upload.job_id for upload in added])
+        names = {upload.frame_id: i for i, upload in enumerate(added)}
         client.query(MAP, queries[0])  # warm-up
         library.ask(queries[0])
         http, cpu, stages = [], [], []
-        for frame in queries:  # alternating, so that both run under the same load
+        for frame in queries:  # alternate, so that both run under the same load
             start, used = time.perf_counter(), sum_over_processes(processor_ns, folder, "serve")
             answer = client.query(MAP, frame)
             http.append(1e3 * (time.perf_counter() - start))
@@ -71,7 +71,7 @@ def measure(
         idle = _healthz(url, 3.0)
         crowds = {n: _load(url, queries, n, uploads=False)[0] for n in (1, CROWD)}
         meanwhile, loaded = _load(url, queries, CLIENTS, uploads=True)
-    sums = [sum(one.values()) for one in stages]
+    sums = [sum(times.values()) for times in stages]
     ratio = statistics.median(h / s for h, s in zip(http, sums, strict=True))
     rates = {n: sum(map(len, crowd)) / SECONDS for n, crowd in crowds.items()}
     return [
@@ -124,13 +124,13 @@ def _load(
             uploading = pool.submit(_upload, url, list(frames))
         barrier.wait(PATIENCE_S)
         healthz = _healthz(url, SECONDS)
-        answers = [one.result() for one in work]
+        answers = [future.result() for future in work]
         if uploads:
             uploading.result()
     return answers, healthz
 
 
-#: Barrier of a client process, which all pass once they have loaded their code.
+#: Barrier of a client process, for a common start after loading the code.
 _barriers: list[Barrier] = []
 
 
@@ -139,20 +139,20 @@ def _join(barrier: Barrier) -> None:
 
 
 def _time_queries(url: str, frames: Sequence[FrameReference], place: int) -> list[float]:
-    """Query frames one after the other; return the milliseconds of each query."""
-    taken: list[float] = []
+    """Query frames consecutively, starting with `place`; return the milliseconds of each query."""
+    times: list[float] = []
     with Client(url) as client:
         client.query(MAP, frames[place % len(frames)])
         _barriers[0].wait(PATIENCE_S)
         until = time.perf_counter() + SECONDS
         while (start := time.perf_counter()) < until:
-            client.query(MAP, frames[(place + len(taken)) % len(frames)])
-            taken.append(1e3 * (time.perf_counter() - start))
-    return taken
+            client.query(MAP, frames[(place + len(times)) % len(frames)])
+            times.append(1e3 * (time.perf_counter() - start))
+    return times
 
 
 def _upload(url: str, frames: Sequence[FrameReference]) -> None:
-    """Keep the worker busy with the same frames in one map after another."""
+    """Upload the same frames to a sequence of new maps, so that the worker is always busy."""
     with Client(url) as client:
         _barriers[0].wait(PATIENCE_S)
         until, number = time.perf_counter() + SECONDS, 0
@@ -164,12 +164,12 @@ def _upload(url: str, frames: Sequence[FrameReference]) -> None:
 
 def _healthz(url: str, seconds: float) -> tuple[float, float]:
     """Return p50 and p99 of /healthz at a constant rate, milliseconds."""
-    taken = []
+    times = []
     with httpx.Client(base_url=url) as client:
         until = time.perf_counter() + seconds
         while (start := time.perf_counter()) < until:
             assert client.get("/healthz").status_code == 200
-            taken.append(1e3 * (time.perf_counter() - start))
+            times.append(1e3 * (time.perf_counter() - start))
             time.sleep(max(1 / RATE - (time.perf_counter() - start), 0.0))
-    p50, p99 = np.percentile(taken, (50, 99)).tolist()
+    p50, p99 = np.percentile(times, (50, 99)).tolist()
     return p50, p99

@@ -11,7 +11,7 @@ import httpx
 
 T = TypeVar("T")
 
-#: Seconds until a wait counts as a failure. With 20 busy processes on two cores, an operation of
+#: Time after which a wait has failed, seconds. With 20 busy processes on two cores, an operation of
 #: 2 s takes 30 s.
 PATIENCE_S = 240.0
 

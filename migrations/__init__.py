@@ -1,1 +1,1 @@
-"""The schema of the database, step by step; run by `sceneprint.store` when it opens one."""
+"""Migrations of the database schema; `sceneprint.store` runs them when it opens a database."""

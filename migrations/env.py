@@ -1,4 +1,4 @@
-"""What Alembic runs: on the connection that the store hands over, in its transaction."""
+"""Script of Alembic; it uses the connection and the transaction of the store."""
 
 from alembic import context
 

@@ -1,1 +1,1 @@
-"""Robots that use a disturbed service, with a count of lost data: `make soak|fleet|siege`."""
+"""Soak tests: robots use a disturbed service, and lost data is counted. `make soak|fleet|siege`."""

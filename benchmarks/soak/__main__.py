@@ -67,7 +67,7 @@ def description(figures: SoakFigures) -> Iterator[str]:
         )
 
 
-#: Sentences for faults that end no process.
+#: Sentences for faults that do not end a process.
 _UNKILLED = {
     FROZEN: f"The primary was frozen {{}} for {FROZEN_S:g} s (SIGSTOP).",
     CUT_OFF: f"A host was cut off {{}} from its servers for {CUT_OFF_S:g} s.",
@@ -77,18 +77,18 @@ _UNKILLED = {
 
 def rows(figures: SoakFigures) -> dict[str, str]:
     """Return the rows of the table: labels and figures."""
-    plan, found = figures.plan, figures.found
+    plan, counts = figures.plan, figures.found
     figure_of = {
         "acknowledged frames, and frames that robots deleted":
-            f"{found.acknowledged + figures.deleted}, {figures.deleted}",
+            f"{counts.acknowledged + figures.deleted}, {figures.deleted}",
         "of the others: indexed, not indexed for a stated reason":
-            f"{found.indexed}, {found.stated}",
+            f"{counts.indexed}, {counts.stated}",
         "of the indexed: queried with their own content, found":
-            f"{found.looked_up}, {found.found}",
+            f"{counts.looked_up}, {counts.found}",
         "**lost**": f"**{figures.lost}**",
     }  # fmt: skip
     if plan.retention_s is not None:
-        figure_of["deleted by retention, with an event"] = f"{found.aged}"
+        figure_of["deleted by retention, with an event"] = f"{counts.aged}"
     if plan.count("offline-hour"):
         sent = f"{figures.spooled}, {figures.spooled_twice}"
         figure_of["frames of the offline robot, frames sent again"] = sent
@@ -96,18 +96,18 @@ def rows(figures: SoakFigures) -> dict[str, str]:
         figure_of[
             "acknowledged frames that the standby had not received: missing, of frames that only "
             "the dead primary has"
-        ] = f"{len(found.missing)}, {figures.window}"
+        ] = f"{len(counts.missing)}, {figures.window}"
     figure_of |= {
         "**stored twice, stored without acknowledgement, restored after deletion**":
-            f"**{found.doubled}, {found.strangers}, {found.returned}**",
-        "**changes without their event or audit entry**": f"**{found.separated}**",
+            f"**{counts.doubled}, {counts.strangers}, {counts.returned}**",
+        "**changes without their event or audit entry**": f"**{counts.separated}**",
         "**damages found by `sceneprint fsck`**": f"**{figures.damaged}**",
         "unreferenced files (`sceneprint fsck` removes them)": f"{figures.leftovers}",
         "events of frames: not received, received twice":
-            f"{found.unheard}, {found.heard_twice}",
-        "answers and lists that differ between services": f"{found.disagreeing}",
+            f"{counts.unheard}, {counts.heard_twice}",
+        "answers and lists that differ between services": f"{counts.disagreeing}",
         "**searches with a wrong distance, order or match**, all searches":
-            f"**{len(found.wrong)}**, {found.searches:,}",
+            f"**{len(counts.wrong)}**, {counts.searches:,}",
         "answered queries, repeated requests, errors":
             f"{figures.queries}, {figures.repeated}, {len(figures.faults)}",
     }  # fmt: skip
@@ -118,7 +118,7 @@ def rows(figures: SoakFigures) -> dict[str, str]:
         figure_of["time that a frame blocks all writers, writers of its map"] = turns
     else:
         figure_of['**"database is locked"**'] = f"**{figures.locked}**"
-    service, worker = (one / 1e6 for one in figures.memory)
+    service, worker = (peak / 1e6 for peak in figures.memory)
     figure_of["peak memory of a service process, of a worker process"] = (
         f"{service:,.0f}, {worker:,.0f} MB"
     )
@@ -132,14 +132,14 @@ def table(figures: SoakFigures) -> list[str]:
     if figures.outages:
         lines += ["", "| fault | longest time without an answer, s |", "|---|--:|"]
     for victim, waits in sorted(figures.outages.items()):
-        waited = [f"{one:.1f}" for one in sorted(waits) if one >= 0.05]
+        waited = [f"{wait:.1f}" for wait in sorted(waits) if wait >= 0.05]
         lines.append(f"| {victim}, {len(waits)} | {', '.join(waited) or '0.0'} |")
     lines.append("")
-    for one in figures.promotions:
-        back = ", ".join(f"{seconds:.1f}" for seconds in one.resumed.values())
+    for promotion in figures.promotions:
+        back = ", ".join(f"{seconds:.1f}" for seconds in promotion.resumed.values())
         lines.append(
-            f"Primary dead for {one.promoted - one.killed:.1f} s until the standby was promoted; "
-            f"each service answered {back} s after that."
+            f"Primary dead for {promotion.promoted - promotion.killed:.1f} s until the standby was "
+            f"promoted; each service answered {back} s after that."
         )
     if figures.broken is not None:
         lines += broken_table(figures.broken)
@@ -178,8 +178,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--page", type=Path, help="Markdown file whose marked section is replaced")
     parser.add_argument("--keep", type=Path, help="new folder for data and logs, which is kept")
     options = parser.parse_args(arguments)
-    changed = {one.name: getattr(options, one.name) for one in fields(Plan)
-               if getattr(options, one.name, None) is not None}  # fmt: skip
+    changed = {option.name: getattr(options, option.name) for option in fields(Plan)
+               if getattr(options, option.name, None) is not None}  # fmt: skip
     if options.faults is not None:
         changed["faults"] = dict(options.faults)
     return max(
@@ -200,7 +200,7 @@ def _run(name: str, plan: Plan, page: Path | None, keep: Path | None) -> int:
         folder = Path(new) if keep is None else keep / name
         folder.mkdir(parents=True, exist_ok=True)
         figures = drive(folder, plan)
-    reports = [one.report for one in figures.operations if not one.sound]
+    reports = [operation.report for operation in figures.operations if not operation.sound]
     broken = [] if figures.broken is None else figures.broken.failed
     for line in (
         *figures.faults[:20], *figures.found.wrong[:20], *broken[:20], *reports, *figures.exceeded

@@ -1,7 +1,6 @@
-"""Attacks by one tenant, and the delays of other tenants during them.
+"""Attacks by one tenant, and the delays of other tenants during the attacks.
 
-The attacks run in their own process, as if from other machines, so they do not compete with the
-other clients for an interpreter.
+The attacks run in their own process, so they do not compete with other clients for an interpreter.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ PATIENCE_S = 60.0
 SESSION = "run"
 #: Number of connections of an attack, independent of the number of its keys.
 _CONNECTIONS = 40
-#: Niceness of the attacking process; its own work must not slow other clients on this machine.
+#: Niceness of the attacking process, so that its own work does not slow other clients.
 _NICENESS = 5
 _PNG = {"Content-Type": "image/png"}
 _FRAMES, _MAP = "/v1/maps/noisy/frames", "/v1/maps/noisy"
@@ -47,7 +46,7 @@ class Attack:
     ----------
     name, url : name of the attack, and address of the service
     secrets : keys of the attacker, all of one tenant
-    shots : frames to upload to the map `noisy`, which already has some
+    shots : frames to upload to the map `noisy`
     """
 
     name: str
@@ -74,8 +73,8 @@ class AttackFigures:
     Parameters
     ----------
     calm_s, under_s : 99th percentiles, seconds, of requests and of the time until frames are signed
-    victim_refused : number of requests of other tenants that had to be repeated
-    sent, refused : number of requests of the attacker, and of those that were rejected
+    victim_refused : number of repetitions of requests of other tenants
+    sent, refused : number of requests of the attacker, and of rejected requests among them
     """
 
     name: str
@@ -105,7 +104,7 @@ def run_attacks(
     url: str, secrets: Sequence[str], shots: list[Shot], seconds: float, log: RequestLog,
     drain: Callable[[], None],
 ) -> Iterator[AttackFigures]:  # fmt: skip
-    """Run every attack while others work, each after an equal period without an attack.
+    """Yield the figures of every attack, each after an equally long period without an attack.
 
     Parameters
     ----------
@@ -127,42 +126,43 @@ def run_attacks(
             time.sleep(seconds)
             stop.set()
             sent, refused = running.result()
-            drain()  # requests of others are answered during this
-            calm, under = (_percentiles(log, one, one + seconds) for one in (begun, middle))
-            repeated = sum(one.tries - 1 for one in _between(log, middle, middle + seconds))
+            drain()  # meanwhile, pending requests of others are answered
+            calm, under = (_percentiles(log, start, start + seconds) for start in (begun, middle))
+            repeated = sum(e.tries - 1 for e in _between(log, middle, middle + seconds))
             yield AttackFigures(name, calm, under, repeated, sent, refused)
 
 
 def _between(log: RequestLog, first: float, last: float) -> list[Exchange]:
     """Return the requests that were open at any time in an interval."""
     with log.lock:
-        return [one for one in log.exchanges if one.begun <= last and one.answered >= first]
+        return [e for e in log.exchanges if e.begun <= last and e.answered >= first]
 
 
 def _percentiles(log: RequestLog, first: float, last: float) -> tuple[float, float]:
-    """Return 99th percentiles of requests, and of the time from upload to signing."""
+    """Return the 99th percentiles of requests, and of the time from upload to signing, seconds."""
     own = _between(log, first, last)
-    signed = [one.answered - one.begun for one in own if one.kind == "upload"]
-    other = [one.answered - one.begun for one in own if one.kind != "upload"]
+    signed = [exchange.answered - exchange.begun for exchange in own if exchange.kind == "upload"]
+    other = [exchange.answered - exchange.begun for exchange in own if exchange.kind != "upload"]
     if not signed or not other:
         raise RuntimeError("No other tenant received an answer.")
     return float(np.percentile(other, 99)), float(np.percentile(signed, 99))
 
 
-def attack_table(found: Sequence[AttackFigures]) -> list[str]:
+def attack_table(attacks: Sequence[AttackFigures]) -> list[str]:
     """Return the figures as lines of Markdown."""
     lines = [
         "| attack | request p99, calm | under attack | ratio | frame signed p99, calm "
         "| under attack | ratio | victim refused | attacker sent | refused |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    for one in found:
+    for attack in attacks:
         times = " | ".join(
             f"{1e3 * calm:.0f} ms | {1e3 * under:.0f} ms | {under / calm:.1f}"
-            for calm, under in zip(one.calm_s, one.under_s, strict=True)
+            for calm, under in zip(attack.calm_s, attack.under_s, strict=True)
         )
         lines.append(
-            f"| {one.name} | {times} | **{one.victim_refused}** | {one.sent} | {one.refused} |"
+            f"| {attack.name} | {times} | **{attack.victim_refused}** | {attack.sent} "
+            f"| {attack.refused} |"
         )
     return lines
 
@@ -180,7 +180,7 @@ def _frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
 
 
 def _same_frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """Upload a stored frame, each time with a different Idempotency-Key."""
+    """Upload a stored frame with a new Idempotency-Key."""
     shot = attack.shot(0)
     key = {"Idempotency-Key": f"{time.monotonic_ns()}-{number}"}
     meta = {"meta": shot.meta.model_dump_json()}
@@ -188,7 +188,7 @@ def _same_frame(attack: Attack, client: httpx.Client, number: int) -> httpx.Resp
 
 
 def _archive(attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
-    """Import an archive of all frames, each time with different bytes."""
+    """Import an archive of all frames with new bytes."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         camera = attack.shot(0).meta.intrinsics
@@ -233,7 +233,7 @@ def _surface(_attack: Attack, client: httpx.Client, number: int) -> httpx.Respon
 
 
 def _gets(*paths: str) -> Send:
-    """Return an attack by GET of several paths in turn; `FRAME` stands for an indexed frame."""
+    """Return an attack by GET of alternating paths, in which `FRAME` is an indexed frame."""
     indexed: list[str] = []
 
     def send(_attack: Attack, client: httpx.Client, number: int) -> httpx.Response:
@@ -277,7 +277,7 @@ def _repeat(send: Send, connections: int = _CONNECTIONS) -> Callable[[Attack], N
 def _hold(
     line: str, head: str, *, body: bytes = b"", two: bool = False, count: int = _CONNECTIONS
 ) -> Callable[[Attack], None]:
-    """Return an attack by incomplete requests on open connections, which are reopened when closed.
+    """Return an attack by incomplete requests on connections that are reopened when closed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Comparison of a store's content and answers with the acknowledgements that clients received."""
+"""Comparison of the content and the answers of a store with the acknowledgements of clients."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from sceneprint_client.api import Frame, FrameState
 
 #: Time limits of the workers to finish the queue, and of events to arrive, seconds.
 PATIENCE_S, EVENTS_S = 600.0, 20.0
-#: Number of frames whose neighbours every service lists, and greatest number that is queried.
+#: Number of frames whose neighbours are compared between services, and of queried frames.
 COMPARED, LOOKED_UP = 20, 1_000
 #: States in which a frame is stored but not searched, with a reason.
 STATED = (FrameState.REJECTED, FrameState.FAILED, FrameState.REDUNDANT)
-#: Changes by clients, each of which has an event and an entry in the audit log.
+#: Changes by clients that have an event and an entry in the audit log.
 CHANGES = ("map.created", "frame.received")
 
 
@@ -44,14 +44,14 @@ class AuditCounts:
 
     Parameters
     ----------
-    acknowledged : frames without those that were deleted
+    acknowledged : acknowledged frames, without deleted frames
     indexed, stated : frames that queries find, and frames with a state that explains their absence
     aged : frames that retention deleted on time, with an event
-    looked_up, found : indexed frames that were queried, and those found at distance 0
+    looked_up, found : indexed frames that were queried, and those that were found at distance 0
     missing : ids of acknowledged frames that are not stored
     returned, stuck : deleted frames that are stored, and frames that are still queued
-    doubled, strangers : frames with the same content as another, and frames without acknowledgement
-    unheard, heard_twice : events of acknowledged frames that were not received, or repeatedly
+    doubled, strangers : frames with duplicate content, and frames without acknowledgement
+    unheard, heard_twice : events of acknowledged frames that were not, or repeatedly, received
     disagreeing : answers and lists that differ between addresses
     separated : changes without their event or their entry in the audit log
     searches, wrong : number of searches by readers and by this check, and their errors
@@ -100,18 +100,16 @@ def check(
     stable : ids of the frames that readers searched
     aging : retention of some maps, seconds
     """
-    expected = {one.frame_id: one for one in ledger.frames if one.frame_id not in ledger.deleted}
-    maps = sorted({one.map_name for one in ledger.frames})
+    expected = {f.frame_id: f for f in ledger.frames if f.frame_id not in ledger.deleted}
+    maps = sorted({frame.map_name for frame in ledger.frames})
     lists = [{name: list(client.frames(name)) for name in maps} for client in clients]
     stored = {frame.frame_id: frame for frames in lists[0].values() for frame in frames}
     present = {name: frame for name, frame in stored.items() if name in expected}
-    indexed = {name for name, one in present.items() if one.state == FrameState.INDEXED}
-    stated = sum(one.state in STATED for one in present.values())
-    contents = Counter((one.map, one.content_id) for one in stored.values())
+    indexed = {name for name, frame in present.items() if frame.state == FrameState.INDEXED}
+    stated = sum(frame.state in STATED for frame in present.values())
+    contents = Counter((frame.map, frame.content_id) for frame in stored.values())
     # Frames of maps with retention may be deleted during the queries.
-    lasting = [
-        one for one in expected.values() if one.frame_id in indexed and one.map_name not in aging
-    ]
+    lasting = [f for f in expected.values() if f.frame_id in indexed and f.map_name not in aging]
     looked_up = lasting[:: -(-len(lasting) // LOOKED_UP) or 1]
     with ThreadPoolExecutor(len(clients)) as pool:
         parts = [looked_up[i :: len(clients)] for i in range(len(clients))]
@@ -119,8 +117,8 @@ def check(
     gone = set(expected) - set(stored)
     aged = {
         str(name)
-        for one in listeners
-        for name, at in one.retired.items()
+        for listener in listeners
+        for name, at in listener.retired.items()
         if name in gone
         and at - expected[name].begun >= aging.get(expected[name].map_name, math.inf)
     }  # fmt: skip
@@ -130,9 +128,9 @@ def check(
         stuck=len(present) - len(indexed) - stated,
         doubled=sum(contents.values()) - len(contents),
         strangers=len(stored.keys() - expected.keys() - ledger.deleted.keys()),
-        disagreeing=sum(_plain(one, aging) != _plain(lists[0], aging) for one in lists[1:]),
+        disagreeing=sum(_plain(other, aging) != _plain(lists[0], aging) for other in lists[1:]),
     )  # fmt: skip
-    some = sorted(lasting, key=lambda one: one.frame_id)[:: max(len(lasting) // COMPARED, 1)]
+    some = sorted(lasting, key=lambda frame: frame.frame_id)[:: max(len(lasting) // COMPARED, 1)]
     _compare_searches(result, ledger, stable, clients, some)
     _compare_events(result, [expected[name] for name in (*present, *sorted(aged))], listeners)
     return result
@@ -140,39 +138,40 @@ def check(
 
 def _plain(lists: dict[str, list[Frame]], aging: Container[str]) -> dict[str, dict[str, str]]:
     return {
-        name: {one.frame_id: one.state for one in frames}
+        name: {frame.frame_id: frame.state for frame in frames}
         for name, frames in lists.items()
         if name not in aging
     }
 
 
-def _search(client: Client, one: Acknowledged, k: int) -> list[tuple[str, int]]:
+def _search(client: Client, frame: Acknowledged, k: int) -> list[tuple[str, int]]:
     answer = client.query(
-        one.map_name, one.shot.png, one.shot.meta, stages=("retrieve",), k=k, exact=True, keep=False
-    )
+        frame.map_name, frame.shot.png, frame.shot.meta, stages=("retrieve",), k=k, exact=True,
+        keep=False,
+    )  # fmt: skip
     return [(match.frame_id, int(match.distance)) for match in answer.matches]
 
 
 def _count_found(client: Client, frames: Sequence[Acknowledged]) -> int:
     """Return the number of frames that a query with the same content finds at distance 0."""
-    return sum((one.frame_id, 0) in _search(client, one, 2) for one in frames)
+    return sum((frame.frame_id, 0) in _search(client, frame, 2) for frame in frames)
 
 
 def _compare_searches(
     result: AuditCounts, ledger: Ledger, stable: Sequence[str], clients: Sequence[Client],
     some: Sequence[Acknowledged],
 ) -> None:  # fmt: skip
-    """Compare searches with each other, and with signatures that only the library computes."""
-    frames = {one.frame_id: one for one in ledger.frames}
+    """Compare searches at several addresses, and with signatures that the library computes."""
+    frames = {frame.frame_id: frame for frame in ledger.frames}
     searches = list(ledger.searches)
-    for one in some:
+    for frame in some:
         begun = time.monotonic()
-        answers = [_search(client, one, K) for client in clients]
+        answers = [_search(client, frame, K) for client in clients]
         result.disagreeing += any(answer != answers[0] for answer in answers[1:])
-        searches.append(Search(one.frame_id, answers[0], begun, time.monotonic()))
+        searches.append(Search(frame.frame_id, answers[0], begun, time.monotonic()))
     result.searches = len(searches)
-    names = {*stable, *(one.frame_id for one in searches)}
-    names |= {name for one in searches for name, _ in one.matches}
+    names = {*stable, *(search.frame_id for search in searches)}
+    names |= {name for search in searches for name, _ in search.matches}
     vectors = {name: signature(frames[name].shot) for name in names & frames.keys()}
     for search in searches:
         own = stable if frames[search.frame_id].map_name == frames[stable[0]].map_name else ()
@@ -217,7 +216,7 @@ def wrong_matches(
     names, distances = {name for name, _ in search.matches}, [far for _, far in search.matches]
     if distances != sorted(distances) or len(names) != len(distances):
         wrong.append("the matches are not in order, or one is repeated")
-    # A frame that is deleted during the search is dropped without a replacement.
+    # A frame that is deleted during the search is not replaced.
     meanwhile = sum(
         begun <= search.answered and done >= search.begun for begun, done in deleted.values()
     )
@@ -248,8 +247,8 @@ def _compare_events(
     result: AuditCounts, stored: Sequence[Acknowledged], listeners: Sequence[Listener]
 ) -> None:
     """Count events of stored frames that were not received, or received repeatedly."""
-    heard = {one.map_name: one.heard for one in listeners}
-    wanted = [(one.map_name, ("frame.received", one.frame_id)) for one in stored]
+    heard = {listener.map_name: listener.heard for listener in listeners}
+    wanted = [(frame.map_name, ("frame.received", frame.frame_id)) for frame in stored]
     end = time.monotonic() + EVENTS_S
     while time.monotonic() < end and not all(heard[name][event] for name, event in wanted):
         time.sleep(0.2)

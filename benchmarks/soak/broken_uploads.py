@@ -1,4 +1,4 @@
-"""Broken uploads, which must not crash a process, cause 5xx, or use much memory."""
+"""Uploads of damaged files, which must not crash a process, cause 5xx, or use much memory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _TEXTS = (
     "null", "-1", "1e999", "NaN", "[]", "{}", '""', '"\\ud800"', "18446744073709551616", "true",
     "[" * 500, '{"a":' * 200, '"' + "x" * 5000 + '"',
 )  # fmt: skip
-#: Points of a cloud; they are few, so that many changes hit the headers.
+#: Points of a cloud, few enough that many changes hit the headers.
 _POINTS = np.random.default_rng(0).uniform(-3, 3, (200, 3)).astype(np.float32)
 
 
@@ -75,7 +75,7 @@ def _tar(shot: Shot) -> bytes:
     return out.getvalue()
 
 
-#: Valid files by kind; the tests of the formats damage files of all other kinds.
+#: Valid files by kind; the tests of formats damage files of other kinds.
 CLOUDS: dict[str, Callable[[Shot], bytes]] = {
     "ply": lambda _: write_ply(_POINTS),
     "kitti": lambda _: np.column_stack([_POINTS, np.ones(200, np.float32)]).tobytes(),
@@ -95,7 +95,7 @@ _WEIGHTS = {**dict.fromkeys(FILES, 2.0), "json": 5.0, "png": 5.0}
 
 @dataclass(frozen=True)
 class BrokenUpload:
-    """A file and its metadata; for the kind "json" the metadata are damaged, else the file."""
+    """A damaged file and its metadata or, for the kind "json", a file and damaged metadata."""
 
     kind: str
     data: bytes
@@ -125,7 +125,7 @@ class BrokenFigures:
 
 
 def damaged_upload(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
-    """Return an upload with one to four damaged places, which depend only on the numbers."""
+    """Return an upload with one to four changes, which depend only on `seed` and `number`."""
     rng = random.Random(f"{seed} {number}")
     shot = rng.choice(shots)
     kind = rng.choices(list(_WEIGHTS), list(_WEIGHTS.values()))[0]
@@ -143,7 +143,7 @@ def damaged_upload(shots: list[Shot], seed: int, number: int) -> BrokenUpload:
 
 
 def _with_checksums(data: bytes) -> bytes:
-    """Return a damaged PNG with correct checksums, so that parsers read on."""
+    """Return a damaged PNG with correct checksums, so that parsers continue."""
     at = data.find(b"\x89PNG") + 8
     out = bytearray(data)
     while 8 <= at <= len(data) - 12:
@@ -182,11 +182,11 @@ def _damage_bytes(data: bytes, rng: random.Random) -> bytes:
 def _damage_json(text: str, rng: random.Random) -> str:
     """Return JSON with an invalid value or character."""
     if rng.random() < 0.5:
-        known: dict[str, Any] = json.loads(text)
-        place = known if rng.random() < 0.5 else known["intrinsics"]
+        metadata: dict[str, Any] = json.loads(text)
+        place = metadata if rng.random() < 0.5 else metadata["intrinsics"]
         name = rng.choice([*place, "pose", "tags", "captured_at", "strange"])
         marked = {**place, name: "@@"}
-        whole = marked if place is known else {**known, "intrinsics": marked}
+        whole = marked if place is metadata else {**metadata, "intrinsics": marked}
         return json.dumps(whole).replace('"@@"', rng.choice(_TEXTS))
     return _damage_bytes(text.encode(), rng).decode("utf-8", "replace")
 
@@ -251,14 +251,14 @@ def _send(client: httpx.Client, upload: BrokenUpload, number: int) -> tuple[int,
     return answer.status_code, answer.text
 
 
-def broken_table(found: BrokenFigures) -> list[str]:
+def broken_table(figures: BrokenFigures) -> list[str]:
     """Return the figures as lines of Markdown."""
-    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(found.sent.items()))
-    answers = ", ".join(f"{n} of {status}" for status, n in found.statuses.items())
+    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(figures.sent.items()))
+    answers = ", ".join(f"{n} of {status}" for status, n in figures.statuses.items())
     return [
-        f"### {sum(found.sent.values())} broken uploads within {found.seconds:.0f} s", "", "| | |",
-        "|---|--:|", f"| files | {kinds} |", f"| answers | {answers} |",
-        f"| **5xx, or no answer** | **{len(found.failed)}** |",
-        f"| **processes that ended** | **{found.crashed}** |",
-        f"| most memory of a process, decoders too | {found.peak_bytes / 2**20:.0f} MiB |", "",
+        f"### {sum(figures.sent.values())} broken uploads within {figures.seconds:.0f} s", "",
+        "| | |", "|---|--:|", f"| files | {kinds} |", f"| answers | {answers} |",
+        f"| **5xx, or no answer** | **{len(figures.failed)}** |",
+        f"| **processes that ended** | **{figures.crashed}** |",
+        f"| most memory of a process, decoders too | {figures.peak_bytes / 2**20:.0f} MiB |", "",
     ]  # fmt: skip

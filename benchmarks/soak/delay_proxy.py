@@ -1,4 +1,4 @@
-"""A proxy that delays messages between two programs of one machine, like a network."""
+"""Proxy that delays messages between two programs on one machine, like a network."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class DelayProxy:
         self.port: int = receiver.recv()
 
     def freeze(self) -> None:
-        """Forward nothing, but keep connections open, like a network that loses all packets."""
+        """Stop forwarding without closing connections, like a network that loses all packets."""
         self._send(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Forward messages again, with all that have arrived meanwhile."""
+        """Continue forwarding, including messages that arrived meanwhile."""
         self._send(signal.SIGCONT)
 
     def _send(self, number: signal.Signals) -> None:
@@ -58,8 +58,8 @@ def _serve(sender: Pipe, port: int, delay_s: float) -> None:
             except OSError:  # the port has no listener now
                 near.close()
                 continue
-            for one in (near, far):
-                one.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            for wire in (near, far):
+                wire.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             threading.Thread(target=_join, args=(near, far, delay_s), daemon=True).start()
 
 
@@ -78,7 +78,7 @@ def _pump(source: socket.socket, to: socket.socket, delay_s: float) -> None:
     with suppress(OSError):
         while is_open or coming:
             wait_s = max(coming[0][0] - time.monotonic(), 0.0) if coming else None
-            # Only `select` has a timeout with a resolution below a millisecond.
+            # `select` has a timeout with a resolution below a millisecond.
             if is_open and select.select([source], [], [], wait_s)[0]:
                 data = source.recv(1 << 16)
                 is_open = bool(data)

@@ -1,4 +1,4 @@
-"""A client that sends requests to several addresses of a service."""
+"""Client that sends requests to alternative addresses of a service."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def bearer(key: str) -> dict[str, str]:
 
 
 class FailoverClient(ExitStack):
-    """A client that tries the next address if one is silent or refuses.
+    """A client that tries the next address if an address does not answer or is busy.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class FailoverClient(ExitStack):
         self._current = next(self._order)
 
     def send(self, kind: str, method: str, path: str, **request: Any) -> httpx.Response:
-        """Send an idempotent request until any address answers it.
+        """Send an idempotent request to the addresses until one of them answers.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class FailoverClient(ExitStack):
                 if response.status_code not in LATER:
                     with self._log.lock:
                         self._log.exchanges.append(Exchange(kind, begun, time.monotonic(), tries))
-                    # 404 answers a deletion whose first answer was lost.
+                    # A repeated deletion whose first answer was lost receives 404.
                     if not response.is_success and (kind, response.status_code) != ("delete", 404):
                         fault = f"{kind}: {response.status_code} {response.text:.300}"
                         self._log.faults.append(fault)

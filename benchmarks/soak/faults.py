@@ -16,23 +16,23 @@ import httpx
 from benchmarks.soak.plan import Plan
 from benchmarks.soak.processes import Fleet, await_service
 
-#: Relative frequencies of killed processes: the signing process and its supervisor are separate.
+#: Relative frequencies of killed processes; a worker supervises a separate signing process.
 VICTIMS = {"service": 3, "worker": 2, "signing process": 2}
 PRIMARY, FROZEN, CUT_OFF = "primary", "frozen primary", "network of a host"
 FULL = "full disk"
 #: Faults at random times, by their names in a schedule.
 AT_RANDOM = {"freeze": FROZEN, "partition": CUT_OFF, "full-disk": FULL}
-#: Duration for which a primary is frozen, seconds, shorter than the timeout of a connection.
+#: Duration of the freeze of a primary, seconds, shorter than the timeout of a connection.
 FROZEN_S = 5.0
-#: Duration for which a host is cut off, seconds, longer than the lease of a job.
+#: Duration of the network partition of a host, seconds, longer than the lease of a job.
 CUT_OFF_S = 12.0
 #: Duration for which the disk is full, seconds.
 FULL_S = 6.0
-#: Fraction of the run before the first fault, and after the last one.
+#: Share of the run without faults, at its start and at its end.
 CALM = 0.1
-#: Seconds until a killed part restarts, and until the standby is promoted.
+#: Range of the delay before a killed part restarts, and delay before the promotion, seconds.
 AWAY_S, UNNOTICED_S = (0.0, 3.0), 1.0
-#: Seconds for which an asynchronous standby receives nothing before its primary is killed.
+#: Time without replication before the primary of an asynchronous standby is killed, seconds.
 STALL_S = 2.0
 
 
@@ -95,7 +95,7 @@ class FaultInjector:
     promotions: list[Promotion] = field(default_factory=list)
 
     def run(self, due: list[tuple[float, str]], show: Callable[[str], None]) -> None:
-        """Inject each fault when it is due, or once the fault before it is over."""
+        """Inject each fault when it is due and the previous fault is over."""
         begun = time.monotonic()
         inject = {
             PRIMARY: self._promote, FROZEN: self._freeze, CUT_OFF: self._cut_off,
@@ -132,13 +132,13 @@ class FaultInjector:
             time.sleep(CUT_OFF_S)
 
     def _fill_disk(self) -> None:
-        """Fill the disk once all services are ready, since none can start on a full disk."""
+        """Fill the disk when all services are ready, because none can start on a full disk."""
         for url in self.fleet.urls:
             await_service(url)
         with self.fleet.full_disk():
             time.sleep(FULL_S)
         for part in (*self.fleet.services, *self.fleet.workers):
-            if not part.is_running:  # a killed worker whose restart is due
+            if not part.is_running:  # a killed worker that could not restart
                 part.start()
 
     def _promote(self) -> None:

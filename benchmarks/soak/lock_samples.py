@@ -1,4 +1,4 @@
-"""Samples of the database locks that show how long writers of a fleet exclude each other."""
+"""Sampling of database locks, to measure how long writers of a fleet exclude each other."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import psycopg
 
 from sceneprint.store.postgres.connection import LOCKS, MAP_LOCKS, TURN
 
-#: Seconds between two samples, and before the next attempt at a server that does not answer.
+#: Interval of samples, and delay before the next attempt if the server does not answer, seconds.
 EVERY_S, AGAIN_S = 0.02, 0.25
 #: Timeout of the last sample, seconds.
 PATIENCE_S = 10.0

@@ -88,7 +88,7 @@ def read_report(caller: str, report: str, code: int) -> OperationFigures:
     counted, tested = _COUNTED.search(report), re.search(r"Tested: (\d+)", report)
     if counted is None or tested is None:
         return OperationFigures(caller, 0, 0, 0, report)
-    requests, failed, passed = (int(one or 0) for one in counted.groups())
+    requests, failed, passed = (int(number or 0) for number in counted.groups())
     if failed:
         passed = requests - failed
     elif code != 0:
@@ -106,7 +106,7 @@ def call_as_everybody(
     folder : empty folder for data and configuration
     examples : number of requests per operation, in addition to the edge cases of its schema
     """
-    found = []
+    figures = []
     plan = Plan("sqlite", services=1, workers=1)
     for caller in ("an operator", "an operator, of what is stored", "its own map", "another map"):
         own = folder / caller
@@ -117,32 +117,32 @@ def call_as_everybody(
             with Client(url, key) as client:
                 for name in ("siege", "other"):
                     client.create_map(name, model=MODEL)
-                    for one in frames:
-                        client.upload(name, one.png, one.meta, wait_s=60)
+                    for shot in frames:
+                        client.upload(name, shot.png, shot.meta, wait_s=60)
                 map_name = "other" if caller == "another map" else "siege"
                 frame = next(iter(client.frames(map_name)))
                 query = client.query(map_name, frame_id=frame.frame_id)
                 if caller.endswith("map"):
                     key = client.create_key("fuzzer", {"siege": "write"}).secret
-            known = {
+            path_values = {
                 "path.map_name": map_name, "path.frame_id": frame.frame_id,
                 "path.job_id": frame.job_id, "path.query_id": query.query_id,
             }  # fmt: skip
             options = ["--phases", phases, "--max-examples", str(examples)]
             options += ["--header", f"Authorization: Bearer {key}"]
-            named = {} if caller == "an operator" else known
-            found.append(call_operations(caller, url, own, options, named))
+            named = {} if caller == "an operator" else path_values
+            figures.append(call_operations(caller, url, own, options, named))
             if caller == "another map":
                 # All requests are rejected, and edge cases of the schemas would take hours.
                 options = ["--phases", "fuzzing", "--max-examples", str(max(examples // 5, 1))]
-                found.append(call_operations("nothing, without a key", url, own, options, {}))
-    return found
+                figures.append(call_operations("nothing, without a key", url, own, options, {}))
+    return figures
 
 
-def operation_table(found: Sequence[OperationFigures]) -> list[str]:
+def operation_table(figures: Sequence[OperationFigures]) -> list[str]:
     """Return the figures as lines of Markdown."""
     return [
-        f"### Every operation of the OpenAPI document ({found[0].operations})", "",
+        f"### Every operation of the OpenAPI document ({figures[0].operations})", "",
         "| called by, or for | answered as declared, none with 5xx |", "|---|--:|",
-        *(f"| {one.caller} | {one.passed} of {one.requests} |" for one in found), "",
+        *(f"| {call.caller} | {call.passed} of {call.requests} |" for call in figures), "",
     ]  # fmt: skip

@@ -9,15 +9,15 @@ from typing import Literal
 
 from benchmarks.soak.failover_client import SILENCE_S
 
-#: Faults by their names on the command line. A kill hits a service, a worker or a signing process.
-#: The number of `operation` is the requests per operation, that of `attack` the seconds per attack.
+#: Names of faults on the command line. A kill hits a service, a worker or a signing process. The
+#: number of `operation` is the requests per operation, of `attack` the seconds per attack.
 FAULTS = (
     "kill", "failover", "freeze", "partition", "full-disk", "offline-hour",
     "broken-upload", "attack", "operation",
 )  # fmt: skip
 #: Name and model of the map that most robots share. Every fourth robot uses one of 19 other maps.
 MAP, MODEL, OWN, OWN_MAPS = "fleet", "depth", 4, 19
-#: Number of robots from which no surfaces are built.
+#: Number of robots from which surfaces are not built automatically.
 CROWD = 100
 
 
@@ -35,9 +35,9 @@ class Plan:
     services, workers : number of processes
     asynchronous : whether the standby may lack acknowledged rows
     objects, delays : whether blobs are in an object store, and whether messages are delayed
-    retention_s : retention of the maps of single robots, seconds; the shared map has none
-    most_turn_ms : longest time for which a frame may block all writers, without the time of hosts
-        that are cut off
+    retention_s : retention of the maps of single robots, seconds; the shared map has no retention
+    most_turn_ms : maximum time for which a frame may block all writers, excluding the time of
+        network partitions
     most_query_ms, most_bytes : bounds of the 99th percentile of queries, and of a process's memory
     data : folder of recordings; default: synthetic rooms
     """
@@ -67,12 +67,12 @@ class Plan:
 
     @property
     def is_crowd(self) -> bool:
-        """Return whether there are too many robots to build surfaces."""
+        """Whether there are too many robots to build surfaces."""
         return self.robots >= CROWD
 
     @property
     def frames(self) -> int:
-        """Return the greatest number of frames that a robot sends."""
+        """Maximum number of frames that a robot sends."""
         return int(self.seconds * self.rate) + 1
 
     def map_of(self, robot: int) -> str:

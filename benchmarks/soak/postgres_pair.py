@@ -1,4 +1,4 @@
-"""Two PostgreSQL servers, of which the standby replicates the primary and can replace it.
+"""A PostgreSQL primary and its standby, which can replace the primary.
 
 primary, standby  --kill_primary-->  standby  --promote-->  primary  --renew-->  primary, standby
 """
@@ -20,7 +20,7 @@ DATABASE = "fleet"
 
 
 class Pair:
-    """A primary and its standby, which exchange their roles.
+    """A primary and its standby.
 
     `synchronous`: whether a commit waits for the standby.
     """
@@ -40,18 +40,18 @@ class Pair:
         self.ports = (self.primary.port, self._standby.port)
 
     def url(self, ports: Sequence[int] | None = None) -> str:
-        """Return the URL of the server that accepts writes; default ports: those of the servers."""
+        """Return a URL that connects to the primary, optionally through other `ports`."""
         hosts = "&".join(f"host=127.0.0.1:{port}" for port in ports or self.ports)
         return f"postgresql+psycopg://postgres@/{DATABASE}?{hosts}&target_session_attrs=read-write"
 
     def stall(self) -> None:
-        """Send no more data to the standby, as if the link had failed."""
+        """Stop sending data to the standby, as if the link had failed."""
         for (pid,) in self.primary.execute("SELECT pid FROM pg_stat_replication"):
             os.kill(cast(int, pid), signal.SIGSTOP)
 
     @contextmanager
     def frozen(self) -> Iterator[None]:
-        """Stop the primary within the context, as if its disk hung."""
+        """Suspend the primary within the context, as if its disk hung."""
         self.primary.signal(signal.SIGSTOP)
         try:
             yield
@@ -65,7 +65,7 @@ class Pair:
         self._dead, self.primary, self._standby = self.primary, self._standby, None
 
     def unreceived(self) -> set[str]:
-        """Start the dead primary, and return the ids of frames that only it has."""
+        """Start the dead primary alone, and return the ids of frames that only it has stored."""
         assert self._dead is not None
         alone = Server(self._dead.folder, durable=True, options={"synchronous_standby_names": ""})
         alone.start()

@@ -23,15 +23,14 @@ from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 from sceneprint.store import Store, open_store
 
-#: Settings of every process. Short leases let another worker soon take over after a kill, and
-#: indexes are published early.
+#: Settings of every process. With short leases, another worker soon continues a job after a kill.
 SETTINGS = {
     "SCENEPRINT_REQUIRE_KEYS": "1", "SCENEPRINT_JOB_LEASE_S": "5",
     "SCENEPRINT_UNINDEXED_FRAMES": "100", "SCENEPRINT_TENANT_REQUESTS_PER_S": "0",
 }  # fmt: skip
-#: Delay of a message to the database, and of one to the object store, in a slow network, seconds.
+#: Delays of a message to the database, and to the object store, in a slow network, seconds.
 DATABASE_S, STORE_S = 0.0005, 0.01
-#: Size of the disk that is filled, a file system in memory, bytes.
+#: Size of the disk to be filled, a file system in memory, bytes.
 DISK_BYTES = 384 << 20
 #: Script that creates a key with all permissions.
 _CREATE_KEY = """
@@ -70,17 +69,17 @@ class Part:
 
     @property
     def pid(self) -> int:
-        """Return the id of the process that leads the group."""
+        """Id of the process that leads the group."""
         assert self._process is not None
         return self._process.pid
 
     @property
     def is_running(self) -> bool:
-        """Return whether the command has not ended."""
+        """Whether the command has started and not ended."""
         return self._process is not None and self._process.poll() is None
 
     def peak_bytes(self) -> int:
-        """Return the peak memory of a process of the group, bytes."""
+        """Return the maximum of the peak memories of the group's processes, bytes."""
         return max(peak_bytes(pid) for pid, group, _ in running_processes() if group == self.pid)
 
     def children(self) -> list[int]:
@@ -91,7 +90,7 @@ class Part:
         ]  # fmt: skip
 
     def kill(self) -> None:
-        """Kill the whole group at once, like a power failure."""
+        """Kill the whole group at once, as in a power failure."""
         if self._process is not None:
             os.killpg(self.pid, signal.SIGKILL)
             self._process.wait()
@@ -188,7 +187,7 @@ class Fleet:
         return Part([*command, "--data", str(data)], log, os.environ | hosts[host])
 
     def _host_environment(self) -> dict[str, str]:
-        """Return the environment of a host, with its own network if the plan requires it."""
+        """Return the environment of a new host, with delayed or separable links if required."""
         self._networks.append([])
         if self.pair is None or not (self._plan.delays or self._plan.count("partition")):
             return self._shared
@@ -200,7 +199,7 @@ class Fleet:
         return own
 
     def _reachable_port(self, port: int, delay_s: float) -> int:
-        """Return the port at which the last created host reaches a server."""
+        """Create a link from the new host to a server, and return its port."""
         proxy = DelayProxy(port, delay_s if self._plan.delays else 0.0)
         self._opened.callback(proxy.end)
         self._networks[-1].append(proxy)
@@ -233,11 +232,11 @@ class Fleet:
             ballast.unlink()
 
     def memory(self) -> tuple[int, int]:
-        """Return the peak memory of a service process and of a worker process, bytes."""
-        found = [
+        """Return the maximum peak memory of services and of workers, bytes."""
+        peaks = [
             max(part.peak_bytes() for part in parts) for parts in (self.services, self.workers)
         ]
-        return found[0], found[1]
+        return peaks[0], peaks[1]
 
     def log_lines(self) -> list[str]:
         """Return the lines of all logs."""
@@ -247,8 +246,8 @@ class Fleet:
     def fsck(self) -> tuple[int, int]:
         """Return the number of unreferenced files, and of damages that `sceneprint fsck` finds."""
         with self.settings() as settings:
-            found = Counter(one.severity for one in fsck(settings, grace_s=0.0))
-        return found["leftover"], found["damage"]
+            counts = Counter(finding.severity for finding in fsck(settings, grace_s=0.0))
+        return counts["leftover"], counts["damage"]
 
     @contextmanager
     def store(self) -> Iterator[Store]:

@@ -1,4 +1,4 @@
-"""Walks that robots replay: frames of recordings, thinned by different grids."""
+"""Walks that robots replay: frames of recordings, downsampled to different grids."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.frame_files import meta_of
 from sceneprint_lab.cli.demo import write_building
 
-#: A grid has every fourth sample of a frame, which makes signing cheap. Frames of different grids
-#: have different content.
+#: A grid contains every fourth row and column of a frame, so signing is cheap. Different grids of a
+#: frame have different content.
 STRIDE = 4
 GRIDS = STRIDE**2
 #: Number of frames of a synthetic room.
@@ -57,13 +57,14 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
     Raise DatasetError if the sequence has fewer frames.
     """
     recorded = [
-        [one for one in sequence.frames if one.kind == "depth"] for sequence in find_sequences(data)
+        [frame for frame in sequence.frames if frame.kind == "depth"]
+        for sequence in find_sequences(data)
     ]
-    # Every robot starts elsewhere; those of one recording have different grids.
+    # Robots start at different places; robots of one recording have different grids.
     places = [(sequence, grid) for grid in range(GRIDS) for sequence in recorded if sequence]
-    found: list[list[tuple[FrameReference, int]]] = [[] for _ in range(n)]
-    while any(len(one) < frames for one in found):
-        for walk in found:
+    walked: list[list[tuple[FrameReference, int]]] = [[] for _ in range(n)]
+    while any(len(walk) < frames for walk in walked):
+        for walk in walked:
             if len(walk) >= frames:
                 continue
             if not places:
@@ -73,14 +74,14 @@ def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
                 )
             sequence, grid = places.pop(0)
             room = frames - len(walk)
-            walk += [(one, grid) for one in sequence[:room]]
-            if len(sequence) > room:  # another robot continues there after all others have started
+            walk += [(frame, grid) for frame in sequence[:room]]
+            if len(sequence) > room:  # another robot may use the rest
                 places.append((sequence[room:], grid))
-    return [[thinned(*one) for one in walk] for walk in found]
+    return [[thinned(*pair) for pair in walk] for walk in walked]
 
 
 def thinned(frame: FrameReference, grid: int) -> Shot:
-    """Return a frame with the samples of one grid."""
+    """Return a frame, downsampled to a grid from 0 to GRIDS - 1."""
     read, meta = _read(frame), meta_of(frame)
     k, (y, x) = read.intrinsics, divmod(grid, STRIDE)
     depth = np.ascontiguousarray(read.depth[y::STRIDE, x::STRIDE])

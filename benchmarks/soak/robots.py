@@ -88,7 +88,7 @@ class Robot:
 
 
 class SoakThread(threading.Thread):
-    """A client in its own thread, whose failure is a fault of the run."""
+    """A client in its own thread; its failure counts as a fault of the run."""
 
     def __init__(self, name: str, log: RequestLog) -> None:
         super().__init__(name=name, daemon=True)
@@ -141,10 +141,10 @@ class Driver(SoakThread):
         self._wait = {"Prefer": "wait=50"} if signed else {}
 
     def work(self) -> None:
-        """Send each frame at its time."""
+        """Send the frames of all robots at their times."""
         begun = time.monotonic()
         with self._client:
-            for number in range(max(len(one.walk) for one in self._robots)):
+            for number in range(max(len(robot.walk) for robot in self._robots)):
                 for robot in self._robots:
                     after, now = robot.begins_s + number / self._rate, time.monotonic()
                     begun = max(begun, now - after)  # late robots keep their rate
@@ -180,7 +180,7 @@ class Driver(SoakThread):
 
 
 class OfflineRobot(SoakThread):
-    """A robot that spools its frames while it is offline, and then sends all of them.
+    """A robot that spools its frames while it is offline, and then uploads them.
 
     Parameters
     ----------
@@ -228,13 +228,13 @@ class OfflineRobot(SoakThread):
         return not spool.status().waiting
 
     def _note_ids(self, client: Client) -> bool:
-        """Record stored frames; a spooled frame that is not stored is lost."""
+        """Record the ids of stored frames; a frame that is not stored gets an unknown id."""
         robot = self._robot
-        ids = {one.name: one.frame_id for one in client.frames(robot.map_name)}
+        ids = {frame.name: frame.frame_id for frame in client.frames(robot.map_name)}
         for number, shot in enumerate(robot.walk):
             frame_id = ids.get(f"{self.name}-{number}", f"never-came-{number}")
-            one = Acknowledged(frame_id, robot.map_name, shot, time.monotonic())
-            self._ledger.frames.append(one)
+            frame = Acknowledged(frame_id, robot.map_name, shot, time.monotonic())
+            self._ledger.frames.append(frame)
         return True
 
 
@@ -267,8 +267,8 @@ class Reader(SoakThread):
                     json=query | {"keep": False},
                 )  # fmt: skip
                 if response.is_success:
-                    found = [(m["frame_id"], m["distance"]) for m in response.json()["matches"]]
-                    search = Search(frame_id, found, begun, time.monotonic())
+                    matches = [(m["frame_id"], m["distance"]) for m in response.json()["matches"]]
+                    search = Search(frame_id, matches, begun, time.monotonic())
                     self._ledger.searches.append(search)
 
 

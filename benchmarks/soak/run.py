@@ -106,8 +106,8 @@ class SoakFigures:
     @property
     def turn_ms(self) -> tuple[float, float]:
         """Return the time for which a frame blocks all writers, and those of its map, ms."""
-        each = 1e3 / max(self.found.acknowledged, 1)
-        return self.locks.everybody * each, self.locks.one_map * each
+        ms_per_frame = 1e3 / max(self.found.acknowledged, 1)
+        return self.locks.everybody * ms_per_frame, self.locks.one_map * ms_per_frame
 
     @property
     def exceeded(self) -> list[str]:
@@ -130,21 +130,22 @@ class SoakFigures:
     @property
     def sound(self) -> bool:
         """Return whether no data was lost, duplicated or damaged, and all bounds hold."""
-        found, plan = self.found, self.plan
-        stored = found.acknowledged - len(found.missing) - found.aged
+        counts, plan = self.found, self.plan
+        stored = counts.acknowledged - len(counts.missing) - counts.aged
         wrong = (
-            self.lost, found.returned, found.stuck, found.doubled, found.strangers,
-            found.heard_twice, found.disagreeing, found.separated, len(found.wrong), self.damaged,
-            len(self.faults), found.looked_up - found.found, stored - found.indexed - found.stated,
-            len(self.exceeded), self.locked, sum(one.victim_refused for one in self.attacks),
-            sum(not one.sound for one in self.operations),
+            self.lost, counts.returned, counts.stuck, counts.doubled, counts.strangers,
+            counts.heard_twice, counts.disagreeing, counts.separated, len(counts.wrong),
+            self.damaged, len(self.faults), counts.looked_up - counts.found,
+            stored - counts.indexed - counts.stated,
+            len(self.exceeded), self.locked, sum(attack.victim_refused for attack in self.attacks),
+            sum(not operation.sound for operation in self.operations),
             0 if self.broken is None else len(self.broken.failed) + self.broken.crashed,
         )  # fmt: skip
-        tried = found.acknowledged > 0 and self.window == len(found.missing)
+        tried = counts.acknowledged > 0 and self.window == len(counts.missing)
         if plan.store == "postgresql":  # a server that is down or frozen is not sampled
             tried &= self.locks.seconds >= SAMPLED * plan.seconds
         tried &= self.spooled == plan.count("offline-hour")
-        return tried and not any(wrong) and (plan.asynchronous or not found.unheard)
+        return tried and not any(wrong) and (plan.asynchronous or not counts.unheard)
 
 
 def drive(folder: Path, plan: Plan) -> SoakFigures:
@@ -176,7 +177,7 @@ class _Run:
         self._ledger, self._log, self._stop = Ledger(), RequestLog(), threading.Event()
         self._rng = random.Random(plan.seed)
         self._figures = SoakFigures(plan, AuditCounts(), faults=self._log.faults)
-        #: Retention of some maps, seconds; the others keep all frames.
+        #: Retention by map, seconds; other maps have no retention.
         self._aging: dict[str, float] = {}
         if plan.retention_s is not None:
             own = {plan.map_of(i) for i in range(plan.robots)} - {MAP}
@@ -199,8 +200,8 @@ class _Run:
                 fleet, plan, partial(_answers, key=key, shot=self._stable[0]), self._rng
             )  # fmt: skip
             self._walk(clients[0], key, [*listeners, *offline, *readers, *sampling], injector)
-            for one in (*offline, *readers):
-                one.finish(OFFLINE_PATIENCE_S)
+            for client in (*offline, *readers):
+                client.finish(OFFLINE_PATIENCE_S)
             for url in fleet.urls:
                 await_service(url)
             await_idle(clients[0])
@@ -214,26 +215,26 @@ class _Run:
             figures.leftovers, figures.damaged = fleet.fsck()
             with fleet.store() as store, store.database.read() as connection:
                 figures.found.separated = count_separated(connection, names)
-        figures.locks, figures.spooled_twice = locks.shares, sum(one.repeated for one in offline)
+        figures.locks, figures.spooled_twice = locks.shares, sum(r.repeated for r in offline)
         self._count(injector)
         return figures
 
     def _count(self, injector: FaultInjector) -> None:
-        """Count the faults, the requests and the acknowledged frames."""
+        """Fill in the figures on faults, requests and acknowledged frames."""
         figures, log, ledger = self._figures, self._log, self._ledger
-        unreceived = {name for one in injector.promotions for name in one.unreceived}
-        window = {one.frame_id for one in ledger.frames} & unreceived
-        figures.kills = Counter(one.victim for one in injector.kills)
+        unreceived = {name for promotion in injector.promotions for name in promotion.unreceived}
+        window = {frame.frame_id for frame in ledger.frames} & unreceived
+        figures.kills = Counter(kill.victim for kill in injector.kills)
         figures.outages = outages(injector.kills, log.exchanges)
         figures.promotions = injector.promotions
-        for kind in sorted({one.kind for one in log.exchanges}):
-            ms = [1e3 * (one.answered - one.begun) for one in log.exchanges if one.kind == kind]
+        for kind in sorted({exchange.kind for exchange in log.exchanges}):
+            ms = [1e3 * (e.answered - e.begun) for e in log.exchanges if e.kind == kind]
             p50, p99 = np.quantile(ms, (0.5, 0.99)).tolist()
             figures.waits_ms[kind] = p50, p99
-        figures.repeated = sum(one.tries - 1 for one in log.exchanges)
+        figures.repeated = sum(exchange.tries - 1 for exchange in log.exchanges)
         figures.deleted, figures.queries = len(ledger.deleted), ledger.queries
         figures.lost, figures.window = len(figures.found.missing - window), len(window)
-        figures.spooled = sum(one.map_name == OFFLINE_MAP for one in ledger.frames)
+        figures.spooled = sum(frame.map_name == OFFLINE_MAP for frame in ledger.frames)
         if self._plan.store == "sqlite":
             lines = self._fleet.log_lines()
             figures.locked = sum(sign in line for line in lines for sign in LOCKED)
@@ -255,13 +256,13 @@ class _Run:
     def _upload_stable(self, client: Client) -> list[str]:
         """Upload the permanent frames, and return their ids."""
         begun = time.monotonic()
-        added = [client.upload(MAP, one.png, one.meta) for one in self._stable]
-        client.wait([one.job_id for one in added])
+        added = [client.upload(MAP, shot.png, shot.meta) for shot in self._stable]
+        client.wait([upload.job_id for upload in added])
         self._ledger.frames += [
-            Acknowledged(one.frame_id, MAP, shot, begun)
-            for one, shot in zip(added, self._stable, strict=True)
+            Acknowledged(upload.frame_id, MAP, shot, begun)
+            for upload, shot in zip(added, self._stable, strict=True)
         ]
-        return [one.frame_id for one in added]
+        return [upload.frame_id for upload in added]
 
     def _walk(
         self, client: Client, key: str, others: Sequence[threading.Thread], injector: FaultInjector
@@ -273,8 +274,8 @@ class _Run:
         with tqdm(total=plan.seconds, unit="s", disable=None, leave=False) as bar:
             showing = threading.Thread(target=_show, args=(bar, self._ledger, stop), daemon=True)
             begun = time.monotonic()
-            for one in (*others, showing, *drivers):
-                one.start()
+            for thread in (*others, showing, *drivers):
+                thread.start()
             try:
                 due = schedule(plan.seconds, plan.faults, self._rng)
                 injector.run(due, bar.set_postfix_str)
@@ -312,15 +313,15 @@ class _Run:
         ]
         few = self._stable[:8]
         for i in range(ROWS):
-            one = few[i % len(few)]
-            client.put_frame("noisy", f"row-{i}", one.png, one.meta)
+            shot = few[i % len(few)]
+            client.put_frame("noisy", f"row-{i}", shot.png, shot.meta)
         self._empty_queue(client)
         for i in range(POSED):
-            one = few[i % len(few)]
+            shot = few[i % len(few)]
             matrix = [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
             pose = {"parent_frame": "map", "matrix": matrix}
-            meta = one.meta.model_dump() | {"session": SESSION, "sequence": i, "pose": pose}
-            client.put_frame("noisy", f"posed-{i}", one.png, FrameMeta.model_validate(meta))
+            meta = shot.meta.model_dump() | {"session": SESSION, "sequence": i, "pose": pose}
+            client.put_frame("noisy", f"posed-{i}", shot.png, FrameMeta.model_validate(meta))
         await_idle(client)
         return keys
 
@@ -333,7 +334,7 @@ class _Run:
         await_idle(client)
 
     def _drivers(self, client: Client) -> list[Driver]:
-        """Return the threads of the robots, which have separate keys and start in turn."""
+        """Return the threads of the robots; each robot has its own key and starting time."""
         plan, robots = self._plan, []
         for i, walk in enumerate(self._walked):
             name, map_name = f"robot-{i}", plan.map_of(i)
@@ -393,19 +394,18 @@ def _show(bar: tqdm[None], ledger: Ledger, stop: threading.Event) -> None:
 
 
 def outages(kills: Sequence[Kill], exchanges: Sequence[Exchange]) -> dict[str, list[float]]:
-    """Return the longest time without an answer after each kill, by victim, in seconds.
+    """Return the longest time without an answer after each kill, by victim, seconds.
 
-    A gap counts for the first kill within it, or else for the last kill before it, whose victim
-    was not back yet.
+    A gap belongs to the first kill within it, or else to the last kill before it.
     """
     longest = [0.0] * len(kills)
     for wait in exchanges:
         if wait.tries > 1:
-            within = [i for i, one in enumerate(kills) if wait.begun <= one.at <= wait.answered]
-            before = [i for i, one in enumerate(kills) if one.at < wait.begun]
+            within = [i for i, kill in enumerate(kills) if wait.begun <= kill.at <= wait.answered]
+            before = [i for i, kill in enumerate(kills) if kill.at < wait.begun]
             for i in within[:1] or before[-1:]:
                 longest[i] = max(longest[i], wait.answered - max(wait.begun, kills[i].at))
-    found: dict[str, list[float]] = {}
+    gaps: dict[str, list[float]] = {}
     for kill, seconds in zip(kills, longest, strict=True):
-        found.setdefault(kill.victim, []).append(seconds)
-    return found
+        gaps.setdefault(kill.victim, []).append(seconds)
+    return gaps

@@ -1,7 +1,7 @@
-"""Name the schema of version 1.0.
+"""Revision of the schema of version 1.0.
 
 `create_schema` in `sceneprint/store/database.py` creates the tables of a new database, so this
-revision changes nothing. Migrations bring databases of earlier versions to that schema.
+revision changes nothing.
 """
 
 revision = "0001"

@@ -1,1 +1,1 @@
-"""One file a step, in order."""
+"""Migrations, one per file."""

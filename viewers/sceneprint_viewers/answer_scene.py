@@ -1,4 +1,4 @@
-"""Answers as moments of a scene, with the query, its matches and its alternatives in the map.
+"""Answers as moments of a scene: the query, its matches and its alternatives in the map.
 
 Answer  --AnswerScene.add-->  Moment
 Association  --association_scene-->  Moment with both sessions and their edges
@@ -66,10 +66,10 @@ from sceneprint_viewers.scene import (
     sensor_outline,
 )
 
-#: Pattern of ids that the service generates, and number of digits by which a scene shows them.
+#: Pattern of ids that the service generates, and number of their digits in labels.
 _GENERATED_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
 SHORT_ID = 8
-#: Path of the text about an answer; no space has this name.
+#: Path of the text about an answer, which is not a space.
 SUMMARY: EntityPath = ("answer",)
 #: Height of a label over its sensor, metres.
 _LABEL_M = 0.12
@@ -77,12 +77,12 @@ _LABEL_M = 0.12
 
 @dataclass(frozen=True)
 class PointLimits:
-    """Maximum numbers of points that are drawn per frame of an answer.
+    """Maximum numbers of drawn points.
 
     Parameters
     ----------
-    query : number for the query
-    match : number for each match, and for the query at each alternative
+    query : number of points of the query
+    match : number of points of each match, and of the query at each alternative
     """
 
     query: int
@@ -94,7 +94,7 @@ ONE, MANY = PointLimits(20_000, 6_000), PointLimits(5_000, 1_500)
 
 
 class AnswerScene:
-    """A scene to which answers are added; a map is added with its first answer.
+    """Writer of answers to a scene; it draws a map together with the first answer from the map.
 
     Parameters
     ----------
@@ -126,19 +126,20 @@ class AnswerScene:
 
         Raise UnknownQuery if the service does not store the answer.
         """
-        named = dict.fromkeys(one.map for one in placed(answer.matches))
+        named = dict.fromkeys(match.map for match in placed(answer.matches))
         for map_name in answer.maps if len(answer.maps) == 1 else named:
             if map_name not in self._drawn:
                 self._draw_map(map_name, several=len(answer.maps) > 1)
         drawing = _Drawing(self._client, answer, name, camera, self._limits)
         entities = [*drawing.entities(), SceneEntity(SUMMARY, TextPage(text))]
-        axes = [one for one in drawing.axes() if one.path[0] not in self._axes]
+        axes = [axis for axis in drawing.axes() if axis.path[0] not in self._axes]
         if axes:
-            self._axes |= {one.path[0] for one in axes}
+            self._axes |= {axis.path[0] for axis in axes}
             self._stream.write(Moment(axes))
         self._stream.write(Moment(entities, index, stamp_ns))
 
     def _draw_map(self, map_name: str, *, several: bool) -> None:
+        """Draw the runs of a map as permanent entities, in a space for each parent frame."""
         self._drawn.add(map_name)
         runs = map_runs(self._client, map_name)
         parents = sorted({run.parent_frame for run in runs})
@@ -152,12 +153,12 @@ class AnswerScene:
 
 
 def space_name(map_name: str, parent_frame: str, *, several: bool) -> str:
-    """Return the name of a parent frame's space, with the map's name if there are several maps."""
+    """Return the name of the space of a parent frame; it contains the map if there are several."""
     return f"{map_name}: {parent_frame}" if several else parent_frame
 
 
 def short_name(frame_id: str, name: str | None = None) -> str:
-    """Return the name of a stored frame in labels: its file, else the first digits of its id."""
+    """Return the name of a stored frame for labels: its file name, else its shortened id."""
     if name:
         return name.rpartition("/")[2]
     return frame_id[:SHORT_ID] if _GENERATED_ID.fullmatch(frame_id) else frame_id
@@ -165,7 +166,7 @@ def short_name(frame_id: str, name: str | None = None) -> str:
 
 def placed(matches: Sequence[Match]) -> list[Match]:
     """Return the matches whose transforms are accepted or ambiguous."""
-    return [one for one in matches if one.validation.status in ("accepted", "ambiguous")]
+    return [match for match in matches if match.validation.status in ("accepted", "ambiguous")]
 
 
 class _Drawing:
@@ -184,13 +185,13 @@ class _Drawing:
 
     def entities(self) -> list[SceneEntity]:
         """Return the entities of the query, its alternatives and its matches."""
-        found = [*self._query(), *self._alternatives()]
+        entities = [*self._query(), *self._alternatives()]
         for number, match in enumerate(placed(self._answer.matches), start=1):
-            found += self._match(match, f"{number}")
-        return found
+            entities += self._match(match, f"{number}")
+        return entities
 
     def axes(self) -> list[SceneEntity]:
-        """Return the up axis of the query's space if that is the sensor's frame."""
+        """Return the up axis of the query's space if the query has no pose in a map."""
         if self._answer.location is not None:
             return []
         space, _ = self._query_space()
@@ -201,7 +202,7 @@ class _Drawing:
         return space_name(map_name or "", parent_frame, several=self._several)
 
     def _query_space(self) -> tuple[str, Transform | None]:
-        """Return the query's space and its pose there; None if it has a separate space."""
+        """Return the space of the query and its pose there; None if the space is its own."""
         location = self._answer.location
         if location is not None:
             return self._space(location.map, location.pose.parent_frame), location.pose
@@ -214,46 +215,46 @@ class _Drawing:
     def _query(self) -> list[SceneEntity]:
         space, pose = self._query_space()
         path, label = (space, "query"), f"{self._name}: {self._answer.status.replace('_', ' ')}"
-        found = _sensor(path, self._points, self._camera, QUERY, label)
+        entities = _sensor(path, self._points, self._camera, QUERY, label)
         if pose is None:
-            return found
-        return [SceneEntity(path, Placement(np.array(pose.matrix), pose.child_frame)), *found]
+            return entities
+        return [SceneEntity(path, Placement(np.array(pose.matrix), pose.child_frame)), *entities]
 
     def _alternatives(self) -> list[SceneEntity]:
         """Return the alternative poses of an ambiguous answer."""
-        found: list[SceneEntity] = []
+        entities: list[SceneEntity] = []
         some = self._points[:: max(len(self._points) // self._limits.match, 1)]
-        for number, one in enumerate(self._answer.alternatives, start=1):
-            path = (self._space(one.map, one.pose.parent_frame), "alternatives", f"{number}")
-            child = f"{one.pose.child_frame} alternative {number}"
-            confidence = "" if one.confidence is None else f", confidence {one.confidence:.2f}"
-            label = f"alternative {number}: support {one.support}{confidence}"
-            found.append(SceneEntity(path, Placement(np.array(one.pose.matrix), child)))
-            found += _sensor(path, some, self._camera, UNSURE, label)
-        return found
+        for number, place in enumerate(self._answer.alternatives, start=1):
+            path = (self._space(place.map, place.pose.parent_frame), "alternatives", f"{number}")
+            child = f"{place.pose.child_frame} alternative {number}"
+            confidence = "" if place.confidence is None else f", confidence {place.confidence:.2f}"
+            label = f"alternative {number}: support {place.support}{confidence}"
+            entities.append(SceneEntity(path, Placement(np.array(place.pose.matrix), child)))
+            entities += _sensor(path, some, self._camera, UNSURE, label)
+        return entities
 
     def _match(self, match: Match, name: str) -> list[SceneEntity]:
-        """Return a match at its pose in the map, with the pose of the query for which it votes.
+        """Return a match at its pose in the map, with a line to the pose for which it votes.
 
-        Its path contains its rank, so that many answers share few paths.
+        Its path contains its number instead of its id, so that many answers share few paths.
         """
         try:
             frame = self._client.frame(match.map, match.frame_id)
             points = self._client.frame_points(
                 match.map, match.frame_id, limit=self._limits.match
             ).points
-        except (NotFound, NotIndexed):  # deleted meanwhile, or being signed again
+        except (NotFound, NotIndexed):  # the frame was deleted, or is being signed again
             return []
         path, placement = self._place_of_match(match, frame, name)
         if path is None:
             return []
         colour, label = _look_of_match(match)
-        found = [] if placement is None else [SceneEntity(path, placement)]
-        found += _sensor(path, points, frame.intrinsics, colour, label)
+        entities = [] if placement is None else [SceneEntity(path, placement)]
+        entities += _sensor(path, points, frame.intrinsics, colour, label)
         if match.transform is not None:
             vote = np.array([np.zeros(3), np.array(match.transform.matrix)[:3, 3]])
-            found.append(SceneEntity((*path, "vote"), LineSet([vote], [colour])))
-        return found
+            entities.append(SceneEntity((*path, "vote"), LineSet([vote], [colour])))
+        return entities
 
     def _place_of_match(
         self, match: Match, frame: Frame, name: str
@@ -286,7 +287,7 @@ def _look_of_match(match: Match) -> tuple[Colour, str]:
 def _sensor(
     path: EntityPath, points: Floats, camera: CameraIntrinsics | None, colour: Colour, label: str
 ) -> list[SceneEntity]:
-    """Return points, outline and label of a sensor in its frame."""
+    """Return points, outline and label of a sensor, in its coordinate frame."""
     colours = plain_colours(len(points), colour)
     base_m = QUERY_POINT_M if colour == QUERY else MATCH_POINT_M
     size_m = point_size(base_m, cameras=camera is not None)
@@ -305,10 +306,10 @@ MOST_EDGES = 20_000
 
 
 def association_scene(client: Client, association: Association, text: str, most: int) -> Moment:
-    """Return the result of a successful association, as entities that are always visible.
+    """Return permanent entities for the result of a successful association.
 
-    Frames have their poses of the pose graph. Joined sessions share one space. Otherwise each
-    session has a separate space, and edges between them are not drawn.
+    Frames have the poses of the pose graph. Joined sessions share one space. Otherwise each session
+    has a separate space, and edges between sessions are not drawn.
 
     Parameters
     ----------
@@ -335,17 +336,17 @@ def association_scene(client: Client, association: Association, text: str, most:
 
 def _runs(client: Client, association: Association, vertices: list[Vertex]) -> list[PosedRun]:
     """Return the posed vertices by session and parent frame."""
-    found: defaultdict[tuple[str, str], list[Vertex]] = defaultdict(list)
-    for one in vertices:
-        if one.pose is not None:
-            found[_session_of(association, one), one.pose.parent_frame].append(one)
+    runs: defaultdict[tuple[str, str], list[Vertex]] = defaultdict(list)
+    for vertex in vertices:
+        if vertex.pose is not None:
+            runs[_session_of(association, vertex), vertex.pose.parent_frame].append(vertex)
     return [
         PosedRun(
-            name, association.map, space, [one.frame_id for one in run],
-            [np.array(one.pose.matrix) for one in run if one.pose is not None],
+            name, association.map, space, [vertex.frame_id for vertex in run],
+            [np.array(vertex.pose.matrix) for vertex in run if vertex.pose is not None],
             client.frame(association.map, run[0].frame_id).kind == "depth",
         )
-        for (name, space), run in found.items()
+        for (name, space), run in runs.items()
     ]  # fmt: skip
 
 
@@ -359,21 +360,21 @@ def _names(association: Association) -> list[str]:
 
 
 def _session_of(association: Association, vertex: Vertex) -> str:
-    """Return the name of a vertex's session."""
-    names, known = _names(association), (vertex.session, f"{vertex.robot}/{vertex.session}")
-    return next((name for name in names if name in known), names[0])
+    """Return the name of a vertex's session, with its robot if the request names robots."""
+    names, possible = _names(association), (vertex.session, f"{vertex.robot}/{vertex.session}")
+    return next((name for name in names if name in possible), names[0])
 
 
 def _run_entities(
     client: Client, run: PosedRun, up: Floats, colour: Colour, most: int, *, alone: bool
 ) -> list[SceneEntity]:
-    """Return points and line of a session; a single session is coloured by height."""
+    """Return points and track of a session; a single session (`alone`) is coloured by height."""
     chosen = evenly_taken([run], most)
     path = (run.parent_frame, "sessions", run.name)
     entities = []
     if chosen:
         limit = points_of_each(2 * len(chosen))
-        points = np.concatenate([placed_points(client, *one, limit) for one in chosen])
+        points = np.concatenate([placed_points(client, *place, limit) for place in chosen])
         size_m = point_size(MAP_POINT_M, cameras=run.cameras)
         colours = height_colours(points, up) if alone else plain_colours(len(points), colour)
         entities.append(SceneEntity((*path, "points"), PointSet(points, colours, size_m)))
@@ -382,8 +383,8 @@ def _run_entities(
 
 
 def _edge_entities(edges: itertools.islice[Edge], vertices: list[Vertex]) -> list[SceneEntity]:
-    """Return lines for edges, in separate entities for confirmed, outvoted and unchecked ones."""
-    poses = {one.frame_id: one.pose for one in vertices if one.pose is not None}
+    """Return separate entities for confirmed, outvoted and unchecked edges, as lines."""
+    poses = {vertex.frame_id: vertex.pose for vertex in vertices if vertex.pose is not None}
     kinds = {
         True: ("confirmed", CONFIRMED),
         False: ("outvoted", OUTVOTED),
@@ -393,7 +394,7 @@ def _edge_entities(edges: itertools.islice[Edge], vertices: list[Vertex]) -> lis
     for edge in edges:
         a, b = poses.get(edge.from_frame), poses.get(edge.to_frame)
         if a is not None and b is not None and a.parent_frame == b.parent_frame:
-            ends = np.array([np.array(one.matrix)[:3, 3] for one in (a, b)])
+            ends = np.array([np.array(pose.matrix)[:3, 3] for pose in (a, b)])
             strips[a.parent_frame, *kinds[edge.consistent]].append(ends)
     return [
         SceneEntity((space, "edges", kind), LineSet(lines, [colour] * len(lines), THIN_PX))

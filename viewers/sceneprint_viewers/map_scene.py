@@ -41,11 +41,11 @@ from sceneprint_viewers.scene import (
 
 #: Default number of frames of a map whose points are drawn.
 MAP_FRAMES = 120
-#: Maximum number of points of a map, over all of these frames.
+#: Maximum number of drawn points of a map.
 MAP_POINTS = 300_000
 #: Maximum number of poses in the line of a run.
 TRACK_POSES = 1000
-#: Clocks by which a run is ordered: the time of capture or, if it is unknown, of arrival.
+#: Clocks for the order of a run: the capture time or, if it is unknown, the upload time.
 CLOCKS: tuple[Literal["taken", "received"], ...] = ("taken", "received")
 #: Maximum number of sessions, and of frames without a session, that are searched for posed frames.
 MOST_LISTED = 1000
@@ -90,6 +90,7 @@ def map_runs(client: Client, map_name: str) -> list[PosedRun]:
 
 
 def _runs_of_session(client: Client, map_name: str, session: Session) -> list[PosedRun]:
+    """Return the run of a session in each parent frame."""
     runs = []
     for parent in session.parent_frames:
         for clock in CLOCKS:
@@ -101,7 +102,7 @@ def _runs_of_session(client: Client, map_name: str, session: Session) -> list[Po
                 break
         else:
             continue
-        with suppress(NotFound):  # deleted meanwhile
+        with suppress(NotFound):  # the frame was deleted
             kind = client.frame(map_name, trajectory.frame_ids[0]).kind
             name = _run_name(session.robot, session.session)
             poses, cameras = [_pose_of_row(row) for row in trajectory.poses], kind == "depth"
@@ -110,27 +111,27 @@ def _runs_of_session(client: Client, map_name: str, session: Session) -> list[Po
 
 
 def listed_runs(frames: Iterable[Frame]) -> list[PosedRun]:
-    """Return the runs of the posed frames of a list, in the same order."""
-    found: defaultdict[tuple[str, str, str, bool], list[Frame]] = defaultdict(list)
-    for one in frames:
-        if one.pose is not None:
-            name = _run_name(one.robot, one.session)
-            found[one.map, one.pose.parent_frame, name, one.kind == "depth"].append(one)
+    """Return the runs of the posed frames among `frames`, in the same order."""
+    runs: defaultdict[tuple[str, str, str, bool], list[Frame]] = defaultdict(list)
+    for frame in frames:
+        if frame.pose is not None:
+            name = _run_name(frame.robot, frame.session)
+            runs[frame.map, frame.pose.parent_frame, name, frame.kind == "depth"].append(frame)
     return [
         PosedRun(
-            name, map_name, parent, [one.frame_id for one in run],
-            [np.array(one.pose.matrix) for one in run if one.pose is not None], cameras,
+            name, map_name, parent, [frame.frame_id for frame in run],
+            [np.array(frame.pose.matrix) for frame in run if frame.pose is not None], cameras,
         )
-        for (map_name, parent, name, cameras), run in found.items()
+        for (map_name, parent, name, cameras), run in runs.items()
     ]  # fmt: skip
 
 
 def _run_name(robot: str | None, session: str | None) -> str:
-    return "/".join(one for one in (robot, session) if one is not None) or "no session"
+    return "/".join(part for part in (robot, session) if part is not None) or "no session"
 
 
 def _pose_of_row(row: Sequence[float]) -> Floats:
-    """Return the pose (4, 4) in a line of a TUM file."""
+    """Return the pose (4, 4) of a row (t, x, y, z, qx, qy, qz, qw)."""
     T = np.eye(4)
     T[:3, 3] = row[1:4]
     T[:3, :3] = rotation_of(np.array(row[4:8]))
@@ -154,7 +155,7 @@ def map_entities(
     chosen = evenly_taken(runs, most)
     if chosen:
         limit = points_of_each(len(chosen))
-        clouds = [placed_points(client, *one, limit) for one in chosen]
+        clouds = [placed_points(client, *place, limit) for place in chosen]
         points = np.concatenate([*clouds, np.zeros((0, 3))])
         colours = height_colours(points, up)
         size_m = point_size(MAP_POINT_M, cameras=all(run.cameras for run in runs))
@@ -172,13 +173,13 @@ def points_of_each(frames: int) -> int:
 
 
 def up_of_runs(runs: Sequence[PosedRun]) -> Floats:
-    """Return the axis of the runs' parent frame that is probably up, by the longest run."""
+    """Return the axis (3,) that is probably up, estimated from the longest run."""
     longest = max(runs, key=lambda run: len(run.poses))
     return up_of_sensors(longest.poses, cameras=longest.cameras)
 
 
 def up_of_map(client: Client, map_name: str) -> Floats | None:
-    """Return up (3,) in the parent frames of a map; None if it is unknown."""
+    """Return the up vector (3,) of a map, or None if it is not set."""
     up = client.map(map_name).up
     return None if up is None else np.array([up.x, up.y, up.z])
 
@@ -196,7 +197,7 @@ def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Fl
 
 
 def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit: int) -> Floats:
-    """Return at most `limit` points (N, 3) of an indexed frame, transformed by its pose."""
+    """Return at most `limit` points (N, 3) of a frame, transformed by T; none if not indexed."""
     try:
         return transform_points(T, client.frame_points(map_name, frame_id, limit=limit).points)
     except (NotFound, NotIndexed):
@@ -219,20 +220,20 @@ def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
         of_parent = [run for run in runs if run.parent_frame == parent]
         entities += map_entities(client, of_parent, parent, up, most // len(parents))
     chosen = {frame_id for _, frame_id, _ in evenly_taken(runs, most)}
-    for one in frames:
-        if one.pose is not None and one.frame_id in chosen:
-            path = (one.pose.parent_frame, "frames", one.frame_id)
-            placement = Placement(np.array(one.pose.matrix), one.pose.child_frame)
+    for frame in frames:
+        if frame.pose is not None and frame.frame_id in chosen:
+            path = (frame.pose.parent_frame, "frames", frame.frame_id)
+            placement = Placement(np.array(frame.pose.matrix), frame.pose.child_frame)
             entities.append(SceneEntity(path, placement))
-            outline = small_outline(one.intrinsics, TRACK)
+            outline = small_outline(frame.intrinsics, TRACK)
             entities.append(SceneEntity((*path, "sensor"), outline))
     return Moment(entities)
 
 
 def frame_scene(client: Client, frame: Frame) -> Moment:
-    """Return permanent entities of one frame, in its parent frame or else in its sensor's frame.
+    """Return permanent entities of a frame, in its parent frame or else in its sensor's frame.
 
-    Raise NotIndexed if the frame is not indexed (yet).
+    Raise NotIndexed if the frame is not indexed.
     """
     optical = frame.kind == "depth"
     points = client.frame_points(frame.map, frame.frame_id).points

@@ -1,4 +1,4 @@
-"""Scenes as MCAP files with Foxglove's schemas; the only module that uses foxglove-sdk.
+"""Writer of scenes as MCAP files with Foxglove's schemas; no other module uses foxglove-sdk.
 
 PointSet: PointCloud on a separate topic, the entity's path
 Placement: FrameTransforms on /tf, and PoseInFrame on a separate topic
@@ -82,7 +82,7 @@ class _OutputFile:
 
 @contextmanager
 def mcap_file(path: Path) -> Iterator[McapWriter]:
-    """Yield a writer of an MCAP file, which is created at the end if it is not empty.
+    """Yield a writer for an MCAP file, which is created at the end unless it is empty.
 
     Raise OSError if the file cannot be written. No partial file remains.
     """
@@ -95,7 +95,7 @@ def mcap_file(path: Path) -> Iterator[McapWriter]:
                 writer = McapWriter(context, file)
                 yield writer
                 writer.finish()
-        except (OSError, RuntimeError) as error:  # errors of foxglove hide the cause
+        except (OSError, RuntimeError) as error:  # foxglove-sdk hides the cause
             why = file.error
             if why is None:
                 raise
@@ -135,7 +135,7 @@ class McapWriter:
 
     @property
     def is_empty(self) -> bool:
-        """Return whether nothing was written."""
+        """Whether nothing was written."""
         return not self._started and not self._waiting
 
     def finish(self) -> None:
@@ -151,40 +151,42 @@ class McapWriter:
 
     def _write(self, entities: Sequence[SceneEntity], gone: Collection[SceneEntity]) -> None:
         now = self._messages.Timestamp(*divmod(self._log_time, 1_000_000_000))
-        for one in gone:
-            self._frames.pop(one.path, None)
+        for entity in gone:
+            self._frames.pop(entity.path, None)
         self._write_frames(entities, now)
         self._write_groups(entities, gone, now)
-        for one in entities:
-            if isinstance(one.content, PointSet):
-                self._log("PointCloud", one.path, self._cloud(one.path, one.content, now))
-            elif isinstance(one.content, TextPage):
+        for entity in entities:
+            if isinstance(entity.content, PointSet):
+                self._log("PointCloud", entity.path, self._cloud(entity.path, entity.content, now))
+            elif isinstance(entity.content, TextPage):
                 level = self._messages.LogLevel.Info
                 text = self._messages.Log(
-                    timestamp=now, level=level, message=one.content.text, name="sceneprint"
+                    timestamp=now, level=level, message=entity.content.text, name="sceneprint"
                 )
                 self._log("Log", ("log",), text)
-        for one in gone:
-            if isinstance(one.content, PointSet):  # replace it by an empty cloud
-                nothing = PointSet(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), one.content.size_m)
-                self._log("PointCloud", one.path, self._cloud(one.path, nothing, now))
+        for entity in gone:
+            if isinstance(entity.content, PointSet):  # an empty cloud replaces it
+                nothing = PointSet(
+                    np.zeros((0, 3)), np.zeros((0, 3), np.uint8), entity.content.size_m
+                )
+                self._log("PointCloud", entity.path, self._cloud(entity.path, nothing, now))
         if self._file.error is not None:
             raise self._file.error
 
     def _write_frames(self, entities: Sequence[SceneEntity], now: Timestamp) -> None:
-        """Write placements as transforms and as poses, which Foxglove draws as axes."""
+        """Write placements as transforms, and as poses that Foxglove draws as axes."""
         m = self._messages
         transforms: list[FrameTransform] = []
-        for one in entities:
-            if isinstance(one.content, UpAxis):
-                space, T = space_of(one.path), upright(one.content.up)
+        for entity in entities:
+            if isinstance(entity.content, UpAxis):
+                space, T = space_of(entity.path), upright(entity.content.up)
                 transforms.append(self._transform(f"{space} upright", space, T, now))
-            elif isinstance(one.content, Placement):
-                parent, T = self._frame_of(one.path[:-1]), one.content.T_parent_child
-                self._frames[one.path] = one.content.child
-                transforms.append(self._transform(parent, one.content.child, T, now))
+            elif isinstance(entity.content, Placement):
+                parent, T = self._frame_of(entity.path[:-1]), entity.content.T_parent_child
+                self._frames[entity.path] = entity.content.child
+                transforms.append(self._transform(parent, entity.content.child, T, now))
                 pose = m.PoseInFrame(timestamp=now, frame_id=parent, pose=self._pose(T))
-                self._log("PoseInFrame", (*one.path, "pose"), pose)
+                self._log("PoseInFrame", (*entity.path, "pose"), pose)
         if transforms:
             self._log("FrameTransforms", ("tf",), m.FrameTransforms(transforms=transforms))
 
@@ -195,19 +197,20 @@ class McapWriter:
         m = self._messages
         groups: defaultdict[EntityPath, tuple[list[FoxgloveEntity], list[SceneEntityDeletion]]]
         groups = defaultdict(lambda: ([], []))
-        for one in entities:
-            if isinstance(one.content, LineSet | TextLabel):
-                groups[one.path[:2]][0].append(self._drawn(one.path, one.content, now))
-        for one in gone:
-            if isinstance(one.content, LineSet | TextLabel):
-                deletion = m.SceneEntityDeletion(timestamp=now, id=_topic(one.path))
-                groups[one.path[:2]][1].append(deletion)
+        for entity in entities:
+            if isinstance(entity.content, LineSet | TextLabel):
+                groups[entity.path[:2]][0].append(self._drawn(entity.path, entity.content, now))
+        for entity in gone:
+            if isinstance(entity.content, LineSet | TextLabel):
+                deletion = m.SceneEntityDeletion(timestamp=now, id=_topic(entity.path))
+                groups[entity.path[:2]][1].append(deletion)
         for path, (drawn, deletions) in groups.items():
             self._log("SceneUpdate", path, m.SceneUpdate(deletions=deletions, entities=drawn))
 
     def _drawn(
         self, path: EntityPath, content: LineSet | TextLabel, now: Timestamp
     ) -> FoxgloveEntity:
+        """Return lines or a label as a Foxglove entity."""
         m = self._messages
         lines, texts = [], []
         if isinstance(content, LineSet):
@@ -255,13 +258,14 @@ class McapWriter:
         return cloud
 
     def _frame_of(self, path: EntityPath) -> str:
-        """Return the coordinate frame of a path: that of its nearest placement, or the space."""
+        """Return the frame of the nearest placement on a path, or else the space."""
         for end in range(len(path), 0, -1):
             if path[:end] in self._frames:
                 return self._frames[path[:end]]
         return space_of(path)
 
     def _log(self, kind: str, path: EntityPath, message: object) -> None:
+        """Write a message of a kind, such as "PointCloud", on the topic of a path."""
         topic = _topic(path)
         if (kind, topic) not in self._channels:
             make = getattr(self._kinds, f"{kind}Channel")
@@ -292,7 +296,7 @@ class McapWriter:
 
 
 def upright(up: Floats) -> Floats:
-    """Return T (4, 4) that rotates a unit vector (3,) to z, which Foxglove draws upwards."""
+    """Return a transform (4, 4) that rotates `up` (3,) to z, the up axis of Foxglove."""
     level = np.zeros(3)
     level[int(np.argmin(np.abs(up)))] = 1.0
     level -= (level @ up) * up
@@ -303,5 +307,5 @@ def upright(up: Floats) -> Floats:
 
 
 def _topic(path: EntityPath) -> str:
-    """Return the topic of a path."""
+    """Return the topic of a path, with slashes between its parts."""
     return "/" + "/".join(part.strip("/").replace(" ", "_") for part in path)

@@ -121,14 +121,14 @@ class Moment:
 
 
 class SceneWriter(Protocol):
-    """A writer of a scene's file."""
+    """Protocol of writers of a scene."""
 
     def write(self, moment: Moment, gone: Collection[SceneEntity]) -> None:
-        """Add a moment; `gone` are the entities of the previous moment that it does not contain."""
+        """Write a moment; `gone` contains the entities of the previous moment that have ended."""
 
 
 class SceneStream:
-    """A scene that is being written; it determines the entities that each moment replaces."""
+    """Stream of moments to a writer; it determines the entities that end with each moment."""
 
     def __init__(self, writer: SceneWriter) -> None:
         self._writer = writer
@@ -136,12 +136,12 @@ class SceneStream:
         self._there: dict[EntityPath, SceneEntity] = {}
 
     def write(self, moment: Moment) -> None:
-        """Replace the previous moment; permanent entities remain."""
+        """Write the next moment, which replaces the previous one but not permanent entities."""
         self.is_empty = False
         gone: list[SceneEntity] = []
         if moment.index is not None:
-            there = {one.path: one for one in moment.entities}
-            gone = [one for path, one in self._there.items() if path not in there]
+            there = {entity.path: entity for entity in moment.entities}
+            gone = [entity for path, entity in self._there.items() if path not in there]
             self._there = there
         self._writer.write(moment, gone)
 
@@ -166,16 +166,15 @@ SESSIONS: tuple[Colour, Colour] = (QUERY, STRONG)
 
 #: Depth of the outline of a camera's image, and length of axes, metres.
 FRUSTUM_M, AXES_M = 0.25, 0.5
-#: Depth of the outline of each of many sensors, metres, and width of their lines and of edges,
-#: pixels.
+#: Depth of small outlines, metres, and width of thin lines, pixels.
 SMALL_M, THIN_PX = 0.1, 1.0
-#: Diameters of points, metres. Points of the query are larger than points of its matches on the
-#: same surfaces, and these are larger than points of the map.
+#: Diameters of points of the map, of matches and of the query, metres. They differ so that points
+#: on the same surface remain visible.
 MAP_POINT_M, MATCH_POINT_M, QUERY_POINT_M = 0.012, 0.018, 0.024
 _SCANNERS_TIMES = 4.0
-#: Percentiles of height at the ends of the colour scale, so that stray points do not compress it.
+#: Percentiles of height at the ends of the colour scale, which exclude stray points.
 _RANGE = (1.0, 99.0)
-#: Factor that dims the colours of heights, since the map is the background.
+#: Factor that dims the colours of heights, because the map is the background.
 _DIMMED = 0.6
 
 
@@ -209,7 +208,7 @@ def sensor_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
 
 
 def small_outline(camera: CameraIntrinsics | None, colour: Colour) -> LineSet:
-    """Return a small `sensor_outline`, for one of many sensors."""
+    """Return a small `sensor_outline` with thin lines."""
     drawn = sensor_axes(SMALL_M) if camera is None else frustum(camera, colour, SMALL_M)
     return replace(drawn, width_px=THIN_PX)
 
@@ -244,7 +243,7 @@ def nearest_axis(direction: Floats) -> Floats:
 
 
 def up_of_sensors(poses: Sequence[Floats], *, cameras: bool) -> Floats:
-    """Return the axis (3,) of a parent frame that is probably up, since most sensors are upright.
+    """Return the axis (3,) of a parent frame that is probably up if most sensors are upright.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The file in which a command of `sceneprint` draws its results, as moments of a scene."""
+"""Files in which the commands of `sceneprint` draw their results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sceneprint_viewers.scene import SceneStream
 
 
 class SceneFile:
-    """The `Scene` in which the commands of `sceneprint` draw their results.
+    """A scene in which the commands of `sceneprint` draw their results.
 
     Parameters
     ----------
@@ -31,14 +31,17 @@ class SceneFile:
 
     @property
     def is_empty(self) -> bool:
-        """Return whether nothing was added."""
+        """Whether nothing was added."""
         return self._stream.is_empty
 
     def add_answer(
         self, answer: Answer, name: str, text: str, camera: CameraIntrinsics | None,
         place: tuple[int, int], stamp_ns: int | None,
     ) -> None:  # fmt: skip
-        """Add an answer as the next moment; the first answer draws the map too."""
+        """Add an answer as the next moment, and draw its map if that was not drawn.
+
+        `place` is the index of the answer and the total number; see `AnswerScene.add`.
+        """
         index, of = place
         if self._answers is None:
             limits = ONE if of == 1 else MANY
@@ -61,7 +64,7 @@ class SceneFile:
 
 @contextmanager
 def open_scene_file(path: Path, client: Client, map_frames: int) -> Iterator[SceneFile]:
-    """Open an MCAP file for drawing, which is created at the end if it is not empty.
+    """Open an MCAP file for drawing; it is created at the end unless it is empty.
 
     Raise OSError if the file cannot be written. No partial file remains.
     """
