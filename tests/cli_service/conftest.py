@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.types import DepthFrame
+from tests.conftest import halved
 
 Run = Callable[..., Any]
 
@@ -22,10 +23,14 @@ def sceneprint(service_url: str, run_command: Run, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.fixture(scope="session")
-def rooms(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three views of each of two rooms, with poses, in 7-Scenes layout."""
-    root = tmp_path_factory.mktemp("rooms")
-    for number, frame in enumerate(room_frames):
+def room_frames(room_frames: tuple[DepthFrame, ...]) -> tuple[DepthFrame, ...]:
+    """The frames of `tests/conftest.py` with a quarter of their samples, which are fast to sign."""
+    return tuple(map(halved, room_frames))
+
+
+def write_rooms(root: Path, frames: Sequence[DepthFrame]) -> Path:
+    """Write three views of each of two rooms, with poses, in 7-Scenes layout; return the folder."""
+    for number, frame in enumerate(frames):
         folder = root / f"room-{number // 3}" / "seq-01"
         folder.mkdir(parents=True, exist_ok=True)
         write_intrinsics(folder, Camera(frame.intrinsics))
@@ -33,3 +38,9 @@ def rooms(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPath
         assert frame.pose is not None
         write_pose(folder / f"frame-{number % 3:06d}.pose.txt", frame.pose)
     return root
+
+
+@pytest.fixture(scope="session")
+def rooms(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three views of each of two rooms; see `write_rooms`."""
+    return write_rooms(tmp_path_factory.mktemp("rooms"), room_frames)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,23 +11,22 @@ import pytest
 
 from sceneprint.formats.dataset import write_pose
 from sceneprint.formats.export import write_ply
-from sceneprint.types import DepthFrame
 
 Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")
-def scans(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scans(room_frames, tmp_path_factory):
     """What two depth images see, as a KITTI scan and a PLY, with their poses; and one that is
     none.
     """
     folder = tmp_path_factory.mktemp("scans") / "walk"
     folder.mkdir()
     for i, frame in enumerate(room_frames[:2]):
-        k, depth = frame.intrinsics, frame.depth[::2, ::2].astype(float)
+        k, depth = frame.intrinsics, frame.depth.astype(float)
         y, x = np.nonzero(depth)
         z = depth[y, x]
-        points = np.stack([(2 * x - k.cx) / k.fx * z, (2 * y - k.cy) / k.fy * z, z], axis=1)
+        points = np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=1)
         if i:
             (folder / "1.ply").write_bytes(write_ply(points))
         else:
@@ -40,7 +38,7 @@ def scans(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPath
     return folder
 
 
-def test_a_folder_of_scans_is_uploaded_and_found(sceneprint: Run, scans: Path, rooms: Path) -> None:
+def test_a_folder_of_scans_is_uploaded_and_found(sceneprint, scans, rooms):
     done = sceneprint("upload", "scanned", scans, "--model", "depth", expect=2)
     assert "3 frames: 2 received, 0 already there, 1 refused; 2 indexed" in done.stdout
     assert "walk/2: " in done.stderr
@@ -55,7 +53,7 @@ def test_a_folder_of_scans_is_uploaded_and_found(sceneprint: Run, scans: Path, r
     assert np.allclose(there["pose"]["matrix"], own, atol=0.02)
 
 
-def test_rows_of_five_are_named_or_refused(sceneprint: Run, scans: Path, tmp_path: Path) -> None:
+def test_rows_of_five_are_named_or_refused(sceneprint, scans, tmp_path):
     rows = np.fromfile(scans / "0.bin", "<f4").reshape(-1, 4)
     ring = np.arange(len(rows)) % 32
     (tmp_path / "0.bin").write_bytes(np.c_[rows, ring].astype("<f4").tobytes())

@@ -25,6 +25,15 @@ from sceneprint_client import Client
 from sceneprint_client.api import JobState
 from sceneprint_lab.cli import demo as served
 from sceneprint_lab.cli.demo import choose_frames, fill, serving
+from sceneprint_lab.synth import SynthRoom
+from tests.cli_service.conftest import write_rooms
+
+
+@pytest.fixture(scope="module")
+def rooms(room_views: Callable[..., SynthRoom], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rooms with all samples: their third frames have no accepted match."""
+    frames = [frame for i in range(2) for frame in room_views(21, i, 3).frames]
+    return write_rooms(tmp_path_factory.mktemp("whole"), frames)
 
 
 @pytest.fixture

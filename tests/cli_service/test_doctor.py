@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ def verdicts(text: str) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def working(service_url: str) -> str:
+def working(service_url):
     """The service, whose worker has begun: that is a while after it answers."""
     with Client(service_url) as client:
         until(lambda: client.stats(minutes=1).workers)
@@ -57,7 +57,7 @@ def working(service_url: str) -> str:
 
 
 @pytest.mark.sqlite_only("this server is told not to wait for its disk")
-def test_a_sound_machine(sceneprint: Run, data_folder: Path, working: str) -> None:
+def test_a_sound_machine(sceneprint, data_folder, working):
     done = sceneprint("doctor", "--data", data_folder)
     found = verdicts(done.stdout)
     assert list(found) == [
@@ -73,7 +73,7 @@ def test_a_sound_machine(sceneprint: Run, data_folder: Path, working: str) -> No
 
 
 @pytest.mark.sqlite_only("what its file takes")
-def test_a_running_service(sceneprint: Run, working: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_running_service(sceneprint, working, monkeypatch):
     """The address alone: what the service tells, and nothing of this machine."""
     with Client(working) as client:
         if not any(one.name == "looked-at" for one in client.maps()):
@@ -96,9 +96,7 @@ def test_a_running_service(sceneprint: Run, working: str, monkeypatch: pytest.Mo
         assert re.search(told, said), told
 
 
-def test_a_key_that_may_not_see_all(
-    sceneprint: Run, service_url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_key_that_may_not_see_all(sceneprint, service_url, monkeypatch):
     def asked(key: str | None) -> list[Check]:
         with Client(service_url, key) as client:
             client._http.headers["X-Forwarded-For"] = "192.0.2.7"  # as behind a proxy
@@ -117,8 +115,8 @@ def test_a_key_that_may_not_see_all(
 
 @pytest.mark.sqlite_only("this server is told not to wait for its disk")
 def test_without_an_address_the_default_folder_is_named(
-    sceneprint: Run, service_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    sceneprint, service_url, tmp_path, monkeypatch
+):
     monkeypatch.delenv("SCENEPRINT_URL")
     monkeypatch.setattr(doctor, "DEFAULT_URL", service_url)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
@@ -129,9 +127,7 @@ def test_without_an_address_the_default_folder_is_named(
 
 
 @pytest.mark.sqlite_only("this server is told not to wait for its disk")
-def test_a_machine_where_nothing_was_used_yet(
-    sceneprint: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_machine_where_nothing_was_used_yet(sceneprint, tmp_path, monkeypatch):
     monkeypatch.delenv("SCENEPRINT_URL")
     monkeypatch.setattr(doctor, "DEFAULT_URL", "http://127.0.0.1:1")
     monkeypatch.setenv("SCENEPRINT_CACHE_DIR", str(tmp_path / "cache"))
@@ -149,7 +145,7 @@ def test_a_machine_where_nothing_was_used_yet(
 
 
 @pytest.mark.sqlite_only("a file that is damaged")
-def test_what_is_wrong_says_what_to_do(sceneprint: Run, tmp_path: Path) -> None:
+def test_what_is_wrong_says_what_to_do(sceneprint, tmp_path):
     (tmp_path / "sceneprint.db").write_bytes(b"not a database " * 100)
     done = sceneprint("doctor", "--data", tmp_path, "--url", "http://127.0.0.1:1", expect=2)
     found = verdicts(done.stdout)
@@ -169,7 +165,7 @@ def found_in(settings: Settings) -> dict[str, Check]:
 
 
 @pytest.mark.sqlite_only("what is in its file")
-def test_databases_of_other_versions(tmp_path: Path) -> None:
+def test_databases_of_other_versions(tmp_path):
     Client.embedded(tmp_path).close()
     settings = Settings(data_dir=tmp_path, database_url=None)
     path = tmp_path / "sceneprint.db"
@@ -195,7 +191,7 @@ def test_databases_of_other_versions(tmp_path: Path) -> None:
     assert found_in(settings)["database"].verdict == "note"
 
 
-def test_a_decoder_is_tried(tmp_path: Path) -> None:
+def test_a_decoder_is_tried(tmp_path):
     settings = Settings(data_dir=tmp_path, decoders=1)
     finding = found_in(settings)["decoders"]
     assert (finding.verdict, "seccomp" in finding.text) == ("ok", True)
@@ -208,7 +204,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.sqlite_only("what is in its file")
-def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
+def test_looking_at_a_database_changes_nothing(tmp_path):
     """One that was closed, one that is in use, one whose process was killed, and a copy of that."""
     path, killed, copy = (tmp_path / one / "sceneprint.db" for one in ("data", "killed", "copy"))
     Client.embedded(path.parent).close()
@@ -259,10 +255,7 @@ def test_looking_at_a_database_changes_nothing(tmp_path: Path) -> None:
         ("nosuch://host/db", "WRONG", "'nosuch' is not a supported database"),
     ],
 )
-def test_addresses_of_databases(
-    sceneprint: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    url: str, verdict: str, said: str,
-) -> None:  # fmt: skip
+def test_addresses_of_databases(sceneprint, tmp_path, monkeypatch, url, verdict, said):
     monkeypatch.setenv("SCENEPRINT_DATABASE_URL", url.format(tmp=str(tmp_path).lstrip("/")
         if url.startswith("sqlite:////") else tmp_path))  # fmt: skip
     done = sceneprint("doctor", "--data", tmp_path, expect=2 if verdict == "WRONG" else 0)
@@ -275,7 +268,7 @@ def test_addresses_of_databases(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_a_machine_may_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_machine_may_lack(tmp_path, monkeypatch):
     monkeypatch.setitem(doctor.OPEN3D_LIBRARIES, "libabsent.so.1", "libabsent1")
     monkeypatch.setattr(checks, "LEAST_FREE", 1 << 62)
     monkeypatch.setattr(doctor, "OLDEST_SQLITE", (99, 0, 0))
@@ -286,22 +279,22 @@ def test_what_a_machine_may_lack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert "SQLite 99.0.0 or later" in found["sqlite"].text
 
 
-def test_open3d_may_be_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open3d_may_be_left_out(tmp_path, monkeypatch):
     monkeypatch.setattr(doctor, "find_spec", lambda _name: None)
     found = found_in(Settings(data_dir=tmp_path, database_url=None))["open3d"]
     assert (found.verdict, found.text.split(": ")[1]) == ("note", "pip install open3d")
 
 
-@pytest.fixture
-def waiting(tmp_path: Path, rooms: Path) -> Iterator[Client]:
+@pytest.fixture(scope="module")
+def waiting(tmp_path_factory, rooms):
     """A map with a frame that nobody signs."""
-    with Client.embedded(tmp_path / "waiting") as client:
+    with Client.embedded(tmp_path_factory.mktemp("waiting") / "data") as client:
         client.create_map("m")
         client.upload("m", find_sequences(rooms)[0].frames[0])
         yield client
 
 
-def test_workers_that_are_missing(waiting: Client) -> None:
+def test_workers_that_are_missing(waiting):
     stats = waiting.stats(minutes=1)
     assert (stats.workers, stats.waiting) == ([], 1)
     found = worker_check(stats, read_only=False)
@@ -320,7 +313,7 @@ def test_workers_that_are_missing(waiting: Client) -> None:
     assert "the oldest for 100 s; 2 failed in every attempt: `sceneprint jobs" in queue.text
 
 
-def test_why_jobs_wait(waiting: Client) -> None:
+def test_why_jobs_wait(waiting):
     stats = waiting.stats(minutes=1)
     assert waiting_reason(stats, 1).startswith("Check that workers are running;")
     busy = [WorkerSeen(name="host:1", job_id="j"), WorkerSeen(name="host:2", job_id=None)]
@@ -330,7 +323,7 @@ def test_why_jobs_wait(waiting: Client) -> None:
     assert waiting_reason(one, 0) == "1 of 1 worker busy, 1 job ahead."
 
 
-def test_what_a_service_may_tell(waiting: Client) -> None:
+def test_what_a_service_may_tell(waiting):
     status = Status(version="99.1", frames={"indexed": 2, "rejected": 1}, jobs={})
     found = version_check("http://x", status)
     assert found.verdict == "note"
@@ -355,9 +348,7 @@ def test_what_a_service_may_tell(waiting: Client) -> None:
     )
 
 
-def test_the_first_use_says_what_it_waits_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_first_use_says_what_it_waits_for(tmp_path, monkeypatch):
     said: list[str] = []
     prepare_presets(Settings(data_dir=tmp_path), said.append)
     said.clear()  # of a checkout in which nothing was compiled

@@ -21,6 +21,7 @@ def found_in(url: str, **other: object) -> dict[str, Check]:
     return {one.subject: one for one in found}
 
 
+@pytest.mark.thorough
 def test_a_server_and_its_standby(postgres: Server, tmp_path: Path) -> None:
     url = postgres.create("looked_at")
     open_database(url).close()

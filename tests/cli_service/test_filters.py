@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +12,7 @@ from sceneprint.cli.options import add_filter_options, filter_of
 Run = Callable[..., Any]
 
 
-def test_options_are_a_filter() -> None:
+def test_options_are_a_filter():
     import argparse
 
     parser = argparse.ArgumentParser()
@@ -33,12 +32,12 @@ def test_options_are_a_filter() -> None:
 
 
 @pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d,e,f", ""])
-def test_a_box_has_six_numbers(sceneprint: Run, text: str) -> None:
+def test_a_box_has_six_numbers(sceneprint, text):
     with pytest.raises(SystemExit):
         sceneprint("query", "m", "x.png", "--region", text)
 
 
-def test_an_upload_counts_what_was_not_kept(sceneprint: Run, rooms: Path) -> None:
+def test_an_upload_counts_what_was_not_kept(sceneprint, rooms):
     done = sceneprint("upload", "novel", rooms / "room-0", "--if-novel=1")
     assert done.stderr == ""  # nothing is wrong
     first = "3 frames: 3 received, 0 already there; 1 indexed, 0 rejected, 0 failed, 2 redundant; "
@@ -49,6 +48,6 @@ def test_an_upload_counts_what_was_not_kept(sceneprint: Run, rooms: Path) -> Non
 
 
 @pytest.mark.parametrize("text", ["0", "1.5", "much", "false"])
-def test_a_condition_is_a_share(sceneprint: Run, rooms: Path, text: str) -> None:
+def test_a_condition_is_a_share(sceneprint, rooms, text):
     with pytest.raises(SystemExit):
         sceneprint("upload", "novel", rooms, f"--if-novel={text}")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -13,13 +11,11 @@ from sceneprint.formats.dataset import read_trajectory
 
 
 @pytest.fixture(scope="module")
-def name() -> str:
+def name():
     return "frames-command"
 
 
-def test_lists_files_and_edits(
-    sceneprint: Callable[..., object], rooms: Path, name: str, tmp_path: Path
-) -> None:
+def test_lists_files_and_edits(sceneprint, rooms, name, tmp_path):
     sceneprint("upload", name, rooms / "room-0", "--model", "depth", "--robot", "r1")
     frames = [json.loads(line) for line in sceneprint("frames", name, "--json").stdout.splitlines()]
     ids = [one["frame_id"] for one in frames]
@@ -91,17 +87,13 @@ def test_lists_files_and_edits(
         (("nobody", "--cloud", "a.ply"), "There is no"),
     ],
 )
-def test_what_cannot_be_is_one_line(
-    sceneprint: Callable[..., object], name: str, arguments: tuple[str, ...], text: str
-) -> None:
+def test_what_cannot_be_is_one_line(sceneprint, name, arguments, text):
     said = sceneprint("frames", name, *arguments, expect=2)
     assert text in said.stderr
     assert said.stderr.count("\n") == 1
 
 
-def test_a_session_is_renamed_tagged_and_deleted(
-    sceneprint: Callable[..., object], rooms: Path, name: str
-) -> None:
+def test_a_session_is_renamed_tagged_and_deleted(sceneprint, rooms, name):
     name = f"{name}-sessions"
     sceneprint("upload", name, rooms / "room-0", "--model", "depth", "--robot", "r1")
     (own,) = [json.loads(one) for one in sceneprint("sessions", name, "--json").stdout.splitlines()]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
@@ -18,9 +17,7 @@ Run = Callable[..., tuple[str, str]]
 
 
 @pytest.fixture
-def dead(
-    sceneprint: Run, data_folder: Path, rooms: Path, service_url: str
-) -> Iterator[tuple[str, str]]:
+def dead(sceneprint, data_folder, rooms, service_url):
     """Jobs of a map of two frames: one as if it had broken down too often, and one done."""
     sceneprint("upload", "jobs", rooms / "room-0", "--every", 2, "--priority", -3)
     with Client(service_url) as client, Engine(Settings(data_dir=data_folder)) as engine:
@@ -41,9 +38,7 @@ def dead(
         client.delete_map("jobs")
 
 
-def test_dead_jobs_are_listed_and_tried_again(
-    sceneprint: Run, dead: tuple[str, str], service_url: str
-) -> None:
+def test_dead_jobs_are_listed_and_tried_again(sceneprint, dead, service_url):
     (said, _) = sceneprint("jobs", "--state", "dead")
     head, line = said.splitlines()
     assert head.split() == ["job", "state", "prio", "tries", "created", "map", "error"]
@@ -66,7 +61,7 @@ def test_dead_jobs_are_listed_and_tried_again(
     assert ids[:3] == [again, *dead]
 
 
-def test_one_job_is_cancelled_or_tried_again(sceneprint: Run, dead: tuple[str, str]) -> None:
+def test_one_job_is_cancelled_or_tried_again(sceneprint, dead):
     said = sceneprint("jobs", "--cancel", dead[1], expect=2)
     assert said[1].startswith(f"sceneprint jobs: Job {dead[1]} is succeeded: ")
     (said_out, _) = sceneprint("jobs", "--retry", dead[0], "--json")
@@ -78,7 +73,7 @@ def test_one_job_is_cancelled_or_tried_again(sceneprint: Run, dead: tuple[str, s
     assert not {one["job_id"] for one in cancelled} & {*dead, again["job_id"]}
 
 
-def test_a_priority_out_of_its_range_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_priority_out_of_its_range_is_refused(capsys):
     for wrong in ("11", "-11", "x", "--5", "1.0"):
         with pytest.raises(SystemExit):
             main(["upload", "m", "path", f"--priority={wrong}"])

@@ -6,10 +6,8 @@ import json
 import runpy
 import sqlite3
 import sys
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,9 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CAMERA = CameraIntrinsics(width=16, height=12, fx=14, fy=14, cx=7.5, cy=5.5)
 
 
-def test_what_was_not_tried_is_not_told_to_be_there(
-    sceneprint: Callable[..., Any], rooms: Path, tmp_path: Path
-) -> None:
+def test_what_was_not_tried_is_not_told_to_be_there(sceneprint, rooms, tmp_path):
     path = tmp_path / "robot.spool"
     sceneprint("spool", path, rooms / "room-0", "--every", 3)
     with closing(sqlite3.connect(path)) as database:  # as a disk that is full after two more
@@ -36,9 +32,7 @@ def test_what_was_not_tried_is_not_told_to_be_there(
     assert "The disk has no room for the spool" in said.stderr
 
 
-def test_frames_are_spooled_and_uploaded(
-    sceneprint: Callable[..., Any], service_url: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_path):
     spool, bare = tmp_path / "robot.spool", tmp_path / "bare"
     said = sceneprint("spool", spool, expect=2)
     assert "there is no spool here" in said.stderr
@@ -77,10 +71,7 @@ def test_frames_are_spooled_and_uploaded(
 
 
 @pytest.fixture
-def run_example(
-    rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> Callable[..., list[str]]:  # fmt: skip
+def run_example(rooms, tmp_path, monkeypatch, capsys):
     def example(url: str, *more: object) -> list[str]:
         given = [rooms, "offline-example", "--spool", tmp_path / "spool", "--url", url, *more]
         monkeypatch.setattr(sys, "argv", ["offline_robot.py", *map(str, given)])
@@ -91,9 +82,7 @@ def run_example(
     return example
 
 
-def test_the_example_goes_on_while_it_is_offline(
-    service_url: str, run_example: Callable[..., list[str]]
-) -> None:
+def test_the_example_goes_on_while_it_is_offline(service_url, run_example):
     example = run_example
     told = example("http://127.0.0.1:9")
     assert told[0].startswith("offline, 6 frames wait: http://127.0.0.1:9 cannot be reached")
@@ -108,9 +97,7 @@ def test_the_example_goes_on_while_it_is_offline(
 
 
 @pytest.mark.sqlite_only("a copy of the maps is a folder with SQLite")
-def test_the_example_localises_by_its_copy(
-    service_url: str, run_example: Callable[..., list[str]], tmp_path: Path
-) -> None:
+def test_the_example_localises_by_its_copy(service_url, run_example, tmp_path):
     with Client(service_url) as client, Client.embedded(tmp_path / "copy") as robot:
         client.delete_map("offline-example")
         for one in (client, robot):

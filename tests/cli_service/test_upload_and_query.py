@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -11,13 +12,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
 
 import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
+from sceneprint.cli import main
 from sceneprint.cli.imports import unsigned_reason
 from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.formats.dataset import read_pose, write_depth_png
@@ -29,14 +31,13 @@ Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="session")
-def house(service_url: str, rooms: Path) -> str:
+def house(service_url, rooms):
     """A map with all frames of both rooms."""
-    arguments = ["upload", "house", rooms, "--robot", "r1", "--url", service_url]
-    done = subprocess.run(
-        [sys.executable, "-m", "sceneprint", *arguments], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    first, second, third, fourth = done.stdout.splitlines()
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        code = main(["upload", "house", str(rooms), "--robot", "r1", "--url", service_url])
+    assert (code, err.getvalue()) == (0, "")  # no bars where nobody looks
+    first, second, third, fourth = out.getvalue().splitlines()
     assert re.fullmatch(
         r"poses of 6 of 6 frames; depth \S+ to \S+ m \(5th to 95th percentile\), \d+ % of pixels "
         "valid", third,
@@ -49,11 +50,10 @@ def house(service_url: str, rooms: Path) -> str:
         "6 frames: 6 received, 0 already there; 6 indexed, 0 rejected, 0 failed; "
     )
     assert re.search(r"; \d+\.\d frames/s$", second)
-    assert done.stderr == ""  # no bars where nobody looks
     return "house"
 
 
-def test_what_was_uploaded_is_there(house: str, service_url: str, rooms: Path) -> None:
+def test_what_was_uploaded_is_there(house, service_url, rooms):
     with Client(service_url) as client:
         frames = sorted(client.frames(house), key=lambda one: (one.session, one.bytes))
     assert {(one.state, one.robot) for one in frames} == {("indexed", "r1")}
@@ -64,7 +64,7 @@ def test_what_was_uploaded_is_there(house: str, service_url: str, rooms: Path) -
     assert parents == {"r1/room-0", "r1/room-1"}  # another robot's room-0 may be another place
 
 
-def test_uploading_again_changes_nothing(sceneprint: Run, house: str, rooms: Path) -> None:
+def test_uploading_again_changes_nothing(sceneprint, house, rooms):
     done = sceneprint("upload", house, rooms / "room-0", "--robot", "r1")  # by another path
     assert done.stdout.startswith("3 frames: 0 received, 3 already there; 3 indexed, ")
     done = sceneprint("upload", house, rooms / "room-0", "--every", 2, expect=2)
@@ -76,13 +76,11 @@ def test_uploading_again_changes_nothing(sceneprint: Run, house: str, rooms: Pat
     assert second.startswith("seq-01/frame-000002: ")
 
 
-def test_bad_frames_stop_no_others(
-    sceneprint: Run, service_url: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_bad_frames_stop_no_others(sceneprint, service_url, rooms, tmp_path):
     folder = tmp_path / "mixed"
     shutil.copytree(rooms / "room-0" / "seq-01", folder)
     (folder / "frame-000001.depth.png").write_bytes(b"no image")
-    wall = np.zeros((480, 640), np.float32)
+    wall = np.zeros((240, 320), np.float32)
     wall[100:105, 100:106] = 2.0
     write_depth_png(folder / "frame-000003.depth.png", wall, 1000.0)
     (folder / "frame-000002.pose.txt").write_text("no pose")
@@ -108,9 +106,7 @@ def test_bad_frames_stop_no_others(
     assert "\nposes of 0 of 4 frames; 4 without: --no-pose; depth " in without.stdout
 
 
-def test_what_is_lost_though_nobody_asked_ends_with_code_2(
-    sceneprint: Run, rooms: Path, tmp_path: Path
-) -> None:
+def test_what_is_lost_though_nobody_asked_ends_with_code_2(sceneprint, rooms, tmp_path):
     """A trajectory of another day: the frames are indexed, and all of its poses are lost."""
     folder = tmp_path / "day"
     shutil.copytree(rooms / "room-0" / "seq-01", folder)
@@ -145,9 +141,7 @@ def test_what_is_lost_though_nobody_asked_ends_with_code_2(
     assert "--depth-scale is for depth images" in done.stderr
 
 
-def test_a_map_without_poses_says_so_and_gives_no_coordinates(
-    sceneprint: Run, service_url: str, rooms: Path
-) -> None:
+def test_a_map_without_poses_says_so_and_gives_no_coordinates(sceneprint, service_url, rooms):
     folder = rooms / "room-0" / "seq-01"
     done = sceneprint("upload", "bare", folder, "--no-pose")
     *_, last = done.stdout.splitlines()
@@ -161,7 +155,7 @@ def test_a_map_without_poses_says_so_and_gives_no_coordinates(
         client.delete_map("bare")
 
 
-def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) -> None:
+def test_upload_without_waiting(sceneprint, service_url, rooms):
     done = sceneprint("upload", "later", rooms, "--no-wait", "--model", "depth", "--parallel", 2)
     assert "6 received" in done.stdout
     with Client(service_url) as client:
@@ -170,9 +164,7 @@ def test_upload_without_waiting(sceneprint: Run, service_url: str, rooms: Path) 
         assert {job.state for job in client.wait(ids, timeout_s=PATIENCE_S)} == {"succeeded"}
 
 
-def test_poses_lead_to_the_frame_that_is_named(
-    sceneprint: Run, service_url: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_poses_lead_to_the_frame_that_is_named(sceneprint, service_url, rooms, tmp_path):
     """Without a robot to the scene's; the same name for two places only where it is asked for."""
     other = tmp_path / "room-0"
     shutil.copytree(rooms / "room-1", other)
@@ -187,9 +179,7 @@ def test_poses_lead_to_the_frame_that_is_named(
             assert sorted(pose.parent_frame for pose in poses if pose is not None) == expected
 
 
-def test_upload_refuses_what_would_mix(
-    sceneprint: Run, house: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_upload_refuses_what_would_mix(sceneprint, house, rooms, tmp_path):
     done = sceneprint("upload", house, rooms, "--model", "paper", expect=2)
     assert re.search(r"Map house already exists with model depth-\w+\. Omit --model", done.stderr)
     done = sceneprint("upload", "absent", rooms, "--no-create", expect=2)
@@ -202,7 +192,7 @@ def test_upload_refuses_what_would_mix(
     assert done.stdout == ""
 
 
-def test_ctrl_c_keeps_what_was_received(service_url: str, rooms: Path) -> None:
+def test_ctrl_c_keeps_what_was_received(service_url, rooms):
     with Client(service_url) as client:
         client.create_map("stopped")
         before = signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background ignores it
@@ -222,11 +212,10 @@ def test_ctrl_c_keeps_what_was_received(service_url: str, rooms: Path) -> None:
     assert "Traceback" not in err
     assert err.splitlines()[-1] == "sceneprint upload: stopped"
     received = re.match(r"6 frames: (\d) received", out)
-    assert received is not None
     assert 1 <= int(received[1]) == kept
 
 
-def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) -> None:
+def test_a_query_is_told_in_a_table(sceneprint, house, rooms):
     done = sceneprint("query", house, rooms / "room-0", "--frame", 1, "--k", 2)
     head, titles, *matches, place, grounds = done.stdout.splitlines()
     assert re.fullmatch(
@@ -253,7 +242,7 @@ def test_a_query_is_told_in_a_table(sceneprint: Run, house: str, rooms: Path) ->
     assert re.match(rests + ", .+, (no other|the next best) place fits", grounds), grounds
 
 
-def test_queries_as_json(sceneprint: Run, house: str, rooms: Path) -> None:
+def test_queries_as_json(sceneprint, house, rooms):
     done = sceneprint("query", house, rooms / "room-1", "--json", "--seed", 3, "--exact")
     lines = [json.loads(line) for line in done.stdout.splitlines()]
     assert [line["name"] for line in lines] == [f"seq-01/frame-00000{i}" for i in range(3)]
@@ -269,9 +258,7 @@ def test_queries_as_json(sceneprint: Run, house: str, rooms: Path) -> None:
     assert json.loads(by_name.stdout)["name"] == "room-1/seq-01/frame-000002"
 
 
-def test_queries_that_cannot_be_asked(
-    sceneprint: Run, house: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_queries_that_cannot_be_asked(sceneprint, house, rooms, tmp_path):
     folder = tmp_path / "seq-01"
     shutil.copytree(rooms / "room-0" / "seq-01", folder)
     (folder / "frame-000000.depth.png").write_bytes(b"no image")
@@ -289,7 +276,7 @@ def test_queries_that_cannot_be_asked(
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
+def test_maps_are_listed_made_and_deleted(sceneprint, house):
     sceneprint("maps", "--create", "hall", "--title", "Hall 2", "--model", "depth")
     rows = [line.split() for line in sceneprint("maps").stdout.splitlines()]
     assert rows[0] == ["map", "indexed", "waiting", "rejected", "failed", "model", "title"]
@@ -314,7 +301,7 @@ def test_maps_are_listed_made_and_deleted(sceneprint: Run, house: str) -> None:
     assert "--create NAME or --edit" in sceneprint("maps", "--title", "x", expect=2).stderr
 
 
-def test_a_service_that_is_not_there(sceneprint: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_is_not_there(sceneprint, monkeypatch):
     monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
     for url, message in (("http://127.0.0.1:1", "cannot be reached"), ("foo", "not the address")):
         done = sceneprint("maps", "--url", url, expect=2)
@@ -323,9 +310,7 @@ def test_a_service_that_is_not_there(sceneprint: Run, monkeypatch: pytest.Monkey
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_an_archive_is_uploaded_as_its_folder_is(
-    sceneprint: Run, house: str, service_url: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_an_archive_is_uploaded_as_its_folder_is(sceneprint, house, service_url, rooms, tmp_path):
     made = shutil.make_archive(str(tmp_path / "rooms"), "gztar", rooms.parent, rooms.name)
     done = sceneprint("upload", house, made, "--robot", "r1")
     assert done.stdout.startswith("6 frames: 0 received, 6 already there; 6 indexed, ")
@@ -351,8 +336,8 @@ def test_an_archive_is_uploaded_as_its_folder_is(
 
 @pytest.mark.parametrize("error", [TooLarge("too many bytes"), MissingDependency("no lazrs")])
 def test_a_query_goes_on_after_a_file_that_is_not_taken(
-    sceneprint: Run, house: str, rooms: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+    sceneprint, house, rooms, monkeypatch, error
+):
     ask = Client.query
 
     def query(client: Client, name: Any, frame: Any, *more: Any, **how: Any) -> Any:
@@ -368,7 +353,7 @@ def test_a_query_goes_on_after_a_file_that_is_not_taken(
     assert done.stderr == f"seq-01/frame-000001: {error}\n"
 
 
-def test_a_map_has_limits(sceneprint: Run, house: str) -> None:
+def test_a_map_has_limits(sceneprint, house):
     made = sceneprint("maps", "--create", "small", "--model", "depth", "--quota-frames", "2")
     assert re.fullmatch(r"map small, depth-\w{12}, 0 of 2 frames\n", made.stdout)
     changes = ("--quota-frames", "none", "--quota-bytes", "1500000", "--retention-days", "30")
@@ -387,17 +372,15 @@ def test_a_map_has_limits(sceneprint: Run, house: str) -> None:
     sceneprint("maps", "--delete", "small", "--yes")
 
 
-def test_an_upload_waits_for_a_service_that_compiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_upload_waits_for_a_service_that_compiles(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(http, "LIMIT_S", 0.0)  # asked once
     with Client.embedded(tmp_path) as client:
-        client._worker._runner._context.signers._compiled.clear()  # type: ignore[union-attr]
+        client._worker._runner._context.signers._compiled.clear()
         assert unsigned_reason(client, []) == "They are signed when it is ready."
     assert "the service is compiling its kernels" in capsys.readouterr().err
 
 
-def test_an_upload_ends_at_its_timeout(sceneprint: Run, tmp_path: Path, rooms: Path) -> None:
+def test_an_upload_ends_at_its_timeout(sceneprint, tmp_path, rooms):
     with serving(tmp_path, 0) as url:
         arguments = ("late", rooms, "--every", "2", "--timeout", "0.2", "--url", url)
         said = sceneprint("upload", *arguments, expect=2)
@@ -410,8 +393,8 @@ def test_an_upload_ends_at_its_timeout(sceneprint: Run, tmp_path: Path, rooms: P
 
 @pytest.mark.thorough
 def test_a_map_that_is_one_file_is_uploaded_as_a_map(
-    sceneprint: Run, service_url: str, room_mesh: bytes, rooms: Path, tmp_path: Path
-) -> None:
+    sceneprint, service_url, room_mesh, rooms, tmp_path
+):
     file = tmp_path / "room.ply"
     file.write_bytes(room_mesh)
     small = ("--camera", "73,73,39.5,29.5,80,60", "--height", "1.2", "--offset", "0,0,1")
@@ -448,8 +431,8 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     ],
 )
 def test_options_of_another_upload_are_errors(
-    sceneprint: Run, house: str, room_mesh: bytes, tmp_path: Path, options: Any, message: str
-) -> None:
+    sceneprint, house, room_mesh, tmp_path, options, message
+):
     file = tmp_path / "room.ply"
     file.write_bytes(room_mesh)
     done = sceneprint("upload", house, file, *options, expect=2)
@@ -457,7 +440,7 @@ def test_options_of_another_upload_are_errors(
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_what_is_no_map_is_refused(sceneprint: Run, house: str, tmp_path: Path) -> None:
+def test_what_is_no_map_is_refused(sceneprint, house, tmp_path):
     file = tmp_path / "map.txt"
     file.write_bytes(b"no map")
     for paths in ((file,), (tmp_path,), (tmp_path / "none.pcd",)):
