@@ -117,7 +117,7 @@ def make_sketches(vectors: Bytes) -> Sketches:
     return Sketches(means, index)
 
 
-def measure_sketches(sketches: Sketches, vectors: Bytes, seed: int = 0) -> tuple[Sketches, Recall]:
+def measure_sketches(sketches: Sketches, vectors: Bytes) -> tuple[Sketches, Recall]:
     """Increase the probes of sketches until the recall of a sample of queries reaches ENOUGH.
 
     Returns
@@ -126,7 +126,7 @@ def measure_sketches(sketches: Sketches, vectors: Bytes, seed: int = 0) -> tuple
     recall : measured recall
     """
     n, d = vectors.shape
-    chosen = draw(n, min(max(COMPARED_BYTES // (n * d), LEAST), MOST), seed)
+    chosen = draw(n, min(max(COMPARED_BYTES // (n * d), LEAST), MOST), 0)
     near, expected = min(NEAR, n - 1), list[tuple[int, NDArray[np.int64]]]()
     for row, others in neighbours(vectors, chosen, 2 * near) if near else ():
         exact = distances(vectors[row], vectors, "l2", others)

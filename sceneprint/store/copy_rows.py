@@ -11,20 +11,17 @@ from typing import Any
 
 from sqlalchemy import Column, Connection, Row, insert, select, update
 
-from sceneprint.store.frames import write_frame
 from sceneprint.store.maps import add_usage, find_map, free_id, next_revision, position
-from sceneprint.store.signatures import StoredSignature, put_signatures, replace_signature
+from sceneprint.store.signatures import StoredSignature, put_signatures
 from sceneprint.store.tables import (
     FrameRow,
     MapRow,
-    blocks,
     frame_row,
     frame_tags,
     frames,
     job_values,
     jobs,
     maps,
-    models,
     signatures,
 )
 from sceneprint_client.api import FrameState, JobState
@@ -65,13 +62,6 @@ def has_artifact(connection: Connection, row: MapRow, digest: str) -> bool:
     """Return whether a blob is the artifact of an indexed frame of a map."""
     statement = _signed(select(frames.c.number), row).where(signatures.c.geometry == digest)
     return connection.execute(statement.limit(1)).first() is not None
-
-
-def model_of(connection: Connection, model_id: str) -> tuple[str, bytes]:
-    """Return the name of a stored model, and its file."""
-    statement = select(models.c.name, models.c.content).where(models.c.id == model_id)
-    name, content = connection.execute(statement).one()
-    return name, bytes(content)
 
 
 def living_rows(connection: Connection, row: MapRow) -> dict[str, FrameRow]:
@@ -142,14 +132,3 @@ def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame
         job | {"id": one, "frame_number": number} for one, number in zip(ids, numbers, strict=True)
     ]
     connection.execute(insert(jobs), done)
-
-
-def edit_copied(connection: Connection, row: MapRow, frame: FrameRow, copied: CopiedFrame) -> None:
-    """Replace metadata and signature of a frame by those of a copy with the same content."""
-    write_frame(connection, row, frame, copied.values)
-    replace_signature(connection, frame, copied.signature)
-
-
-def numbers_in_blocks(rows: Sequence[FrameRow]) -> list[list[int]]:
-    """Split the numbers of frames into blocks."""
-    return [list(some) for some in blocks([one.number for one in rows])]

@@ -10,7 +10,6 @@ import errno
 import logging
 import os
 import re
-import shutil
 import sqlite3
 import sys
 import time
@@ -97,33 +96,29 @@ def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
         return ReadOnlyStore(
             f"{what} The database or its folder is read-only. Make both writable, and start again."
         )
-    if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and _turned_read_only(url.database):
+    # SQLite does not report a read-only or full disk for all operations
+    disk = _disk_of(url.database) if code in _OF_DISK else None
+    if disk is not None and disk.f_flag & os.ST_RDONLY:
         return ReadOnlyStore(
             f"{what} The disk is mounted read-only, possibly after a disk error. Check the system "
             "log, make the disk writable, and start again."
         )
-    no_room = code == sqlite3.SQLITE_IOERR and _no_room(url.database)
-    if code == sqlite3.SQLITE_FULL or no_room:
+    no_room = disk is not None and disk.f_bavail * disk.f_frsize < NO_ROOM
+    if code == sqlite3.SQLITE_FULL or (code == sqlite3.SQLITE_IOERR and no_room):
         return StoreFull(f"{what} The disk is full. Nothing was stored. Free some space.")
     return UnusableStore(
         f"{what} Check that the database exists and is writable, and that the disk has free space."
     )
 
 
-def _turned_read_only(path: str | None) -> bool:
-    """Return whether the disk of a file is read-only, which SQLite reports as an I/O error."""
-    try:
-        return path is not None and bool(os.statvfs(Path(path).parent).f_flag & os.ST_RDONLY)
-    except OSError:
-        return False
+_OF_DISK = (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN)
 
 
-def _no_room(path: str | None) -> bool:
-    """Return whether the disk of a file is full, which SQLite does not report for all writes."""
+def _disk_of(path: str | None) -> os.statvfs_result | None:
     try:
-        return path is not None and shutil.disk_usage(Path(path).parent).free < NO_ROOM
+        return None if path is None else os.statvfs(Path(path).parent)
     except OSError:
-        return False
+        return None
 
 
 def _database_message(error: DBAPIError) -> str:

@@ -8,7 +8,6 @@ blobs as doomed, so that they are removed even if this process is killed.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -154,15 +153,13 @@ def without_content(frame: FrameRow) -> FrameRow:
 PURGED_AT_ONCE = 100
 
 
-def oldest_tombstones(
-    connection: Connection, map_number: int, limit: int = PURGED_AT_ONCE
-) -> list[tuple[int, int, float]]:
+def oldest_tombstones(connection: Connection, map_number: int) -> list[tuple[int, int, float]]:
     """Return frame number, size in bytes and deletion time of the oldest tombstones of a map."""
     c = frames.c
     statement = select(c.number, c.bytes, c.ended_at).where(
         c.map_number == map_number, c.deletion.is_not(None)
     )
-    rows = connection.execute(statement.order_by(c.deletion, c.number).limit(limit))
+    rows = connection.execute(statement.order_by(c.deletion, c.number).limit(PURGED_AT_ONCE))
     return [(number, size, at) for number, size, at in rows]
 
 
@@ -239,8 +236,7 @@ BLOCK = 500
 
 def remove_in_blocks(
     database: Database, find: Callable[[Connection, int], Sequence[int]],
-    remove: Callable[[Connection, Sequence[int]], None], most: float = math.inf,
-    block: int = BLOCK,
+    remove: Callable[[Connection, Sequence[int]], None], most: int, block: int = BLOCK,
 ) -> int:  # fmt: skip
     """Remove rows in blocks of one commit each, so that other writers can write in between.
 

@@ -19,7 +19,7 @@ from sqlalchemy import (
 from sceneprint.errors import UnknownFrame
 from sceneprint.store.deletion import delete_frames
 from sceneprint.store.events import record_event
-from sceneprint.store.maps import ROOMLESS, add_usage, find_map, frame_of, write_tags
+from sceneprint.store.maps import ROOMLESS, add_usage, find_map, frame_of, position, write_tags
 from sceneprint.store.surface_rows import FUSED_COLUMNS, note_edit
 from sceneprint.store.tables import (
     FrameRow,
@@ -174,14 +174,13 @@ def write_frame(
         return frame
     written = dict(changed)
     if "pose" in changed:
-        pose = changed["pose"]
-        written |= {f"pose_{a}": pose and pose[i][3] for i, a in enumerate("xyz")}
+        written |= position(changed["pose"])
     connection.execute(update(frames).where(frames.c.number == frame.number).values(**written))
     if "tags" in changed:
         connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == frame.number))
         write_tags(connection, frame.number, changed["tags"])
     if FUSED_COLUMNS & set(changed):
-        note_edit(connection, frame.number, row.number)
+        note_edit(connection, [frame.number], row.number)
     record_event(connection, "frame.edited", row.name, frame.id, fields=sorted(changed))
     return frame_of(connection, frame.number)
 

@@ -18,7 +18,7 @@ import numpy as np
 from sqlalchemy import Connection, bindparam, delete, func, insert, select, update
 
 from sceneprint.store.maps import position
-from sceneprint.store.surface_rows import note_edits
+from sceneprint.store.surface_rows import note_edit
 from sceneprint.store.tables import FrameRow, frames, parent_joins
 from sceneprint.types import Floats
 from sceneprint_client.api import FrameState
@@ -183,4 +183,4 @@ def _move_frames(connection: Connection, map_number: int, before: Mapping[str, P
     columns = [name for name in moved[0] if name != "own"]
     named = own.values({name: bindparam(name, type_=f[name].type) for name in columns})
     connection.execute(named, moved)
-    note_edits(connection, [row["own"] for row in moved], map_number)
+    note_edit(connection, [row["own"] for row in moved], map_number)

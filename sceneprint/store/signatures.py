@@ -14,7 +14,6 @@ from sqlalchemy import (
     Connection,
     TextClause,
     delete,
-    func,
     insert,
     select,
     text,
@@ -80,7 +79,7 @@ def index_frame(connection: Connection, frame: FrameRow, signature: StoredSignat
     """Store a signature, index its frame, and return the new revision of the map."""
     # a signature may exist after a return to a former model
     _write_signature(connection, frame, signature)
-    mark_edited(connection, frame.number)  # a surface may contain the frame
+    mark_edited(connection, [frame.number])  # a surface may contain the frame
     revision = next_revision(connection, frame.map_number)
     moved = root_columns(connection, frame)
     if moved:
@@ -188,7 +187,7 @@ def replace_signature(connection: Connection, frame: FrameRow, signature: Stored
     searched = select(maps.c.model_id).where(maps.c.number == frame.map_number)
     is_searched = connection.execute(searched).scalar_one() == signature.model_id
     if is_searched:  # the artifact may have been lost
-        note_edit(connection, frame.number, frame.map_number)
+        note_edit(connection, [frame.number], frame.map_number)
     # compare the checksum too, since readers skip frames with a wrong checksum
     if before is not None and tuple(before) == (signature.vector, crc32(signature.vector)):
         return False
@@ -255,20 +254,12 @@ def _change(
     return SignatureChange(number, frame_id, revision, vector if sound else None)
 
 
-def count_indexed(
-    connection: Connection, map_number: int, revision: int, most: int | None = None
-) -> int:
-    """Count the frames of a map that were indexed after a revision, up to `most`."""
-    newer = (
-        select(frames.c.number)
-        .where(
-            frames.c.map_number == map_number,
-            frames.c.revision > revision,
-            frames.c.state == FrameState.INDEXED,
-        )
-        .limit(most)
-    )
-    return int(connection.execute(select(func.count()).select_from(newer.subquery())).scalar_one())
+def count_indexed(connection: Connection, map_number: int, revision: int) -> int:
+    """Count the frames of a map that were indexed after a revision."""
+    return count_rows(
+        connection, frames.c.map_number == map_number, frames.c.revision > revision,
+        frames.c.state == FrameState.INDEXED,
+    )  # fmt: skip
 
 
 def deleted_since(connection: Connection, map_number: int, revision: int) -> frozenset[int]:

@@ -19,6 +19,7 @@ from sqlalchemy import (
     delete,
     func,
     insert,
+    null,
     or_,
     select,
     tuple_,
@@ -106,28 +107,17 @@ def write_surface(connection: Connection, map_number: int, **values: object) -> 
     connection.execute(update(surfaces).where(own).values(**values))
 
 
-def note_edit(connection: Connection, frame_number: int, map_number: int) -> None:
-    """Mark a fused frame as edited, and count the edit, in the transaction of the edit."""
-    mark_edited(connection, frame_number)
-    _count_edit(connection, map_number)
-
-
-def note_edits(connection: Connection, numbers: Sequence[int], map_number: int) -> None:
-    """Mark several frames as edited; see `note_edit`."""
-    for block in blocks(numbers):
-        own = among(connection, surface_frames.c.frame_number, block)
-        connection.execute(update(surface_frames).where(own).values(changed=True))
-    _count_edit(connection, map_number)
-
-
-def _count_edit(connection: Connection, map_number: int) -> None:
+def note_edit(connection: Connection, numbers: Sequence[int], map_number: int) -> None:
+    """Mark fused frames as edited, and count the edit, in the transaction of the edit."""
+    mark_edited(connection, numbers)
     write_surface(connection, map_number, pose_edits=surfaces.c.pose_edits + 1)
 
 
-def mark_edited(connection: Connection, frame_number: int) -> None:
-    """Mark a fused frame as edited without counting the edit; its map has a new revision anyway."""
-    own = surface_frames.c.frame_number == frame_number
-    connection.execute(update(surface_frames).where(own).values(changed=True))
+def mark_edited(connection: Connection, numbers: Sequence[int]) -> None:
+    """Mark fused frames as edited without counting it; their map has a new revision anyway."""
+    for block in blocks(numbers):
+        own = among(connection, surface_frames.c.frame_number, block)
+        connection.execute(update(surface_frames).where(own).values(changed=True))
 
 
 def maps_to_update(connection: Connection) -> list[tuple[MapRow, SurfaceRow | None]]:
@@ -383,7 +373,7 @@ def schedule_rebuild(connection: Connection, tile: TileRow) -> None:
     else:
         connection.execute(delete(surface_tiles).where(own))
         forget_scale(connection, tile.map_number, tile.parent, tile.place, FACTOR**tile.level)
-    _count_edit(connection, tile.map_number)
+    note_edit(connection, [], tile.map_number)
 
 
 def list_tiles(
@@ -631,21 +621,15 @@ def _sightings(
     apart = [getattr(c, f"pose_{axis}") - at for axis, at in zip("xyz", spot, strict=True)]
     square = apart[0] * apart[0] + apart[1] * apart[1] + apart[2] * apart[2]
     statement = _posed(surface.map_number, surface.model_id).with_only_columns(
-        c.number, c.id, c.name, c.intrinsics, c.cloud, c.robot, c.session, c.captured_at, c.pose,
-        signatures.c.geometry, square.label("square"),
+        c.number, c.id, c.name, c.cloud.is_not(null()), c.robot, c.session, c.captured_at, c.pose,
+        signatures.c.geometry, square,
     ).where(*conditions)  # fmt: skip
     if beyond is not None:
         statement = statement.where(
             or_(square > beyond[0], and_(square == beyond[0], c.number > beyond[1]))
         )
     rows = connection.execute(statement.order_by(square, c.number).limit(limit))
-    return [
-        SightingFrame(
-            row.number, row.id, row.name, row.cloud is not None, row.robot, row.session,
-            row.captured_at, row.pose, row.geometry, row.square,
-        )
-        for row in rows
-    ]  # fmt: skip
+    return [SightingFrame(*row) for row in rows]
 
 
 def living_surface(connection: Connection, name: str) -> tuple[MapRow, SurfaceRow | None]:

@@ -21,6 +21,7 @@ from sqlalchemy import JSON, Connection
 
 from sceneprint.atomic_files import make_folder, write_durable
 from sceneprint.bundle.rows import Row, cut_rows, decoded_rows, encoded_rows, read_rows, write_part
+from sceneprint.engine.serializers import copy_fields
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, NotFound, UnknownMap
 from sceneprint.models import parse_model
@@ -32,18 +33,22 @@ from sceneprint.store.copy_rows import (
     add_copied,
     copied_rows,
     date_map,
-    edit_copied,
     has_artifact,
     living_rows,
-    model_of,
-    numbers_in_blocks,
 )
 from sceneprint.store.deletion import BLOCK, delete_frames, remove_map
-from sceneprint.store.frames import write_map
-from sceneprint.store.maps import add_map, find_map, list_maps, store_model
+from sceneprint.store.frames import write_frame, write_map
+from sceneprint.store.maps import (
+    add_map,
+    find_map,
+    list_maps,
+    model_content,
+    model_names,
+    store_model,
+)
 from sceneprint.store.postgres.connection import allow
-from sceneprint.store.signatures import StoredSignature
-from sceneprint.store.tables import FrameRow, MapRow
+from sceneprint.store.signatures import StoredSignature, replace_signature
+from sceneprint.store.tables import FrameRow, MapRow, blocks
 from sceneprint_client.api.copies import CopyPart, MapCopy
 
 if TYPE_CHECKING:
@@ -84,17 +89,14 @@ class MapCopies:
         with self._store.database.read() as connection:
             allow(connection, 0)  # no time limit, since sorting the rows of a large map takes long
             row = find_map(connection, map_name)
-            name, _ = model_of(connection, row.model_id)
+            name = model_names(connection)[row.model_id]
             for digest, data, count in copy_parts(connection, row):
                 is_sent = digest not in have and size < MOST_BYTES
                 if is_sent:
                     sent.append(data)
                     size += len(data)
                 parts.append(CopyPart(digest=digest, bytes=len(data), rows=count, sent=is_sent))
-        head = MapCopy(
-            name=row.name, title=row.title, up=row.up, created_at=row.created_at,
-            revision=row.revision, model_id=row.model_id, model=name, parts=parts,
-        )  # fmt: skip
+        head = copy_fields(MapCopy, row, model=name, parts=parts)
         return b"".join((head.model_dump_json().encode(), b"\n", *sent))
 
     def artifact(self, map_name: str, digest: str) -> bytes:
@@ -118,7 +120,7 @@ class MapCopies:
         """Return the model of a map as a file; raise UnknownMap if the map does not exist."""
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-            return model_of(connection, row.model_id)[1]
+            return model_content(connection, row.model_id)
 
 
 @dataclass(frozen=True)
@@ -202,8 +204,10 @@ def pull_map(
     artifacts = size = idle = 0
     while True:
         head, parts = client.map_copy(map_name, [*pull.own, *pull.fetched])
-        if pull.own and not _is_copy_of(store, head):
-            pull.own.clear()  # these rows belong to another map
+        if pull.own:
+            with store.database.read() as connection:
+                if _find_copy(connection, head) is None:
+                    pull.own.clear()  # these rows belong to another map
             continue
         before = len(pull.fetched)
         for digest, data in parts.items():
@@ -244,11 +248,6 @@ def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
             digest: {one[0]: one for one in read_rows(data, _NAMES)}
             for digest, data, _ in copy_parts(connection, row)
         }
-
-
-def _is_copy_of(store: Store, head: MapCopy) -> bool:
-    with store.database.read() as connection:
-        return _find_copy(connection, head) is not None
 
 
 def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
@@ -311,8 +310,8 @@ def _write(
             existing[one.id] for one in written
             if one.id in existing and existing[one.id].content_id != one.values["content_id"]
         ]  # fmt: skip
-        for some in numbers_in_blocks([*deleted, *renewed]):
-            blobs += delete_frames(connection, row, some)
+        for some in blocks([one.number for one in (*deleted, *renewed)]):
+            blobs += delete_frames(connection, row, list(some))
         remaining = existing.keys() - {one.id for one in renewed}
         for one in written:
             if not store.blobs.holds(one.signature.geometry):
@@ -321,7 +320,8 @@ def _write(
                     "the map again."
                 )
             if one.id in remaining:
-                edit_copied(connection, row, existing[one.id], one)
+                write_frame(connection, row, existing[one.id], one.values)
+                replace_signature(connection, existing[one.id], one.signature)
         new = [one for one in written if one.id not in remaining]
         for first in range(0, len(new), BLOCK):
             add_copied(connection, row, new[first : first + BLOCK])
