@@ -192,9 +192,8 @@ def _damage_json(text: str, rng: random.Random) -> str:
 
 
 def send_broken(
-    url: str, key: str, parts: Sequence[Part], shots: list[Shot], n: int, seed: int,
-    threads: int = 4,
-) -> BrokenFigures:  # fmt: skip
+    url: str, key: str, parts: Sequence[Part], shots: list[Shot], n: int, seed: int
+) -> BrokenFigures:
     """Send broken uploads to a service with the map `siege`, and monitor the processes.
 
     Parameters
@@ -203,7 +202,6 @@ def send_broken(
     parts : services and workers
     shots : frames to damage
     n : number of uploads
-    threads : number of sending threads
     """
     before = {pid for part in parts for pid in [part.pid, *part.children()]}
     statuses: Counter[int] = Counter()
@@ -226,7 +224,7 @@ def send_broken(
 
     bar = tqdm(total=n, desc="broken uploads", disable=None, leave=False)
     client = httpx.Client(base_url=url, timeout=60, trust_env=False, headers=bearer(key))
-    with bar, client, ThreadPoolExecutor(threads) as pool:  # the client is safe to share
+    with bar, client, ThreadPoolExecutor(4) as pool:  # the client is safe to share
         list(pool.map(send, range(n)))
     ended = before - {pid for pid, _, _ in running_processes()}
     return BrokenFigures(

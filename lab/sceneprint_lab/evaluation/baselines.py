@@ -335,20 +335,6 @@ def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
     return unit, filled
 
 
-def ring_distance(a: Floats32, b: Floats32) -> tuple[float, int]:
-    """Return the distance between two scans independently of their yaw.
-
-    Returns
-    -------
-    distance : mean of 1 - cosine over columns that are not empty in both, at the best shift; 0 to 2
-    shift : number of sectors by which the columns of `a` are shifted in `b`
-
-    `a`, `b`: (rings, sectors) descriptors.
-    """
-    distance, shift = _best_shift(*_columns(a), *_columns(b))
-    return float(distance), int(shift)
-
-
 def ring_distances(query: Floats32, database: Floats32) -> Floats:
     """Return the distances (N,) from a descriptor to N descriptors (N, rings, sectors)."""
     own = _columns(query)

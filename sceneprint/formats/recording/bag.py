@@ -112,7 +112,7 @@ class Bag:
         _types(ros1=is_bag)  # this limits rosbags before it opens the file
         with _dataset_errors(path):
             self._reader = _open_reader(path, ros1=is_bag)
-        self._closes = weakref.finalize(self, _close, self._reader)
+        self._closes = weakref.finalize(self, self._reader.close)
         with _dataset_errors(path):
             self._connections: list[Connection] = [
                 connection
@@ -248,10 +248,6 @@ def _open_reader(path: Path, *, ros1: bool) -> Ros1Reader | Ros2Reader:
     recording = Ros2Reader(path)
     recording.open()
     return recording
-
-
-def _close(reader: Ros1Reader | Ros2Reader) -> None:
-    reader.close()
 
 
 @contextmanager
