@@ -14,11 +14,11 @@ from worker.supervisor import run
 
 
 def main() -> int:
-    """Run workers until a signal ends them. Errors are printed in one line, with exit code 2."""
+    """Run workers until a signal ends them; print errors in one line, and return 2 for them."""
     log_as_json()
     try:
         settings = Settings()
-        require_writable(settings)  # reports errors once, instead of in every worker
+        require_writable(settings)  # report errors once, instead of in each worker
         run(settings)
     except (SceneprintError, ValidationError) as error:
         print(f"worker: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201

@@ -1,4 +1,4 @@
-"""One worker process: its loop over jobs, and the traces that survive its death."""
+"""A worker process: its loop over jobs, and traces that its parent can read after its death."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from sceneprint.store.wakeup import Listening, process_name
 
 log = logging.getLogger(__name__)
 
-#: Minimum and maximum pause between reads of an empty queue, seconds. Wake-ups usually end the
-#: pause earlier, but not for jobs that another machine has queued.
+#: Minimum and maximum pause between reads of an empty queue, seconds; wake-ups usually end it
+#: early.
 SHORTEST_S, LONGEST_S = 0.05, 2.0
-#: Interval of housekeeping, and the pause after a lack of memory, seconds.
+#: Interval of housekeeping, and its pause after a lack of memory, seconds.
 UPKEEP_S, POOR_S = 5.0, 300.0
-#: Increment of the process's niceness. Queries of robots have precedence over signing.
+#: Niceness of the process, since queries have precedence over signing.
 NICENESS = 5
 #: Pause after an error of the database, seconds.
 TROUBLE_S = 2.0
@@ -42,15 +42,14 @@ OUTDATED_S = 60.0
 
 
 def work(settings: Settings, parent: int, trace: Trace) -> None:
-    """Work until a signal ends the process, or until its parent process has ended.
+    """Run jobs until a signal arrives, the parent process has ended, or an unexpected error occurs.
 
-    After SIGTERM or SIGINT, the current frame is finished first. An unexpected error also ends the
-    process in an orderly way, so that the next attempt has a new process.
+    After SIGTERM or SIGINT, the current frame is finished first.
 
     Parameters
     ----------
     parent : process id of the parent
-    trace : memory that the parent reads when this process has died
+    trace : memory that the parent reads after this process has died
     """
     log_as_json()
     os.nice(NICENESS)
@@ -63,7 +62,7 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
         return not stop.requested and os.getppid() == parent
 
     with ExitStack() as stack:
-        try:  # it waits without a limit, because a replacement would have to wait too
+        try:  # wait without a limit, since a replacement would have to wait too
             context = stack.enter_context(open_context(settings, math.inf, should_continue))
         except StoreAway:
             return
@@ -78,11 +77,11 @@ def work(settings: Settings, parent: int, trace: Trace) -> None:
     log.info("worker stopped", extra={"worker": worker.name})
     if worker.unsound:
         logging.shutdown()
-        os._exit(0)  # an orderly shutdown takes a second and may crash
+        os._exit(0)  # a regular exit takes a second and may crash
 
 
 class Worker:
-    """The work of one process."""
+    """The loop of a worker process."""
 
     def __init__(
         self, context: Context, listener: Listening, trace: Trace, stop: StopSignal
@@ -93,7 +92,7 @@ class Worker:
         self._listener, self._trace, self._stop = listener, trace, stop
         self.name = process_name()
         self.unsound = False  # whether an unexpected error has occurred
-        # Frames come first: if publishing kills workers, each of them still signs for a while.
+        # Sign first: if housekeeping kills workers, each still signs frames for a while.
         self._upkeep_at = time.monotonic() + UPKEEP_S
         starter = multiprocessing.parent_process()
         self._wakers = (stop.descriptor, -1 if starter is None else int(starter.sentinel))
@@ -106,7 +105,7 @@ class Worker:
                 was_busy = self._publish() or was_busy
             if not was_busy:
                 self._listener.wait(self._pause(), *self._wakers)
-        except NewerSchema as error:  # only a later version can continue
+        except NewerSchema as error:
             log.error("store migrated by a later version", extra={"error": str(error)})
             self._stop.wait(OUTDATED_S)
         except SceneprintError as error:
@@ -132,7 +131,7 @@ class Worker:
 
     def _publish(self) -> bool:
         """Run housekeeping and the scrub until a wake-up; return whether there was one."""
-        self._upkeep_at = time.monotonic() + UPKEEP_S  # even after an error: frames come first
+        self._upkeep_at = time.monotonic() + UPKEEP_S  # before housekeeping, in case of an error
         woken = False
 
         def is_quiet() -> bool:
@@ -143,13 +142,13 @@ class Worker:
         try:
             self._housekeeping.run()
             self._scrub.run(is_quiet)
-        except MemoryError:  # a new process would not have more
+        except MemoryError:  # a new process would not have more memory
             log.error("not enough memory to publish an index; raise SCENEPRINT_WORKER_MEMORY_BYTES")
             self._upkeep_at = time.monotonic() + POOR_S
         return woken
 
     def _pause(self) -> float:
-        """Return the pause without a wake-up, seconds."""
+        """Return the maximum seconds to wait for a wake-up."""
         due_s = self._jobs.due_in_s()
         left = LONGEST_S if due_s is None else min(due_s, LONGEST_S)
         left = min(left, self._upkeep_at - time.monotonic())
@@ -158,18 +157,18 @@ class Worker:
 
 # Traces: the current job of a worker, and the traceback of its death.
 #
-# A worker that crashes, or hangs in code that never releases the interpreter, cannot report it.
-# Python's faulthandler can still write tracebacks to shared memory, which the parent reads.
+# A worker that crashes, or hangs in code that never releases the interpreter lock, cannot report
+# it. The faulthandler of Python then writes tracebacks to shared memory, which the parent reads.
 
-#: Maximum size of a traceback, of which the end is kept, and of its first line, bytes.
+#: Maximum number of bytes of a traceback (its end), and of the head with the current job.
 KEPT, HEAD = 20_000, 200
-#: First words of faulthandler's output after a timeout.
+#: Prefix of the output of faulthandler after a timeout.
 _TIMEOUT = "Timeout ("
 
 
 @dataclass(frozen=True)
 class WorkerTrace:
-    """Trace of a dead worker.
+    """The trace of a dead worker.
 
     Parameters
     ----------
@@ -183,12 +182,12 @@ class WorkerTrace:
 
     @property
     def timed_out(self) -> bool:
-        """Whether the worker was ended because its job exceeded the time limit."""
+        """Whether the worker ended because its job exceeded the time limit."""
         return self.text.startswith(_TIMEOUT)
 
 
 class Trace:
-    """Memory that a worker shares with its parent, passed to the worker as an argument."""
+    """Memory that a worker shares with its parent; it is passed to the worker as an argument."""
 
     def __init__(self) -> None:
         self._descriptor = os.memfd_create("sceneprint-trace")
@@ -207,14 +206,14 @@ class Trace:
     def job(self, job_id: str, token: int, limit_s: float) -> Iterator[None]:
         """Record the current job; the process ends if the job exceeds `limit_s`."""
         self._begin(f"{job_id} {token}\n")
-        # The timer runs in a C thread, which does not need the interpreter.
+        # The timer runs in a C thread, which does not need the interpreter lock.
         faulthandler.dump_traceback_later(limit_s, exit=True, file=self._descriptor)
         try:
             yield
         except SceneprintError:
             self._end()
             raise
-        except BaseException:  # it ends this process, and the job is still claimed
+        except BaseException:  # leave the record: the process ends with the job claimed
             faulthandler.cancel_dump_traceback_later()
             os.write(self._descriptor, traceback.format_exc().encode())
             raise
@@ -227,7 +226,7 @@ class Trace:
         start = max(len(head) + 1, size - KEPT)
         text = os.pread(self._descriptor, KEPT, start).decode(errors="replace")
         job_id, _, token = head.decode(errors="replace").partition(" ")
-        if not token.isdigit():  # it crashed without a job
+        if not token.isdigit():  # the worker crashed without a job
             text = os.pread(self._descriptor, KEPT, 0).decode(errors="replace")
             return WorkerTrace(None, 0, text)
         return WorkerTrace(job_id, int(token), text)

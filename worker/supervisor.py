@@ -1,4 +1,4 @@
-"""Supervisor of worker processes: starts them, replaces those that end, and stops them."""
+"""Supervisor of worker processes: it starts, replaces and stops them."""
 
 from __future__ import annotations
 
@@ -22,17 +22,16 @@ from worker.loop import Trace, WorkerTrace, work
 
 log = logging.getLogger(__name__)
 
-#: Time for the current frame after the signal to stop, seconds.
+#: Seconds for the current frame after the signal to stop.
 GRACE_S = 20.0
-#: Pause before the replacement of a worker that died without a job, seconds, so that a worker that
-#: cannot start does not spin.
+#: Seconds before a worker that died without a job is replaced, in case that it cannot start.
 RESTART_S = 1.0
-#: Signals from outside, which do not mean that the current job is at fault.
+#: Signals that are not caused by the current job.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 class Slot:
-    """A slot for a worker: its process, or the time from which it may be replaced."""
+    """A slot of the supervisor: a worker process, or the earliest time of its replacement."""
 
     def __init__(self) -> None:
         self.worker: SpawnProcess | None = None
@@ -40,7 +39,7 @@ class Slot:
         self.free_at = 0.0
 
     def end(self) -> tuple[int, int, WorkerTrace]:
-        """Return process id, exit code and trace of a worker that has ended, and free the slot."""
+        """Free the slot of an ended worker; return its process id, exit code and trace."""
         assert self.worker is not None
         self.worker.join()
         pid, code = self.worker.pid or 0, self.worker.exitcode or 0
@@ -52,11 +51,11 @@ class Slot:
 
 
 class Supervisor:
-    """A group of worker processes of constant size."""
+    """A group of a constant number of worker processes."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        # Forked children would inherit locks of threads and crash in OpenMP.
+        # Forked processes would inherit locks of threads, and crash in OpenMP.
         self._context = multiprocessing.get_context("spawn")
         self._slots: list[Slot] = []
 
@@ -67,7 +66,7 @@ class Supervisor:
             self._start_worker(slot)
 
     def watch(self, stop: threading.Event) -> None:
-        """Replace workers that end until `stop` is set; then stop all of them."""
+        """Replace workers that end until `stop` is set; then stop all workers."""
         try:
             with _readable(stop) as stopped:
                 while not stop.is_set():
@@ -80,11 +79,11 @@ class Supervisor:
                     for one in wait([stopped, *busy], min(free, default=None)):
                         if isinstance(one, int) and one in busy:
                             self._replace(busy[one])
-        finally:  # even if a worker cannot start, so that no others stay behind
+        finally:  # also if a worker cannot start
             self.stop()
 
     def stop(self) -> None:
-        """Let every worker finish its frame, and kill those that take too long."""
+        """Let all workers finish their frames, and kill those that take longer than GRACE_S."""
         slots = [(slot, slot.worker) for slot in self._slots if slot.worker is not None]
         for _, worker in slots:
             worker.terminate()
@@ -121,7 +120,7 @@ class Supervisor:
         self._report(code, left)
 
     def _report(self, code: int, left: WorkerTrace) -> None:
-        """Record the failure of a dead worker's job, instead of waiting for its lease."""
+        """Release the job of a dead worker, instead of waiting for the end of its lease."""
         if left.job_id is None:
             return
         error = _cause(code, left, self._settings.job_timeout_s)
@@ -131,7 +130,7 @@ class Supervisor:
             store = open_store(self._settings.database, self._settings.blobs)
             with closing(store):
                 worker_died(store, left.job_id, left.token, error, text, counts=counts)
-        except SceneprintError as trouble:  # the lease will expire
+        except SceneprintError as trouble:  # the job waits for the end of its lease
             log.error("store unreachable", extra={"error": str(trouble)})
 
 
@@ -147,8 +146,8 @@ def _cause(code: int, left: WorkerTrace, job_s: float) -> str:
 
 @contextmanager
 def _readable(event: threading.Event) -> Iterator[int]:
-    """Yield a descriptor that becomes readable once the event is set, to wait for both processes
-    and the event. The event is always set at the end, so that its thread ends.
+    """Yield a descriptor that becomes readable once an event is set, to wait for it together with
+    processes. The event is always set at the end.
     """
     reader, writer = os.pipe()
 
@@ -161,7 +160,7 @@ def _readable(event: threading.Event) -> Iterator[int]:
     try:
         yield reader
     finally:
-        if not event.is_set():  # the lock of the event is not reentrant for signal handlers
+        if not event.is_set():  # the lock of the event is not reentrant in signal handlers
             event.set()
         thread.join()
         os.close(reader)

@@ -1,4 +1,4 @@
-"""The `sceneprint` command: its parser, and types for its options."""
+"""The `sceneprint` command: its parser, and the types of its options."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from sceneprint import __version__
 from sceneprint.errors import SceneprintError
 from sceneprint.process import read_secret_files
 
-#: Exit code of a command whose arguments or preconditions are wrong.
+#: Exit code of a command with wrong arguments or unmet preconditions.
 USAGE = 2
 
 
-#: Module in this package and line of help of each command, in the order of `sceneprint --help`.
-#: The module has `add_NAME`, which adds the options. The docstring of the function that runs the
-#: command is its description.
+#: Module and help line of each command, in the order of `sceneprint --help`. Function `add_NAME` of
+#: the module adds the options. The docstring of the function that runs the command is its
+#: description.
 COMMANDS = {
     "serve": ("serve", "run the HTTP service and its workers"),
     "work": ("serve", "run workers without the HTTP service"),
@@ -56,7 +56,7 @@ COMMANDS = {
 
 
 class Command(NamedTuple):
-    """A command: the function that adds its options, as `MODULE:FUNCTION`, and a line of help."""
+    """A command: the function that adds its options, as `MODULE:FUNCTION`, and its help line."""
 
     function: str
     line: str
@@ -69,10 +69,10 @@ def own_command(name: str) -> Command:
 
 
 def all_commands() -> dict[str, Command]:
-    """Return all commands by their names without importing their modules.
+    """Return all commands by name, without importing their modules.
 
-    Other distributions, such as sceneprint-lab, add commands as entry points. The package of their
-    modules has the lines of help in `COMMANDS`.
+    Other distributions, such as sceneprint-lab, add commands as entry points. `COMMANDS` in the
+    package of their modules contains the help lines.
     """
     found = {name: own_command(name) for name in COMMANDS}
     for one in entry_points(group="sceneprint.commands"):
@@ -82,12 +82,12 @@ def all_commands() -> dict[str, Command]:
 
 
 def parser(name: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser of one command or of all commands.
+    """Return the parser of a command or of all commands.
 
     Parameters
     ----------
-    name : command whose module is imported and whose options are added; None adds those of all
-        commands, and an unknown name adds none
+    name : command whose options are added; None adds the options of all commands, and an unknown
+        name adds no options
     """
     top = argparse.ArgumentParser(
         prog="sceneprint",
@@ -95,7 +95,7 @@ def parser(name: str | None = None) -> argparse.ArgumentParser:
     )
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    # Searching for entry points takes as long as the rest of a small command's parser.
+    # Search for entry points only if necessary, since this doubles the time of a small parser.
     found = {name: own_command(name)} if name in COMMANDS else all_commands()
     for each, (function, line) in found.items():
         command = commands.add_parser(each, help=line)
@@ -106,13 +106,13 @@ def parser(name: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command. Errors are printed in one line on standard error, with exit code 2."""
-    for stream in (sys.stdout, sys.stderr):  # file names may contain unprintable characters
+    """Run a command; print errors in one line on standard error, and return 2 for them."""
+    for stream in (sys.stdout, sys.stderr):  # escape unprintable characters in file names
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     command = "sceneprint"
     arguments = sys.argv[1:] if arguments is None else arguments
-    # httpx imports rich and click for its own command, which takes longer than everything else.
+    # Prevent httpx from importing rich and click for its own command, which is slow.
     sys.modules.setdefault("httpx._main", None)  # type: ignore[arg-type]
     try:
         options = parser(arguments[0] if arguments else "").parse_args(arguments)
@@ -121,9 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return int(options.run(options))
     except SceneprintError as error:
         return _refuse(command, str(error))
-    except UnicodeEncodeError as error:  # from an argument; our own output is escaped
+    except UnicodeEncodeError as error:  # caused by an argument
         return _refuse(command, f"{error.object!a:.80} is not valid UTF-8. Use another name.")
-    except BrokenPipeError:  # the reader, such as `head`, has closed the pipe
+    except BrokenPipeError:  # closed by the reader, such as `head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
@@ -150,12 +150,12 @@ def _refuse(command: str, message: str) -> int:
 
 
 def whole_number(text: str) -> int:
-    """Return an integer of at least 0."""
+    """Parse an integer of at least 0."""
     return _at_least(text, 0)
 
 
 def positive(text: str) -> int:
-    """Return an integer of at least 1."""
+    """Parse an integer of at least 1."""
     return _at_least(text, 1)
 
 
@@ -170,7 +170,7 @@ def _at_least(text: str, least: int) -> int:
 
 
 def number_within(text: str, allowed: Callable[[float], bool], what: str) -> float:
-    """Return a number that is allowed; `what` describes allowed numbers. NaN is never allowed."""
+    """Parse a number that satisfies `allowed`; `what` describes such numbers in the error."""
     try:
         number = float(text)
     except ValueError:
@@ -181,12 +181,12 @@ def number_within(text: str, allowed: Callable[[float], bool], what: str) -> flo
 
 
 def positive_number(text: str) -> float:
-    """Return a number above 0."""
+    """Parse a number above 0."""
     return number_within(text, lambda number: 0 < number < math.inf, "a number above 0")
 
 
 def metres(text: str) -> float:
-    """Return a positive distance in metres."""
+    """Parse a positive distance in metres."""
     return number_within(text, lambda number: 0 < number <= 1e4, "a distance of up to 10000 m")
 
 
@@ -194,7 +194,7 @@ _SECONDS = {"m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
 
 
 def duration(text: str) -> timedelta:
-    """Return a duration such as 12h."""
+    """Parse a duration such as 12h."""
     found = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
     if found is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a duration such as 12h, 30d or 8w")

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sceneprint.store.audit_log import AuditFilter
     from sceneprint_client.api.admin import AuditLine, Key, MadeKey, Scope
 
-#: Remaining lifetime below which the list warns about the expiry of a key.
+#: Remaining validity below which the list of keys warns about an expiry.
 SOON = timedelta(days=7)
 
 
@@ -136,7 +136,7 @@ def _print_secret(key: MadeKey) -> None:
 
 
 def _print_keys(store: Store) -> None:
-    """Print all keys, followed by a warning about those that expire soon."""
+    """Print all keys, and a warning about keys that expire soon."""
     from sceneprint.engine.admin.operations import list_keys
 
     now, cursor, soon = datetime.now(UTC), None, []
@@ -173,7 +173,7 @@ def _key_line(key: Key) -> str:
 
 # `sceneprint audit`.
 
-#: Priority of RFC 5424 for the facility `log audit` and the severity `notice`.
+#: Syslog priority (RFC 5424) of the facility `log audit` and the severity `notice`.
 _PRIORITY = 13 * 8 + 5
 
 
@@ -253,7 +253,7 @@ def _audit_line(one: AuditLine) -> str:
 
 
 def _syslog_message(one: AuditLine) -> str:
-    """Return a message of RFC 5424 with the line as JSON."""
+    """Return a syslog message (RFC 5424) with the line as JSON."""
     at = one.at.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     host = socket.gethostname() or "-"
     return f"<{_PRIORITY}>1 {at} {host} sceneprint - audit - {one.model_dump_json()}"

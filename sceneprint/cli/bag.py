@@ -63,7 +63,7 @@ def _from_zero(text: str) -> float:
 
 @contextmanager
 def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]:
-    """Yield the options for recordings, and show a progress bar while a recording is read."""
+    """Yield the options for recordings; meanwhile, show a progress bar while a file is read."""
     names = (
         "topic", "camera_info", "pose_frame", "keyframe_m", "keyframe_deg", "keyframe_s",
         "join_m", "sensor_frame", "depth_scale",
@@ -74,13 +74,13 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
 
 
 def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSequence:
-    """Return a sequence with this depth scale, or unchanged if there is none.
+    """Return a sequence with a depth scale; None returns it unchanged.
 
     Raises
     ------
     InvalidRequest : If the frames are clouds, or their files define the unit.
     """
-    if scale is None or sequence.layout is Layout.RECORDING:  # recordings have their own option
+    if scale is None or sequence.layout is Layout.RECORDING:  # recordings handle the scale
         return sequence
     if sequence.layout.is_export or any(one.camera is None for one in sequence.frames):
         raise InvalidRequest(
@@ -99,9 +99,7 @@ def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSeque
 def sequences_at(
     path: Path, options: argparse.Namespace, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences at a path, and print notes on omitted data. The parameter `camera` and
-    the errors are those of `find_sequences`.
-    """
+    """Return the sequences at a path (see `find_sequences`); print notes on omitted data."""
     with recording_options(options) as recording:
         found = find_sequences(path, recording, camera)
     for sequence in found:
@@ -110,7 +108,7 @@ def sequences_at(
 
 
 def print_note(sequence: FrameSequence) -> None:
-    """Print the note on omitted data of a recording on standard error."""
+    """Print the note of a sequence on omitted data, if any, on standard error."""
     if sequence.note:
         print_error(f"{one_line(str(sequence.folder))}: {sequence.note}")
 

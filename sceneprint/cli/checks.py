@@ -1,4 +1,4 @@
-"""Checks of a running service for `sceneprint doctor`."""
+"""Checks of a running service, for `sceneprint doctor`."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 
 Verdict = Literal["ok", "note", "WRONG"]
 
-#: Free space below which uploads are soon refused, and below which a note appears, bytes.
+#: Free space in bytes below which a check fails, and below which it warns.
 LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
-#: Maximum difference between clocks without a note, seconds.
+#: Difference between clocks above which a check warns, seconds.
 APART_S = 2.0
 
 
 @dataclass(frozen=True)
 class Check:
-    """Result of one check.
+    """The result of a check.
 
     Parameters
     ----------
-    verdict : ok; note: something optional is missing, or is created on first use; WRONG: something
-        required is missing
-    subject : name of what was checked
-    text : the finding and advice
+    verdict : ok; note (something optional is missing, or is created on first use); or WRONG
+        (something required is missing)
+    subject : name of the checked object
+    text : finding and advice
     """
 
     verdict: Verdict
@@ -50,21 +50,21 @@ def disk_check(subject: str, free: int) -> Check:
 
 
 def seconds_apart(before: float, there: float, after: float) -> float:
-    """Return the minimum difference between two clocks, seconds.
+    """Return the minimum possible difference between two clocks in seconds.
 
     Parameters
     ----------
-    before, after : times of this clock before and after the other clock was read
-    there : time of the other clock
+    before, after : readings of this clock before and after the other clock was read
+    there : reading of the other clock
     """
     return max(before - there, there - after, 0.0)
 
 
-# Checks of a running service, by its responses.
+# Checks of the responses of a running service.
 
-#: Age of a waiting job above which missing workers are an error, seconds.
+#: Age of a waiting job in seconds above which missing workers are an error.
 LONGEST_S = 60.0
-#: Maximum number of names in a line.
+#: Maximum number of names per line.
 _MOST_NAMES = 5
 
 
@@ -72,7 +72,7 @@ def service_checks(client: Client, url: str) -> Iterator[Check]:
     """Yield checks of a service at `url`; raise SceneprintError if it stops responding."""
     try:
         status = client.status()
-    except KeyRequired as error:  # the key is unknown
+    except KeyRequired as error:
         yield Check("WRONG", "service", f"{url}: {error}")
         return
     except SceneprintError as error:
@@ -132,17 +132,14 @@ def clock_check(before: float, there: float, after: float) -> Check:
 def store_check(stats: Stats) -> Check:
     """Report the sizes of the database, the blobs and the indexes."""
     sizes = stats.bytes
-    # A response does not show the address of the database.
+    # Responses do not contain the address of the database.
     place = "database" if sizes.database is None else f"database of {sizes.database / 1e6:.1f} MB"
     text = f"{place}, blobs of {sizes.blobs / 1e6:.1f} MB, indexes of {sizes.index / 1e6:.1f} MB"
     return Check("ok", "store", text)
 
 
 def scrub_check(stats: Stats) -> Check:
-    """Report the progress of the scrub, which reads all stored bytes.
-
-    The result is a note if nothing was verified yet or data is damaged, and otherwise ok.
-    """
+    """Report the progress of the scrub: a note if nothing was verified, or data is damaged."""
     seen = stats.scrub
     if seen is None:
         return Check("note", "scrub", "no stored data has been verified yet")
@@ -160,7 +157,7 @@ def scrub_check(stats: Stats) -> Check:
 
 
 def worker_check(stats: Stats, *, read_only: bool) -> Check:
-    """Check that workers run."""
+    """Check that workers are running."""
     workers = stats.workers or []
     busy = sum(one.job_id is not None for one in workers)
     if workers or read_only:
@@ -173,7 +170,7 @@ def worker_check(stats: Stats, *, read_only: bool) -> Check:
 
 
 def queue_check(stats: Stats) -> Check:
-    """Count the jobs that wait and those that have failed permanently."""
+    """Report the waiting jobs, and the jobs that have failed permanently."""
     jobs = "1 job" if stats.waiting == 1 else f"{stats.waiting} jobs"
     text = f"{jobs} waiting, {stats.jobs.get('running', 0)} running"
     if stats.oldest_waiting_s:
@@ -185,7 +182,7 @@ def queue_check(stats: Stats) -> Check:
 
 
 def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
-    """List the models of the maps, with a note about outdated presets."""
+    """Report the models of the maps; the result is a note if a preset is outdated."""
     presets = {one.name: one for one in models if one.preset}
     by_model: dict[str, list[str]] = defaultdict(list)
     older = []

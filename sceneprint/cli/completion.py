@@ -1,4 +1,4 @@
-"""`sceneprint completion`: a script for the completion of commands and options in a shell."""
+"""`sceneprint completion`: a shell script that completes commands and options."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def run_completion(options: argparse.Namespace) -> int:
     bash)` to ~/.bashrc, or the same with zsh to ~/.zshrc.
     """
     found = [(name, one) for name, _, one in subcommands(parser())]
-    # Subcommands come first, because the pattern of their command also matches them.
+    # Subcommands come first, because the pattern of their command would match them too.
     cases = [f'    "{name} "*) words="{" ".join(_words(one))}" ;;' for name, one in found[::-1]]
     commands = " ".join(name for name, _ in found if " " not in name)
     if options.shell == "zsh":
@@ -42,7 +42,7 @@ def run_completion(options: argparse.Namespace) -> int:
 def subcommands(
     above: argparse.ArgumentParser,
 ) -> Iterator[tuple[str, str, argparse.ArgumentParser]]:
-    """Yield the name, the line of help and the parser of each command and subcommand."""
+    """Yield name, help line and parser of each command and subcommand."""
     for action in above._actions:
         if isinstance(action, argparse._SubParsersAction):
             lines = {one.dest: one.help or "" for one in action._choices_actions}
@@ -52,6 +52,6 @@ def subcommands(
 
 
 def _words(one: argparse.ArgumentParser) -> Iterator[str]:
-    """Yield the options and the fixed values of a command."""
+    """Yield the words that complete a command: its options and fixed values."""
     for action in one._actions:
         yield from action.option_strings or map(str, action.choices or ())

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
     from sceneprint.store import Database
     from sceneprint.store.database import SchemaRange
 
-# Checks of the database, which is only read.
+# Checks of the database, which do not write to it.
 
 _CHECK = "Check SCENEPRINT_DATABASE_URL, or the data folder."
 
 
 def database(settings: Settings) -> Check:
-    """Check the address of the database, its file or server, and its schema."""
+    """Check the URL and the schema of the database, and the file of SQLite."""
     from sqlalchemy import make_url
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -55,7 +55,7 @@ def database(settings: Settings) -> Check:
 
     try:
         url = make_url(settings.database)
-    except ValueError:  # the text after the colon may be part of a password, so it is not shown
+    except ValueError:  # do not print the text after the colon, which may be part of a password
         return _wrong(
             "SCENEPRINT_DATABASE_URL: the port is not a number. Correct it; in a password, "
             "write @, : and / as %40, %3A and %2F."
@@ -79,7 +79,7 @@ def database(settings: Settings) -> Check:
 
 
 def _sqlite_file(settings: Settings, url: URL) -> Check:
-    """Check an SQLite file, opened in a way that writes nothing."""
+    """Check a SQLite file without writing to it."""
     from sqlalchemy import NullPool, create_engine
 
     from sceneprint.store.database import schema_range_of
@@ -88,17 +88,17 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
     if path is None:
         return _wrong("is an in-memory database, which processes cannot share. Specify a file.")
     if not path.exists():
-        # Only the data folder is created automatically.
+        # Only the data folder is created on first use.
         if settings.database_url is not None and not path.parent.is_dir():
             return _wrong(
                 f"the folder of {path} does not exist. Create it, or specify another file."
             )
         return Check("ok", "database", f"none yet; the first use creates {path}")
     wal, shm = (path.with_name(path.name + end) for end in ("-wal", "-shm"))
-    if wal.exists() and not shm.exists():  # reading it would create the shm file
+    if wal.exists() and not shm.exists():  # reading would create the shm file
         text = f"{path} was not closed cleanly; the next use recovers it"
         return Check("note", "database", text)
-    # Without a write-ahead log the file is complete; with one, the shared memory is only read.
+    # Without a write-ahead log, the file is complete; with a log, the shared memory is only read.
     how = "readonly_shm=1" if wal.exists() else "immutable=1"
 
     def connect() -> sqlite3.Connection:
@@ -110,7 +110,7 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
             found = _schema_check(schema_range_of(connection), repr(engine.url))
     finally:
         engine.dispose()
-    # A folder that is not writable is reported by its own check.
+    # Another check reports a folder that is not writable.
     writable = os.access(path, os.W_OK) or not os.access(path.parent, os.W_OK)
     if found.verdict != "WRONG" and not writable:
         return _wrong(
@@ -120,7 +120,7 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
 
 
 def _path_of(url: URL) -> Path | None:
-    """Return the file of an SQLite URL; None if it is in memory."""
+    """Return the file of a SQLite URL; None for a database in memory."""
     name = url.database or ""
     if name.startswith("file:") and "uri" in url.query:
         if url.query.get("mode") == "memory":
@@ -156,10 +156,7 @@ def _wrong(text: str) -> Check:
 
 
 def object_stores(settings: Settings) -> Iterator[Check]:
-    """Yield a check of each configured object store, of blobs and of indexes.
-
-    The check writes, reads and deletes an object.
-    """
+    """Yield a check of each configured object store; it writes, reads and deletes an object."""
     from sceneprint.store.blobs.object_client import VARIABLES, check_objects, open_objects
 
     blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()
@@ -181,9 +178,9 @@ def object_stores(settings: Settings) -> Iterator[Check]:
         yield Check("ok", subject, text)
 
 
-# Checks of a database server, which is only read.
+# Checks of a database server, which do not write to it.
 
-#: Settings without which acknowledged commits do not survive a loss of power.
+#: Settings that must be on so that acknowledged commits survive a power failure.
 _DURABLE = ("fsync", "full_page_writes")
 _SETTINGS = """
 SELECT current_setting('server_version') AS version,
@@ -201,7 +198,7 @@ SELECT current_setting('server_version') AS version,
 
 
 def server(settings: Settings) -> Iterator[Check]:
-    """Yield checks of the database server; SQLite has none."""
+    """Yield checks of a PostgreSQL server; nothing for SQLite."""
     from sceneprint.store.database import reach_database
 
     database = reach_database(settings.database)
@@ -267,8 +264,9 @@ def _connections(values: Mapping[str, object], settings: Settings) -> Check:
     from sceneprint.store.postgres.connection import MOST
 
     most, taken = int(str(values["connections"])), int(str(values["taken"]))
-    # A worker uses one for its work, one for its lease, one for wake-ups and three for locks of
-    # blobs and indexes. A service uses one per concurrent request and three permanent ones.
+    # A worker uses one connection for work, one for its lease, one for wake-ups, and three for
+    # locks of blobs and indexes. A service uses one per concurrent request, and three permanent
+    # ones.
     wanted = (
         6 * settings.workers
         + min(settings.concurrent_requests + settings.queued_requests, MOST)
@@ -340,7 +338,7 @@ def _kernels() -> Check:
 
 
 def _decoders(settings: Settings) -> Check:
-    """Start a decoder, and check its confinement."""
+    """Check that a decoder starts and is confined."""
     if settings.decoders == 0:
         text = "uploads are decoded in service and workers (SCENEPRINT_DECODERS is 0)"
         return Check("note", "decoders", text)
@@ -434,15 +432,15 @@ def _open3d() -> Check:
 
 
 def _may_write(folder: Path) -> bool:
-    """Return whether a file can be created in the folder, or above it if it is missing."""
+    """Return whether a file can be created in a folder or, if it is missing, in its parent."""
     return _unwritable(folder) is None
 
 
 def _unwritable(folder: Path) -> int | None:
-    """Return the `errno` of creating a file in a folder; None if it succeeds."""
-    try:  # permissions do not show read-only disks, and do not apply to root
+    """Try to create a file in a folder; return the `errno`, or None on success."""
+    try:  # permissions do not reveal read-only disks, and do not apply to root
         with tempfile.TemporaryFile(dir=nearest_folder(folder)) as file:
-            file.write(b"x")  # a full disk may still have room for an empty file
+            file.write(b"x")  # full disks may have room for empty files
             file.flush()
         return None
     except OSError as error:
@@ -462,7 +460,7 @@ def run_doctor(options: argparse.Namespace) -> int:
     changed. The exit code is 2 if something required is missing; optional parts are only noted.
     """
     settings, wrong = settings_of(options), 0
-    # With only the address of a service, this machine does not matter.
+    # With only --url, skip the checks of this machine.
     stores = {"data_dir", "database_url", "blob_url"} & settings.model_fields_set
     here = machine(settings) if options.url is None or stores else ()
     for finding in (*here, *_service(options)):
@@ -473,7 +471,7 @@ def run_doctor(options: argparse.Namespace) -> int:
 
 
 def _service(options: argparse.Namespace) -> Iterator[Check]:
-    """Yield checks of the service. A missing service is wrong only if the options name it."""
+    """Yield checks of the service; if it does not respond, this is an error only with --url."""
     from sceneprint_client import Client
 
     url = options.url or DEFAULT_URL

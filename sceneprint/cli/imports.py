@@ -1,4 +1,4 @@
-"""Uploads of whole files: archives of sequences, and maps in one file.
+"""Uploads of whole files: archives of sequences, and maps in single files.
 
 files  --import_archives-->  frames, counted
 files  --import_maps-->  rendered views, and the result of test views
@@ -38,16 +38,16 @@ if TYPE_CHECKING:
     from sceneprint_client.api import Job, Progress
     from sceneprint_client.api.base import Direction
 
-#: Time without progress after which no worker seems to be running, seconds.
+#: Seconds without progress after which the command gives up.
 STALL_S = 120.0
 
 
 class TimeLimit:
-    """A time limit for the jobs of an upload: a deadline, or STALL_S without progress.
+    """A time limit for the jobs of an upload: a total time, or STALL_S without progress.
 
     Parameters
     ----------
-    limit_s : time limit, seconds; None: no limit while there is progress
+    limit_s : total time, seconds; None sets no limit while there is progress
     """
 
     def __init__(self, limit_s: float | None) -> None:
@@ -56,16 +56,16 @@ class TimeLimit:
 
     @property
     def left_s(self) -> float:
-        """Remaining time without further progress, seconds."""
+        """Seconds until the limit, without further progress."""
         until = self._moved + STALL_S if self._until is None else self._until
         return max(until - time.monotonic(), 0.0)
 
     def note_progress(self) -> None:
-        """Restart the limit of time without progress."""
+        """Restart the time without progress."""
         self._moved = time.monotonic()
 
     def is_over(self, client: Client) -> bool:
-        """Return whether to give up. A service that is still starting extends the limit."""
+        """Return whether the limit is reached; a service that is still starting extends it."""
         if self.left_s > 0:
             return False
         if self._until is None and is_starting(client):
@@ -75,7 +75,7 @@ class TimeLimit:
 
 
 def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
-    """Return why jobs have not ended, from the statistics of the service."""
+    """Explain why jobs have not ended, from the statistics of the service."""
     from sceneprint_client.api import JobState
 
     if is_starting(client):
@@ -83,13 +83,13 @@ def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
     try:
         stats = client.stats(minutes=1)
         own = sum(job.state is JobState.QUEUED for job in client.wait(jobs, timeout_s=0.0))
-    except SceneprintError:  # the key cannot read all maps
+    except SceneprintError:  # the key may not read them
         return waiting_reason(None)
     return waiting_reason(stats, own)
 
 
 def is_starting(client: Client) -> bool:
-    """Return whether the service still compiles kernels, before any worker runs."""
+    """Return whether the service is still compiling kernels, before any worker runs."""
     try:
         client.status()
     except Busy:
@@ -99,7 +99,7 @@ def is_starting(client: Client) -> bool:
 
 
 def _options_of(options: argparse.Namespace, file: str, **more: Any) -> ImportOptions:
-    """Return the options for importing a file; raise InvalidRequest if they are not valid."""
+    """Return the import options of a file; raise InvalidRequest if they are not valid."""
     return checked(
         ImportOptions, f"The metadata of {file}", robot=options.robot, session=options.session,
         tags=options.tag, parent_frame=options.parent_frame, with_poses=not options.no_pose,
@@ -109,25 +109,25 @@ def _options_of(options: argparse.Namespace, file: str, **more: Any) -> ImportOp
     )  # fmt: skip
 
 
-# Archives, sent whole; their imports are awaited.
+# Archives: send them, and wait for their imports.
 
-#: Descriptions of the phases of a map import in the progress bar.
+#: Labels of the phases of a map import in the progress bar.
 _PHASES = {
     "read": "read", "choose": "choose viewpoints", "render": "render views", "sign": "sign views",
     "test": "query test views",
 }  # fmt: skip
-#: Number of bytes that identify an archive, and interval of the checks of an import, seconds.
+#: Number of bytes that identify an archive, and seconds between checks of an import.
 _HEAD, _PAUSE_S = 512, 2.0
 
 
 def is_archive_file(path: Path) -> bool:
-    """Return whether a path is an archive file, and not an export that contains frames."""
+    """Return whether a path is an archive file, but not an export with frames."""
     try:
         if not path.is_file() or is_export(path):
             return False
         with path.open("rb") as file:
             return is_archive(file.read(_HEAD))
-    except OSError:  # reported when the file is read
+    except OSError:  # the error appears when the file is read
         return False
 
 
@@ -166,7 +166,7 @@ def _report_late(client: Client, options: argparse.Namespace, name: str, job: Jo
 
 
 def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job: Job) -> Job:
-    """Return the job of an import when it has ended or the time limit is over."""
+    """Wait until an import has ended or the time limit is reached; return its job."""
     from sceneprint_client.api import JobState
 
     limit, seen = TimeLimit(options.timeout), job.progress
@@ -185,7 +185,7 @@ def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job
 
 
 def _show_progress(bar: tqdm[Any], name: str, progress: Progress) -> None:
-    """Show the progress of an import in a bar; for a map, the progress of its phase."""
+    """Update a bar with the progress of an import; for a map, with that of its phase."""
     done, total = progress.done, progress.total
     if progress.phase is not None:
         steps = {"render": progress.rendered, "sign": progress.signed, "test": progress.tested}
@@ -205,10 +205,10 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
             tally.refuse(item.name, "refused" if item.problem is None else item.problem.detail)
             continue
         state = FrameState.RECEIVED
-        if item.status == 200:  # the frame may have been signed long ago
+        if item.status == 200:
             try:
                 state = client.frame(map_name, item.frame_id).state
-            except UnknownFrame:  # it was deleted in the meantime
+            except UnknownFrame:  # deleted
                 continue
         added = Added(frame_id=item.frame_id, job_id=item.job_id, state=state, reason=None)
         tally.count(item.name, added, item.status == 202)
@@ -216,22 +216,22 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
 
 # Maps in one file: `sceneprint upload --as-map`.
 
-#: Number of units per metre.
+#: Number of units per metre, by name of the unit.
 _UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
-#: Size of a file of points above which it is probably not one scan, bytes.
+#: Size of a point file in bytes above which it is probably not a single scan.
 _SCAN_BYTES = 24 << 20
 #: Maximum number of printed weak areas.
 _MOST_WEAK = 5
 
 
 def axis_or_up(text: str) -> Axis | list[float]:
-    """Return an axis of a file, or the up vector in the axes of a sensor."""
+    """Parse an axis of a file, or an up vector in the axes of a sensor."""
     axis = next((one for one in get_args(Axis) if one == text), None)
     return up_of(text) if axis is None else axis
 
 
 def _fields(read: Callable[[str], dict[str, float]]) -> Callable[[str], dict[str, float]]:
-    """Return a parser of comma-separated numbers that raises errors for argparse."""
+    """Convert a parser of comma-separated numbers to a type of argparse."""
 
     def fields(text: str) -> dict[str, float]:
         try:
@@ -367,7 +367,7 @@ def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
 
 
 def _axis(up: Direction) -> str:
-    """Return the axis of a direction, or its numbers if it is along none."""
+    """Return a direction as text: the name of its axis, else its numbers."""
     for axis, value in zip("xyz", (up.x, up.y, up.z), strict=True):
         if abs(value) > 0.9999:
             return axis if value > 0 else f"-{axis}"

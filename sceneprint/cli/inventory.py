@@ -1,4 +1,4 @@
-"""`sceneprint maps`, `frames`, `queries` and `jobs`: contents of a service."""
+"""`sceneprint maps`, `frames`, `queries` and `jobs`: the content of a service."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from sceneprint_client.api import Frame, Job, Map
     from sceneprint_client.api.results import QueryRecord
 
-#: Options that write one part of a frame to a file.
+#: Options that write data of a frame to a file.
 _FILES = ("cloud", "preview", "patches", "signature", "upload")
 
 
@@ -136,7 +136,7 @@ def run_frames(options: argparse.Namespace) -> int:
 
 
 def _show_frames(scene: Scene, frames: list[Frame]) -> None:
-    """Write the scene of listed frames; raise InvalidRequest if none has a pose."""
+    """Write a scene of the listed frames; raise InvalidRequest if no frame has a pose."""
     posed = [one for one in frames if one.pose is not None]
     if not posed:
         raise InvalidRequest(
@@ -314,9 +314,7 @@ def run_jobs(options: argparse.Namespace) -> int:
 
 
 def _retry_dead(client: Client, *, as_json: bool) -> int:
-    """Retry the dead jobs, except those that a later job of the same frame replaced; return 2 if
-    one cannot be retried.
-    """
+    """Retry all dead jobs that were not retried yet; return 2 if a job cannot be retried."""
     again, refused = 0, 0
     for done in client.retry_dead_jobs():
         again, refused = again + len(done.retried), refused + len(done.refused)
@@ -413,7 +411,7 @@ def _limit(kind: type[int] | type[float]) -> Any:
     def read(text: str) -> float | str:
         return NONE if text == NONE else kind(text)
 
-    read.__name__ = "number"  # argparse shows it in its message
+    read.__name__ = "number"  # appears in messages of argparse
     return read
 
 

@@ -1,4 +1,4 @@
-"""Options that several commands share: services, filters, queries and data folders."""
+"""Options shared by several commands: services, filters, queries and data folders."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
 
 
 def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the filter of the options as JSON; None without a filter.
+    """Return the filter options as a JSON object; None without a filter.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
 
 
 def numbers_of(text: str, count: int, what: str) -> list[float]:
-    """Return comma-separated numbers; `what` describes the expected text in the error."""
+    """Parse comma-separated numbers; `what` describes the expected text in the error."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
@@ -101,7 +101,7 @@ def _box(text: str) -> tuple[dict[str, float], ...]:
 
 
 def base_of(text: str) -> GivenBase:
-    """Return the mounting pose of a sensor from seven numbers."""
+    """Parse the mounting pose of a sensor, T_base_sensor, from seven numbers."""
     what = "seven comma-separated numbers: metres and a unit quaternion"
     numbers = numbers_of(text, 7, what)
     translation, rotation = zip("xyz", numbers, strict=False), zip("xyzw", numbers[3:], strict=True)
@@ -114,7 +114,7 @@ def base_of(text: str) -> GivenBase:
 
 
 def mounting_of(options: argparse.Namespace) -> GivenBase | None:
-    """Return the mounting pose of `--base` in the frame of `--base-frame`."""
+    """Return the mounting pose in `--base` and `--base-frame`; None without `--base`."""
     base: GivenBase | None = options.base
     if base is None or options.base_frame is None:
         return base
@@ -122,12 +122,12 @@ def mounting_of(options: argparse.Namespace) -> GivenBase | None:
 
 
 def up_of(text: str) -> list[float]:
-    """Return three numbers; the record of the frame checks that they are a unit vector."""
+    """Parse three numbers; the record of the frame checks that they are a unit vector."""
     return numbers_of(text, 3, "three comma-separated numbers")
 
 
 def add_up_option(command: argparse.ArgumentParser, read: Callable[[str], object] = up_of) -> None:
-    """Add `--up`, whose value `read` parses."""
+    """Add `--up`; `read` parses its value."""
     command.add_argument(
         "--up", type=read, metavar="X,Y,Z",
         help="unit vector up in the sensor's axes, such as 0,-1,0 for a level camera (write "
@@ -142,7 +142,7 @@ _A_PRIOR = (
 
 
 def prior_of(text: str) -> dict[str, Any]:
-    """Return a prior as JSON, from JSON text or from a file."""
+    """Parse a prior from JSON text or from a JSON file."""
     document = text
     if not text.lstrip().startswith("{"):
         try:
@@ -235,7 +235,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0])
-        # A URL may contain a password, which the error of pydantic also quotes.
+        # Do not print URLs, which may contain a password.
         secret = name.endswith("_url")
         value = "not usable" if secret else f"{first['input']!r:.60}"
         raise InvalidRequest(
@@ -245,7 +245,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
 
 
 def existing_store(options: argparse.Namespace) -> Settings:
-    """Return the settings of an existing store, so that a mistyped --data creates none.
+    """Return the settings of an existing store, so that a mistyped --data does not create a store.
 
     Raises
     ------
@@ -260,7 +260,7 @@ def existing_store(options: argparse.Namespace) -> Settings:
 
 
 def open_command_store(settings: Settings) -> AbstractContextManager[Store]:
-    """Open the store of the settings, creating it if it is missing."""
+    """Open the store of some settings; create it if it is missing."""
     from sceneprint.store import open_store
 
     return closing(open_store(settings.database, settings.blobs))
@@ -279,7 +279,7 @@ def add_service_options(command: argparse.ArgumentParser) -> None:
 
 
 def open_client(options: argparse.Namespace) -> Client:
-    """Return a client of the service in the options; raise Unreachable if `--url` is invalid."""
+    """Return a client of the service in the options; raise Unreachable if `--url` is not valid."""
     from sceneprint_client import Client
 
     return Client(options.url or DEFAULT_URL, options.key)
@@ -341,7 +341,7 @@ def add_query_options(command: argparse.ArgumentParser) -> None:
 
 
 def query_fields(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of a query for `Client.query`."""
+    """Return the query options as arguments of `Client.query`."""
     names = (
         "k", "exact", "seed", "candidates", "confidence", "deadline_ms", "explain",
         "explain_frame", "prior",
@@ -362,7 +362,7 @@ def _assignment(text: str) -> tuple[str, str]:
     return name, value
 
 
-# Signals that end a command like Ctrl-C, so that it deletes its temporary files.
+# Signals that end a command like Ctrl-C, so that it removes its temporary files.
 
 _ENDING = (signal.SIGTERM, signal.SIGHUP)
 
@@ -379,7 +379,7 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    # `nohup` ignores SIGHUP on purpose.
+    # Leave SIGHUP ignored by `nohup`.
     caught = [one for one in _ENDING if signal.getsignal(one) is signal.SIG_DFL]
     for number in caught:
         signal.signal(number, end)

@@ -17,7 +17,7 @@ Row = TypeVar("Row", bound="BaseModel")
 
 
 def one_line(text: str) -> str:
-    """Return a text without line breaks and control characters."""
+    """Replace line breaks and control characters in a text."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
@@ -32,24 +32,24 @@ def count_of(number: int, noun: str) -> str:
 
 
 def frame_label(frame_id: str, name: str | None) -> str:
-    """Return the id of a frame and the name of its file."""
+    """Return a label of a frame: its id, and the name of its file."""
     return one_line(frame_id if name is None else f"{frame_id} ({name})")
 
 
 def source_label(record: Any) -> str:
-    """Return the robot and the session of a record."""
+    """Return a label with the robot and the session of a record."""
     return one_line(f"{record.robot or '-'}/{record.session or '-'}")
 
 
 def print_rows(
     rows: Iterable[Row], line: Callable[[Row], str], *, header: str, none: str, as_json: bool
 ) -> None:
-    """Print records while they arrive, as a table or as one line of JSON each.
+    """Print records as they arrive: as rows of a table, or as lines of JSON.
 
     Parameters
     ----------
-    line : function that returns the line of a record in the table
-    none : text that replaces an empty table
+    line : function that converts a record to a row of the table
+    none : text to print instead of an empty table
     """
     empty = True
     for row in rows:
@@ -70,7 +70,7 @@ def print_error(text: str) -> None:
 def progress_bar(
     name: str, unit: str = "frame", **options: Any
 ) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar on a terminal; yield a function that takes the done and total steps."""
+    """Show a progress bar on a terminal; yield a function that sets its done and total steps."""
     from tqdm import tqdm
 
     with tqdm(desc=name, unit=unit, disable=None, **options) as bar:
@@ -83,12 +83,12 @@ def progress_bar(
 
 
 def waiting_reason(stats: Stats | None, own: int = 0) -> str:
-    """Return why jobs wait, and what to do.
+    """Explain why jobs wait, and what to do.
 
     Parameters
     ----------
     stats : statistics of the service; None if the key cannot read them
-    own : number of the caller's waiting jobs; all other waiting jobs are ahead of them
+    own : number of own waiting jobs; all others count as ahead of them
     """
     if stats is None or not stats.workers:
         return "Check that workers are running; `sceneprint work` starts some."

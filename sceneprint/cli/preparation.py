@@ -33,7 +33,7 @@ def open_signer_of(options: argparse.Namespace, settings: Settings, *, psi: bool
     """Return the signer of the model in the options, with compiled kernels and an open table. Raise
     UnreadableModel if the model does not exist.
 
-    With `psi`, the signer returns psi itself; the default model is then `paper`.
+    With `psi`, the signer returns psi instead of signatures, and the default model is `paper`.
     """
     compile_kernels(settings.cache_dir, ("signing",), _print)
     name = options.model or options.preset or ("paper" if psi else PRESETS[0])
@@ -50,14 +50,13 @@ def prepare_presets(
     settings: Settings, say: Callable[[str], None] | None = None, *, clouds: bool = False,
     stop: threading.Event | None = None,
 ) -> None:  # fmt: skip
-    """Compile kernels and build the tables of the presets, once after an installation, so that the
-    first frame of a service does not wait for them.
+    """Compile kernels and build the tables of the presets, unless this was done before.
 
     Parameters
     ----------
-    say : function that reports each step (default: print on standard error)
-    clouds : whether to compile the kernels of clouds too; otherwise the first cloud waits for them
-    stop : event that ends the preparation
+    say : function that receives lines of progress; default: print them on standard error
+    clouds : whether to include kernels of clouds; otherwise the first cloud waits for them
+    stop : event that cancels the preparation
     """
     parts = ALL if clouds else DEPTH
     compile_kernels(settings.cache_dir, parts, say or _print, stop)

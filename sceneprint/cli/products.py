@@ -1,4 +1,4 @@
-"""`sceneprint make`: results that a worker computes from a map, such as a mesh."""
+"""`sceneprint make`: products that a worker computes from a map, such as a mesh."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _associate(options: argparse.Namespace) -> int:
             "An association requires one or two sessions. Specify --session once or twice."
         )
     kind = None if options.out is None else _FORMATS.get(options.out.suffix.lower())
-    if options.out is not None:  # checked before the job, which may take an hour
+    if options.out is not None:  # check before the job, which may take an hour
         if kind is None:
             raise InvalidRequest(
                 f"{options.out.name!a:.80} has an unknown file type. Use a name for --out that "
@@ -165,7 +165,7 @@ def _print_association(one: Association, options: argparse.Namespace) -> None:
 
 
 def _association_lines(one: Association) -> list[str]:
-    """Return the lines of an association with its edges and joins."""
+    """Return lines that describe an association, its edges and its joins."""
     name = f"association {one.job_id}"
     if one.result is None:
         why = "" if one.error is None else f": {one_line(one.error)}"
@@ -258,7 +258,7 @@ def _reconstruct(options: argparse.Namespace) -> int:
 
 
 def _coverage_lines(coverage: Coverage) -> list[str]:
-    """Return the lines that describe what the views show together."""
+    """Return lines that describe the coverage of the fused views."""
     lines = [
         f"  {len(coverage.views)} views show {coverage.area_m2:.2f} m2 of surface and "
         f"{coverage.observed_volume_m3:.2f} m3 of space; {coverage.query_explained:.0%} of the "

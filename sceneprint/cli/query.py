@@ -81,7 +81,7 @@ def add_query(command: argparse.ArgumentParser) -> None:
 
 
 def _add_frame_options(command: argparse.ArgumentParser) -> None:
-    """Add the options that both commands have."""
+    """Add the options that `query` and `localize` share."""
     command.add_argument("map", metavar="MAP")
     command.add_argument(
         "path", type=Path, metavar="PATH", help="a depth image, a cloud, a folder or a recording"
@@ -109,7 +109,7 @@ def run_query(options: argparse.Namespace) -> int:
     several = options.map == "*" or options.also
     if several:
         fields["maps"] = "*" if options.map == "*" else [options.map, *options.also]
-    if options.overlay is not None:  # checked before the first query
+    if options.overlay is not None:  # check before the first query
         if len(references) != 1:
             raise DatasetError(
                 f"{options.path} has {len(references)} frames, but --overlay writes a single "
@@ -141,7 +141,7 @@ def _results(
     references: Sequence[FrameReference],
     ask: Callable[[FrameReference], tuple[Any, str]],
 ) -> Iterator[tuple[FrameReference, tuple[Any, str] | None]]:
-    """Query frames; print and yield each answer with its text, or None if a frame is invalid."""
+    """Query frames; print each result, and yield it with its text, or None after an error."""
     for reference in references:
         try:
             record, text = ask(reference)
@@ -164,7 +164,7 @@ def _check_scene(options: argparse.Namespace) -> None:
 
 
 def _save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -> str:
-    """Write the points of the query aligned with its best match, and return a message.
+    """Write the points of the query, aligned with its best match, to a file; return a message.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def _save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -
 def _answer_scene(
     scene: Scene | None, references: Sequence[FrameReference]
 ) -> Callable[[FrameReference, Answer, str], None]:
-    """Return a function that adds an answer and its text to the scene, if there is a scene."""
+    """Return a function that adds an answer and its text to the scene; no-op without a scene."""
     places = {one.path: place for place, one in enumerate(references)}
     stamps = stamps_of(references)
 
@@ -239,7 +239,7 @@ def _wanted_frames(
 
 
 def answer_lines(name: str, answer: Answer) -> list[str]:
-    """Return the lines of an answer: status, matches and pose."""
+    """Return lines that describe an answer: status, matches and pose."""
     counts = answer.counts
     tried = f"{counts.accepted} of {counts.validated} validated, " if counts.validated else ""
     of = f"{counts.map}"
@@ -292,7 +292,7 @@ _DECIDED = {
 
 
 def _grounds(there: Location | Localization) -> str:
-    """Return the votes, the verification and the evidence for a pose as text."""
+    """Describe the votes, the verification and the evidence for a pose."""
     if there.support == 0:
         voted = "no match votes for it"
     elif there.support == 1:
@@ -306,7 +306,7 @@ def _grounds(there: Location | Localization) -> str:
 
 
 def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
-    """Return the evidence for a pose as text; `expected` if only places near the prior count."""
+    """Describe the evidence for a pose; `expected`: only places near the prior are rivals."""
     if e is None:
         return "not compared with other places"
     place = "place that the prior expects" if expected else "place"
@@ -319,12 +319,12 @@ def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
 
 
 def _percent(confidence: float | None) -> str:
-    """Return a confidence to print after a status, or nothing."""
+    """Return a confidence as a suffix of a status; empty without a confidence."""
     return "" if confidence is None else f" {percent(confidence)}"
 
 
 def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
-    """Return the lines of the poses of an ambiguous answer."""
+    """Return lines that describe the alternative poses of an ambiguous answer."""
     if not alternatives:
         return []
     head = f"  {len(alternatives)} poses are supported; at most one is right:"
@@ -340,13 +340,13 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
 
 
 def _label(match: Match, several: bool) -> str:
-    """Return the map (if several), robot, session and file of a match, and its id."""
+    """Return a label of a match: map (if several), robot, session and file, and frame id."""
     seen = "/".join(one_line(who) for who in (match.robot, match.session, match.name) if who)
     return "  ".join(part for part in (match.map if several else "", seen, match.frame_id) if part)
 
 
 def _metres(transform: Transform | None) -> str:
-    """Return a translation as text."""
+    """Return the translation of a transform as text, metres."""
     if transform is None:
         return ""
     t = transform.translation
@@ -354,7 +354,7 @@ def _metres(transform: Transform | None) -> str:
 
 
 def _degrees(transform: Transform | None) -> str:
-    """Return the angle of a rotation in degrees as text."""
+    """Return the rotation angle of a transform as text, degrees."""
     if transform is None:
         return ""
     r = transform.rotation
@@ -362,7 +362,7 @@ def _degrees(transform: Transform | None) -> str:
 
 
 def _explanation_lines(answer: Answer) -> list[str]:
-    """Return the explanations of the answer, if they were requested."""
+    """Return lines with the explanations in an answer; empty without explanations."""
     lines = [
         f"  {one.rank:4}  {frame_label(one.frame_id, one.name)}  {one.similarity:4.2f}  "
         f"{one.stage}: {one.outcome.replace('_', ' ')}; {one_line(one.reason)}"
@@ -452,20 +452,20 @@ def _localize(
     client: Client, options: argparse.Namespace, every: list[FrameReference],
     reference: FrameReference, fields: dict[str, Any],
 ) -> Localization:  # fmt: skip
-    """Query a frame with earlier frames, or alone if the service refuses one of them."""
+    """Query a frame together with earlier frames, or alone if the service refuses the sequence."""
     before = _frames_before(options, every, reference)
     if before:
         try:
             return client.localize_sequence(options.map, [*before, reference], **fields)
         except (FrameError, TooLarge):
-            pass  # the query of the frame alone shows whether that frame is invalid
+            pass  # query the frame alone below
     return client.localize(options.map, reference, up=options.up, **fields)
 
 
 def _frames_before(
     options: argparse.Namespace, every: list[FrameReference], reference: FrameReference
 ) -> list[FrameReference]:
-    """Return the earlier frames of the sequence to query together with a frame.
+    """Return the earlier frames to query together with a frame, in chronological order.
 
     Raises
     ------
@@ -490,7 +490,7 @@ def _frames_before(
 
 
 def _pose_or_none(reference: FrameReference) -> Floats | None:
-    """Return the pose of a frame; None without a pose or if tracking was lost."""
+    """Return the pose of a frame; None without a valid pose."""
     try:
         return reference.pose
     except InvalidPose:
@@ -498,7 +498,7 @@ def _pose_or_none(reference: FrameReference) -> Floats | None:
 
 
 def localization_lines(name: str, there: Localization) -> list[str]:
-    """Return the lines of a localization."""
+    """Return lines that describe a localisation."""
     sure = f" ({there.strength})" if there.strength else ""
     several = f"{there.frames} frames, " if there.frames > 1 else ""
     lines = [

@@ -1,4 +1,4 @@
-"""Scenes of the results of commands, which the package sceneprint-viewers writes."""
+"""Scenes with the results of commands, written by the package sceneprint-viewers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Scene(Protocol):
-    """A scene in one file, to which a command adds results of one service."""
+    """A scene file, to which a command adds results of a service."""
 
     @property
     def is_empty(self) -> bool:
@@ -39,26 +39,26 @@ class Scene(Protocol):
 
         Parameters
         ----------
-        answer : answer that the service stores
+        answer : answer, which the service must store
         name : name of the queried frame
-        text : description of the answer, for people
+        text : description of the answer
         camera : camera of the frame; None for a cloud
-        place : index of the frame among the queried frames, from 0, and their number
+        place : index of the frame among the queried frames, from 0, and number of these frames
         stamp_ns : capture time, nanoseconds since 1970; None if unknown
         """
 
     def add_frame(self, frame: Frame) -> None:
-        """Add one frame of a map."""
+        """Add a frame of a map."""
 
     def add_frames(self, frames: Sequence[Frame]) -> None:
-        """Add frames with poses of one map."""
+        """Add frames of a map that have poses."""
 
     def add_association(self, association: Association, text: str) -> None:
-        """Add an association with a description for people."""
+        """Add an association with a description."""
 
 
-#: Function that opens the scene of a file. It also takes the client and the maximum number of
-#: frames of the map to show. The file appears only if the block ends without an error.
+#: Function that opens a scene file, with the client and the maximum number of frames of the map to
+#: include. The file appears only if the context ends without an error.
 SceneOpener: TypeAlias = "Callable[[Path, Client, int], AbstractContextManager[Scene]]"
 
 
@@ -78,7 +78,7 @@ def add_scene_options(command: argparse.ArgumentParser) -> None:
 
 
 def check_scene(options: argparse.Namespace) -> None:
-    """Check early that the scene can be written.
+    """Check, before any work, that the scene can be written.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def _opener() -> SceneOpener:
 
 @contextmanager
 def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | None]:
-    """Open the scene of `--mcap`; yield None without the option."""
+    """Open the scene file of `--mcap`; yield None without the option."""
     if options.mcap is None:
         yield None
         return
@@ -113,7 +113,7 @@ def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | 
 
 
 def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:
-    """Return the capture times of frames, nanoseconds since 1970; all None unless they increase."""
+    """Return the capture times of frames, nanoseconds since 1970; all None unless increasing."""
     stamps = [one.timestamp for one in references]
     known = [t for t in stamps if t is not None and 0 <= t < 2**63 * 1e-9]
     rising = all(a < b for a, b in itertools.pairwise(known))

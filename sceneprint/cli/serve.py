@@ -39,7 +39,7 @@ def run_serve(options: argparse.Namespace) -> int:
     """Run the HTTP service and its workers. No configuration is required; every option can also be
     set in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).
     """
-    gc.disable()  # until imports are done; collections would take a twelfth of the start
+    gc.disable()  # until imports are done, to start faster
     from sceneprint.process import log_as_json
     from service.server import run as serve
 
@@ -54,28 +54,28 @@ def run_serve(options: argparse.Namespace) -> int:
             from worker.supervisor import Supervisor
 
             prepare_presets(settings, logging.getLogger(__name__).info, stop=stop)
-            if not (read_only or stop.is_set()):  # workers would have nothing to do
+            if not (read_only or stop.is_set()):
                 supervisor = Supervisor(settings)
                 supervisor.start()
                 supervisor.watch(stop)
-        except Exception as error:  # the service must not run without its workers
+        except Exception as error:  # stop the service, which must not run without workers
             failures.append(error)
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
 
     threads: list[threading.Thread] = []
 
     def ready(url: str, read_only: bool) -> None:
-        # The service responds while kernels are compiled; workers start afterwards.
+        # The service responds while the thread compiles kernels and then starts workers.
         threads.append(threading.Thread(target=work, args=(read_only,), name="supervisor"))
         threads[0].start()
         print(f"sceneprint: serving {url}\nsceneprint: dashboard {url}/dashboard", flush=True)
 
-    # uvicorn handles both signals while it runs; this covers the time before and after.
+    # uvicorn handles both signals while it runs; this handles them before and after.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         serve(settings, ready)
     except KeyboardInterrupt:
-        pass  # the normal end
+        pass
     finally:
         stop.set()
         for thread in threads:
@@ -106,7 +106,7 @@ def run_work(options: argparse.Namespace) -> int:
     settings = settings_of(options)
     log_as_json()
     warn_if_public(settings.data_dir)
-    require_writable(settings)  # reports errors once, instead of in every worker
+    require_writable(settings)  # report errors once, instead of in each worker
     prepare_presets(settings, logging.getLogger(__name__).info)
     work(settings)
     return 0

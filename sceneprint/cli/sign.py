@@ -48,7 +48,7 @@ def run_sign(options: argparse.Namespace) -> int:
     if out is not None:
         _prepare_folder(out, signer)
     entries: list[dict[str, Any]] = []
-    has_reader = True  # of standard output, which may be closed
+    has_reader = True  # whether standard output is open
     try:
         with tqdm(frames.items(), desc="sign", unit="frame", disable=None) as bar:
             for name, reference in bar:
@@ -61,7 +61,7 @@ def run_sign(options: argparse.Namespace) -> int:
                     if out is None:
                         raise
                     has_reader = False
-    finally:  # written signatures are listed even after an error
+    finally:  # list the written signatures even after an error
         if out is not None:
             names = ("name", "id", "signature_bytes", "metric", "unrelated_distance")
             model = {name: getattr(signer.model, name) for name in names}
@@ -89,7 +89,7 @@ def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
     frames: dict[str, FrameReference] = {}
     files: set[Path] = set()
     for path in options.paths:
-        several = len(options.paths) > 1 and path.is_dir()  # the name of a file is unique already
+        several = len(options.paths) > 1 and path.is_dir()
         prefix = f"{path.resolve().name}/" if several else ""
         for sequence in sequences_at(path, options):
             for reference in sequence.frames:
@@ -106,7 +106,7 @@ def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
 
 
 def _prepare_folder(folder: Path, signer: Signer) -> None:
-    """Create the folder, or check that its signatures are of the same model."""
+    """Create a folder, or raise an error if it has signatures of another model."""
     folder.mkdir(parents=True, exist_ok=True)
     index = folder / "signatures.json"
     try:
@@ -124,7 +124,7 @@ def _prepare_folder(folder: Path, signer: Signer) -> None:
 def _sign(
     name: str, reference: FrameReference, signer: Signer, out: Path | None
 ) -> tuple[dict[str, Any], str]:
-    """Sign a frame and write its signature; return its entry in the index and its output line."""
+    """Sign a frame and write its signature; return its entry in the index, and its output line."""
     entry: dict[str, Any] = {"name": name, "path": str(reference.path)}
     file = None if out is None else out / f"{name}.sig"
     try:
@@ -133,7 +133,7 @@ def _sign(
         signature = sign(frame, signer)
     except FrameError as error:
         if file is not None:
-            file.unlink(missing_ok=True)  # the signature of an earlier run
+            file.unlink(missing_ok=True)  # the outdated signature of an earlier run
         line = f"{one_line(name)}  NOT SIGNED  {one_line(str(error))}"
         return entry | {"signed": False, "reason": str(error)}, line
     milliseconds = 1e3 * (time.perf_counter() - start)

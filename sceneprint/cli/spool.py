@@ -20,7 +20,7 @@ from sceneprint_client.spool import MOST_BYTES, Spool, SyncReport
 
 
 def add_spool(command: argparse.ArgumentParser) -> None:
-    """Add the arguments of `sceneprint spool`, and the function that runs it."""
+    """Add the options of `sceneprint spool`."""
     command.add_argument("spool", type=Path, metavar="FILE", help="file of the spool")
     command.add_argument(
         "paths", nargs="*", type=Path, metavar="PATH",
@@ -75,7 +75,7 @@ def run_spool(options: argparse.Namespace) -> int:
 
 
 def _add(options: argparse.Namespace) -> int:
-    """Add frames; return 2 if one cannot be read."""
+    """Add frames to the spool; return 2 if a frame cannot be read."""
     sequences = sequences_of(options.paths, options)
     found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
     new, there, errors = 0, 0, []
@@ -88,7 +88,7 @@ def _add(options: argparse.Namespace) -> int:
                     new, there = new + is_new, there + (not is_new)
                 except OF_FRAME as error:
                     errors.append(f"{one_line(frame.name)}: {one_line(str(error))}")
-        finally:  # added frames stay, even after an error
+        finally:  # report the added frames even after an error
             now = spool.status()
             left = len(found) - new - there - len(errors)
             print(
@@ -128,7 +128,7 @@ def _status(spool: Spool, options: argparse.Namespace) -> int:
 
 
 def _sync(spool: Spool, options: argparse.Namespace) -> int:
-    """Upload the waiting frames; return 2 if one is refused."""
+    """Upload the waiting frames; return 2 if frames are refused or still wait."""
     if options.retry_refused:
         spool.retry_refused()
     before = spool.status()
@@ -140,7 +140,7 @@ def _sync(spool: Spool, options: argparse.Namespace) -> int:
                     client, options.to, priority=options.priority, if_novel=options.if_novel,
                     progress=progress,
                 )  # fmt: skip
-        finally:  # uploaded frames stay in the map, even after an error
+        finally:  # report the uploaded frames even after an error
             now = spool.status()
             parts = f", {report.there} of them already there" if report and report.there else ""
             print(

@@ -67,7 +67,7 @@ def run_migrate(options: argparse.Namespace) -> int:
         if options.check:
             print(shown if usable else f"{shown}; run `sceneprint migrate`")
             return 0 if usable else 1
-        with open_command_store(settings):  # creates or upgrades the schema
+        with open_command_store(settings):  # migrates the schema
             pass
         after, _ = _revisions(database)
     finally:
@@ -77,7 +77,7 @@ def run_migrate(options: argparse.Namespace) -> int:
 
 
 def _revisions(database: Database) -> tuple[str | None, bool]:
-    """Return the revision of a store's schema, and whether this version can use it unchanged."""
+    """Return the schema revision of a store, and whether this version can use it unchanged."""
     from sceneprint.store.database import current_revision, known_revisions, revision_of
 
     with database.read() as connection:
@@ -85,7 +85,7 @@ def _revisions(database: Database) -> tuple[str | None, bool]:
 
 
 def add_fsck(command: argparse.ArgumentParser) -> None:
-    """Add the options of `sceneprint fsck`, and the function that runs it."""
+    """Add the options of `sceneprint fsck`."""
     add_data_option(command)
     command.add_argument("--map", metavar="MAP", help="check only this map")
     how = command.add_mutually_exclusive_group()
@@ -187,7 +187,7 @@ def _record(finding: Finding) -> dict[str, object]:
 
 
 def _purge(options: argparse.Namespace) -> int:
-    """Erase deleted frames; return 1 if the write-ahead log could not be emptied."""
+    """Purge deleted frames; return 1 if the write-ahead log could not be emptied."""
     from sceneprint.engine.context import open_context
     from sceneprint.engine.upkeep.housekeeping import purging_of
 
@@ -207,7 +207,7 @@ def _purge(options: argparse.Namespace) -> int:
 
 # `sceneprint snapshot` and `restore`.
 
-#: Maximum number of damaged blobs that are printed.
+#: Maximum number of damaged blobs to print.
 _SHOWN = 10
 
 
@@ -254,7 +254,7 @@ def _add_database_options(command: argparse.ArgumentParser) -> None:
 
 
 def _named_database(options: argparse.Namespace) -> Settings:
-    """Return the settings of the environment with the database of `--database`.
+    """Return the settings of the environment, with the database in `--database` if present.
 
     Raises
     ------
@@ -290,7 +290,7 @@ def _contents(bundle: Bundle) -> str:
 
 
 def _report_lost(bundle: Bundle, advice: str) -> int:
-    """Print the blobs that a bundle lacks on standard error; return 1 if there are any."""
+    """Print the missing blobs of a bundle on standard error; return 1 if there are any."""
     if not bundle.lost:
         return 0
     for one in bundle.lost[:_SHOWN]:
@@ -377,7 +377,7 @@ def run_restore(options: argparse.Namespace) -> int:
 
 
 def _keep_keys(choice: str | None, keys: list[str]) -> bool:
-    """Return whether restored keys stay valid: as chosen, or as answered in a terminal."""
+    """Return whether restored keys remain valid: by the option, or by a question in a terminal."""
     if choice is not None or not keys or not sys.stdin.isatty():
         return choice != "revoke"
     print(
@@ -403,7 +403,7 @@ def _list_bundles(name: str) -> int:
 
 
 def _server(settings: Settings) -> str:
-    """Return the address of a fleet's database; raise InvalidRequest for SQLite."""
+    """Return the URL of the PostgreSQL database; raise InvalidRequest for SQLite."""
     from sceneprint.store.database import reach_database
 
     database = reach_database(settings.database)
@@ -466,9 +466,9 @@ def run_pull(options: argparse.Namespace) -> int:
 
 # `sceneprint reencode`.
 
-#: Time without a signed frame after which no worker seems to run, seconds.
+#: Seconds without a signed frame after which the command gives up.
 STALL_S = 120.0
-#: Interval of progress checks, seconds; at least ten times the duration of a check.
+#: Minimum seconds between progress checks, which take at most a tenth of the time.
 LOOK_S = 0.5
 
 
@@ -529,7 +529,7 @@ def _print_reencoding(one: Map) -> None:
 
 
 def _wait(context: Context, one: Map) -> int:
-    """Wait while frames are being signed; return 2 if the progress stops."""
+    """Wait until a map has switched its model; return 2 if there is no progress."""
     from sceneprint.engine.admin.statistics import Statistics
     from sceneprint.engine.maps.map_lifecycle import get_map
 

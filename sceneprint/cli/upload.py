@@ -68,7 +68,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Tally:
-    """Counts of frames by their outcomes."""
+    """Counts of uploaded frames by outcome."""
 
     new: int = 0
     there: int = 0  #: frames that the map already had
@@ -76,16 +76,16 @@ class Tally:
     indexed: int = 0
     rejected: int = 0
     failed: int = 0
-    redundant: int = 0  #: frames that were not kept, because the map already covered their places
-    #: Names of frames that are not signed yet, by their jobs. Frames of equal content share a job.
+    redundant: int = 0  #: frames of places that the map already covered
+    #: Names of unsigned frames by job; frames with the same content share a job.
     waiting: dict[str, list[str]] = field(default_factory=dict)
-    errors: list[tuple[str, str]] = field(default_factory=list)  #: name of a frame, and reason
+    errors: list[tuple[str, str]] = field(default_factory=list)  #: frame name and reason
     ranges: list[SampleRange] = field(default_factory=list)  #: ranges of received frames
     summaries: list[str] = field(default_factory=list)  #: summaries of archives
-    lost: int = 0  #: frames and poses that were not sent, although no option excludes them
+    lost: int = 0  #: frames and poses that could not be sent
 
     def count(self, name: str, added: Added, new: bool) -> None:
-        """Count a frame that was received or is already in the map."""
+        """Count an accepted frame, new or already in the map."""
         from sceneprint_client.api import FrameState
 
         self.new += new
@@ -107,7 +107,7 @@ class Tally:
         self.errors.append((name, reason))
 
     def end(self, job: Job, *, redundant: bool = False) -> None:
-        """Count the frames of a finished job; `redundant` if they were not kept."""
+        """Count the frames of a finished job, which may have become redundant."""
         from sceneprint_client.api import JobState
 
         for name in self.waiting.pop(job.job_id):
@@ -120,7 +120,7 @@ class Tally:
                 self._lose(name, reason, rejected=job.state is JobState.FAILED)
 
     def report(self, total: int, seconds: float) -> None:
-        """Print the counts, and one line for each frame that was not indexed."""
+        """Print the counts, and a line for each frame that was not indexed."""
         refused = f", {self.refused} refused" if self.refused else ""
         waiting = f", {len(self.waiting)} waiting" if self.waiting else ""
         redundant = f", {self.redundant} redundant" if self.redundant else ""
@@ -145,13 +145,12 @@ class Tally:
 def wait_for_all(
     client: Client, map_name: str, tally: Tally, limit: TimeLimit, *, may_be_redundant: bool
 ) -> None:
-    """Wait for jobs until all have ended or the time limit is over; `tally.waiting` has the rest.
+    """Wait until all jobs have ended or the time limit is reached.
 
     Parameters
     ----------
-    tally : counts of the upload, updated for every job that ends
-    limit : time limit
-    may_be_redundant : whether frames were sent with the condition that their place is new
+    tally : counts of the upload, updated for each job that ends; `waiting` contains the others
+    may_be_redundant : whether frames were sent with `if_novel`
     """
     total = len(tally.waiting)
     with progress_bar("sign", total=total) as progress:
@@ -172,7 +171,7 @@ def wait_for_all(
 
 
 def _is_redundant(client: Client, map_name: str, job: Job) -> bool:
-    """Return whether a frame was signed but not kept, which its job does not show."""
+    """Return whether the frame of a succeeded job is redundant."""
     from sceneprint_client.api import FrameState, JobState
 
     if job.state is not JobState.SUCCEEDED:
@@ -225,7 +224,7 @@ def add_frame_options(
 def frame_metadata(
     options: argparse.Namespace, sequence: FrameSequence, reference: FrameReference
 ) -> FrameMeta:
-    """Return the metadata of a frame, including the options; errors are those of `meta_of`."""
+    """Return the metadata of a frame, including the options; see `meta_of` for errors."""
     from sceneprint.formats.dataset.frame_reference import parent_frame_of, session_of
     from sceneprint_client.frame_files import meta_of
 
@@ -315,11 +314,11 @@ def run_upload(options: argparse.Namespace) -> int:
                 if tally.waiting:
                     late = True
                     _report_late(client, options, tally)
-        finally:  # received frames stay, even after an error
+        finally:  # report the received frames even after an error
             counted = tally.new + tally.there + tally.refused
             tally.report(max(len(found), counted), time.perf_counter() - start)
             for sequence in sequences:
-                if sequence.layout.is_export:  # the summary contains the notes of others
+                if sequence.layout.is_export:  # other notes are in the summary
                     print_note(sequence)
                 tally.lost += 0 if options.no_pose else sequence.lost
             hint_at_maps(paths)
@@ -343,7 +342,7 @@ def _report_late(client: Client, options: argparse.Namespace, tally: Tally) -> N
 
 
 def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
-    """Return advice after an upload about the poses, the parent frames and the model of the map.
+    """Return advice on the poses, the parent frames and the model of a map after an upload.
 
     Parameters
     ----------
@@ -440,7 +439,7 @@ def row_option(text: str) -> tuple[str, ...]:
 
 
 def _with_row(sequence: FrameSequence, row: tuple[str, ...]) -> FrameSequence:
-    """Return a sequence of .bin files with these names of values in a row."""
+    """Return a sequence of .bin files with the names of the values in a row."""
     frames = tuple(
         replace(one, cloud=replace(one.cloud, row=row)) for one in sequence.frames if one.cloud
     )
@@ -475,7 +474,7 @@ def _send_all(
     found: list[tuple[FrameSequence, FrameReference]],
     tally: Tally,
 ) -> None:
-    """Upload all frames, several at a time, until the service fails."""
+    """Upload all frames concurrently; stop if the service fails."""
     pool = ThreadPoolExecutor(options.parallel, thread_name_prefix="upload")
     sent = {pool.submit(_send, client, options, *one): one[1].name for one in found}
     try:
@@ -487,7 +486,7 @@ def _send_all(
                 except OF_FRAME as error:
                     tally.refuse(name, str(error))
                 bar.update()
-    finally:  # uploads in progress complete, even after Ctrl-C, and no others start
+    finally:  # complete uploads in progress, even after Ctrl-C, but start no others
         pool.shutdown(cancel_futures=True)
         for future, name in sent.items():
             if not future.cancelled() and future.exception() is None:

@@ -1,10 +1,9 @@
-"""Read all stored bytes at a low rate to find damage before a query or a restore needs the bytes.
+"""The scrub: verification of all stored bytes at a low rate, to find damage early.
 
     frames of the store  --Scrub.run, a slice every 4 s-->  reported damage, repaired signatures
 
-The scrub applies the checks of `sceneprint fsck` to frames. Workers compute damaged signatures and
-artifacts again from the uploads. Other damage is only reported, because its repair moves files and
-needs an operator.
+The scrub applies the checks of `sceneprint fsck` to frames. Workers rebuild damaged signatures and
+artifacts from uploads. Other damage is only reported, because its repair requires an operator.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ from sceneprint.store.scrub_rows import (
 
 log = logging.getLogger(__name__)
 
-#: Number of frames that are checked together, and maximum duration of a slice, seconds.
+#: Number of frames per block, and maximum duration of a slice, seconds.
 AT_ONCE, TURN_S = 16, 0.2
 #: Seconds between the start of a process and its first slice.
 BEGIN_S = 60.0
 
 
 class Scrub:
-    """Scrub of the store in slices, which several processes share.
+    """The scrub of a store in slices; several processes may run it at the same time.
 
     Parameters
     ----------
@@ -56,13 +55,12 @@ class Scrub:
     def run(
         self, may_go_on: Callable[[], bool] = lambda: True, *, now: bool = False
     ) -> ScrubRow | None:
-        """Read the next slice if it is due. After an error, log it and read the slice again later.
+        """Verify the next slice if it is due. Errors are logged; the slice is then repeated later.
 
         Parameters
         ----------
-        may_go_on : function that is called after every few frames; the slice ends if it returns
-            False
-        now : whether to skip this process's interval between slices
+        may_go_on : function that is called after each block; the slice ends if it returns False
+        now : whether to ignore the interval of this process between slices
 
         Returns
         -------
@@ -73,7 +71,7 @@ class Scrub:
             return None
         self._next = time.monotonic() + SLICE_S
         try:
-            with self._store.database.read() as connection:  # avoids the write lock in most cases
+            with self._store.database.read() as connection:  # usually none is due: avoid a lock
                 row = read_scrub(connection)
                 if row is not None and not row.is_due(read_clock(connection)):
                     return None
@@ -87,7 +85,7 @@ class Scrub:
     def _read(self, row: ScrubRow, may_go_on: Callable[[], bool]) -> ScrubRow:
         until, folder = time.monotonic() + TURN_S, Folder(self._settings, self._store)
         damaged, finished, over = 0, False, False
-        while not over:  # each slice checks at least one block, so every pass ends
+        while not over:  # at least one block, so that each pass ends
             with self._store.database.read() as connection:
                 numbers = next_frames(connection, row.position, AT_ONCE)
             if not numbers:
@@ -112,7 +110,7 @@ class Scrub:
         return row
 
     def _report(self, finding: Finding) -> None:
-        """Log a finding, and have derived data computed again."""
+        """Log a finding, and schedule damaged derived data to be rebuilt."""
         about = {"map": finding.map, "frame_id": finding.frame_id, "finding": finding.kind}
         log.error("damage found", extra=about | {"means": finding.means})
         if finding.map is None or finding.frame_id is None:
@@ -121,7 +119,7 @@ class Scrub:
             with self._store.database.read() as connection:
                 row = find_map(connection, finding.map)
                 frame = find_frame(connection, row, finding.frame_id)
-        except NotFound:  # the frame was deleted in the meantime
+        except NotFound:
             return
         if finding.kind.endswith("-upload"):
             with self._store.database.write() as connection:

@@ -1,4 +1,4 @@
-"""Compare referenced blobs with their digests, and find unreferenced files."""
+"""Checks of blobs: content against digests, and unreferenced files."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _HAS_UPLOAD = frames.c.state.not_in((FrameState.DELETED, FrameState.REDUNDANT))
 
 @dataclass(frozen=True)
 class BlobReference:
-    """Reference of a row to a blob.
+    """A reference of a row to a blob.
 
     Parameters
     ----------
-    name : name of the blob within the row: an artifact's model, a file's name, a tile's position
+    name : name of the blob within the row: model of an artifact, name of a file, position of a tile
     owner : id of the frame or job
     state, reason : state and reason of the frame; None for rows of other tables
-    on_its_way : whether a job will compute the blob again
+    on_its_way : whether a queued job will compute the blob again
     """
 
     kind: str
@@ -111,7 +111,7 @@ def _tiles(blob: Column[str]) -> Select[Any]:
     )
 
 
-# Repairs after a blob was lost, or was moved to the quarantine because it is damaged.
+# Repairs of references to lost blobs, and to damaged blobs, which were moved to quarantine.
 
 
 def _note_loss(connection: Connection, one: BlobReference, condition: Condition) -> str:
@@ -159,7 +159,7 @@ def _rebuild_tile(connection: Connection, one: BlobReference, _: Condition) -> s
 
 @dataclass(frozen=True)
 class _Kind:
-    """Kind of blob: its references, the consequence of its loss, and its repair."""
+    """A kind of blob: references, consequence of a loss, and repair."""
 
     table: Table
     references: tuple[Select[Any], ...]
@@ -190,7 +190,7 @@ _KINDS = {
 
 
 def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobReference]:
-    """Return the references of the rows with these numbers, in order."""
+    """Read the references of some rows, in the order of their numbers."""
     number = _KINDS[kind].table.c.number
     return [
         BlobReference(kind, *row)
@@ -200,7 +200,7 @@ def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobRef
 
 
 def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Finding]:
-    """Compare the blobs of some rows with their digests, and yield the findings.
+    """Verify the blobs of some rows, and yield the findings.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
         if condition == "sound" and not recovered:
             continue
         with folder.store.database.read() as connection:
-            if _current_reference(connection, one) is None:  # the row was deleted in the meantime
+            if _current_reference(connection, one) is None:  # the row was deleted
                 continue
         finding = partial(
             Finding, what=one.what, map=one.map, frame_id=one.frame_id,
@@ -244,7 +244,7 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
 
 
 def _is_recovered(one: BlobReference, condition: Condition) -> bool:
-    """Return whether a sound upload exists although its frame's reason says that it is lost."""
+    """Return whether an upload is sound although the reason of its frame states its loss."""
     return one.kind == "upload" and condition == "sound" and is_known_loss(one.reason)
 
 
@@ -264,7 +264,7 @@ def _current_reference(connection: Connection, one: BlobReference) -> BlobRefere
 
 
 def _repair(folder: Folder, one: BlobReference) -> str:
-    # one transaction, so that the repair cannot remove a new upload of the same bytes
+    # one transaction, so that the repair does not remove a new upload of the same bytes
     with folder.store.database.write() as connection:
         now, condition = (
             _current_reference(connection, one),
@@ -278,14 +278,14 @@ def _repair(folder: Folder, one: BlobReference) -> str:
         return moved + _KINDS[one.kind].repair(connection, now, condition)
 
 
-#: Age from which an unfinished file is reported, seconds.
+#: Age in seconds from which an unfinished file is reported.
 WRITING_S = 60.0
 #: Number of files to look up in one transaction.
 _BATCH = 200
 
 
 def check_files(folder: Folder) -> Iterator[Finding]:
-    """Find unreferenced and foreign files in the blob store."""
+    """Yield findings of unreferenced and foreign files in the blob storage."""
     if folder.map_name is not None:
         return
     now, waiting = time.time(), list[BlobEntry]()
@@ -324,12 +324,12 @@ def _unreferenced(folder: Folder, entries: list[BlobEntry]) -> Iterator[Finding]
 
 def _remove(folder: Folder, entry: BlobEntry) -> str:
     if entry.digest is None:
-        Path(entry.place).unlink(missing_ok=True)  # only folders list unfinished files
+        Path(entry.place).unlink(missing_ok=True)
         return "removed"
     collect_blobs(folder.store, [entry.digest])
     if not folder.store.blobs.holds(entry.digest):
         return "removed"
     with folder.store.database.read() as connection:
-        if referred_blobs(connection, [entry.digest]):  # a new upload refers to it
+        if referred_blobs(connection, [entry.digest]):  # by a new upload
             return GONE
     raise StoreError(BUSY_BLOBS)

@@ -1,9 +1,9 @@
-"""Check a whole data folder for lost, damaged and superfluous data, and repair it.
+"""Check and repair of a data folder: lost, damaged and superfluous data.
 
     Settings  --fsck-->  Findings, as they are discovered
 
-Without `repair` the check writes nothing. With it, a transaction verifies each finding again and
-repairs it at once, since services and workers may run in the meantime.
+Without `repair`, the check writes nothing. With `repair`, one transaction verifies each finding
+again and repairs it, since services and workers may be running.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ def _check_all_frames(folder: Folder) -> Iterator[Finding]:
         yield from check_frames(folder, numbers)
 
 
-#: Files come before frames: blobs that the repair of a frame dooms are not superfluous files.
+#: Checks in order; files precede frames, since repairs of frames doom blobs, which would be
+#: reported.
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
     check_database, check_models, check_counts, check_files, _check_all_frames, check_products,
     check_indexes,
@@ -70,11 +71,11 @@ def fsck(
 
     Parameters
     ----------
-    map_name : map to check; None checks all maps, and data that belongs to no map
-    repair : whether to repair the findings; if not, nothing is changed
+    map_name : map to check; None checks all maps, and data without a map
+    repair : whether to repair the findings
     quick : whether to check only that blobs and rows exist, without reading their content
-    grace_s : age below which an unreferenced file is ignored, seconds
-    counts : counter to which the check adds the numbers of checked objects
+    grace_s : age in seconds below which unreferenced files are ignored
+    counts : counter to which the numbers of checked objects are added
 
     Yields
     ------
@@ -102,7 +103,7 @@ def fsck(
 
 
 def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -> Iterator[Finding]:
-    """Yield the findings of a check; if the database is unreadable, that is the last finding."""
+    """Yield the findings of a check; an unreadable database is the last finding."""
     try:
         yield from check(folder)
     except (ValueError, TypeError, KeyError, UnusableStore) as error:
@@ -125,7 +126,7 @@ def _repaired(finding: Finding, trusted: bool) -> Finding:
 
 @contextmanager
 def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
-    # without this check, a disk that is not mounted would look like an empty folder
+    # a disk that is not mounted would look like an empty folder
     if isinstance(settings.blobs, Path):
         require_folder(settings.blobs)
     # a repair must not create a database
@@ -145,7 +146,7 @@ def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
 
 
 def _require_blobs(database: Database, blobs: Blobs, place: Path | str) -> None:
-    """Raise UnusableStore if frames refer to blobs but none exists: the disk may not be mounted."""
+    """Raise UnusableStore if frames refer to blobs but no blob exists: an unmounted disk."""
     without = FrameState.DELETED, FrameState.REDUNDANT
     refers = select(frames.c.number).where(frames.c.state.not_in(without)).limit(1)
     with database.read() as connection:

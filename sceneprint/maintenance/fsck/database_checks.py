@@ -1,7 +1,7 @@
-"""Check the database, and find rows that are contradictory, damaged or unreadable.
+"""Checks of the database: pages, foreign keys, and inconsistent, damaged or unreadable rows.
 
-If pages or foreign keys are damaged, nothing is repaired: the rows are unreliable, and a repair
-might remove sound data.
+If pages or foreign keys are damaged, nothing is repaired, since a repair that relies on damaged
+rows might remove sound data.
 """
 
 from __future__ import annotations
@@ -69,10 +69,10 @@ _RESTORE = (
 
 
 def check_database(folder: Folder) -> Iterator[Finding]:
-    """Check the pages and indexes of SQLite, and the foreign keys of SQLite or PostgreSQL.
+    """Check the pages and indexes of SQLite, and the foreign keys of both databases.
 
-    PostgreSQL does not enforce foreign keys while a dump is loaded without triggers. Use pg_amcheck
-    to check its pages.
+    PostgreSQL does not enforce foreign keys while a dump is loaded without triggers. To check its
+    pages, use pg_amcheck.
     """
     database = folder.store.database
     folder.progress("database", 0, 1)
@@ -112,12 +112,12 @@ def _dangling(folder: Folder, key: ForeignKeyConstraint) -> Iterator[Finding]:
 
 
 def damaged_database(message: str) -> Finding:
-    """Return the finding for an unreadable or contradictory database."""
+    """Return the finding of an unreadable or inconsistent database."""
     return Finding("damaged-database", "the database", "damage", message, _RESTORE)
 
 
 def check_models(folder: Folder) -> Iterator[Finding]:
-    """Find models whose file is damaged, so that they can neither sign nor search."""
+    """Yield findings of models with damaged files, which can neither sign nor search."""
     with folder.store.database.read() as connection:
         stored = connection.execute(select(models.c.id)).scalars().all()
     for model_id in stored:
@@ -141,7 +141,7 @@ def _put_preset(folder: Folder, model_id: str, source: str) -> str:
 
 
 def check_counts(folder: Folder) -> Iterator[Finding]:
-    """Find maps whose stored usage is wrong; quotas depend on it."""
+    """Yield findings of maps whose stored usage, on which quotas depend, is wrong."""
     with folder.store.database.read() as connection:
         rows = list_maps(connection)
     for row in rows:
@@ -176,17 +176,17 @@ _GONE = (FrameState.DELETED, FrameState.REDUNDANT, FrameState.REJECTED)
 
 @dataclass(frozen=True)
 class _CheckedFrame:
-    """Frame with its rows in other tables."""
+    """A frame with its rows in other tables."""
 
     frame: FrameRow
     map: MapRow
     tags: frozenset[str]
-    signed: dict[str, bool]  # for each model with a signature, whether the signature is sound
+    signed: dict[str, bool]  # whether the signature is sound, by model
     busy: bool  # whether a job will sign the frame
 
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Find frames, by their numbers, whose rows are contradictory, damaged or unreadable."""
+    """Check the rows of some frames, and yield findings of inconsistent or damaged rows."""
     for one in read_rows(folder, numbers, partial(_read_frames, folder)):
         folder.counts["frames"] += 1
         if isinstance(one, tuple):
@@ -211,7 +211,7 @@ def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
 
 def _repair_row(folder: Folder, number: int, fault: _Fault) -> str:
     with folder.store.database.write() as connection:
-        for one in _read_frames(folder, connection, [number]):  # the row may have changed
+        for one in _read_frames(folder, connection, [number]):  # read the row again
             if fault.is_found(one):
                 return fault.fix(folder, connection, one)
     return GONE
@@ -245,7 +245,7 @@ def _signatures(folder: Folder, numbers: list[int]) -> Select[Any]:
     statement = select(c.frame_number, c.model_id).where(c.frame_number.in_(numbers))
     if folder.quick:
         return statement
-    # SQLite stores arbitrary bytes in text columns, which then fail to decode
+    # read bytes, since damaged text columns of SQLite cannot be decoded
     raw = LargeBinary if folder.store.database.is_sqlite else Text
     counts = (cast(one, raw) for one in (c.n_patches, c.n_pairs))
     return statement.add_columns(cast(c.vector, LargeBinary), c.checksum, *counts)
@@ -266,15 +266,15 @@ def _is_indexed(one: _CheckedFrame) -> bool:
 
 
 def _damaged(one: _CheckedFrame) -> set[str]:
-    """Return the models of the map whose signature of an indexed frame is damaged."""
+    """Return the models of the map by which an indexed frame has a damaged signature."""
     own = (one.map.model_id, one.map.next_model_id) if _is_indexed(one) else ()
     return {model_id for model_id, sound in one.signed.items() if not sound and model_id in own}
 
 
 def _stray(one: _CheckedFrame) -> set[str]:
-    """Return the models with a signature of the frame that its state or map does not allow."""
+    """Return the models by which a frame has signatures that it should not have."""
     if one.frame.deletion is not None:
-        return set()  # the deletion may be undone
+        return set()  # keep them, since the deletion may be undone
     if one.frame.state in _GONE:
         return set(one.signed)
     # a signature of an unsigned frame would prevent signing
@@ -287,7 +287,7 @@ def _place(frame: FrameRow) -> tuple[float | None, ...]:
 
 
 def _is_stale(one: _CheckedFrame) -> bool:
-    """Return whether the search columns for tags and position differ from the frame's values."""
+    """Return whether the search columns for tags and position differ from the frame."""
     frame = one.frame
     placed = (frame.pose_x, frame.pose_y, frame.pose_z) == _place(frame)
     return not placed or (frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags))
@@ -300,11 +300,11 @@ def _queue(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
 
 
 def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
-    """Have a frame signed again from its upload; set it to failed if the upload is lost."""
+    """Schedule a frame to be signed again, or mark it as failed if its upload is lost."""
     frame, row, damaged = one.frame, one.map, _damaged(one)
     _remove_signatures(connection, frame.number, damaged)
     if row.model_id in one.signed and row.model_id not in damaged:
-        for model_id in damaged:  # queries use the sound signature in the meantime
+        for model_id in damaged:  # queries continue to use sound signatures
             enqueue(connection, REENCODE, frame.number, PRIORITY, model_id)
         return "a worker computes it again from the upload"
     condition = folder.store.blobs.condition(frame.blob)
@@ -313,7 +313,7 @@ def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
         "state": FrameState.RECEIVED if loss is None else FrameState.FAILED,
         "reason": loss,
         "indexed_at": None,
-        "novelty": None,  # the map has already accepted the frame
+        "novelty": None,  # the frame was accepted earlier
         # a new revision makes readers and indexes drop the frame until it is signed
         "revision": next_revision(connection, row.number),
     }
@@ -357,7 +357,7 @@ def _assign_revision(_: Folder, connection: Connection, one: _CheckedFrame) -> s
 
 @dataclass(frozen=True)
 class _Fault:
-    """Fault of a frame's rows; `fix` repairs it and returns a description of the repair."""
+    """A fault in the rows of a frame; `fix` repairs it, and returns a description."""
 
     is_found: Callable[[_CheckedFrame], object]
     means: str

@@ -19,20 +19,20 @@ from sceneprint.store import Store
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, models
 
-#: damage: stored data is lost or changed; leftover: data is superfluous; note: harmless, or on
-#: record.
+#: damage: stored data is lost or changed; leftover: data is superfluous; note: the finding is
+#: harmless or recorded.
 Severity = Literal["damage", "leftover", "note"]
-#: Function that takes the checked subject, the number of checked objects, and their total.
+#: Callback with the checked subject, the number of checked objects, and their total number.
 Progress = Callable[[str, int, int], None]
 #: SQLSTATE codes with which PostgreSQL reports damaged pages and indexes.
 _DAMAGED = ("XX001", "XX002")
-#: Age below which an unreferenced file may belong to an unfinished upload, seconds.
+#: Age in seconds below which an unreferenced file may belong to an unfinished upload.
 GRACE_S = 3600.0
-#: Number of rows that are read in one transaction.
+#: Number of rows to read in one transaction.
 BLOCK = 64
 #: Result of a repair that is no longer necessary.
-GONE = "nothing: the data was repaired or deleted in the meantime"
-#: Reason why a blob cannot be moved.
+GONE = "nothing: the data was repaired or deleted meanwhile"
+#: Error text if a blob cannot be moved.
 BUSY_BLOBS = (
     "a backup or another process that removes blobs is running; run the check again after it ends"
 )
@@ -42,17 +42,17 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Finding:
-    """Fault in a data folder.
+    """A fault in a data folder.
 
     Parameters
     ----------
-    kind : identifier in kebab-case
-    what : description of the record or file
+    kind : identifier in kebab case
+    what : description of the faulty record or file
     means : consequence of the fault
-    would : description of the repair that `repair` performs; None if there is none
-    map, frame_id, path : map, frame and file of the fault, if any
-    repair : function that repairs the fault and returns a description of the repair; raises a
-        SceneprintError if that fails
+    would : description of the possible repair; None if there is none
+    map, frame_id, path : map, frame and file of the fault; None if it has none
+    repair : function that repairs the fault, and returns a description; raises SceneprintError if
+        the repair fails
     done : description of the completed repair; None before a repair
     error : reason why the repair failed
     """
@@ -77,15 +77,15 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Folder:
-    """Data folder under check.
+    """The data folder to check.
 
     Parameters
     ----------
     store : database and blobs
-    map_name : map to check; None checks all maps, and data that belongs to no map
+    map_name : map to check; None checks all maps, and data without a map
     quick : whether to check only that blobs and rows exist, without reading their content
-    grace_s : age below which an unreferenced file is ignored, seconds
-    counts : numbers of checked objects, by subject
+    grace_s : age in seconds below which unreferenced files are ignored
+    counts : number of checked objects by subject
     """
 
     settings: Settings
@@ -135,7 +135,7 @@ class Folder:
 def read_rows(
     folder: Folder, numbers: list[int], read: Callable[[Connection, list[int]], list[T]]
 ) -> Iterator[T | tuple[int, Exception]]:
-    """Yield the rows with these numbers; for an unreadable row, yield its number and the error."""
+    """Yield the results of `read` for some rows, or number and error of an unreadable row."""
     try:
         with folder.store.database.read() as connection:
             rows = read(connection, numbers)
@@ -148,12 +148,12 @@ def read_rows(
     else:
         yield from rows
         return
-    for number in numbers:  # an unreadable row must not hide the rest of its block
+    for number in numbers:  # one by one, since an unreadable row makes the whole block fail
         yield from read_rows(folder, [number], read)
 
 
 def is_of_rows(error: Exception) -> bool:
-    """Return whether damaged data caused an error, rather than the machine."""
+    """Return whether an error is caused by damaged data, not by the machine."""
     if not isinstance(error, UnusableStore):
         return True
     cause = error.__cause__
@@ -165,7 +165,7 @@ def is_of_rows(error: Exception) -> bool:
 
 
 def quarantine_blob(folder: Folder, digest: str) -> str:
-    """Move a damaged blob to quarantine, and return a description.
+    """Move a damaged blob to quarantine; return a description of the move.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Compare search indexes with the database. Workers rebuild an index that a repair removes."""
+"""Checks of search indexes against the database. Workers rebuild indexes that a repair removes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sceneprint_client.api import FrameState
 
 
 def check_indexes(folder: Folder) -> Iterator[Finding]:
-    """Check that the newest index of each map is sound and agrees with the database."""
+    """Yield findings of newest indexes that are damaged or differ from the database."""
     with folder.store.database.read() as connection:
         rows = [row for row in list_maps(connection) if folder.map_name in (None, row.name)]
     for done, row in enumerate(() if folder.quick else rows):
@@ -57,7 +57,7 @@ def _differing_frames(folder: Folder, row: MapRow, index: IndexVersion) -> Itera
     """Yield the ids of frames whose signature is missing or different in the index."""
     with folder.store.database.read() as connection:
         version = trusted(connection, row, index)
-    if version is None:  # queries ignore an index of another history, for example after a restore
+    if version is None:  # of another history, such as after a restore; queries ignore it
         return
     after = 0
     here = (
