@@ -273,7 +273,7 @@ def _serialize_pages_of(endpoint: Callable[..., Any]) -> Callable[..., Any]:
 
 def page_response(page: Page[Any]) -> Response:
     """Return a page as a JSON response, the same bytes as pydantic writes in one call."""
-    items = ",".join([one.model_dump_json(by_alias=True) for one in page.items])
+    items = ",".join([item.model_dump_json(by_alias=True) for item in page.items])
     rest = page.model_dump_json(by_alias=True, exclude={"items"})
     return Response(f'{{"items":[{items}],{rest[1:]}', media_type="application/json")
 

@@ -65,7 +65,7 @@ _SEVEN = ("tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 def content(types: Sequence[str] = TYPES) -> dict[str, Any]:
     """Return `requestBody.content` of these media types for the OpenAPI document."""
-    return {one: {"schema": FILE} for one in types}
+    return {kind: {"schema": FILE} for kind in types}
 
 
 def parameters() -> list[dict[str, Any]]:
@@ -108,16 +108,16 @@ def option_parameter(name: str, option: Mapping[str, Any]) -> dict[str, Any]:
 def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
     """Return the schema of an option in a form: objects as JSON text, lists separated by commas."""
     kinds = option.get("anyOf", [])
-    reference = next((one for one in kinds if "$ref" in one), None)
+    reference = next((kind for kind in kinds if "$ref" in kind), None)
     texts = {name: option[name] for name in ("description", "title") if name in option}
     if reference is not None:
         content = {"contentMediaType": JSON, "contentSchema": reference}
         return {"type": "string", **content, **texts}
-    if any(one.get("type") == "array" for one in kinds):
+    if any(kind.get("type") == "array" for kind in kinds):
         values = option.get("default")
         default = {} if values is None else {"default": ",".join(values)}
         return {"type": "string", **default, **texts}
-    one = next((one for one in kinds if one.get("type") != "null"), None)
+    one = next((kind for kind in kinds if kind.get("type") != "null"), None)
     return dict(option) if one is None else {**one, **texts}
 
 
@@ -584,7 +584,9 @@ class FormFrames:
 
     def faults(self) -> list[str]:
         """Return a text with index and error for each frame with invalid metadata."""
-        return [f"{i} {one}" for i, one in enumerate(self.metas) if not isinstance(one, FrameMeta)]
+        return [
+            f"{i} {meta}" for i, meta in enumerate(self.metas) if not isinstance(meta, FrameMeta)
+        ]
 
 
 @asynccontextmanager
@@ -626,8 +628,8 @@ def upload_responses(batch: FormFrames, outcomes: Sequence[UploadResult]) -> Bat
     rest = iter(outcomes)
     return Batch(
         items=[
-            item_of(next(rest) if isinstance(one, FrameMeta) else UploadResult(None, error=one))
-            for one in batch.metas
+            item_of(next(rest) if isinstance(meta, FrameMeta) else UploadResult(None, error=meta))
+            for meta in batch.metas
         ]
     )
 
@@ -654,7 +656,7 @@ def _metas(text: str | None, count: int) -> list[FrameMeta | InvalidRequest]:
             "list with one object for each frame.",
             (("metas", "not one for each frame"),),
         )
-    return [_batch_meta(one) for one in metas]
+    return [_batch_meta(meta) for meta in metas]
 
 
 def _batch_meta(meta: Any) -> FrameMeta | InvalidRequest:

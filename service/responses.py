@@ -83,7 +83,7 @@ def file_responses(
     tagged : whether the file has an entity tag
     ranges : whether the route supports byte ranges; see `send_file`
     """
-    content = {one: {"schema": _STRING if one.startswith("text/") else _BINARY} for one in kinds}
+    content = {kind: {"schema": _STRING if kind.startswith("text/") else _BINARY} for kind in kinds}
     done: dict[str, Any] = {"description": description, "content": content}
     if tagged:
         done["headers"] = {"ETag": _TAG_HEADER}

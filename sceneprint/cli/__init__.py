@@ -75,9 +75,9 @@ def all_commands() -> dict[str, Command]:
     package of their modules contains the help lines.
     """
     found = {name: own_command(name) for name in COMMANDS}
-    for one in entry_points(group="sceneprint.commands"):
-        lines = import_module(one.module.rpartition(".")[0]).COMMANDS
-        found[one.name] = Command(one.value, lines[one.name])
+    for entry in entry_points(group="sceneprint.commands"):
+        lines = import_module(entry.module.rpartition(".")[0]).COMMANDS
+        found[entry.name] = Command(entry.value, lines[entry.name])
     return found
 
 

@@ -244,19 +244,19 @@ def _newest(audit: Audit, wanted: AuditFilter, left: int) -> Iterator[AuditLine]
             return
 
 
-def _audit_line(one: AuditLine) -> str:
-    who = "no key" if one.actor is None else one.actor
-    origin = "" if one.address is None else f" from {one.address}"
-    operation = one.data.get("operation") if one.action == "refused" else None
-    what = " ".join(part for part in (one.action, operation, one.map, one.target) if part)
-    return one_line(f"{one.at:%Y-%m-%dT%H:%M:%SZ}  {who}{origin}  {what}")
+def _audit_line(line: AuditLine) -> str:
+    who = "no key" if line.actor is None else line.actor
+    origin = "" if line.address is None else f" from {line.address}"
+    operation = line.data.get("operation") if line.action == "refused" else None
+    what = " ".join(part for part in (line.action, operation, line.map, line.target) if part)
+    return one_line(f"{line.at:%Y-%m-%dT%H:%M:%SZ}  {who}{origin}  {what}")
 
 
-def _syslog_message(one: AuditLine) -> str:
+def _syslog_message(line: AuditLine) -> str:
     """Return a syslog message (RFC 5424) with the line as JSON."""
-    at = one.at.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    at = line.at.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     host = socket.gethostname() or "-"
-    return f"<{_PRIORITY}>1 {at} {host} sceneprint - audit - {one.model_dump_json()}"
+    return f"<{_PRIORITY}>1 {at} {host} sceneprint - audit - {line.model_dump_json()}"
 
 
 _FORMATS: dict[str, Callable[[AuditLine], str]] = {

@@ -82,16 +82,16 @@ def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSeque
     """
     if scale is None or sequence.layout is Layout.RECORDING:  # recordings handle the scale
         return sequence
-    if sequence.layout.is_export or any(one.camera is None for one in sequence.frames):
+    if sequence.layout.is_export or any(frame.camera is None for frame in sequence.frames):
         raise InvalidRequest(
             f"--depth-scale is for depth images without a unit, but {sequence.name} defines its "
             "unit. Omit the option.",
             (("depth_scale", "not allowed for these files"),),
         )
     frames = tuple(
-        replace(one, camera=replace(one.camera, depth_scale=scale))
-        for one in sequence.frames
-        if one.camera is not None
+        replace(frame, camera=replace(frame.camera, depth_scale=scale))
+        for frame in sequence.frames
+        if frame.camera is not None
     )
     return replace(sequence, frames=frames)
 
@@ -132,24 +132,24 @@ def run_bag(options: argparse.Namespace) -> int:
         with recording_options(options) as recording:
             outlines.append(bag_outline(path, recording))
         print("\n".join(_outline_lines(path, outlines[-1])))
-    return 0 if all(one.sequences for one in outlines) else 1
+    return 0 if all(outline.sequences for outline in outlines) else 1
 
 
 def _outline_lines(path: Path, outline: BagOutline) -> list[str]:
-    count = sum(one.count for one in outline.topics)
+    count = sum(topic.count for topic in outline.topics)
     lines = [
         f"{one_line(str(path))}: {outline.kind}, {count} messages of {len(outline.topics)} topics, "
         f"{outline.span}"
     ]
-    width = max((len(one_line(one.name)) for one in outline.topics), default=0)
-    kinds = max((len(one_line(one.type)) for one in outline.topics), default=0)
-    for one in outline.topics:
+    width = max((len(one_line(topic.name)) for topic in outline.topics), default=0)
+    kinds = max((len(one_line(topic.type)) for topic in outline.topics), default=0)
+    for topic in outline.topics:
         rate = ""
-        if outline.seconds > 0 and one.count > 1:
-            rate = f"{one.count / outline.seconds:.1f} Hz"
+        if outline.seconds > 0 and topic.count > 1:
+            rate = f"{topic.count / outline.seconds:.1f} Hz"
         lines.append(
-            f"  {one_line(one.name):{width}}  {one_line(one.type):{kinds}}  {one.count:8}  "
-            f"{rate:>9}  {outline.use_of(one)}".rstrip()
+            f"  {one_line(topic.name):{width}}  {one_line(topic.type):{kinds}}  {topic.count:8}  "
+            f"{rate:>9}  {outline.use_of(topic)}".rstrip()
         )
     if not outline.sequences:
         return [*lines, f"no frame can be used: {one_line(outline.problem)}"]

@@ -159,7 +159,7 @@ def scrub_check(stats: Stats) -> Check:
 def worker_check(stats: Stats, *, read_only: bool) -> Check:
     """Check that workers are running."""
     workers = stats.workers or []
-    busy = sum(one.job_id is not None for one in workers)
+    busy = sum(worker.job_id is not None for worker in workers)
     if workers or read_only:
         run = "1 worker runs" if len(workers) == 1 else f"{len(workers)} workers run"
         return Check("ok", "workers", f"{run}, {busy} busy")
@@ -186,11 +186,11 @@ def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
     presets = {one.name: one for one in models if one.preset}
     by_model: dict[str, list[str]] = defaultdict(list)
     older = []
-    for one in maps:
-        by_model[one.model].append(one.name)
-        preset = presets.get(one.model.rpartition("-")[0])
-        if preset is not None and preset.model_id != one.model_id and one.reencoding is None:
-            older.append((one.name, preset))
+    for record in maps:
+        by_model[record.model].append(record.name)
+        preset = presets.get(record.model.rpartition("-")[0])
+        if preset is not None and preset.model_id != record.model_id and record.reencoding is None:
+            older.append((record.name, preset))
     lines = [f"{model}: {_listed(names)}" for model, names in sorted(by_model.items())]
     text = "; ".join(lines) or "no maps yet"
     if older:

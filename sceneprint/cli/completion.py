@@ -51,7 +51,7 @@ def subcommands(
                 yield from subcommands(one)
 
 
-def _words(one: argparse.ArgumentParser) -> Iterator[str]:
+def _words(command: argparse.ArgumentParser) -> Iterator[str]:
     """Yield the words that complete a command: its options and fixed values."""
-    for action in one._actions:
+    for action in command._actions:
         yield from action.option_strings or map(str, action.choices or ())

@@ -137,7 +137,7 @@ def run_frames(options: argparse.Namespace) -> int:
 
 def _show_frames(scene: Scene, frames: list[Frame]) -> None:
     """Write a scene of the listed frames; raise InvalidRequest if no frame has a pose."""
-    posed = [one for one in frames if one.pose is not None]
+    posed = [frame for frame in frames if frame.pose is not None]
     if not posed:
         raise InvalidRequest(
             "No listed frame has a pose, so the scene would be empty. Specify one FRAME."
@@ -182,13 +182,13 @@ def _write_trajectory(client: Client, options: argparse.Namespace) -> None:
     print(f"wrote {options.trajectory}: {poses} poses{one_line(''.join(why[:1]))}")
 
 
-def _frame_line(one: Frame) -> str:
-    at = "" if one.captured_at is None else f"{one.captured_at:%Y-%m-%d %H:%M:%S}"
-    pose = "no" if one.pose is None else "yes"
-    place = "" if one.sequence is None else one.sequence
+def _frame_line(frame: Frame) -> str:
+    at = "" if frame.captured_at is None else f"{frame.captured_at:%Y-%m-%d %H:%M:%S}"
+    pose = "no" if frame.pose is None else "yes"
+    place = "" if frame.sequence is None else frame.sequence
     return (
-        f"{one.frame_id:32}  {one.state:9}  {at:19}  {pose:4}  {place:>8}  {source_label(one)}  "
-        f"{one_line(one.name or '-')}  {one_line(','.join(one.tags))}"
+        f"{frame.frame_id:32}  {frame.state:9}  {at:19}  {pose:4}  {place:>8}  "
+        f"{source_label(frame)}  {one_line(frame.name or '-')}  {one_line(','.join(frame.tags))}"
     )
 
 
@@ -260,19 +260,19 @@ def run_queries(options: argparse.Namespace) -> int:
     return 0
 
 
-def _query_line(one: QueryRecord) -> str:
-    if one.pose is None:
-        result = one_line(one.reason)
+def _query_line(query: QueryRecord) -> str:
+    if query.pose is None:
+        result = one_line(query.reason)
     else:
-        t = one.pose.translation
-        sure = "" if one.confidence is None else f", {percent(one.confidence)}"
+        t = query.pose.translation
+        sure = "" if query.confidence is None else f", {percent(query.confidence)}"
         result = (
-            f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in {one_line(one.pose.parent_frame)}, "
-            f"{count_of(one.support or 0, 'view')}{sure}"
+            f"{t.x:.2f} {t.y:.2f} {t.z:.2f} m in {one_line(query.pose.parent_frame)}, "
+            f"{count_of(query.support or 0, 'view')}{sure}"
         )
     return (
-        f"{one.query_id}  {one.at:%Y-%m-%d %H:%M:%S}  {one.status:11}  {one.milliseconds:5.0f}  "
-        f"{one.map}  {source_label(one)}  {result}"
+        f"{query.query_id}  {query.at:%Y-%m-%d %H:%M:%S}  {query.status:11}  "
+        f"{query.milliseconds:5.0f}  {query.map}  {source_label(query)}  {result}"
     )
 
 
@@ -318,8 +318,8 @@ def _retry_dead(client: Client, *, as_json: bool) -> int:
     again, refused = 0, 0
     for done in client.retry_dead_jobs():
         again, refused = again + len(done.retried), refused + len(done.refused)
-        for one in done.refused:
-            print_error(f"sceneprint jobs: {one_line(one.reason)}")
+        for refusal in done.refused:
+            print_error(f"sceneprint jobs: {one_line(refusal.reason)}")
         for job in done.retried:
             _print_job(job, as_json=as_json)
     if not as_json:
@@ -440,34 +440,34 @@ def _delete(client: Client, name: str, *, confirmed: bool) -> None:
     print(f"deleted map {name} and its {n_frames} frames")
 
 
-def _notes(one: Map) -> list[str]:
+def _notes(record: Map) -> list[str]:
     """Return notes on poses, quotas, retention and up vector of a map."""
     parts = []
-    if one.frames.get("indexed") and not one.posed_frames:
+    if record.frames.get("indexed") and not record.posed_frames:
         parts.append("no poses")
-    if one.parent_frames > 1:
-        parts.append(f"{one.parent_frames} parent frames")
-    if one.quota_frames is not None:
-        parts.append(f"{one.used_frames} of {one.quota_frames} frames")
-    if one.quota_bytes is not None:
-        parts.append(f"{one.used_bytes / 1e6:.1f} of {one.quota_bytes / 1e6:.1f} MB")
-    if one.retention_days is not None:
-        parts.append(f"kept {one.retention_days:g} days")
-    if one.up is not None:
-        parts.append(f"up {one.up.x:g},{one.up.y:g},{one.up.z:g}")
+    if record.parent_frames > 1:
+        parts.append(f"{record.parent_frames} parent frames")
+    if record.quota_frames is not None:
+        parts.append(f"{record.used_frames} of {record.quota_frames} frames")
+    if record.quota_bytes is not None:
+        parts.append(f"{record.used_bytes / 1e6:.1f} of {record.quota_bytes / 1e6:.1f} MB")
+    if record.retention_days is not None:
+        parts.append(f"kept {record.retention_days:g} days")
+    if record.up is not None:
+        parts.append(f"up {record.up.x:g},{record.up.y:g},{record.up.z:g}")
     return parts
 
 
 def _print_maps(maps: list[Map], *, as_json: bool) -> None:
-    width = max(3, *(len(one.name) for one in maps)) if maps else 0
+    width = max(3, *(len(record.name) for record in maps)) if maps else 0
 
-    def line(one: Map) -> str:
-        n, notes = one.frames, ", ".join(_notes(one))
+    def line(record: Map) -> str:
+        n, notes = record.frames, ", ".join(_notes(record))
         waiting = n.get("received", 0) + n.get("signing", 0)
-        label = one_line(one.title or "") + (f"  ({notes})" if notes else "")
+        label = one_line(record.title or "") + (f"  ({notes})" if notes else "")
         return (
-            f"{one.name:{width}}  {n.get('indexed', 0):7}  {waiting:7}  {n.get('rejected', 0):8}  "
-            f"{n.get('failed', 0):6}  {one.model:20}  {label.strip()}"
+            f"{record.name:{width}}  {n.get('indexed', 0):7}  {waiting:7}  "
+            f"{n.get('rejected', 0):8}  {n.get('failed', 0):6}  {record.model:20}  {label.strip()}"
         )
 
     print_rows(

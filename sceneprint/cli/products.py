@@ -160,39 +160,43 @@ def _associate(options: argparse.Namespace) -> int:
     return 0 if succeeded else 2
 
 
-def _print_association(one: Association, options: argparse.Namespace) -> None:
-    print(one.model_dump_json() if options.json else "\n".join(_association_lines(one)))
+def _print_association(association: Association, options: argparse.Namespace) -> None:
+    print(
+        association.model_dump_json()
+        if options.json
+        else "\n".join(_association_lines(association))
+    )
 
 
-def _association_lines(one: Association) -> list[str]:
+def _association_lines(association: Association) -> list[str]:
     """Return lines that describe an association, its edges and its joins."""
-    name = f"association {one.job_id}"
-    if one.result is None:
-        why = "" if one.error is None else f": {one_line(one.error)}"
-        return [f"{name} is {one.state}{why}"]
-    r = one.result
+    name = f"association {association.job_id}"
+    if association.result is None:
+        why = "" if association.error is None else f": {one_line(association.error)}"
+        return [f"{name} is {association.state}{why}"]
+    r = association.result
     lines = [
         f"{name}: {r.edges} edges from {r.frames} frames ({r.validated} pairs validated)",
         f"edges: {r.consistent} supported by others, {r.inconsistent} outvoted, {r.unchecked} "
         "unsupported",
     ]
     lines += [line for join in r.joins for line in _join_lines(join)]
-    if len(one.request.sessions) == 2 and not r.joins:
+    if len(association.request.sessions) == 2 and not r.joins:
         lines.append("not joined: no edge connects frames with poses")
     return lines
 
 
-def _join_lines(one: Join) -> list[str]:
-    names = f"{one_line(one.from_parent)} onto {one_line(one.to_parent)}"
-    if one.transform is None:
-        return [f"not joined, {names}: {one_line(one.reason)}"]
-    sure = "strongly" if one.strength == "strong" else "weakly (check it before you rely on it)"
-    t, r = one.transform.translation, one.transform.rotation
-    moved = [] if one.root is None else [f"  all their poses are now in {one_line(one.root)}"]
-    moved += ["  undone: it no longer moves poses"] if one.undone else []
+def _join_lines(join: Join) -> list[str]:
+    names = f"{one_line(join.from_parent)} onto {one_line(join.to_parent)}"
+    if join.transform is None:
+        return [f"not joined, {names}: {one_line(join.reason)}"]
+    sure = "strongly" if join.strength == "strong" else "weakly (check it before you rely on it)"
+    t, r = join.transform.translation, join.transform.rotation
+    moved = [] if join.root is None else [f"  all their poses are now in {one_line(join.root)}"]
+    moved += ["  undone: it no longer moves poses"] if join.undone else []
     return [
-        f"joined {sure}, {names}: {one_line(one.reason)}, spread "
-        f"{100 * (one.spread_m or 0.0):.1f} cm, {one.spread_deg or 0.0:.1f} deg",
+        f"joined {sure}, {names}: {one_line(join.reason)}, spread "
+        f"{100 * (join.spread_m or 0.0):.1f} cm, {join.spread_deg or 0.0:.1f} deg",
         f"  translation {t.x:.4f} {t.y:.4f} {t.z:.4f} m, rotation {r.x:.6f} {r.y:.6f} {r.z:.6f} "
         f"{r.w:.6f} (x y z w)",
         *moved,

@@ -206,7 +206,7 @@ def _answer_scene(
 
 
 def _frames_at(options: argparse.Namespace) -> list[FrameReference]:
-    return [frame for one in sequences_at(options.path, options) for frame in one.frames]
+    return [frame for sequence in sequences_at(options.path, options) for frame in sequence.frames]
 
 
 def _wanted_frames(
@@ -331,10 +331,10 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
     if len(alternatives) == 1:
         head = "  one pose is supported, but not confirmed:"
     places = [
-        f"  {_percent(one.confidence):>7}  {_metres(one.pose)} m in "
-        f"{one_line(one.pose.parent_frame)}, support {one.support}; "
-        f"{_evidence(one.evidence)}"
-        for one in alternatives
+        f"  {_percent(alternative.confidence):>7}  {_metres(alternative.pose)} m in "
+        f"{one_line(alternative.pose.parent_frame)}, support {alternative.support}; "
+        f"{_evidence(alternative.evidence)}"
+        for alternative in alternatives
     ]
     return [head, *places]
 
@@ -364,9 +364,9 @@ def _degrees(transform: Transform | None) -> str:
 def _explanation_lines(answer: Answer) -> list[str]:
     """Return lines with the explanations in an answer; empty without explanations."""
     lines = [
-        f"  {one.rank:4}  {frame_label(one.frame_id, one.name)}  {one.similarity:4.2f}  "
-        f"{one.stage}: {one.outcome.replace('_', ' ')}; {one_line(one.reason)}"
-        for one in answer.explanations or []
+        f"  {e.rank:4}  {frame_label(e.frame_id, e.name)}  {e.similarity:4.2f}  "
+        f"{e.stage}: {e.outcome.replace('_', ' ')}; {one_line(e.reason)}"
+        for e in answer.explanations or []
     ]
     one = answer.explained_frame
     if one is not None:

@@ -91,8 +91,8 @@ def check_scene(options: argparse.Namespace) -> None:
 
 
 def _opener() -> SceneOpener:
-    for one in entry_points(group="sceneprint.scenes"):
-        found: SceneOpener = one.load()
+    for entry in entry_points(group="sceneprint.scenes"):
+        found: SceneOpener = entry.load()
         return found
     raise MissingDependency(
         "Scenes are written by sceneprint-viewers, which is not installed. "
@@ -114,7 +114,7 @@ def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | 
 
 def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:
     """Return the capture times of frames, nanoseconds since 1970; all None unless increasing."""
-    stamps = [one.timestamp for one in references]
+    stamps = [reference.timestamp for reference in references]
     known = [t for t in stamps if t is not None and 0 <= t < 2**63 * 1e-9]
     rising = all(a < b for a, b in itertools.pairwise(known))
     if len(known) < len(stamps) or not rising:

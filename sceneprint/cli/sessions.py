@@ -57,8 +57,8 @@ def run_sessions(options: argparse.Namespace) -> int:
         if options.undo is not None:
             undone = client.restore_deletion(options.map, options.undo)
             print(f"restored {undone.frames} frames")
-            for one in undone.refused:
-                print(f"not restored: {one.frame_id}: {one_line(one.reason)}")
+            for refusal in undone.refused:
+                print(f"not restored: {refusal.frame_id}: {one_line(refusal.reason)}")
         elif options.deletions:
             print_rows(
                 client.deletions(options.map), _deletion_line, as_json=options.json,
@@ -102,18 +102,18 @@ def _delete_session(client: Client, options: argparse.Namespace) -> None:
         )
 
 
-def _deletion_line(one: FrameDeletion) -> str:
-    at, until = (f"{time:%Y-%m-%d %H:%M:%S}" for time in (one.at, one.until))
-    return f"{one.deletion_id:32}  {one.frames:6}  {at}  {until}"
+def _deletion_line(deletion: FrameDeletion) -> str:
+    at, until = (f"{time:%Y-%m-%d %H:%M:%S}" for time in (deletion.at, deletion.until))
+    return f"{deletion.deletion_id:32}  {deletion.frames:6}  {at}  {until}"
 
 
-def _session_line(one: Session) -> str:
+def _session_line(session: Session) -> str:
     first, last = (
         "" if at is None else f"{at:%Y-%m-%d %H:%M:%S}"
-        for at in (one.first_captured_at, one.last_captured_at)
+        for at in (session.first_captured_at, session.last_captured_at)
     )
-    tags = one_line(f"  [{', '.join(one.tags)}]") if one.tags else ""
+    tags = one_line(f"  [{', '.join(session.tags)}]") if session.tags else ""
     return (
-        f"{sum(one.frames.values()):6}  {one.frames.get('indexed', 0):7}  {one.with_pose:5}  "
-        f"{first:19}  {last:19}  {source_label(one)}{tags}"
+        f"{sum(session.frames.values()):6}  {session.frames.get('indexed', 0):7}  "
+        f"{session.with_pose:5}  {first:19}  {last:19}  {source_label(session)}{tags}"
     )

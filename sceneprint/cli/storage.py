@@ -293,8 +293,8 @@ def _report_lost(bundle: Bundle, advice: str) -> int:
     """Print the missing blobs of a bundle on standard error; return 1 if there are any."""
     if not bundle.lost:
         return 0
-    for one in bundle.lost[:_SHOWN]:
-        print_error(f"missing: blob {one.digest[:12]}, {one.why}")
+    for blob in bundle.lost[:_SHOWN]:
+        print_error(f"missing: blob {blob.digest[:12]}, {blob.why}")
     if len(bundle.lost) > _SHOWN:
         print_error(f"... and {len(bundle.lost) - _SHOWN} more")
     print_error(f"Everything else is included. {advice}")
@@ -510,9 +510,9 @@ def run_reencode(options: argparse.Namespace) -> int:
     return 0
 
 
-def _print_reencoding(one: Map) -> None:
-    print(f"map {one.name}, model {one.model}")
-    coming = one.reencoding
+def _print_reencoding(record: Map) -> None:
+    print(f"map {record.name}, model {record.model}")
+    coming = record.reencoding
     if coming is None:
         return
     print(f"next model: {coming.model}; {coming.done} frames signed, {coming.left} waiting")
@@ -528,20 +528,20 @@ def _print_reencoding(one: Map) -> None:
         )
 
 
-def _wait(context: Context, one: Map) -> int:
+def _wait(context: Context, record: Map) -> int:
     """Wait until a map has switched its model; return 2 if there is no progress."""
     from sceneprint.engine.admin.statistics import Statistics
     from sceneprint.engine.maps.map_lifecycle import get_map
 
-    coming = one.reencoding
+    coming = record.reencoding
     assert coming is not None
     last, since = -1, time.monotonic()
     with progress_bar(f"sign with {coming.model}") as progress:
         while True:
             looked = time.monotonic()
-            one = get_map(context.store, one.name)
+            record = get_map(context.store, record.name)
             took = time.monotonic() - looked
-            now = one.reencoding
+            now = record.reencoding
             if now is None or now.model_id != coming.model_id:
                 break
             done = now.done + now.failed
@@ -552,9 +552,9 @@ def _wait(context: Context, one: Map) -> int:
             if stalled or (now.dead and not now.left):
                 break
             time.sleep(max(LOOK_S, 10 * took))
-    _print_reencoding(one)
+    _print_reencoding(record)
     if now is not None and now.model_id == coming.model_id and not now.dead:
         stats = Statistics(context).collect(minutes=1)
         reason = waiting_reason(stats, now.left)
         print_error(f"no progress for {STALL_S:.0f} s. {reason}")
-    return 0 if one.model_id == coming.model_id else 2
+    return 0 if record.model_id == coming.model_id else 2

@@ -441,9 +441,11 @@ def row_option(text: str) -> tuple[str, ...]:
 def _with_row(sequence: FrameSequence, row: tuple[str, ...]) -> FrameSequence:
     """Return a sequence of .bin files with the names of the values in a row."""
     frames = tuple(
-        replace(one, cloud=replace(one.cloud, row=row)) for one in sequence.frames if one.cloud
+        replace(frame, cloud=replace(frame.cloud, row=row))
+        for frame in sequence.frames
+        if frame.cloud
     )
-    if len(frames) < len(sequence.frames) or not all(one.row for one in frames):
+    if len(frames) < len(sequence.frames) or not all(frame.row for frame in frames):
         raise InvalidRequest(
             f"--row is for .bin files, but {sequence.name} has other files. Omit it, or specify "
             "only folders of .bin files.",

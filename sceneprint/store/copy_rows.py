@@ -101,29 +101,29 @@ def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame
     copies : frames that the map does not have, or only as deleted frames
     """
     deleted = select(frames.c.id).where(
-        frames.c.map_number == row.number, frames.c.id.in_([one.id for one in copies])
+        frames.c.map_number == row.number, frames.c.id.in_([copy.id for copy in copies])
     )
     for frame_id in connection.execute(deleted).scalars().all():
         free_id(connection, row.number, frame_id)
     last = next_revision(connection, row.number, len(copies))
     rows = [
         {
-            **one.values, **position(one.values["pose"]), "id": one.id, "map_number": row.number,
+            **copy.values, **position(copy.values["pose"]), "id": copy.id, "map_number": row.number,
             "state": FrameState.INDEXED, "revision": last - len(copies) + i,
         }
-        for i, one in enumerate(copies, 1)
+        for i, copy in enumerate(copies, 1)
     ]  # fmt: skip
     added = insert(frames).returning(frames.c.number, sort_by_parameter_order=True)
     numbers = connection.execute(added, rows).scalars().all()
-    add_usage(connection, row.number, len(copies), sum(one.values["bytes"] for one in copies))
+    add_usage(connection, row.number, len(copies), sum(copy.values["bytes"] for copy in copies))
     tags = [
         {"frame_number": number, "tag": tag}
-        for number, one in zip(numbers, copies, strict=True)
-        for tag in sorted(set(one.values["tags"]))
+        for number, copy in zip(numbers, copies, strict=True)
+        for tag in sorted(set(copy.values["tags"]))
     ]
     if tags:
         connection.execute(insert(frame_tags), tags)
-    put_signatures(connection, list(zip(numbers, [one.signature for one in copies], strict=True)))
+    put_signatures(connection, list(zip(numbers, [copy.signature for copy in copies], strict=True)))
     job, at = job_values(connection, "sign", 0), time.time()
     job |= {"map_number": row.number, "state": JobState.SUCCEEDED, "attempts": 1}
     job |= dict.fromkeys(("created_at", "run_after", "started_at", "finished_at"), at)

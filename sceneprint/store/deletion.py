@@ -131,12 +131,12 @@ def purge_frames(connection: Connection, map_number: int, numbers: Sequence[int]
     uploads = connection.execute(select(c.blob, c.bytes, c.deleted_from).where(own)).all()
     signed = signatures.c.frame_number.in_(numbers)
     artifacts = connection.execute(select(signatures.c.geometry).where(signed)).scalars()
-    blobs = list(dict.fromkeys([*(one.blob for one in uploads), *artifacts]))
+    blobs = list(dict.fromkeys([*(upload.blob for upload in uploads), *artifacts]))
     doom(connection, blobs)
     connection.execute(delete(signatures).where(signed))
     connection.execute(delete(frame_tags).where(frame_tags.c.frame_number.in_(numbers)))
     connection.execute(update(frames).where(own).values(tags=[], **dict.fromkeys(_PURGED)))
-    size = sum(one.bytes for one in uploads if one.deleted_from != FrameState.REDUNDANT)
+    size = sum(upload.bytes for upload in uploads if upload.deleted_from != FrameState.REDUNDANT)
     add_usage(connection, map_number, 0, -size)
     return blobs
 
@@ -210,7 +210,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
             for column in (surface_tiles.c.blob, surface_tiles.c.draft)
         ),
     )
-    blobs = sorted({blob for one in statements for blob in connection.execute(one).scalars()})
+    blobs = sorted({blob for query in statements for blob in connection.execute(query).scalars()})
     doom_found(connection, *statements)
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
     tiles = select(surface_tiles.c.number).where(surface_tiles.c.map_number == row.number)

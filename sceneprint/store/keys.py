@@ -187,7 +187,7 @@ def _unknown_key(name: str) -> UnknownKey:
 
 
 def _select_keys() -> Select[Any]:
-    return select(*(keys.c[one.name] for one in fields(KeyRow)))
+    return select(*(keys.c[member.name] for member in fields(KeyRow)))
 
 
 def _new_secret() -> str:

@@ -137,14 +137,14 @@ def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
     IntegrityError : If another map stores a result for the same idempotency key concurrently.
     """
     of_content = dict[tuple[int, str], NewFrame]()
-    for one in new:
-        of_content.setdefault(one.content, one)
+    for frame in new:
+        of_content.setdefault(frame.content, frame)
     first = list(of_content.values())
     if connection.dialect.name == "sqlite":
-        return {one.frame_id for one in first if _insert_on_sqlite(connection, one)}
+        return {frame.frame_id for frame in first if _insert_on_sqlite(connection, frame)}
     if not first:
         return set()
-    rows = [one.rows(connection) for one in first]
+    rows = [frame.rows(connection) for frame in first]
     names = dict[str, dict[str, None]]()
     for row in rows:
         for of, values in row.items():
@@ -154,20 +154,20 @@ def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
                     if of in names)  # fmt: skip
     statement = _insert_frames(
         events_table(connection), columns, fixed=tuple(fixed.items()),
-        tagged=any(one.tags for one in first),
+        tagged=any(frame.tags for frame in first),
     )  # fmt: skip
-    records = [_record(i, *one) for i, one in enumerate(zip(first, rows, strict=True))]
+    records = [_record(i, *pair) for i, pair in enumerate(zip(first, rows, strict=True))]
     return set(connection.execute(statement, {"records": records}).scalars())
 
 
-def _insert_on_sqlite(connection: Connection, one: NewFrame) -> bool:
+def _insert_on_sqlite(connection: Connection, frame: NewFrame) -> bool:
     """Insert a frame on SQLite unless its map has the content; return whether it was inserted."""
-    if connection.execute(_count_frame(), one.room).first() is None:
+    if connection.execute(_count_frame(), frame.room).first() is None:
         return False
-    rows = one.rows(connection)
+    rows = frame.rows(connection)
     new = insert(frames).values(rows["frame"]).returning(frames.c.number)
     number = connection.execute(new).scalar_one()
-    write_tags(connection, number, one.tags)
+    write_tags(connection, number, frame.tags)
     connection.execute(insert(jobs).values(frame_number=number, **rows["job"]))
     connection.execute(insert(events_table(connection)).values(rows["event"]))
     append_lines(connection, [rows.get("line")])
@@ -234,10 +234,10 @@ def _is_sent(key: str) -> bool:
     return not (key in _STAMPED or key in _FIXED or key in _SAME)
 
 
-def _record(place: int, one: NewFrame, rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _record(place: int, frame: NewFrame, rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return the record of a frame for `_insert_frames`."""
     values = {key: rows[of][name] for of, name, key in _keys(rows) if _is_sent(key)}
-    return {**values, "place": place, "tags": one.tags, "size": one.room["size"]}
+    return {**values, "place": place, "tags": frame.tags, "size": frame.room["size"]}
 
 
 @cache

@@ -119,7 +119,7 @@ class QueryRow(_Query):
 
 #: Statement that selects rows without their answers.
 _ROW = select(
-    *(_c[one.name] for one in fields(QueryRow) if one.name not in ("map", "key")),
+    *(_c[member.name] for member in fields(QueryRow) if member.name not in ("map", "key")),
     select(maps.c.name).where(maps.c.number == _c.map_number).scalar_subquery().label("map"),
     select(keys.c.name).where(keys.c.id == _c.key_id).scalar_subquery().label("key"),
 )
@@ -135,40 +135,46 @@ def add_queries(connection: Connection, new: Sequence[NewQuery]) -> None:
 
     Queries whose map was deleted or replaced since are ignored.
     """
-    names = sorted({one.map for one in new})
+    names = sorted({query.map for query in new})
     statement = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
     existing = {row.name: row for row in connection.execute(statement)}
-    valid = [one for one in new if one.map in existing and existing[one.map].created_at <= one.at]
+    valid = [
+        query
+        for query in new
+        if query.map in existing and existing[query.map].created_at <= query.at
+    ]
     if not valid:
         return
-    connection.execute(insert(queries), [_values(one, existing[one.map].number) for one in valid])
-    if reported := [_event(one) for one in valid if one.listed]:
+    connection.execute(
+        insert(queries), [_values(query, existing[query.map].number) for query in valid]
+    )
+    if reported := [_event(query) for query in valid if query.listed]:
         connection.execute(insert(events), reported)
 
 
-def _values(one: NewQuery, map_number: int) -> dict[str, Any]:
-    row = {each.name: getattr(one, each.name) for each in fields(one) if each.name != "map"}
+def _values(query: NewQuery, map_number: int) -> dict[str, Any]:
+    row = {each.name: getattr(query, each.name) for each in fields(query) if each.name != "map"}
     return row | {
         "map_number": map_number,
-        "reason": one.reason.replace("\0", "")[:MOST_REASON],
-        "shown": sorted(set(one.shown)) if one.bytes else None,
+        "reason": query.reason.replace("\0", "")[:MOST_REASON],
+        "shown": sorted(set(query.shown)) if query.bytes else None,
     }
 
 
-def _event(one: NewQuery) -> dict[str, Any]:
-    data: dict[str, Any] = {"query_id": one.id}
-    data |= {name: getattr(one, name) for name in _REPORTED if getattr(one, name) is not None}
-    if one.pose is not None:
-        x, y, z, qx, qy, qz, qw = one.pose
+def _event(query: NewQuery) -> dict[str, Any]:
+    data: dict[str, Any] = {"query_id": query.id}
+    data |= {name: getattr(query, name) for name in _REPORTED if getattr(query, name) is not None}
+    if query.pose is not None:
+        x, y, z, qx, qy, qz, qw = query.pose
         data["pose"] = {
-            "parent_frame": one.pose_parent,
+            "parent_frame": query.pose_parent,
             "translation": {"x": x, "y": y, "z": z},
             "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
         }
-    own = one.frame_id if one.frame_map == one.map else None
+    own = query.frame_id if query.frame_map == query.map else None
     # the time of the event, by which events are sorted, not the time of the query
     return {
-        "at": time.time(), "kind": EVENT, "map": one.map, "frame_id": own, "job_id": None,
+        "at": time.time(), "kind": EVENT, "map": query.map, "frame_id": own, "job_id": None,
         "data": data,
     }  # fmt: skip
 

@@ -720,11 +720,11 @@ def items_of(
 
 def add_files(connection: Connection, job_number: int, files: Iterable[JobFile]) -> None:
     """Add files to a job; replace files of the same names."""
-    for one in files:
-        remove_parts(connection, job_number, items=False, files=[one.name])
-        connection.execute(insert(job_files).values(job_number=job_number, **asdict(one)))
-        if one.name == ARCHIVE:
-            _count_archive(connection, job_number, one.bytes)
+    for file in files:
+        remove_parts(connection, job_number, items=False, files=[file.name])
+        connection.execute(insert(job_files).values(job_number=job_number, **asdict(file)))
+        if file.name == ARCHIVE:
+            _count_archive(connection, job_number, file.bytes)
 
 
 def _count_archive(connection: Connection, job_number: int, size: int) -> None:

@@ -258,12 +258,13 @@ def fused_frames(
 def add_fused(connection: Connection, surface: SurfaceRow, fused: Sequence[FusedFrame]) -> None:
     """Record frames as fused; mark those as edited that have changed since they were read."""
     now = {
-        one.number: one for one in fused_frames(connection, surface, [one.number for one in fused])
+        frame.number: frame
+        for frame in fused_frames(connection, surface, [f.number for f in fused])
     }
     rows = [
-        {"frame_number": one.number, "map_number": surface.map_number, "parent": one.parent,
-         "changed": now.get(one.number) != one}
-        for one in fused
+        {"frame_number": frame.number, "map_number": surface.map_number, "parent": frame.parent,
+         "changed": now.get(frame.number) != frame}
+        for frame in fused
     ]  # fmt: skip
     if rows:
         connection.execute(insert(surface_frames), rows)
@@ -591,7 +592,7 @@ def frames_seeing(
     """
     tiles = tiles_at(connection, surface.map_number, parent, 0, places)
     touching = select(surface_touches.c.frame_number).where(
-        among(connection, surface_touches.c.tile_number, [one.number for one in tiles.values()])
+        among(connection, surface_touches.c.tile_number, [tile.number for tile in tiles.values()])
     )
     return _sightings(
         connection, surface, [frames.c.number.in_(touching), frames.c.pose_parent == parent],

@@ -764,9 +764,9 @@ def job_of_columns(row: Sequence[Any]) -> JobRow:
 
 
 #: Columns of `maps`, `frames` and `jobs` in the order of the fields of their rows.
-MAP_COLUMNS = tuple(maps.c[one.name] for one in fields(MapRow))
-FRAME_COLUMNS = tuple(frames.c[one.name] for one in fields(FrameRow))
-JOB_COLUMNS = tuple(jobs.c[one.name] for one in fields(JobRow))
+MAP_COLUMNS = tuple(maps.c[member.name] for member in fields(MapRow))
+FRAME_COLUMNS = tuple(frames.c[member.name] for member in fields(FrameRow))
+JOB_COLUMNS = tuple(jobs.c[member.name] for member in fields(JobRow))
 _FRAME_STATE = [column.name for column in FRAME_COLUMNS].index("state")
 _JOB_STATE = [column.name for column in JOB_COLUMNS].index("state")
 

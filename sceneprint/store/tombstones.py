@@ -73,7 +73,7 @@ def find_deletion(
 ) -> Deletion | None:
     """Return a deletion by number; None if it cannot be undone. See `list_deletions`."""
     deletions = list_deletions(connection, map_number, seconds, 1, number + 1)
-    return next((one for one in deletions if one.number == number), None)
+    return next((deletion for deletion in deletions if deletion.number == number), None)
 
 
 def tombstones_of(

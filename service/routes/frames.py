@@ -177,7 +177,7 @@ async def add_batch(
 
         def add() -> tuple[Batch, bool]:
             uploads = batch.read()
-            contents = [(one.data, one.meta) for one in uploads]
+            contents = [(upload.data, upload.meta) for upload in uploads]
             parts = ("batch", map_name, contents, batch.priority, batch.if_novel, batch.faults())
             once = bodies.idempotent_request(caller, key, *parts)
             outcomes, replayed = here.uploads.add_all(map_name, uploads, once)

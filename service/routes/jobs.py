@@ -62,7 +62,7 @@ def list_jobs(
         get_map(here.context.store, map_name)
         names = (map_name,)
     elif names is None and not caller.may("admin"):
-        names = tuple(one.name for one in get_maps(here.context.store))
+        names = tuple(record.name for record in get_maps(here.context.store))
     return lifecycle.list_jobs(here.context.store, state, cursor, limit, kind, names)
 
 
@@ -243,5 +243,5 @@ async def _messages(
     yield BEGIN
     async with aclosing(feed.batches(wanted, after, has_access)) as batches:
         async for rows, seen in batches:
-            messages = [message(event_record(seals, one)) for one in rows]
+            messages = [message(event_record(seals, row)) for row in rows]
             yield b"".join(messages) if rows else alive(seals.seal("event", seen))

@@ -343,10 +343,10 @@ async def localize_sequence(
         bodies.read_frames(request, *options, most=MOST_OF_SEQUENCE) as sent,
     ):
         query = record_of(Query, sent.texts, _QUERY)
-        wrong = next((one for one in sent.metas if not isinstance(one, FrameMeta)), None)
+        wrong = next((meta for meta in sent.metas if not isinstance(meta, FrameMeta)), None)
         if wrong is not None:
             raise wrong
-        *_, last = (one for one in sent.metas if isinstance(one, FrameMeta))
+        *_, last = (meta for meta in sent.metas if isinstance(meta, FrameMeta))
         log = SentQuery([map_name], query, last.robot, last.session, caller.key_id, at=at)
         answer = await run_query(
             here, log, since,

@@ -178,7 +178,7 @@ class Events:
                 connection, wanted, after=least, before=before, limit=limit + 1,
                 newest_first=newest_first,
             )  # fmt: skip
-        items = [event_record(seals, one) for one in rows[:limit]]
+        items = [event_record(seals, row) for row in rows[:limit]]
         more = items[-1].id if len(rows) > limit else None
         return EventPage(items=items, next_cursor=more, newest=seals.seal("event", newest))
 
@@ -297,8 +297,8 @@ class Audit:
         before = seals.row("audit", cursor)
         with self._store.database.read() as connection:
             rows = audit_log.list_lines(connection, wanted, limit + 1, before=before)
-        more = seals.next_cursor("audit", [one.number for one in rows], limit)
-        return Page[AuditLine](items=[_audit_line(one) for one in rows[:limit]], next_cursor=more)
+        more = seals.next_cursor("audit", [row.number for row in rows], limit)
+        return Page[AuditLine](items=[_audit_line(row) for row in rows[:limit]], next_cursor=more)
 
 
 def _audit_line(row: AuditRow) -> AuditLine:

@@ -182,7 +182,7 @@ def _of_blobs(folder: Path) -> int:
     File names are hashes, so all subfolders have similar sizes.
     """
     try:
-        parts = sorted(one.path for one in os.scandir(folder) if one.is_dir())
+        parts = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir())
     except OSError:
         return 0
     total, seen = 0, 0
@@ -197,9 +197,9 @@ def _of_blobs(folder: Path) -> int:
 def _file_sizes(folder: Path) -> Iterator[int]:
     """Yield the size of each file in a folder, bytes."""
     try:
-        for one in os.scandir(folder):
-            if one.is_file(follow_symlinks=False):
-                yield _size(one)
+        for entry in os.scandir(folder):
+            if entry.is_file(follow_symlinks=False):
+                yield _size(entry)
     except OSError:
         return
 
@@ -485,7 +485,7 @@ def _recent_counts(
 def _latency(parts: list[dict[str, int]]) -> Latency | None:
     histogram = merged(parts)  # type: ignore[arg-type]
     quantiles = [quantile(histogram, share) for share in (0.5, 0.95, 0.99)]
-    if any(one is None for one in quantiles):
+    if any(value is None for value in quantiles):
         return None
-    p50, p95, p99 = (round(one, 6) for one in quantiles if one is not None)
+    p50, p95, p99 = (round(value, 6) for value in quantiles if value is not None)
     return Latency(p50=p50, p95=p95, p99=p99)

@@ -449,8 +449,8 @@ def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
     up = stored.surface.up
     flat = plan_axes(up)
     queried = [
-        QueriedPosition(pose[:3, 3], one)
-        for pose, one in zip(stored.held_out, outcomes, strict=True)
+        QueriedPosition(pose[:3, 3], outcome)
+        for pose, outcome in zip(stored.held_out, outcomes, strict=True)
     ]
     plans, width = coverage_plans(
         {"": queried}, {"": stored.poses[:, :3, 3]}, {"": PlanAxes(flat, "frames")}, None

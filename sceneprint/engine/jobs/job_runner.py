@@ -42,7 +42,7 @@ class JobRunner:
             KINDS["map"]: MapImporter(context, uploads, queries),
             KINDS["recording"]: RecordingImporter(context, uploads),
             SURFACE: SurfaceHandler(context.store, context.signers),
-            **{one.kind: one.run_slice for one in products},
+            **{product.kind: product.run_slice for product in products},
         }
         self._context = context
         self._tasks = Tasks(context.store, context.bell, self.handlers)

@@ -187,9 +187,9 @@ def list_jobs(
     with store.database.read() as connection:
         rows = list_stored(connection, before, limit + 1, state, kind, map_names)
     items = [
-        job_record(one.job, one.frame_id, one.map_name, one.followed_by) for one in rows[:limit]
+        job_record(row.job, row.frame_id, row.map_name, row.followed_by) for row in rows[:limit]
     ]
-    more = store.seals.next_cursor("job", [one.job.number for one in rows], limit)
+    more = store.seals.next_cursor("job", [row.job.number for row in rows], limit)
     return Page[Job](items=items, next_cursor=more)
 
 

@@ -166,7 +166,7 @@ def queue_task(
                 job_before = queue.find_job(connection, before["job_id"])
                 return job_record(job_before, None, map_name), True
         _check_files(store, files)
-        size = sum(one.bytes for one in files if one.name == ARCHIVE)
+        size = sum(file.bytes for file in files if file.name == ARCHIVE)
         unused = [] if row is None else make_room(connection, row, size, new=False)
         number = None if row is None else row.number
         job = queue.enqueue(connection, kind, None, priority, map_number=number, data=data)

@@ -176,7 +176,7 @@ class _Pull:
     def rows(self, head: MapCopy) -> dict[str, Row]:
         """Return the rows of all frames of the map, by frame id."""
         parts = self.own | self.fetched
-        return {name: row for one in head.parts for name, row in parts[one.digest].items()}
+        return {name: row for part in head.parts for name, row in parts[part.digest].items()}
 
 
 def pull_map(
@@ -222,10 +222,10 @@ def pull_map(
                 continue
             pull.fetched[digest] = rows
             if progress is not None:
-                total = sum(one.rows for one in head.parts if one.digest not in pull.own)
-                done = sum(one.rows for one in head.parts if one.digest in pull.fetched)
+                total = sum(part.rows for part in head.parts if part.digest not in pull.own)
+                done = sum(part.rows for part in head.parts if part.digest in pull.fetched)
                 progress(done, total)
-        if all(one.digest in pull.own or one.digest in pull.fetched for one in head.parts):
+        if all(part.digest in pull.own or part.digest in pull.fetched for part in head.parts):
             break
         idle = 0 if len(pull.fetched) > before else idle + 1
         if idle >= ROUNDS:
@@ -241,7 +241,7 @@ def pull_map(
 def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
     """Return the rows of a map in the store by part digest and frame id; empty without the map."""
     with store.database.read() as connection:
-        row = next((one for one in list_maps(connection) if one.name == map_name), None)
+        row = next((record for record in list_maps(connection) if record.name == map_name), None)
         if row is None:
             return {}
         return {
@@ -258,7 +258,7 @@ def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
     rows = list(read_rows(data, _NAMES))
     for _ in decoded_rows(COLUMNS, rows):  # checks the types of values
         pass
-    return {one[0]: one for one in rows}
+    return {row[0]: row for row in rows}
 
 
 def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) -> int:
@@ -288,7 +288,7 @@ def _changed(map_name: str) -> Conflict:
 
 def _find_copy(connection: Connection, head: MapCopy) -> MapRow | None:
     """Return the copy of a map; None without a copy, or if it is of a former map of this name."""
-    row = next((one for one in list_maps(connection) if one.name == head.name), None)
+    row = next((record for record in list_maps(connection) if record.name == head.name), None)
     if row is None or (row.created_at, row.model_id) != (head.created_at, head.model_id):
         return None
     return row
@@ -307,8 +307,8 @@ def _write(
         existing = living_rows(connection, row)
         deleted = [one for name, one in existing.items() if name not in rows]
         renewed = [
-            existing[one.id] for one in written
-            if one.id in existing and existing[one.id].content_id != one.values["content_id"]
+            existing[copy.id] for copy in written
+            if copy.id in existing and existing[copy.id].content_id != copy.values["content_id"]
         ]  # fmt: skip
         for some in blocks([one.number for one in (*deleted, *renewed)]):
             blobs += delete_frames(connection, row, list(some))
@@ -316,8 +316,8 @@ def _write(
         for one in written:
             if not store.blobs.holds(one.signature.geometry):
                 raise DamagedBlob(
-                    f"The artifact {one.signature.geometry[:12]} was removed during the pull. Pull "
-                    "the map again."
+                    f"The artifact {copy.signature.geometry[:12]} was removed during the pull. "
+                    "Pull the map again."
                 )
             if one.id in remaining:
                 write_frame(connection, row, existing[one.id], one.values)
@@ -348,7 +348,7 @@ def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: lis
     ------
     Conflict : If the copy has uploaded frames, which would be lost.
     """
-    rows = {one.name: one for one in list_maps(connection)}
+    rows = {record.name: record for record in list_maps(connection)}
     before, row = rows.get(head.name), _find_copy(connection, head)
     if before is not None:
         _require_copied(store, living_rows(connection, before).values(), head.name)
@@ -362,7 +362,7 @@ def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: lis
 
 def _require_copied(store: Store, rows: Iterable[FrameRow], map_name: str) -> None:
     """Raise Conflict if a frame was uploaded into the copy, that is, has an upload."""
-    own = [one.id for one in rows if store.blobs.holds(one.blob)]
+    own = [row.id for row in rows if store.blobs.holds(row.blob)]
     if own:
         raise Conflict(
             f"The copy of map {map_name!r} has {len(own)} uploaded frames, such as {own[0]}. "

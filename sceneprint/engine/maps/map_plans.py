@@ -149,7 +149,7 @@ def plan_changes(
         earlier, later = _by_place(before, name), _by_place(after, name)
         places = sorted({*earlier, *later}, key=lambda place: place[::-1])
         changes = [_change(place, earlier.get(place), later.get(place)) for place in places]
-        changes_here = [one for one in changes if one is not None]
+        changes_here = [change for change in changes if change is not None]
         changed.append(PlanChanges(parent_frame=name, cells=changes_here))
     return changed
 

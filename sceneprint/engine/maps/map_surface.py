@@ -229,18 +229,18 @@ class MapSurfaces:
                 block = stored.frames_seeing(
                     connection, surface, name, places, spot, beyond, _AT_ONCE
                 )
-            for one in block:
-                beyond = one.square, one.number
+            for row in block:
+                beyond = row.square, row.number
                 count += 1
-                if self._saw(one, spot, within):
-                    hits.append(one)
+                if self._saw(row, spot, within):
+                    hits.append(row)
                 if len(hits) == limit:
                     break
             if len(block) < _AT_ONCE and len(hits) < limit:
                 beyond = None
                 break
         more = None if beyond is None else self._moment(beyond)
-        items = [_sighting(one, name, math.sqrt(one.square)) for one in hits]
+        items = [_sighting(hit, name, math.sqrt(hit.square)) for hit in hits]
         return Page[SurfaceSighting](items=items, next_cursor=more)
 
     def frames_in(
@@ -265,7 +265,7 @@ class MapSurfaces:
             )
         last = rows[limit - 1] if len(rows) > limit else None
         more = None if last is None else self._moment((last.square, last.number))
-        items = [_sighting(one, name, None) for one in rows[:limit]]
+        items = [_sighting(row, name, None) for row in rows[:limit]]
         return Page[SurfaceSighting](items=items, next_cursor=more)
 
     def picture(
@@ -307,7 +307,7 @@ class MapSurfaces:
         def make() -> bytes:
             with self._store.database.read() as connection:
                 tiles = stored.list_tiles(connection, row.number, totals[0].parent, level)
-            points = (self._points(surface, one) for one in tiles)
+            points = (self._points(surface, tile) for tile in tiles)
             return surface_picture(plan, axes, points, surface.cell_m * FACTOR**level, (low, high))
 
         tag = tag_of("surface-plan", row.number, surface.updated_at, record["axes"], width, low,
@@ -525,7 +525,7 @@ def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | N
         parents=[
             _parent_record(surface, parent, own)
             for parent in surface.parents
-            if (own := [one for one in totals if one.parent == parent["parent_frame"]])
+            if (own := [level for level in totals if level.parent == parent["parent_frame"]])
         ],
     )  # fmt: skip
 
@@ -541,11 +541,11 @@ def _parent_record(
         low=vector(finest.low), high=vector(finest.high),
         levels=[
             SurfaceLevel(
-                level=one.level, cell_m=surface.cell_m * FACTOR**one.level,
-                tile_m=surface.cell_m * FACTOR**one.level * SIDE, tiles=one.tiles,
-                cells=one.cells, bytes=one.cells * CELL.itemsize,
+                level=level.level, cell_m=surface.cell_m * FACTOR**level.level,
+                tile_m=surface.cell_m * FACTOR**level.level * SIDE, tiles=level.tiles,
+                cells=level.cells, bytes=level.cells * CELL.itemsize,
             )
-            for one in totals
+            for level in totals
         ],
         plan=copy_fields(SurfacePlan, plan),
     )  # fmt: skip
@@ -596,7 +596,7 @@ def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[T
 
 def _drawn_level(surface: SurfaceRow, totals: Sequence[LevelTotals], plan: PlanFrame) -> int:
     """Return the coarsest level as fine as a pixel, or a coarser level that has fewer cells."""
-    fine = [one for one in totals if surface.cell_m * FACTOR**one.level <= plan.m_per_pixel]
+    fine = [level for level in totals if surface.cell_m * FACTOR**level.level <= plan.m_per_pixel]
     first = fine[-1].level if fine else 0
-    few = [one.level for one in totals if one.level >= first and one.cells <= _DRAWN_CELLS]
+    few = [level.level for level in totals if level.level >= first and level.cells <= _DRAWN_CELLS]
     return few[0] if few else totals[-1].level

@@ -232,13 +232,13 @@ class SurfaceHandler:
                 touching = stored.frames_touching(connection, numbers, last, _FRAMES)
                 frames = stored.fused_frames(connection, surface, touching)
             over = len(touching) < _FRAMES
-            for one in frames:
-                for key, cells in self._cells(surface, one, sessions).items():
+            for frame in frames:
+                for key, cells in self._cells(surface, frame, sessions).items():
                     if key in sums:
                         sums[key].append(cells)
-                last = one.number
+                last = frame.number
                 if is_over():
-                    over = over and one is frames[-1]
+                    over = over and frame is frames[-1]
                     break
             else:
                 last = touching[-1] if touching else last
@@ -268,7 +268,7 @@ class SurfaceHandler:
         new: Sequence[FusedFrame], is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
         """Fuse frames into the tiles that they overlap, while time allows."""
-        times = [one.captured_at for one in new if one.captured_at is not None]
+        times = [frame.captured_at for frame in new if frame.captured_at is not None]
         scale = scale_of(surface)
         if times and (scale is None or not scale.holds(min(times), max(times))):
             return self._change_scale(surface, progress)
@@ -277,12 +277,12 @@ class SurfaceHandler:
         touches: list[tuple[_Key, int]] = []
         added: list[FusedFrame] = []
         cell_count = 0
-        for one in new:
-            for key, cells in self._cells(surface, one, sessions).items():
+        for frame in new:
+            for key, cells in self._cells(surface, frame, sessions).items():
                 parts.setdefault(key, []).append(cells)
-                touches.append((key, one.number))
+                touches.append((key, frame.number))
                 cell_count += len(cells)
-            added.append(one)
+            added.append(frame)
             if is_over() or cell_count > _CELLS or len(parts) > _TILES:
                 break
         done = _Slice()
@@ -337,7 +337,7 @@ class SurfaceHandler:
             return ()
 
         progress["done"] = progress["total"]
-        result = {"frames": frames, "tiles": sum(one.tiles for one in totals)}
+        result = {"frames": frames, "tiles": sum(level.tiles for level in totals)}
         return SliceResult(True, progress, result=result, event=UPDATED, write=write)
 
     def _cells(
@@ -436,7 +436,7 @@ class SurfaceHandler:
                 )
                 values["parents"] = parent_records(
                     connection, addition.row,
-                    {one["parent_frame"]: one for one in surface.parents},
+                    {parent["parent_frame"]: parent for parent in surface.parents},
                 )  # fmt: skip
             if sessions.names != surface.sessions:
                 values["sessions"] = sessions.names
@@ -514,7 +514,7 @@ def _restart(surface: SurfaceRow, progress: dict[str, Any], keys: Sequence[_Key]
 
 def _first_cells(tiles: Sequence[TileRow]) -> list[TileRow]:
     """Return as many of the first tiles as have up to _CELLS cells in total, at least one."""
-    room = np.cumsum([one.cells for one in tiles]) <= _CELLS
+    room = np.cumsum([tile.cells for tile in tiles]) <= _CELLS
     return list(tiles[: max(int(room.sum()), 1)])
 
 

@@ -85,8 +85,8 @@ class Tombstones:
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
             deletions = list_deletions(connection, row.number, self._seconds, limit + 1, before)
-        more = self._store.seals.next_cursor("deletion", [one.number for one in deletions], limit)
-        items = [self._record(one) for one in deletions[:limit]]
+        more = self._store.seals.next_cursor("deletion", [row.number for row in deletions], limit)
+        items = [self._record(deletion) for deletion in deletions[:limit]]
         return Page[FrameDeletion](items=items, next_cursor=more)
 
     def restore_one(self, map_name: str, frame_id: str) -> None:
@@ -185,10 +185,10 @@ class Tombstones:
             oldest = oldest_tombstones(connection, row.number)
         return [number for number, _, at in oldest if everything or at <= over]
 
-    def _record(self, one: Deletion) -> FrameDeletion:
+    def _record(self, deletion: Deletion) -> FrameDeletion:
         return FrameDeletion(
-            deletion_id=str(one.number), at=when(one.at), until=when(one.at + self._seconds),
-            frames=one.frames,
+            deletion_id=str(deletion.number), at=when(deletion.at),
+            until=when(deletion.at + self._seconds), frames=deletion.frames,
         )  # fmt: skip
 
 

@@ -189,11 +189,13 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         progress["validated"] += len(matches)
         order = {number: i for i, number in enumerate(ranking.indices.tolist())}
         accepted = sorted(
-            (one for one in matches if one.validation.status == "accepted"),
+            (match for match in matches if match.validation.status == "accepted"),
             key=lambda one: order[one.index],
         )
         return [
-            _item(number, one) for one in accepted if one.validation.overlap >= request.min_overlap
+            _item(number, match)
+            for match in accepted
+            if match.validation.overlap >= request.min_overlap
         ]
 
     def finish(
@@ -228,15 +230,15 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             parents = [run.parent for run in posed_runs(connection, task.of_map.number)]
         place = {name: i for i, name in enumerate(dict.fromkeys(parents))}
         rooted: dict[str, ParentJoin] = {}
-        for one in joins:
-            ends = one["from_parent"], one["to_parent"]
-            if one["strength"] != "strong" or ends[0] == ends[1] or not place.keys() >= {*ends}:
+        for join in joins:
+            ends = join["from_parent"], join["to_parent"]
+            if join["strength"] != "strong" or ends[0] == ends[1] or not place.keys() >= {*ends}:
                 continue
             root, parent = sorted(ends, key=place.__getitem__)
-            T = np.array(one["transform"]["matrix"])
+            T = np.array(join["transform"]["matrix"])
             if parent in rooted or root in rooted:
                 continue
-            one["root"] = root
+            join["root"] = root
             rooted[parent] = ParentJoin(parent, root, T if root == ends[1] else inverse(T))
         return list(rooted.values())
 
@@ -375,9 +377,9 @@ def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> li
     ------
     Swept : If another association joined one of the parent frames, so the slice must be repeated.
     """
-    for one in joins:
-        if not join_parent(connection, task.of_map.number, one, task.job.id):
-            raise Swept(f"Another association has joined {one.parent} or {one.root} meanwhile.")
+    for join in joins:
+        if not join_parent(connection, task.of_map.number, join, task.job.id):
+            raise Swept(f"Another association has joined {join.parent} or {join.root} meanwhile.")
     return []
 
 

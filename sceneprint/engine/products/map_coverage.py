@@ -276,7 +276,7 @@ def _require_comparable(before: _Measured, after: _Measured) -> None:
 def _plans(connection: Connection, job: JobRow) -> list[CoveragePlan]:
     """Return the plans of a succeeded job, which are stored as items after those of the frames."""
     items = items_of(connection, job.number, (job.result or {})["frames"])
-    return [CoveragePlan.model_validate(one) for one in items]
+    return [CoveragePlan.model_validate(item) for item in items]
 
 
 def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> CoverageFrame:
@@ -309,7 +309,7 @@ def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict
         outcome = "unchecked" if off is None else "found" if _is_within(off, request) else "wrong"
     elif answer.status == "ambiguous":
         outcome = "ambiguous"
-    poses = [one.pose for one in answer.alternatives]
+    poses = [alternative.pose for alternative in answer.alternatives]
     if outcome == "wrong" and location is not None:
         poses = [location]
     elsewhere = [
@@ -347,11 +347,11 @@ def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
     frame_ids: list[str] = []
     for pose in poses:
         near = [
-            (off[0], one.frame_id)
-            for one in answer.matches
-            if one.pose_in_map is not None
-            and (off := _difference(pose, np.array(one.pose_in_map.matrix),
-                                    one.pose_in_map.parent_frame)) is not None
+            (off[0], match.frame_id)
+            for match in answer.matches
+            if match.pose_in_map is not None
+            and (off := _difference(pose, np.array(match.pose_in_map.matrix),
+                                    match.pose_in_map.parent_frame)) is not None
             and off[0] <= _SAME_POSE_M
         ]  # fmt: skip
         if near:

@@ -129,14 +129,15 @@ def _placed(
 def _joined(parent: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, Floats]]:
     """Return the neighbours of a parent frame by joins: name and T_parent_neighbour (4, 4)."""
     neighbours = []
-    for one in joins:
-        if one["transform"] is None or one["from_parent"] == one["to_parent"] or one.get("undone"):
+    for join in joins:
+        is_loop = join["from_parent"] == join["to_parent"]
+        if join["transform"] is None or is_loop or join.get("undone"):
             continue
-        T = np.array(one["transform"]["matrix"])
-        if one["to_parent"] == parent:
-            neighbours.append((one["from_parent"], T))
-        if one["from_parent"] == parent:
-            neighbours.append((one["to_parent"], inverse(T)))
+        T = np.array(join["transform"]["matrix"])
+        if join["to_parent"] == parent:
+            neighbours.append((join["from_parent"], T))
+        if join["from_parent"] == parent:
+            neighbours.append((join["to_parent"], inverse(T)))
     return neighbours
 
 

@@ -130,8 +130,8 @@ class Products(ABC, Generic[Request, Record]):
         with self._store.database.read() as connection:
             find_map(connection, map_name)
             rows = queue.list_jobs(connection, before, limit + 1, None, self.kind, [map_name])
-        more = seals.next_cursor("job", [one.job.number for one in rows], limit)
-        items = [self.record_of(one.job, map_name) for one in rows[:limit]]
+        more = seals.next_cursor("job", [row.job.number for row in rows], limit)
+        items = [self.record_of(row.job, map_name) for row in rows[:limit]]
         return Page[self.record](items=items, next_cursor=more)  # type: ignore[name-defined]
 
     def get(self, map_name: str | None, job_id: str) -> Record:

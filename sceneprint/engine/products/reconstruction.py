@@ -124,7 +124,7 @@ def fused(
             continue
         frames.append(prepare_view(frame, p))
         parts.append(_fused_view(view, frames[-1], source))
-    others = [frame for frame, one in zip(frames, parts, strict=True) if one.frame_id is not None]
+    others = [frame for frame, part in zip(frames, parts, strict=True) if part.frame_id is not None]
     if not others:
         raise UselessFrame(
             f"None of the {len(views)} matches can be fused: {left_out[0].reason} Use another "
@@ -137,7 +137,9 @@ def fused(
     as_mesh = request.output == "mesh"
     seen = None if query is None else query.surface.points[query.surface.valid].astype(np.float64)
     coverage = Coverage(
-        views=[one.model_copy(update={"added_m2": a}) for one, a in zip(parts, added, strict=True)],
+        views=[
+            part.model_copy(update={"added_m2": a}) for part, a in zip(parts, added, strict=True)
+        ],
         left_out=left_out,
         area_m2=float(sum(added)),
         observed_volume_m3=volume,
@@ -277,7 +279,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
             except Swept:
                 continue
             except BaseException:
-                collect_deleted_blobs(self._store, [one.blob for one in files])
+                collect_deleted_blobs(self._store, [file.blob for file in files])
                 raise
             return self.get(None, job.job_id)
 
@@ -359,7 +361,7 @@ def _is_current(connection: Connection, job: JobRow) -> bool:
     """Return whether all frames of a job exist or can be restored."""
     data = job.data or {}
     views = [*data["views"], *([] if data["own"] is None else [data["own"]])]
-    places = {(one["map"], one["frame_id"]) for one in views}
+    places = {(view["map"], view["frame_id"]) for view in views}
     statement = (
         select(maps.c.name, frames.c.id)
         .join(maps, maps.c.number == frames.c.map_number)

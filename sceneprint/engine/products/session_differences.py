@@ -215,7 +215,7 @@ class Differences(Products[NewDifference, Difference]):
         )  # fmt: skip
         groups = [positions[side][states[side] == own] for side, own in kinds]
         points = np.concatenate(groups)
-        counts = [len(one) for one in groups]
+        counts = [len(group) for group in groups]
         with self._store.database.read() as connection:
             axes = parent_axes(connection, row, frames["before"] + frames["after"]).axes
         result = DifferenceResult(

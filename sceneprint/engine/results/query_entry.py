@@ -61,27 +61,27 @@ _PARTS = struct.Struct("<II")
 DAMAGED = (ValueError, KeyError, TypeError, ValidationError, struct.error)
 
 
-def encode_answer(one: StoredAnswer) -> bytes:
+def encode_answer(stored: StoredAnswer) -> bytes:
     """Encode an answer as bytes."""
     head = json.dumps(
         {
-            "answer": one.answer.model_dump(mode="json"),
+            "answer": stored.answer.model_dump(mode="json"),
             # omit the maps, which are in the answer, and unset fields: defaults of `validation`
             # depend on the model
-            "query": one.query.model_dump(
+            "query": stored.query.model_dump(
                 mode="json", include=set(Query.model_fields), exclude_unset=True
             ),
-            "model_id": one.model_id,
-            "geometry": one.geometry is not None,
-            "ranked": one.ranked,
-            "at": one.at,
-            "taken": asdict(one.origin),
-            "base": None if one.base is None else [one.base[0], one.base[1].tolist()],
-            "up": None if one.up is None else one.up.tolist(),
+            "model_id": stored.model_id,
+            "geometry": stored.geometry is not None,
+            "ranked": stored.ranked,
+            "at": stored.at,
+            "taken": asdict(stored.origin),
+            "base": None if stored.base is None else [stored.base[0], stored.base[1].tolist()],
+            "up": None if stored.up is None else stored.up.tolist(),
         }
     ).encode()
-    vector = one.vector.tobytes()
-    return _PARTS.pack(len(head), len(vector)) + head + vector + (one.geometry or b"")
+    vector = stored.vector.tobytes()
+    return _PARTS.pack(len(head), len(vector)) + head + vector + (stored.geometry or b"")
 
 
 def decode_answer(data: bytes) -> StoredAnswer:
@@ -146,7 +146,7 @@ def query_row(sent: SentQuery, outcome: Answer | Exception, seconds: float) -> N
         return replace(row, cause="internal-error", reason=reason)
     location = outcome.location
     places = [location, *outcome.alternatives, *outcome.matches]
-    own = next((one.map for one in places if one is not None and one.map is not None), None)
+    own = next((place.map for place in places if place is not None and place.map is not None), None)
     row = replace(
         row, id=outcome.query_id, map=own if several and own else row.map, status=outcome.status,
         cause=outcome.cause, reason=outcome.reason, kind=outcome.kind,

@@ -196,7 +196,7 @@ class QueryLog:
             rows = [one.row for one in batch if one.row.listed or one.row.bytes]
             with self._store.database.write() as connection:
                 add_queries(connection, rows)
-            self._bytes_written += sum(one.bytes for one in rows)
+            self._bytes_written += sum(row.bytes for row in rows)
         except ReadOnlyStore as error:
             loss_reason = str(error)
         except SceneprintError as error:
@@ -209,9 +209,9 @@ class QueryLog:
             loss_reason = "an unexpected error"
         self._written_at = time.monotonic()
         with self._changed:
-            for one in batch[: len(self._waiting)]:  # `close` may have emptied the list
+            for waiting in batch[: len(self._waiting)]:  # `close` may have emptied the list
                 self._waiting.popleft()
-                self._bytes_waiting -= one.size
+                self._bytes_waiting -= waiting.size
             self._settled += len(batch)
             self._flushing = self._flushing and len(self._waiting) > 0
             if loss_reason is not None:
@@ -225,18 +225,18 @@ class QueryLog:
     def _write_file(self, one: _Waiting) -> None:
         if one.answer is None or one.row.bytes:  # stored by an earlier attempt
             return
-        data = encode_answer(one.answer)
+        data = encode_answer(entry.answer)
         if len(data) > self._room:
             return
         try:
-            self._files.put(one.row.id, data)
+            self._files.put(entry.row.id, data)
         except (OSError, UnusableStore) as error:
             if not self._unstorable:  # log only the first of consecutive failures
                 log.warning("answers cannot be stored", extra={"error": str(error)})
             self._unstorable = True
             return
         self._unstorable = False
-        one.row = replace(one.row, bytes=len(data))
+        entry.row = replace(entry.row, bytes=len(data))
 
     def _lose(self, count: int, reason: str) -> None:
         self._lost += count

@@ -136,18 +136,18 @@ def answer(
     # search the last frame first, so that a deadline only excludes votes of earlier frames
     last = _attempt(store, places, model, prepared, query, deadline, prior, clock)
     before = [
-        _attempt(store, places, model, one.prepared, query, deadline, prior) for one in earlier
+        _attempt(store, places, model, frame.prepared, query, deadline, prior) for frame in earlier
     ]
     if before:
         clock.stage("earlier")
     estimate = None
     if prepared.geometry is not None:
         database = _StoredDatabase(store, [*before, last], prior, model, query, deadline)
-        poses = [*(one.T for one in earlier), np.eye(4)]
+        poses = [*(frame.T for frame in earlier), np.eye(4)]
         frames = [
-            QueryFrame(one.prepared.geometry, one.matches, T)
-            for one, T in zip(database.attempts, poses, strict=True)
-            if one.prepared.geometry is not None
+            QueryFrame(attempt.prepared.geometry, attempt.matches, T)
+            for attempt, T in zip(database.attempts, poses, strict=True)
+            if attempt.prepared.geometry is not None
         ]
         estimate = decide(frames, last.searched.ranking, database, numbers_of(model, query))
         last = database.attempts[-1]
@@ -169,8 +169,9 @@ class _StoredDatabase:
         self._query, self._deadline = query, deadline
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
-        rows = {number: row for one in self.attempts for number, row in one.rows.items()}
-        geometries = {n: g for one in self.attempts for n, g in one.checks.geometries.items()}
+        rows = {number: row for attempt in self.attempts for number, row in attempt.rows.items()}
+        checks = [attempt.checks for attempt in self.attempts]
+        geometries = {n: g for check in checks for n, g in check.geometries.items()}
         return placed(
             self._store, self.attempts[-1].searched, geometries, rows, frames, self._prior,
             self._model, self._query,
@@ -184,7 +185,7 @@ class _StoredDatabase:
         self.attempts[frame] = replace(
             before,
             checks=replace(checks, geometries=before.checks.geometries | checks.geometries),
-            matches=[one for one in checks.matches if one.index in before.rows],
+            matches=[match for match in checks.matches if match.index in before.rows],
         )
         return self.attempts[frame].matches
 
@@ -200,12 +201,12 @@ class _StoredDatabase:
         positions = np.flatnonzero(np.isin(last.searched.ranking.indices, rows)).tolist()
         more = self._validated(last, positions, retry=False)
         with self._store.database.read() as connection:
-            known = frames_of(connection, [one.index for one in more.matches])
+            known = frames_of(connection, [match.index for match in more.matches])
         self.attempts[-1] = replace(
             last,
             checks=replace(last.checks, geometries=last.checks.geometries | more.geometries),
             rows=last.rows | known,
-            rivals=[one for one in more.matches if one.index in known],
+            rivals=[match for match in more.matches if match.index in known],
             late=bool(more.late),
         )
         return self.attempts[-1].rivals
@@ -248,7 +249,7 @@ def _attempt(
     shown = range(len(ranking)) if query.explain else chosen
     with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
-    matches = [one for one in checks.matches if one.index in rows]  # without deleted frames
+    matches = [match for match in checks.matches if match.index in rows]  # without deleted frames
     return _Attempt(prepared, searched, selection, among, scales, chosen, checks, rows, matches)
 
 
@@ -260,8 +261,8 @@ def _answer(
     prepared, searched, p = last.prepared, last.searched, model.parameters.validation
     ranking, checks = searched.ranking, _validate_more(store, last, query, deadline, p)
     clock.stage("validate")
-    rivals_left = [one for one in last.rivals if one.validation.status != "rejected"]
-    matches = [*(one for one in checks.matches if one.index in last.rows), *rivals_left]
+    rivals_left = [rival for rival in last.rivals if rival.validation.status != "rejected"]
+    matches = [*(match for match in checks.matches if match.index in last.rows), *rivals_left]
     names = {place.row.number: place.row.name for place in places}
     sensor = query_sensor(prepared.name, prepared.kind, list(names.values()))
     candidates = Candidates(
@@ -318,11 +319,11 @@ def _listed_matches(
     candidates: Candidates, last: _Attempt, checks: Validated, rivals: Sequence[PairMatch], k: int
 ) -> list[Match]:
     """Return the match records of the candidates and the rivals, with at most `k` accepted ones."""
-    shown = listed([one for one in checks.matches if one.index in last.rows], k)
-    hidden = {one.index for one in checks.matches} - {one.index for one in shown}
+    shown = listed([match for match in checks.matches if match.index in last.rows], k)
+    hidden = {match.index for match in checks.matches} - {match.index for match in shown}
     order = candidates.ranking.indices.tolist()
     chosen = [position for position in last.chosen if order[position] not in hidden]
-    beyond = [order.index(one.index) for one in rivals]
+    beyond = [order.index(rival.index) for rival in rivals]
     return match_records(candidates, [*chosen, *beyond], [*shown, *rivals])
 
 
@@ -331,10 +332,10 @@ def _validate_more(
 ) -> Validated:
     """Validate further candidates if `k` requires it; return the validations of all candidates."""
     checks = last.checks
-    accepted = sum(one.validation.status == "accepted" for one in checks.matches)
+    accepted = sum(match.validation.status == "accepted" for match in checks.matches)
     rest = [position for position in last.chosen if position not in checks.chosen]
     if query.k > VERDICT_MATCHES and (rest or accepted == VERDICT_MATCHES) and not checks.late:
-        known = {one.index: one.validation for one in checks.matches}
+        known = {match.index: match.validation for match in checks.matches}
         return validated(
             store, last.searched, [*checks.chosen, *rest], last.prepared.geometry, query, deadline,
             p, last.prepared.up, known, k=query.k, retry=False,
@@ -379,7 +380,9 @@ def _counts(
     part, hits = searched.parts[i], searched.hits[i]
     number = part.place.row.number
     statuses = [
-        one.validation.status for one in matches if candidates.rows[one.index].map_number == number
+        match.validation.status
+        for match in matches
+        if candidates.rows[match.index].map_number == number
     ]
     own = searched.owners == i
     return Counts(
@@ -425,14 +428,14 @@ def answer_status(
     """
     if "validate" not in query.stages:
         return Outcome("unvalidated", "validation was not requested")
-    accepted = [one for one in matches if one.validation.status == "accepted"]
+    accepted = [match for match in matches if match.validation.status == "accepted"]
     if accepted and not posed:
         return Outcome(
             "found",
             f"{len(accepted)} matches are accepted, but none has a pose in the map; `best` "
             "contains the transform to the first match",
         )
-    unsure = next((one for one in matches if one.validation.status == "ambiguous"), None)
+    unsure = next((match for match in matches if match.validation.status == "ambiguous"), None)
     decided = estimate is not None and estimate.status == "found"
     if estimate is not None and (decided or accepted or (estimate.alternatives and not unsure)):
         return Outcome(estimate.status, estimate.reason)
@@ -457,7 +460,7 @@ def _likeliest_cause(
         if counts.map:
             return "no_frames", "no frame of the map passes the filter. Widen the filter"
         return "no_frames", "the map has no indexed frames. Upload frames of the place"
-    tilted = next((one for one in matches if one.validation.contradicts_up), None)
+    tilted = next((match for match in matches if match.validation.contradicts_up), None)
     if tilted is not None:
         return "gravity", tilted.validation.reason
     if geometry is not None:

@@ -173,7 +173,7 @@ class IndexPlace:
         numbered = _numbered(listed)
         if self._store is None or not numbered:
             return
-        now = max(one.changed_at for one in listed)  # by the clock of the object store
+        now = max(entry.changed_at for entry in listed)  # by the clock of the object store
         before = math.inf if clean else now - GRACE_S
         fetchable = [one for one, after in pairwise(numbered) if after.changed_at >= before]
         needed = set[str]()
@@ -307,7 +307,7 @@ class IndexPlace:
             now = find_map(connection, row.name)
             if now.number != row.number or trusted(connection, now, manifest) is None:
                 return None
-        missing = [one for one in manifest.files if not _is_here(folder, *one)]
+        missing = [file for file in manifest.files if not _is_here(folder, *file)]
         with suppress(DamagedIndex):
             if not missing and read_manifest(folder / manifest.name) == manifest:
                 return manifest
@@ -430,7 +430,8 @@ def _number(listed: ListedObject) -> int | None:
 
 def _numbered(listed: Iterable[ListedObject]) -> list[ListedObject]:
     """Return the manifests among objects, newest last."""
-    return sorted((one for one in listed if _number(one) is not None), key=lambda one: one.key)
+    numbered = (entry for entry in listed if _number(entry) is not None)
+    return sorted(numbered, key=lambda entry: entry.key)
 
 
 def _is_here(folder: Path, name: str, size: int) -> bool:

@@ -269,7 +269,7 @@ class Queries:
         def ask(rows: list[MapRow]) -> Answer:
             signer = self._signers(rows[0].model_id)
             decoders = self._store.decoders
-            *before, last = [prepare_upload(*one, signer, query, decoders) for one in frames]
+            *before, last = [prepare_upload(*frame, signer, query, decoders) for frame in frames]
             earlier = [
                 SequenceFrame(one, inverse(_odometry(last)) @ _odometry(one)) for one in before
             ]
@@ -379,7 +379,7 @@ class Queries:
                 tuple(ranked), origin=prepared.origin, base=prepared.base, up=prepared.up,
             )  # fmt: skip
 
-            shown = {ranked[one.rank - 1] for one in response.explanations or response.matches}
+            shown = {ranked[part.rank - 1] for part in response.explanations or response.matches}
             shown |= set() if prepared.frame is None else {prepared.frame[0]}
         self._log.note(replace(row, listed=listed), stored, sorted(shown))
 
@@ -476,7 +476,7 @@ def check_localizes(query: Query) -> None:
 
 def localization_of(answer: Answer) -> Localization:
     """Convert the answer to a validated query of one map to a pose with its confidence."""
-    accepted = [one for one in answer.matches if one.validation.status == "accepted"]
+    accepted = [match for match in answer.matches if match.validation.status == "accepted"]
     status: LocalizationStatus = "not_found"
     if answer.status in ("found", "ambiguous"):
         status = answer.status

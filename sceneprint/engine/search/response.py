@@ -97,8 +97,8 @@ class Candidates:
 
 def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
     """Return matches without the accepted matches beyond the first `k`."""
-    accepted = [one.index for one in matches if one.validation.status == "accepted"]
-    return [one for one in matches if one.index not in accepted[k:]]
+    accepted = [match.index for match in matches if match.validation.status == "accepted"]
+    return [match for match in matches if match.index not in accepted[k:]]
 
 
 def match_records(
@@ -155,13 +155,13 @@ def alternative_records(
     number, _, parent = estimate.parent.partition(" ")
     return [
         AlternativeRecord(
-            pose=transform(one.T, parent, candidates.query_frame),
+            pose=transform(alternative.T, parent, candidates.query_frame),
             map=candidates.maps[int(number)],
-            confidence=one.confidence,
-            evidence=evidence_record(one.evidence),
-            support=one.support,
+            confidence=alternative.confidence,
+            evidence=evidence_record(alternative.evidence),
+            support=alternative.support,
         )
-        for one in estimate.alternatives
+        for alternative in estimate.alternatives
     ]
 
 
@@ -237,7 +237,7 @@ def uncertainty_record(
             rotation=vector(one.rotation.tolist()),
             deviation=one.deviation,
         )
-        for one in free_directions(covariance, p)
+        for direction in free_directions(covariance, p)
     ]
     return Uncertainty(covariance=covariance.ravel().tolist(), method=method, degenerate=free)
 
@@ -490,7 +490,7 @@ def _aligned(
     geometry = case.prepared.geometry
     if geometry is None:
         return None, None
-    earlier: dict[int, PairValidation] = {one.index: one.validation for one in case.checks.matches}
+    earlier: dict[int, PairValidation] = {m.index: m.validation for m in case.checks.matches}
     aligned = earlier.get(row.number)
     if aligned is None:
         if not case.deadline.allows():

@@ -346,7 +346,7 @@ class Searched:
     @property
     def exact(self) -> bool:
         """Whether all frames that pass the filter were compared."""
-        return all(one.exact for one in self.hits)
+        return all(hit.exact for hit in self.hits)
 
     def signatures(self) -> Bytes:
         """Return the signatures (r, D) of the frames of R."""
@@ -384,9 +384,9 @@ def search_maps(
         )
         for part in parts
     )
-    keys = np.concatenate([one.keys for one in hits])
-    all_distances = np.concatenate([one.distances for one in hits])
-    owners = np.repeat(np.arange(len(parts)), [len(one) for one in hits])
+    keys = np.concatenate([hit.keys for hit in hits])
+    all_distances = np.concatenate([hit.distances for hit in hits])
+    owners = np.repeat(np.arange(len(parts)), [len(hit) for hit in hits])
     first = np.lexsort((keys, all_distances))[:size]  # ties in upload order
     distances = all_distances[first]
     shares = similarity(distances, model.unrelated_distance)

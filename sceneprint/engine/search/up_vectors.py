@@ -41,8 +41,8 @@ def known_ups(connection: Connection, numbers: Iterable[int]) -> dict[int, Float
         up vector of the parent frame
     """
     groups: dict[tuple[int, str | None], list[FrameUp]] = {}
-    for one in frame_ups(connection, numbers):
-        groups.setdefault((one.map_number, one.parent), []).append(one)
+    for frame in frame_ups(connection, numbers):
+        groups.setdefault((frame.map_number, frame.parent), []).append(frame)
     return {number: up for group in groups.values() for number, up in _of_parent(group).items()}
 
 
@@ -64,17 +64,17 @@ def parent_up(connection: Connection, numbers: Iterable[int]) -> Floats | None:
 def _of_parent(group: Sequence[FrameUp]) -> dict[int, Floats]:
     shared, sure = _shared_up(group)
     ups = {}
-    for one in group:
-        own = None if one.up is None else np.array(one.up)
+    for frame in group:
+        own = None if frame.up is None else np.array(frame.up)
         implied = None
-        if shared is not None and one.pose is not None:
-            implied = np.array(one.pose)[:3, :3].T @ shared
+        if shared is not None and frame.pose is not None:
+            implied = np.array(frame.pose)[:3, :3].T @ shared
         if own is None or implied is None:
             up = implied if own is None else own
         else:
             up = own if own @ implied >= math.cos(AGREE) else implied if sure else None
         if up is not None:
-            ups[one.number] = up
+            ups[frame.number] = up
     return ups
 
 
@@ -83,9 +83,9 @@ def _shared_up(group: Sequence[FrameUp]) -> tuple[Floats | None, bool]:
     if group[0].map_up is not None:
         return np.array(group[0].map_up), True
     ups = [
-        np.array(one.pose)[:3, :3] @ np.array(one.up)
-        for one in group
-        if one.pose is not None and one.up is not None
+        np.array(frame.pose)[:3, :3] @ np.array(frame.up)
+        for frame in group
+        if frame.pose is not None and frame.up is not None
     ]
     if len(ups) < _FEWEST:
         return None, False

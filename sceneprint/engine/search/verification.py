@@ -118,7 +118,7 @@ def validated(
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
         ups = {} if up is None else known_ups(connection, ranking.indices.tolist())
         viewpoints = viewpoints_among(connection, list(blobs)) if guided else []
-    posed = {one.number: (parent_key(one), one.pose) for one in viewpoints}
+    posed = {viewpoint.number: (parent_key(viewpoint), viewpoint.pose) for viewpoint in viewpoints}
     unreadable: dict[int, str] = {}
     loaded: dict[int, Geometry] = {}
 
@@ -191,7 +191,8 @@ def placed(
     poses = {number: np.array(row.pose) for number, row in rows.items() if row.pose is not None}
     parents = {number: parent_key(rows[number]) for number in poses}
     frames = [
-        replace(one, matches=[m for m in one.matches if m.index in poses]) for one in query_frames
+        replace(frame, matches=[m for m in frame.matches if m.index in poses])
+        for frame in query_frames
     ]
     own_p, agreement = numbers_of(model, query), model.parameters.validation.agreement
 
@@ -307,7 +308,7 @@ def nearest_first(
     """Sort candidates (positions in R): first those near a prior, then the others."""
     with store.database.read() as connection:
         viewpoints = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
-    posed = {one.number: one for one in viewpoints}
+    posed = {viewpoint.number: viewpoint for viewpoint in viewpoints}
 
     def far(position: int) -> bool:
         one = posed.get(int(ranking.indices[position]))
@@ -338,8 +339,8 @@ def _near_frames(
                 )  # fmt: skip
                 if len(near) == _NEAR_FRAMES:
                     break
-            frames |= {one.number: one for one in near}
+            frames |= {frame.number: frame for frame in near}
     passing = set(frames)
     if part.among is not None:
         passing = set(np.intersect1d(list(frames), part.among).tolist())
-    return {n: one for n, one in frames.items() if n in passing and n not in part.dead}
+    return {n: frame for n, frame in frames.items() if n in passing and n not in part.dead}

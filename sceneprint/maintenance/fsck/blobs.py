@@ -114,44 +114,44 @@ def _tiles(blob: Column[str]) -> Select[Any]:
 # Repairs of references to lost blobs, and to damaged blobs, which were moved to quarantine.
 
 
-def _note_loss(connection: Connection, one: BlobReference, condition: Condition) -> str:
-    waiting = one.state in _BEING_SIGNED
-    state = FrameState.FAILED if waiting else one.state
-    loss = reason_of_loss(condition, found=one.state == FrameState.INDEXED)
-    if one.reason is not None and one.state == FrameState.REJECTED:
-        loss = f"{one.reason}; {loss}"
-    own = update(frames).where(frames.c.number == one.number)
+def _note_loss(connection: Connection, reference: BlobReference, condition: Condition) -> str:
+    waiting = reference.state in _BEING_SIGNED
+    state = FrameState.FAILED if waiting else reference.state
+    loss = reason_of_loss(condition, found=reference.state == FrameState.INDEXED)
+    if reference.reason is not None and reference.state == FrameState.REJECTED:
+        loss = f"{reference.reason}; {loss}"
+    own = update(frames).where(frames.c.number == reference.number)
     connection.execute(own.values(state=state, reason=loss))
     if waiting:
-        cancel_jobs(connection, jobs.c.frame_number == one.number)
-        record_event(connection, "frame.failed", str(one.map), one.frame_id)
+        cancel_jobs(connection, jobs.c.frame_number == reference.number)
+        record_event(connection, "frame.failed", str(reference.map), reference.frame_id)
     return f"the frame is {state}, and its reason describes the loss"
 
 
-def _clear_loss(connection: Connection, one: BlobReference) -> str:
-    own = update(frames).where(frames.c.number == one.number)
-    if one.state != FrameState.FAILED:
-        connection.execute(own.values(reason=without_loss(one.reason)))
+def _clear_loss(connection: Connection, reference: BlobReference) -> str:
+    own = update(frames).where(frames.c.number == reference.number)
+    if reference.state != FrameState.FAILED:
+        connection.execute(own.values(reason=without_loss(reference.reason)))
         return "cleared"
     connection.execute(own.values(state=FrameState.RECEIVED, reason=None))
-    return f"job {enqueue(connection, 'sign', one.number).id} is queued"
+    return f"job {enqueue(connection, 'sign', reference.number).id} is queued"
 
 
-def _rebuild_artifact(connection: Connection, one: BlobReference, _: Condition) -> str:
-    if is_known_loss(one.reason):
+def _rebuild_artifact(connection: Connection, reference: BlobReference, _: Condition) -> str:
+    if is_known_loss(reference.reason):
         return "its upload is lost too: upload the frame again"
-    if not one.on_its_way:
-        enqueue(connection, REENCODE, one.number, PRIORITY, one.name)
+    if not reference.on_its_way:
+        enqueue(connection, REENCODE, reference.number, PRIORITY, reference.name)
     return "a worker computes it again from the upload"
 
 
-def _remove_job_file(connection: Connection, one: BlobReference, _: Condition) -> str:
-    remove_parts(connection, one.number, items=False, files=[one.name])
+def _remove_job_file(connection: Connection, reference: BlobReference, _: Condition) -> str:
+    remove_parts(connection, reference.number, items=False, files=[reference.name])
     return "the file is removed from the job"
 
 
-def _rebuild_tile(connection: Connection, one: BlobReference, _: Condition) -> str:
-    tile = tile_of_number(connection, one.number)
+def _rebuild_tile(connection: Connection, reference: BlobReference, _: Condition) -> str:
+    tile = tile_of_number(connection, reference.number)
     if tile is not None:
         schedule_rebuild(connection, tile)
     return "a worker computes it again from the frames"
@@ -243,9 +243,9 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
             )  # fmt: skip
 
 
-def _is_recovered(one: BlobReference, condition: Condition) -> bool:
+def _is_recovered(reference: BlobReference, condition: Condition) -> bool:
     """Return whether an upload is sound although the reason of its frame states its loss."""
-    return one.kind == "upload" and condition == "sound" and is_known_loss(one.reason)
+    return reference.kind == "upload" and condition == "sound" and is_known_loss(reference.reason)
 
 
 def check_products(folder: Folder) -> Iterator[Finding]:
@@ -257,25 +257,27 @@ def check_products(folder: Folder) -> Iterator[Finding]:
         yield from check_blobs(folder, "tile", numbers)
 
 
-def _current_reference(connection: Connection, one: BlobReference) -> BlobReference | None:
+def _current_reference(connection: Connection, reference: BlobReference) -> BlobReference | None:
     """Read a reference again; return None if the row no longer refers to the blob."""
-    references = _read(one.kind, connection, [one.number])
-    return next((o for o in references if (o.digest, o.name) == (one.digest, one.name)), None)
+    references = _read(reference.kind, connection, [reference.number])
+    return next(
+        (o for o in references if (o.digest, o.name) == (reference.digest, reference.name)), None
+    )
 
 
-def _repair(folder: Folder, one: BlobReference) -> str:
+def _repair(folder: Folder, reference: BlobReference) -> str:
     # one transaction, so that the repair does not remove a new upload of the same bytes
     with folder.store.database.write() as connection:
         now, condition = (
-            _current_reference(connection, one),
-            folder.store.blobs.condition(one.digest),
+            _current_reference(connection, reference),
+            folder.store.blobs.condition(reference.digest),
         )
         if now is not None and _is_recovered(now, condition):
             return _clear_loss(connection, now)
         if now is None or condition == "sound":
             return GONE
-        moved = quarantine_blob(folder, one.digest) if condition == "damaged" else ""
-        return moved + _KINDS[one.kind].repair(connection, now, condition)
+        moved = quarantine_blob(folder, reference.digest) if condition == "damaged" else ""
+        return moved + _KINDS[reference.kind].repair(connection, now, condition)
 
 
 #: Age in seconds from which an unfinished file is reported.

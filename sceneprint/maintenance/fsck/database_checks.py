@@ -81,7 +81,7 @@ def check_database(folder: Folder) -> Iterator[Finding]:
         pragma = "quick_check" if folder.quick else "integrity_check"
         with database.read() as connection:
             lines = connection.execute(text(f"PRAGMA {pragma}({_MOST})")).scalars().all()
-        yield from (damaged_database(" ".join(one.split())) for one in lines if one != "ok")
+        yield from (damaged_database(" ".join(line.split())) for line in lines if line != "ok")
     keys = [] if folder.quick else [
         key for table in metadata.sorted_tables
         for key in sorted(table.foreign_key_constraints, key=lambda one: str(one.name))
@@ -93,7 +93,7 @@ def check_database(folder: Folder) -> Iterator[Finding]:
 
 def _dangling(folder: Folder, key: ForeignKeyConstraint) -> Iterator[Finding]:
     child, parent = key.table, key.referred_table
-    pairs = [(one.parent, one.column) for one in key.elements]
+    pairs = [(element.parent, element.column) for element in key.elements]
     lost = (
         select(*child.primary_key.columns)
         .join(parent, and_(*(own == its for own, its in pairs)), isouter=True)
@@ -254,56 +254,58 @@ def _signatures(folder: Folder, numbers: list[int]) -> Select[Any]:
 def _is_sound(model: Model | None, vector: bytes, checksum: int, *counts: str | bytes) -> bool:
     """Return whether the checksum and length of a signature are correct."""
     try:
-        readable = all(isinstance(json.loads(one), list) for one in counts)
+        readable = all(isinstance(json.loads(count), list) for count in counts)
         fits = model is None or len(vector) == model.signature_bytes
         return readable and fits and crc32(vector) == checksum
     except (ValueError, TypeError):
         return False
 
 
-def _is_indexed(one: _CheckedFrame) -> bool:
-    return one.frame.state == FrameState.INDEXED
+def _is_indexed(checked: _CheckedFrame) -> bool:
+    return checked.frame.state == FrameState.INDEXED
 
 
-def _damaged(one: _CheckedFrame) -> set[str]:
+def _damaged(checked: _CheckedFrame) -> set[str]:
     """Return the models of the map by which an indexed frame has a damaged signature."""
-    own = (one.map.model_id, one.map.next_model_id) if _is_indexed(one) else ()
-    return {model_id for model_id, sound in one.signed.items() if not sound and model_id in own}
+    own = (checked.map.model_id, checked.map.next_model_id) if _is_indexed(checked) else ()
+    return {model_id for model_id, sound in checked.signed.items() if not sound and model_id in own}
 
 
-def _stray(one: _CheckedFrame) -> set[str]:
+def _stray(checked: _CheckedFrame) -> set[str]:
     """Return the models by which a frame has signatures that it should not have."""
-    if one.frame.deletion is not None:
+    if checked.frame.deletion is not None:
         return set()  # keep them, since the deletion may be undone
-    if one.frame.state in _GONE:
-        return set(one.signed)
+    if checked.frame.state in _GONE:
+        return set(checked.signed)
     # a signature of an unsigned frame would prevent signing
-    own = {one.map.model_id} if _is_indexed(one) else set[str]()
-    return one.signed.keys() - own - {one.map.next_model_id or ""}
+    own = {checked.map.model_id} if _is_indexed(checked) else set[str]()
+    return checked.signed.keys() - own - {checked.map.next_model_id or ""}
 
 
 def _place(frame: FrameRow) -> tuple[float | None, ...]:
     return (None,) * 3 if frame.pose is None else tuple(row[3] for row in frame.pose[:3])
 
 
-def _is_stale(one: _CheckedFrame) -> bool:
+def _is_stale(checked: _CheckedFrame) -> bool:
     """Return whether the search columns for tags and position differ from the frame."""
-    frame = one.frame
+    frame = checked.frame
     placed = (frame.pose_x, frame.pose_y, frame.pose_z) == _place(frame)
-    return not placed or (frame.state != FrameState.DELETED and one.tags != frozenset(frame.tags))
+    return not placed or (
+        frame.state != FrameState.DELETED and checked.tags != frozenset(frame.tags)
+    )
 
 
-def _queue(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
-    own = update(frames).where(frames.c.number == one.frame.number)
+def _queue(_: Folder, connection: Connection, checked: _CheckedFrame) -> str:
+    own = update(frames).where(frames.c.number == checked.frame.number)
     connection.execute(own.values(state=FrameState.RECEIVED, reason=None))
-    return f"job {enqueue(connection, 'sign', one.frame.number).id} is queued"
+    return f"job {enqueue(connection, 'sign', checked.frame.number).id} is queued"
 
 
-def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
+def _sign(folder: Folder, connection: Connection, checked: _CheckedFrame) -> str:
     """Schedule a frame to be signed again, or mark it as failed if its upload is lost."""
-    frame, row, damaged = one.frame, one.map, _damaged(one)
+    frame, row, damaged = checked.frame, checked.map, _damaged(checked)
     _remove_signatures(connection, frame.number, damaged)
-    if row.model_id in one.signed and row.model_id not in damaged:
+    if row.model_id in checked.signed and row.model_id not in damaged:
         for model_id in damaged:  # queries continue to use sound signatures
             enqueue(connection, REENCODE, frame.number, PRIORITY, model_id)
         return "a worker computes it again from the upload"
@@ -326,9 +328,9 @@ def _sign(folder: Folder, connection: Connection, one: _CheckedFrame) -> str:
     return "a worker signs it again from its upload"
 
 
-def _remove_stray(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
-    _remove_signatures(connection, one.frame.number, _stray(one))
-    return f"{len(_stray(one))} signatures removed"
+def _remove_stray(_: Folder, connection: Connection, checked: _CheckedFrame) -> str:
+    _remove_signatures(connection, checked.frame.number, _stray(checked))
+    return f"{len(_stray(checked))} signatures removed"
 
 
 def _remove_signatures(connection: Connection, number: int, models: set[str]) -> None:
@@ -336,21 +338,21 @@ def _remove_signatures(connection: Connection, number: int, models: set[str]) ->
         doom(connection, remove_signature(connection, number, model_id))
 
 
-def _write_derived(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
-    number, (x, y, z) = one.frame.number, _place(one.frame)
+def _write_derived(_: Folder, connection: Connection, checked: _CheckedFrame) -> str:
+    number, (x, y, z) = checked.frame.number, _place(checked.frame)
     own = update(frames).where(frames.c.number == number)
     connection.execute(own.values(pose_x=x, pose_y=y, pose_z=z))
-    if one.frame.state != FrameState.DELETED:
+    if checked.frame.state != FrameState.DELETED:
         connection.execute(delete(frame_tags).where(frame_tags.c.frame_number == number))
-        named = [{"frame_number": number, "tag": tag} for tag in sorted(set(one.frame.tags))]
+        named = [{"frame_number": number, "tag": tag} for tag in sorted(set(checked.frame.tags))]
         if named:
             connection.execute(insert(frame_tags), named)
     return "copied from the frame"
 
 
-def _assign_revision(_: Folder, connection: Connection, one: _CheckedFrame) -> str:
-    revision = next_revision(connection, one.map.number)
-    own = update(frames).where(frames.c.number == one.frame.number)
+def _assign_revision(_: Folder, connection: Connection, checked: _CheckedFrame) -> str:
+    revision = next_revision(connection, checked.map.number)
+    own = update(frames).where(frames.c.number == checked.frame.number)
     connection.execute(own.values(revision=revision))
     return f"the frame is now at revision {revision}"
 

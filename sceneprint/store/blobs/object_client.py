@@ -408,7 +408,7 @@ def check_url(url: str, setting: str = "SCENEPRINT_BLOB_URL") -> None:
             "environment (AWS_..., GOOGLE_..., AZURE_...)."
         )
     steps = unquote(parts.path).split("/")
-    wrong = any(one in (".", "..") for one in steps) or not unquote(parts.path).isprintable()
+    wrong = any(step in (".", "..") for step in steps) or not unquote(parts.path).isprintable()
     lacking = {"file": not parts.path.startswith("/") or parts.path == "/", "memory": False}
     if named not in VARIABLES or wrong or lacking.get(named, not netloc) or (
         named in lacking and netloc
