@@ -54,8 +54,8 @@ def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
 
     The value of the header is not used, because any client can send it.
     """
-    found = (name for name in headers if name.startswith(_FORWARDING))
-    return next((name.decode("latin-1").title() for name in found), None)
+    names = (name for name in headers if name.startswith(_FORWARDING))
+    return next((name.decode("latin-1").title() for name in names), None)
 
 
 def foreign_request_error(
@@ -101,8 +101,8 @@ def foreign_request_error(
 
 def _is_here(authority: str) -> bool:
     """Return whether a host, optionally with a port, is a loopback address."""
-    found = _HOST.fullmatch(authority)
-    return found is not None and is_loopback(found["v6"] or found["name"] or "")
+    match = _HOST.fullmatch(authority)
+    return match is not None and is_loopback(match["v6"] or match["name"] or "")
 
 
 # CORS: pages of other origins that may send requests.

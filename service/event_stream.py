@@ -144,20 +144,20 @@ class Feed:
                 yield [missed(seen)], seen
                 continue
             if self._since is None or place < self._since:
-                found, place, seen = await to_thread.run_sync(
+                rows, place, seen = await to_thread.run_sync(
                     next_events, self._database, wanted, place, MOST
                 )
-                if found:
-                    yield found, seen
+                if rows:
+                    yield rows, seen
                     continue
                 if self._since is not None and place < self._since:
                     continue
             if self._since is not None and place < self._newest:
                 held, place = self._after(place)
                 seen = max((event.number for event in held if wanted.sees(event)), default=seen)
-                found = [event for event in held if wanted(event)]
-                if found:
-                    yield found, seen
+                rows = [event for event in held if wanted(event)]
+                if rows:
+                    yield rows, seen
                 continue
             with suppress(TimeoutError):
                 await asyncio.wait_for(news.wait(), max(due - clock(), 0.0))
@@ -168,8 +168,8 @@ class Feed:
         """
         newer = sum(1 for event in reversed(self._held) if event.number > place)
         start = len(self._held) - newer
-        found = list(islice(self._held, start, start + MOST))
-        return found, found[-1].number if found else self._newest
+        rows = list(islice(self._held, start, start + MOST))
+        return rows, rows[-1].number if rows else self._newest
 
     def _is_behind(self) -> bool:
         """Return whether the last known event is missing or different in the database."""
@@ -203,7 +203,7 @@ class Feed:
                 if self._since is None:
                     await self._begin()
                     self._wake()
-                found = await to_thread.run_sync(self._read, self._newest)
+                rows = await to_thread.run_sync(self._read, self._newest)
                 if self._history != self._database.history:
                     history = self._database.history
                     if await to_thread.run_sync(self._is_behind):
@@ -218,12 +218,12 @@ class Feed:
                 log.error("events cannot be read", extra={"error": str(error)})
                 pause = TROUBLE_S
                 continue
-            pause = 0.0 if len(found) == MOST else POLL_S / (2 if found else 1)
-            if found:
-                self._held.extend(found)
+            pause = 0.0 if len(rows) == MOST else POLL_S / (2 if rows else 1)
+            if rows:
+                self._held.extend(rows)
                 while len(self._held) > HELD:
                     self._since = self._held.popleft().number
-                self._newest, self._last = found[-1].number, found[-1]
+                self._newest, self._last = rows[-1].number, rows[-1]
                 self._wake()
 
     def _wake(self) -> None:

@@ -328,14 +328,14 @@ def enforce_rate_limit(
 def network_of(address: str) -> str:
     """Return an IPv4 address, or the /64 network of an IPv6 address, which has one owner."""
     try:
-        found = ipaddress.ip_address(address.partition("%")[0])
+        ip = ipaddress.ip_address(address.partition("%")[0])
     except ValueError:
         return "unknown"  # shared by all connections without an IP address
-    if isinstance(found, ipaddress.IPv6Address):
-        if found.ipv4_mapped is not None:
-            return str(found.ipv4_mapped)
-        return str(ipaddress.ip_network((found, 64), strict=False))
-    return str(found)
+    if isinstance(ip, ipaddress.IPv6Address):
+        if ip.ipv4_mapped is not None:
+            return str(ip.ipv4_mapped)
+        return str(ipaddress.ip_network((ip, 64), strict=False))
+    return str(ip)
 
 
 #: Maximum seconds without data in a body, for the whole body, and in addition per MiB of it.
@@ -377,8 +377,8 @@ class BodySpool:
 
     def _room(self) -> int:
         """Return the maximum number of spooled bytes of all tenants."""
-        found = os.statvfs(tempfile.gettempdir())
-        return found.f_bavail * found.f_frsize + self._held.total
+        disk = os.statvfs(tempfile.gettempdir())
+        return disk.f_bavail * disk.f_frsize + self._held.total
 
     @staticmethod
     def _full(room: int) -> RateLimited:

@@ -31,14 +31,14 @@ def expected_tags(request: Request) -> Collection[str] | None:
     header = ", ".join(request.headers.getlist("if-match")).strip()
     if header in ("", "*"):
         return None
-    found = _TAG.findall(header)
-    if not found:
+    tags = _TAG.findall(header)
+    if not tags:
         raise InvalidRequest(
             f"The header If-Match is {header!r:.80}. Send the ETag that you received with the "
             "resource, including its quotes.",
             (("If-Match", "not an entity tag"),),
         )
-    return frozenset(tag for weak, tag in found if not weak)
+    return frozenset(tag for weak, tag in tags if not weak)
 
 
 def is_known(request: Request, tag: str) -> bool:
@@ -51,8 +51,8 @@ def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
     """Return the offered media type that Accept prefers; by default, the first."""
     ranges: dict[str, float] = {}
     for kind, parameters in _TYPE.findall(", ".join(request.headers.getlist("accept"))[:1000]):
-        found = _QUALITY.search(parameters)
-        quality = min(float(found[1]), 1.0) if found else 1.0
+        match = _QUALITY.search(parameters)
+        quality = min(float(match[1]), 1.0) if match else 1.0
         ranges[kind.lower()] = max(quality, ranges.get(kind.lower(), 0.0))
 
     def quality_of(offer: str) -> float:
@@ -87,13 +87,13 @@ def file_responses(
     done: dict[str, Any] = {"description": description, "content": content}
     if tagged:
         done["headers"] = {"ETag": _TAG_HEADER}
-    found: dict[int | str, dict[str, Any]] = {304: _UNCHANGED} if tagged else {}
+    responses: dict[int | str, dict[str, Any]] = {304: _UNCHANGED} if tagged else {}
     if ranges:
         done["headers"]["Accept-Ranges"] = {"schema": _STRING}
-        found[206] = {**done, "description": "The requested range."}
+        responses[206] = {**done, "description": "The requested range."}
         statuses += (416,)
-    found[200] = done if model is None else {**done, "model": model}
-    return found | refusals(*statuses)
+    responses[200] = done if model is None else {**done, "model": model}
+    return responses | refusals(*statuses)
 
 
 def tag_headers(output: Output[Any]) -> dict[str, str]:
@@ -204,13 +204,13 @@ def _requested_range(request: Request, tag: str, size: int) -> tuple[int, int]:
     condition = request.headers.get("if-range")
     if condition is not None and condition.strip() != f'"{tag}"':
         return whole
-    found = _RANGE.fullmatch(request.headers.get("range", ""))
-    if found is None or not (found[1] or found[2]) or size == 0:
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    if match is None or not (match[1] or match[2]) or size == 0:
         return whole
-    if not found[1]:  # a suffix range
-        return (size - min(int(found[2]), size), size - 1) if int(found[2]) else (size, size - 1)
-    first, last = int(found[1]), int(found[2] or size - 1)
-    return whole if found[2] and last < first else (first, min(last, size - 1))
+    if not match[1]:  # a suffix range
+        return (size - min(int(match[2]), size), size - 1) if int(match[2]) else (size, size - 1)
+    first, last = int(match[1]), int(match[2] or size - 1)
+    return whole if match[2] and last < first else (first, min(last, size - 1))
 
 
 def _chunks(file: BinaryIO, first: int, last: int) -> Iterator[bytes]:

@@ -106,10 +106,10 @@ class Service:
     def find_key(self, secret: str) -> KeyRow | None:
         """Return the key of a secret, even if it has expired; None for an unknown secret."""
         with self.context.store.database.read() as connection:
-            found = find_key(connection, secret)
-        if found is not None and (found.expires_at is None or found.expires_at > time.time()):
-            self.key_uses.note(found)
-        return found
+            row = find_key(connection, secret)
+        if row is not None and (row.expires_at is None or row.expires_at > time.time()):
+            self.key_uses.note(row)
+        return row
 
     async def run(self, do: Callable[..., T], *arguments: object, patient: bool = False) -> T:
         """Wait for a turn of the tenant, and run a function in a shared thread. Do not call this

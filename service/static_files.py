@@ -156,7 +156,7 @@ def _file(name: str) -> StaticFile:
         return pack_file(".html", _PAGE.encode())
     if name == "start.js":
         return pack_file(".js", _START.encode())
-    found = find_spec("fastapi_offline")
-    if found is None or found.origin is None:
+    spec = find_spec("fastapi_offline")
+    if spec is None or spec.origin is None:
         raise HTTPException(404, "the package fastapi-offline, which has Swagger UI, is missing")
-    return read_file(Path(found.origin).parent / "static" / name)
+    return read_file(Path(spec.origin).parent / "static" / name)

@@ -74,11 +74,11 @@ def all_commands() -> dict[str, Command]:
     Other distributions, such as sceneprint-lab, add commands as entry points. `COMMANDS` in the
     package of their modules contains the help lines.
     """
-    found = {name: own_command(name) for name in COMMANDS}
+    commands = {name: own_command(name) for name in COMMANDS}
     for entry in entry_points(group="sceneprint.commands"):
         lines = import_module(entry.module.rpartition(".")[0]).COMMANDS
-        found[entry.name] = Command(entry.value, lines[entry.name])
-    return found
+        commands[entry.name] = Command(entry.value, lines[entry.name])
+    return commands
 
 
 def parser(name: str | None = None) -> argparse.ArgumentParser:
@@ -195,7 +195,7 @@ _SECONDS = {"m": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
 
 def duration(text: str) -> timedelta:
     """Parse a duration such as 12h."""
-    found = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
-    if found is None:
+    parts = re.fullmatch(r"([1-9][0-9]{0,4})([mhdw])", text)
+    if parts is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a duration such as 12h, 30d or 8w")
-    return timedelta(seconds=int(found[1]) * _SECONDS[found[2]])
+    return timedelta(seconds=int(parts[1]) * _SECONDS[parts[2]])

@@ -101,10 +101,10 @@ def sequences_at(
 ) -> tuple[FrameSequence, ...]:
     """Return the sequences at a path (see `find_sequences`); print notes on omitted data."""
     with recording_options(options) as recording:
-        found = find_sequences(path, recording, camera)
-    for sequence in found:
+        sequences = find_sequences(path, recording, camera)
+    for sequence in sequences:
         print_note(sequence)
-    return tuple(with_depth_scale(one, options.depth_scale) for one in found)
+    return tuple(with_depth_scale(one, options.depth_scale) for one in sequences)
 
 
 def print_note(sequence: FrameSequence) -> None:

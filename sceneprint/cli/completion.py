@@ -29,10 +29,10 @@ def run_completion(options: argparse.Namespace) -> int:
     """Print a script that completes commands and options. Add `source <(sceneprint completion
     bash)` to ~/.bashrc, or the same with zsh to ~/.zshrc.
     """
-    found = [(name, one) for name, _, one in subcommands(parser())]
+    parsers = [(name, one) for name, _, one in subcommands(parser())]
     # Subcommands come first, because the pattern of their command would match them too.
-    cases = [f'    "{name} "*) words="{" ".join(_words(one))}" ;;' for name, one in found[::-1]]
-    commands = " ".join(name for name, _ in found if " " not in name)
+    cases = [f'    "{name} "*) words="{" ".join(_words(one))}" ;;' for name, one in parsers[::-1]]
+    commands = " ".join(name for name, _ in parsers if " " not in name)
     if options.shell == "zsh":
         print("autoload -U +X compinit bashcompinit && compinit && bashcompinit")
     print(_SCRIPT.format(commands=commands, cases="\n".join(cases)))

@@ -107,16 +107,16 @@ def _sqlite_file(settings: Settings, url: URL) -> Check:
     engine = create_engine(url, creator=connect, poolclass=NullPool)
     try:
         with engine.connect() as connection:
-            found = _schema_check(schema_range_of(connection), repr(engine.url))
+            check = _schema_check(schema_range_of(connection), repr(engine.url))
     finally:
         engine.dispose()
     # Another check reports a folder that is not writable.
     writable = os.access(path, os.W_OK) or not os.access(path.parent, os.W_OK)
-    if found.verdict != "WRONG" and not writable:
+    if check.verdict != "WRONG" and not writable:
         return _wrong(
             f"{path} is readable but not writable, so uploads fail. Check its permissions."
         )
-    return found
+    return check
 
 
 def _path_of(url: URL) -> Path | None:
@@ -129,17 +129,17 @@ def _path_of(url: URL) -> Path | None:
     return None if name in ("", ":memory:") else Path(name).absolute()
 
 
-def _schema_check(found: SchemaRange | None, place: str) -> Check:
+def _schema_check(schema: SchemaRange | None, place: str) -> Check:
     """Compare the schema of a database with that of this version."""
     from sceneprint.store.database import known_revisions
 
     head, known = known_revisions()
-    shown = f"{place}, schema {None if found is None else found.revision}"
-    if found is None or (found.revision in known and found.revision != head):
+    shown = f"{place}, schema {None if schema is None else schema.revision}"
+    if schema is None or (schema.revision in known and schema.revision != head):
         return Check("note", "database", f"{shown}; the next use migrates it to {head}")
-    if found.revision == head:
+    if schema.revision == head:
         return Check("ok", "database", shown)
-    if found.allows(head):
+    if schema.allows(head):
         text = f"{shown} of a later version, which this version can still use. Upgrade this one."
         return Check("note", "database", text)
     return _wrong(
@@ -263,7 +263,7 @@ def _durability(values: Mapping[str, object]) -> Check:
 def _connections(values: Mapping[str, object], settings: Settings) -> Check:
     from sceneprint.store.postgres.connection import MOST
 
-    most, taken = int(str(values["connections"])), int(str(values["taken"]))
+    most, in_use = int(str(values["connections"])), int(str(values["taken"]))
     # A worker uses one connection for work, one for its lease, one for wake-ups, and three for
     # locks of blobs and indexes. A service uses one per concurrent request, and three permanent
     # ones.
@@ -273,10 +273,10 @@ def _connections(values: Mapping[str, object], settings: Settings) -> Check:
         + 3
     )
     text = (
-        f"{most} connections allowed (max_connections), {taken} in use; a service and "
+        f"{most} connections allowed (max_connections), {in_use} in use; a service and "
         f"{settings.workers} workers may use {wanted}"
     )
-    if taken + wanted > most:
+    if in_use + wanted > most:
         return Check("note", "connections", f"{text}. Raise max_connections, or run fewer workers.")
     return Check("ok", "connections", text)
 
@@ -303,9 +303,9 @@ def machine(settings: Settings) -> Iterator[Check]:
     yield _kernels()
     yield from _tables(settings.cache_dir)
     yield from _folder(settings.data_dir)
-    found = database(settings)
-    yield found
-    if found.verdict != "WRONG":
+    check = database(settings)
+    yield check
+    if check.verdict != "WRONG":
         yield from server(settings)
     yield from object_stores(settings)
     yield _decoders(settings)
@@ -347,16 +347,16 @@ def _decoders(settings: Settings) -> Check:
     pool = DecoderPool(1, settings.decoder_memory_bytes, settings.decoder_timeout_s)
     try:
         pool.start()
-        found = pool.protections
+        protections = pool.protections
     finally:
         pool.close()
-    if found is None:
+    if protections is None:
         text = "no decoder can be started, so uploads get 503; the log of the service says why"
         return Check("WRONG", "decoders", text)
-    if not found.seccomp:
-        text = f"{found.text}. This kernel has no seccomp filter: confine the service itself"
+    if not protections.seccomp:
+        text = f"{protections.text}. This kernel has no seccomp filter: confine the service itself"
         return Check("note", "decoders", text)
-    return Check("ok", "decoders", found.text)
+    return Check("ok", "decoders", protections.text)
 
 
 def _tables(cache_dir: Path) -> Iterator[Check]:
@@ -481,12 +481,12 @@ def _service(options: argparse.Namespace) -> Iterator[Check]:
                 text = f"no service responds at {url}; `sceneprint serve` starts one"
                 yield Check("WRONG" if options.url else "note", "service", text)
             elif options.url is None:
-                found = version_check(url, client.status())
+                check = version_check(url, client.status())
                 text = (
-                    f"{found.text}. It may use another data folder: `sceneprint doctor --url "
+                    f"{check.text}. It may use another data folder: `sceneprint doctor --url "
                     f"{url}` checks the service itself"
                 )
-                yield Check(found.verdict, "service", text)
+                yield Check(check.verdict, "service", text)
             else:
                 yield from service_checks(client, url)
     except SceneprintError as error:

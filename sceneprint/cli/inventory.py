@@ -248,12 +248,12 @@ def run_queries(options: argparse.Namespace) -> int:
     robots, and poses or reasons.
     """
     with open_client(options) as client:
-        found = client.queries(
+        queries = client.queries(
             options.map, status=options.status, robot=options.robot, since=options.since,
             until=options.until, kept=options.kept,
         )  # fmt: skip
         print_rows(
-            islice(found, options.limit), _query_line, as_json=options.json,
+            islice(queries, options.limit), _query_line, as_json=options.json,
             header=f"{'query':32}  {'time':19}  status          ms  map  robot/session  pose or "
             "reason", none="no queries match",
         )  # fmt: skip

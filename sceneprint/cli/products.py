@@ -147,14 +147,14 @@ def _associate(options: argparse.Namespace) -> int:
     }  # fmt: skip
     with open_client(options) as client, open_scene(options, client) as scene:
         with progress_bar("associate") as progress:
-            found = client.compute(Association, options.map, progress=progress, **fields)
-        succeeded = found.state is JobState.SUCCEEDED
+            association = client.compute(Association, options.map, progress=progress, **fields)
+        succeeded = association.state is JobState.SUCCEEDED
         if kind is not None and succeeded:
-            graph = client.graph(options.map, found.job_id, kind, odometry=options.odometry)
+            graph = client.graph(options.map, association.job_id, kind, odometry=options.odometry)
             write_whole(options.out, graph.encode())
         if scene is not None and succeeded:
-            scene.add_association(found, "\n".join(_association_lines(found)))
-    _print_association(found, options)
+            scene.add_association(association, "\n".join(_association_lines(association)))
+    _print_association(association, options)
     if succeeded and options.out is not None and not options.json:
         print(f"wrote {options.out}")
     return 0 if succeeded else 2

@@ -231,9 +231,9 @@ def _wanted_frames(
     ]
     if len(named) == 1:
         return named
-    found = f"{len(named)} frames are named" if named else "no frame is named"
+    count = f"{len(named)} frames are named" if named else "no frame is named"
     raise DatasetError(
-        f"{path}: {found} {wanted}. Set --frame to an index from 0, or to a name such as "
+        f"{path}: {count} {wanted}. Set --frame to an index from 0, or to a name such as "
         f"{references[0].name}."
     )
 

@@ -92,8 +92,8 @@ def check_scene(options: argparse.Namespace) -> None:
 
 def _opener() -> SceneOpener:
     for entry in entry_points(group="sceneprint.scenes"):
-        found: SceneOpener = entry.load()
-        return found
+        opener: SceneOpener = entry.load()
+        return opener
     raise MissingDependency(
         "Scenes are written by sceneprint-viewers, which is not installed. "
         "In a clone, run: pip install ./viewers"

@@ -71,10 +71,10 @@ def run_sessions(options: argparse.Namespace) -> int:
             edited = client.edit_session(options.map, options.session, robot=options.robot, **edits)
             print(f"edited {edited} frames of session {one_line(options.session)}")
         else:
-            found = client.sessions(options.map)
+            sessions = client.sessions(options.map)
             names = {"session": options.session, "robot": options.robot}
             wanted = {name: value for name, value in names.items() if value is not None}
-            rows = (s for s in found if all(getattr(s, n) == v for n, v in wanted.items()))
+            rows = (s for s in sessions if all(getattr(s, n) == v for n, v in wanted.items()))
             print_rows(
                 rows, _session_line, as_json=options.json, none="no sessions yet",
                 header="frames  indexed  poses  first captured       last captured        "

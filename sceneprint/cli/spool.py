@@ -77,12 +77,12 @@ def run_spool(options: argparse.Namespace) -> int:
 def _add(options: argparse.Namespace) -> int:
     """Add frames to the spool; return 2 if a frame cannot be read."""
     sequences = sequences_of(options.paths, options)
-    found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
+    frames = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
     new, there, errors = 0, 0, []
     with Spool(options.spool, options.most_bytes) as spool:
         before = spool.status()
         try:
-            for sequence, frame in tqdm(found, desc="spool", unit="frame", disable=None):
+            for sequence, frame in tqdm(frames, desc="spool", unit="frame", disable=None):
                 try:
                     is_new = spool.add(frame, frame_metadata(options, sequence, frame))
                     new, there = new + is_new, there + (not is_new)
@@ -90,9 +90,9 @@ def _add(options: argparse.Namespace) -> int:
                     errors.append(f"{one_line(frame.name)}: {one_line(str(error))}")
         finally:  # report the added frames even after an error
             now = spool.status()
-            left = len(found) - new - there - len(errors)
+            left = len(frames) - new - there - len(errors)
             print(
-                f"{len(found)} frames: {new} added, {there} already there, {len(errors)} refused"
+                f"{len(frames)} frames: {new} added, {there} already there, {len(errors)} refused"
                 f"{f', {left} not added' if left else ''}; "
                 f"{now.waiting} wait, {now.thinned - before.thinned} thinned"
             )

@@ -172,12 +172,12 @@ def _summary(findings: list[Finding], *, repair: bool) -> str:
     damaged, unneeded, left = kinds["damage"], kinds["leftover"], sum(o.left for o in findings)
     if not damaged and not unneeded:
         return "no problems found"
-    found = f"{damaged} damaged, {unneeded} left over"
+    counts = f"{damaged} damaged, {unneeded} left over"
     if repair:
         done = f"{damaged + unneeded - left} repaired, {left} not"
-        return f"{found}: {done}. Run it again once workers have signed the queued frames."
+        return f"{counts}: {done}. Run it again once workers have signed the queued frames."
     possible = sum(each.repair is not None for each in findings)
-    return f"{found}; nothing was changed: `sceneprint fsck --repair` can repair {possible}"
+    return f"{counts}; nothing was changed: `sceneprint fsck --repair` can repair {possible}"
 
 
 def _record(finding: Finding) -> dict[str, object]:
@@ -194,10 +194,10 @@ def _purge(options: argparse.Namespace) -> int:
     if not options.map is options.grace is options.json is None:
         raise InvalidRequest("--purge checks nothing. Use it only with --data.")
     with open_context(existing_store(options)) as context:
-        found = purging_of(context).now()
+        purged = purging_of(context).now()
         print(
-            f"purged {found.blobs} blobs, {found.answers} stored answers, "
-            f"{found.products} products; rebuilt {found.indexes} indexes"
+            f"purged {purged.blobs} blobs, {purged.answers} stored answers, "
+            f"{purged.products} products; rebuilt {purged.indexes} indexes"
         )
         if not context.store.database.shrink_log():
             print("the database log is in use: run this again when no process reads the database")
@@ -452,12 +452,12 @@ def run_pull(options: argparse.Namespace) -> int:
             for name in dict.fromkeys(options.map):
                 start = time.perf_counter()
                 with progress_bar(name) as progress:
-                    found = pull_map(client, store, name, progress)
+                    pulled = pull_map(client, store, name, progress)
                 print(
-                    f"{one_line(str(folder))} has map {name} of revision {found.revision}: "
-                    f"{found.frames} frames, {found.written} new or changed, {found.removed} "
-                    f"removed; {found.artifacts} artifacts, {found.bytes / 1e6:.1f} MB fetched in "
-                    f"{time.perf_counter() - start:.1f} s"
+                    f"{one_line(str(folder))} has map {name} of revision {pulled.revision}: "
+                    f"{pulled.frames} frames, {pulled.written} new or changed, {pulled.removed} "
+                    f"removed; {pulled.artifacts} artifacts, {pulled.bytes / 1e6:.1f} MB fetched "
+                    f"in {time.perf_counter() - start:.1f} s"
                 )
         finally:
             store.close()

@@ -300,12 +300,12 @@ def run_upload(options: argparse.Namespace) -> int:
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
     sequences = sequences_of(paths, options)
-    found = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
+    frames = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
     tally, start, late = Tally(), time.perf_counter(), False
     with open_client(options) as client:
         _ensure_map(client, options)
         try:
-            _send_all(client, options, found, tally)
+            _send_all(client, options, frames, tally)
             late = not import_archives(client, options, archives, tally)
             if not options.no_wait and not late:
                 novel = options.if_novel is not None
@@ -316,18 +316,18 @@ def run_upload(options: argparse.Namespace) -> int:
                     _report_late(client, options, tally)
         finally:  # report the received frames even after an error
             counted = tally.new + tally.there + tally.refused
-            tally.report(max(len(found), counted), time.perf_counter() - start)
+            tally.report(max(len(frames), counted), time.perf_counter() - start)
             for sequence in sequences:
                 if sequence.layout.is_export:  # other notes are in the summary
                     print_note(sequence)
                 tally.lost += 0 if options.no_pose else sequence.lost
             hint_at_maps(paths)
-            if found:
-                summary = summary_of(found, tally, with_pose=not options.no_pose)
+            if frames:
+                summary = summary_of(frames, tally, with_pose=not options.no_pose)
                 tally.summaries.append(summary.text)
             for line in tally.summaries:
                 print(line)
-        clouds = sum(frame.cloud is not None for _, frame in found)
+        clouds = sum(frame.cloud is not None for _, frame in frames)
         for line in map_lines(client, options.map, clouds) if tally.new or tally.there else ():
             print(line)
     return 2 if tally.errors or tally.lost or late else 0
@@ -381,23 +381,23 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
 
 
 def summary_of(
-    found: list[tuple[FrameSequence, FrameReference]], tally: Tally, *, with_pose: bool
+    frames: list[tuple[FrameSequence, FrameReference]], tally: Tally, *, with_pose: bool
 ) -> UploadSummary:
     """Return the summary of the uploaded frames."""
     from sceneprint_client.api.frames import upload_summary
 
     failed = {name for name, _ in tally.errors}
     without: Counter[str] = Counter()
-    for sequence, frame in found:
+    for sequence, frame in frames:
         if not with_pose:
             without["--no-pose"] += 1
         elif frame.pose_source is None:
             without[sequence.unposed] += 1
         elif frame.name in failed:
             without["not indexed"] += 1
-    sequences = dict.fromkeys(sequence for sequence, _ in found)
+    sequences = dict.fromkeys(sequence for sequence, _ in frames)
     notes = [one_line(one.note) for one in sequences if one.note and not one.layout.is_export]
-    return upload_summary(len(found), without, tally.ranges, notes)
+    return upload_summary(len(frames), without, tally.ranges, notes)
 
 
 def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
@@ -473,12 +473,12 @@ def _ensure_map(client: Client, options: argparse.Namespace) -> None:
 def _send_all(
     client: Client,
     options: argparse.Namespace,
-    found: list[tuple[FrameSequence, FrameReference]],
+    frames: list[tuple[FrameSequence, FrameReference]],
     tally: Tally,
 ) -> None:
     """Upload all frames concurrently; stop if the service fails."""
     pool = ThreadPoolExecutor(options.parallel, thread_name_prefix="upload")
-    sent = {pool.submit(_send, client, options, *one): one[1].name for one in found}
+    sent = {pool.submit(_send, client, options, *one): one[1].name for one in frames}
     try:
         with tqdm(total=len(sent), desc="upload", unit="frame", disable=None) as bar:
             for future in as_completed(tuple(sent)):

@@ -122,14 +122,14 @@ def require_schema(connection: Connection) -> None:
 
 
 def _check_schema(engine: Engine, row: Any) -> None:
-    found, own = SchemaRange(*row), known_revisions()[0]
-    if found.allows(own):
+    schema, own = SchemaRange(*row), known_revisions()[0]
+    if schema.allows(own):
         return
-    what = "later" if found.revision > own else "earlier"
+    what = "later" if schema.revision > own else "earlier"
     raise NewerSchema(
-        f"{database_label(engine.url)} was migrated to schema {found.revision} of a {what} version "
-        f"of sceneprint while this process, which needs {own}, was running. Nothing was stored. "
-        "Stop this process, and start the version of the other processes."
+        f"{database_label(engine.url)} was migrated to schema {schema.revision} of a {what} "
+        f"version of sceneprint while this process, which needs {own}, was running. Nothing was "
+        "stored. Stop this process, and start the version of the other processes."
     )
 
 

@@ -195,16 +195,16 @@ def count_jobs(
         counts = counts.where(jobs.c.map_number == map_number)
     if states is not None:
         counts = counts.where(jobs.c.state.in_(states))
-    found = dict.fromkeys(map(str, states or ()), 0)
-    found |= {row[0]: row[1] for row in connection.execute(counts)}
-    if found.get(JobState.DEAD):
+    totals = dict.fromkeys(map(str, states or ()), 0)
+    totals |= {row[0]: row[1] for row in connection.execute(counts)}
+    if totals.get(JobState.DEAD):
         retried = select(func.count()).where(jobs.c.state == JobState.DEAD, _later_job().exists())
         if map_number is not None:
             retried = retried.where(jobs.c.map_number == map_number)
-        found[JobState.DEAD] -= connection.execute(retried).scalar_one()
-        if states is None and not found[JobState.DEAD]:
-            del found[JobState.DEAD]
-    return found
+        totals[JobState.DEAD] -= connection.execute(retried).scalar_one()
+        if states is None and not totals[JobState.DEAD]:
+            del totals[JobState.DEAD]
+    return totals
 
 
 def waiting_by_tenant(connection: Connection) -> dict[str, int]:

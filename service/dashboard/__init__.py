@@ -35,10 +35,10 @@ def routes(files: Mapping[str, StaticFile]) -> APIRouter:
     router = APIRouter(include_in_schema=False)
 
     def respond(request: Request, name: str) -> Response:
-        found = files.get(name)
-        if found is None:
+        file = files.get(name)
+        if file is None:
             raise HTTPException(404, "the dashboard does not have this file")
-        return answer_file(request, found, POLICY)
+        return answer_file(request, file, POLICY)
 
     @router.api_route("/", methods=["GET", "HEAD"])
     def front(request: Request) -> Response:

@@ -87,12 +87,12 @@ async def readyz(here: Here, caller: Guest) -> Readiness:
     not respond, while kernels are being compiled, and permanently after a later version has
     migrated the store. No key is required. The result is at most one second old.
     """
-    found = await here.checks.get("readiness", partial(_check_readiness, here.context))
+    state = await here.checks.get("readiness", partial(_check_readiness, here.context))
     # Requests without a key get no counts, whose computation takes time.
     if caller is None or not caller.reads_every:
-        return found
+        return state
     frames, jobs = await here.checks.get("counts", here.statistics.state_counts)
-    return found.model_copy(update={"frames": frames, "jobs": jobs})
+    return state.model_copy(update={"frames": frames, "jobs": jobs})
 
 
 def _check_readiness(context: Context) -> Readiness:
@@ -246,10 +246,10 @@ def stats(
 @operations_router.get("/models", responses=refusals())
 def models(here: Here, caller: Sender) -> Page[ModelInfo]:
     """List the models for maps (the presets, and all models that maps have or had)."""
-    found = here.catalogue.list_all(lambda name: caller.may("read", name))
+    models = here.catalogue.list_all(lambda name: caller.may("read", name))
     if not caller.reads_every:  # do not reveal models of unreadable maps
-        found = [one for one in found if one.preset or one.maps]
-    return Page[ModelInfo](items=found)
+        models = [one for one in models if one.preset or one.maps]
+    return Page[ModelInfo](items=models)
 
 
 @operations_router.post(

@@ -63,8 +63,8 @@ async def get_cloud(
     A point cloud is first rendered as a range image around its viewpoint. The original samples are
     in the upload.
     """
-    found = await here.run(lambda: here.outputs.cloud(map_name, frame_id, frame))
-    return await send_output(request, here, found, PLY, name=f"{frame_id}-{frame}.ply")
+    output = await here.run(lambda: here.outputs.cloud(map_name, frame_id, frame))
+    return await send_output(request, here, output, PLY, name=f"{frame_id}-{frame}.ply")
 
 
 @router.get(
@@ -94,8 +94,8 @@ async def get_preview(
     ] = WIDTH,
 ) -> Response:
     """Return a picture of a frame."""
-    found = await here.run(lambda: here.outputs.preview(map_name, frame_id, view, width))
-    return await send_output(request, here, found, PNG, name=f"{frame_id}-{view}.png")
+    output = await here.run(lambda: here.outputs.preview(map_name, frame_id, view, width))
+    return await send_output(request, here, output, PNG, name=f"{frame_id}-{view}.png")
 
 
 @router.get(
@@ -105,8 +105,8 @@ async def get_preview(
 )
 async def get_patches(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """Return the surface patches of a frame by level, and the patches that validation compares."""
-    found = await here.run(lambda: here.outputs.patches(map_name, frame_id))
-    document = Output(found.tag, lambda: found.make().model_dump_json().encode())
+    output = await here.run(lambda: here.outputs.patches(map_name, frame_id))
+    document = Output(output.tag, lambda: output.make().model_dump_json().encode())
     return await send_output(request, here, document, JSON)
 
 
@@ -142,22 +142,22 @@ async def get_signature(map_name: str, frame_id: str, request: Request, here: He
 )
 async def get_upload(map_name: str, frame_id: str, request: Request, here: Here) -> Response:
     """Return the uploaded file of a frame."""
-    found = await here.run(lambda: here.outputs.upload(map_name, frame_id))
-    if is_known(request, found.tag):
-        return Response(None, 304, tag_headers(found))
-    return await here.gate.enter(lambda: _upload(request, here, found, frame_id))
+    output = await here.run(lambda: here.outputs.upload(map_name, frame_id))
+    if is_known(request, output.tag):
+        return Response(None, 304, tag_headers(output))
+    return await here.gate.enter(lambda: _upload(request, here, output, frame_id))
 
 
-def _upload(request: Request, here: Service, found: Output[bytes], frame_id: str) -> Response:
+def _upload(request: Request, here: Service, output: Output[bytes], frame_id: str) -> Response:
     """Return a response with an upload, sent from its file to limit memory."""
-    blobs, blob = here.context.store.blobs, found.blob or ""
+    blobs, blob = here.context.store.blobs, output.blob or ""
     if blobs.condition(blob) == "sound":
         with suppress(FileNotFoundError):
             with blobs.open(blob) as file:
                 kind, suffix = upload_type(file.read(HEAD))
             name = safe(f"{frame_id}{suffix}")
-            return send_file(request, lambda: blobs.open(blob), kind, found.tag, name)
-    found.make()  # raises the error of the blob
+            return send_file(request, lambda: blobs.open(blob), kind, output.tag, name)
+    output.make()  # raises the error of the blob
     raise DamagedBlob(f"The upload of frame {frame_id} has just been restored. Try again.")
 
 
@@ -195,8 +195,8 @@ async def get_frame_points(
     limit: _MostPoints = LIMIT,
 ) -> Response:
     """Return the points of `cloud.ply` in a third of its bytes, for display on a web page."""
-    found = await here.run(lambda: here.points.frame(map_name, frame_id, frame, limit))
-    return await send_output(request, here, found, MEDIA_TYPE)
+    output = await here.run(lambda: here.points.frame(map_name, frame_id, frame, limit))
+    return await send_output(request, here, output, MEDIA_TYPE)
 
 
 @points_router.get(
@@ -207,8 +207,8 @@ async def get_query_points(
 ) -> Response:
     """Return the surface of a query in the frame of its sensor, for display on a web page."""
     await here.run(require_readable, query_id, here, caller)
-    found = await here.run(lambda: here.points.query(query_id, limit))
-    return await send_output(request, here, found, MEDIA_TYPE)
+    output = await here.run(lambda: here.points.query(query_id, limit))
+    return await send_output(request, here, output, MEDIA_TYPE)
 
 
 @points_router.get(
@@ -238,7 +238,7 @@ async def get_match_points(
     page. Every point has its distance from the surface of the other frame.
     """
     await here.run(require_readable, query_id, here, caller)
-    found = await here.run(
+    output = await here.run(
         lambda: here.points.match(query_id, frame_id, map_name, side, transform, limit)
     )
-    return await send_output(request, here, found, MEDIA_TYPE)
+    return await send_output(request, here, output, MEDIA_TYPE)

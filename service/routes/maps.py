@@ -41,16 +41,16 @@ async def create_map(request: Request, here: Here, caller: Sender, response: Res
 @router.get("", responses=refusals())
 def list_maps(here: Here, caller: Sender) -> Page[Map]:
     """List the maps that the key may read, sorted by name."""
-    found = map_lifecycle.get_maps(here.context.store)
-    return Page[Map](items=[one for one in found if caller.may("read", one.name)])
+    records = map_lifecycle.get_maps(here.context.store)
+    return Page[Map](items=[one for one in records if caller.may("read", one.name)])
 
 
 @router.get("/{map_name}", responses=refusals(404), dependencies=[Depends(may_read)])
 def get_map(map_name: str, here: Here, response: Response) -> Map:
     """Return a map with its number of frames in each state. The ETag changes with each PATCH."""
-    found = map_lifecycle.get_map(here.context.store, map_name)
-    response.headers["ETag"] = f'"{found.etag}"'
-    return found
+    record = map_lifecycle.get_map(here.context.store, map_name)
+    response.headers["ETag"] = f'"{record.etag}"'
+    return record
 
 
 @router.delete(

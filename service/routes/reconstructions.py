@@ -90,7 +90,7 @@ def _stored_answer(here: Service, caller: Caller, query_id: str) -> StoredAnswer
 
 
 def _find_reconstruction(here: Service, caller: Caller, job_id: str) -> Reconstruction:
-    found = here.reconstructions.get(None, job_id)
-    if not all(caller.may("read", name) for name in found.maps):
+    record = here.reconstructions.get(None, job_id)
+    if not all(caller.may("read", name) for name in record.maps):
         raise here.reconstructions.unknown(job_id)
-    return found
+    return record

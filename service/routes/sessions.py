@@ -99,8 +99,8 @@ async def get_trajectory(
     kind = preferred_media_type(request, (_PLAIN, _JSON))
 
     def make() -> bytes:
-        found = trajectory(here.context.store, map_name, run)
-        return (found.model_dump_json() if kind == _JSON else trajectory_file(found)).encode()
+        track = trajectory(here.context.store, map_name, run)
+        return (track.model_dump_json() if kind == _JSON else trajectory_file(track)).encode()
 
     data = await here.gate.enter(make)
     return Response(data, 200, {"Vary": "Accept"}, kind)

@@ -88,11 +88,11 @@ def list_surface_tiles(
 )
 def get_surface_tile(map_name: str, digest: str, request: Request, here: Here) -> Response:
     """Return the cells of a tile. Tiles with different cells have different digests."""
-    found = here.surfaces.tile(map_name, digest)
-    headers = {"ETag": f'"{found.tag}"', "Cache-Control": _FOREVER}
-    if is_known(request, found.tag):
+    output = here.surfaces.tile(map_name, digest)
+    headers = {"ETag": f'"{output.tag}"', "Cache-Control": _FOREVER}
+    if is_known(request, output.tag):
         return Response(None, 304, headers)
-    return Response(found.make(), 200, headers, _BYTES)
+    return Response(output.make(), 200, headers, _BYTES)
 
 
 @router.get("/frames", responses=refusals(404, 422))
@@ -172,12 +172,12 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
     `count` valid numbers.
     """
     try:
-        found = [float(part) for part in text.split(",")]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
-        found = []
-    if len(found) != count or not all(abs(one) <= FARTHEST_M for one in found):  # false for NaN
+        numbers = []
+    if len(numbers) != count or not all(abs(one) <= FARTHEST_M for one in numbers):  # false for NaN
         raise InvalidRequest(
             f"`{name}` is {text!r:.80}. Specify {count} numbers in metres, separated by commas.",
             ((name, f"not {count} numbers"),),
         )
-    return found
+    return numbers
