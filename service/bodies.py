@@ -308,7 +308,7 @@ FIELD_BYTES = 1 << 18
 #: Charsets that a form may declare; text in them is also valid UTF-8.
 _CHARSETS = ("utf-8", "utf8", "us-ascii", "ascii")
 
-_FORMATS = ", ".join(f"{one.title} ({one.content})" for one in formats_of("depth"))
+_FORMATS = ", ".join(f"{form.title} ({form.content})" for form in formats_of("depth"))
 _FRAME = f"A depth image as {_FORMATS}. Or a point cloud as {titles_of('cloud', last='or')}."
 FRAME_PARTS: dict[str, Any] = {"frame": {**FILE, "description": _FRAME}, "meta": META}
 
@@ -607,7 +607,7 @@ async def read_frames(
     """
     async with read_form(request, most_files=most) as form:
         check_parts(form, ("frame", "metas", *fields))
-        files = [one.file for one in form.getlist("frame") if isinstance(one, UploadFile)]
+        files = [file.file for file in form.getlist("frame") if isinstance(file, UploadFile)]
         if not files or len(files) != len(form.getlist("frame")):
             raise InvalidRequest(
                 "The form has no file part `frame`, or a part of that name that is not a file. "
@@ -714,5 +714,5 @@ def _plain(part: object) -> object:
         # Exclude defaults, so that a new field in a later version does not change the fingerprint.
         return part.model_dump(mode="json", exclude_defaults=True)
     if isinstance(part, list | tuple):
-        return [_plain(one) for one in part]
+        return [_plain(value) for value in part]
     return part

@@ -136,7 +136,7 @@ class Origins:
     """
 
     def __init__(self, allowed: Iterable[str]) -> None:
-        self._allowed = {one.strip().rstrip("/").lower().encode() for one in allowed}
+        self._allowed = {origin.strip().rstrip("/").lower().encode() for origin in allowed}
 
     def allows(self, origin: bytes) -> bool:
         """Return whether pages of an origin may send requests."""

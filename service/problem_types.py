@@ -136,5 +136,5 @@ PROBLEM_TYPES = {
 def problem_type(kind: type[BaseException]) -> ProblemType:
     """Return the problem type of an error class."""
     return next(
-        PROBLEM_TYPES[one.__name__] for one in kind.__mro__ if one.__name__ in PROBLEM_TYPES
+        PROBLEM_TYPES[base.__name__] for base in kind.__mro__ if base.__name__ in PROBLEM_TYPES
     )

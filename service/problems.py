@@ -122,10 +122,10 @@ def install(app: FastAPI) -> None:
 def _allowed(app: FastAPI, path: str) -> list[str]:
     """Return the methods of a path, from the route with the fewest parameters."""
     paths = app.openapi()["paths"]
-    matches = [one for one in paths if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", one), path)]
+    matches = [route for route in paths if re.fullmatch(re.sub(r"\{\w+\}", "[^/]+", route), path)]
     if not matches:
         return ["GET"]  # paths outside of the document are read-only
-    return sorted(method.upper() for method in paths[min(matches, key=lambda one: one.count("{"))])
+    return sorted(method.upper() for method in paths[min(matches, key=lambda p: p.count("{"))])
 
 
 def _id(request: Request) -> str:

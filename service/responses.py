@@ -57,7 +57,7 @@ def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
 
     def quality_of(offer: str) -> float:
         specific = (offer, f"{offer.partition('/')[0]}/*", "*/*")
-        return next((ranges[one] for one in specific if one in ranges), 0.0)
+        return next((ranges[rule] for rule in specific if rule in ranges), 0.0)
 
     return max(offers, key=quality_of)
 
@@ -117,8 +117,8 @@ async def send_output(
 
 def safe(name: str) -> str:
     """Replace characters of an id that are not allowed in headers."""
-    return "".join(one if one.isascii() and one.isprintable() and one not in '"\\/' else "_"
-                   for one in name)  # fmt: skip
+    return "".join(c if c.isascii() and c.isprintable() and c not in '"\\/' else "_"
+                   for c in name)  # fmt: skip
 
 
 # Files sent in chunks, which limits memory.

@@ -135,12 +135,12 @@ class Connection(H11Protocol):
 
 def close_oldest(connections: Iterable[object], new: object) -> None:
     """Beyond the limit, close the connection that has been silent for longest, except `new`."""
-    all_ours = [one for one in connections if isinstance(one, Connection | Handshake)]
+    all_ours = [each for each in connections if isinstance(each, Connection | Handshake)]
     if len(all_ours) <= connection_limit():
         return
-    waiting = [one for one in all_ours if one is not new and one.idle]
+    waiting = [connection for connection in all_ours if connection is not new and connection.idle]
     if waiting:
-        min(waiting, key=lambda one: one.silent_since).transport.abort()
+        min(waiting, key=lambda connection: connection.silent_since).transport.abort()
 
 
 # TLS. asyncio creates a connection only after the handshake, which may take a minute, so handshakes

@@ -229,8 +229,8 @@ def run_audit(options: argparse.Namespace) -> int:
             return 0
         target = options.output
         with nullcontext(sys.stdout) if target is None else target.open("a") as file:
-            for one in audit.lines(wanted):
-                print(_FORMATS[options.format](one), file=file)
+            for line in audit.lines(wanted):
+                print(_FORMATS[options.format](line), file=file)
     return 0
 
 
@@ -260,6 +260,6 @@ def _syslog_message(line: AuditLine) -> str:
 
 
 _FORMATS: dict[str, Callable[[AuditLine], str]] = {
-    "jsonl": lambda one: one.model_dump_json(),
+    "jsonl": lambda line: line.model_dump_json(),
     "syslog": _syslog_message,
 }

@@ -104,7 +104,7 @@ def sequences_at(
         sequences = find_sequences(path, recording, camera)
     for sequence in sequences:
         print_note(sequence)
-    return tuple(with_depth_scale(one, options.depth_scale) for one in sequences)
+    return tuple(with_depth_scale(sequence, options.depth_scale) for sequence in sequences)
 
 
 def print_note(sequence: FrameSequence) -> None:

@@ -183,7 +183,7 @@ def queue_check(stats: Stats) -> Check:
 
 def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
     """Report the models of the maps; the result is a note if a preset is outdated."""
-    presets = {one.name: one for one in models if one.preset}
+    presets = {model.name: model for model in models if model.preset}
     by_model: dict[str, list[str]] = defaultdict(list)
     older = []
     for record in maps:

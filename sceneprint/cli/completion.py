@@ -29,9 +29,9 @@ def run_completion(options: argparse.Namespace) -> int:
     """Print a script that completes commands and options. Add `source <(sceneprint completion
     bash)` to ~/.bashrc, or the same with zsh to ~/.zshrc.
     """
-    parsers = [(name, one) for name, _, one in subcommands(parser())]
+    parsers = [(name, command) for name, _, command in subcommands(parser())]
     # Subcommands come first, because the pattern of their command would match them too.
-    cases = [f'    "{name} "*) words="{" ".join(_words(one))}" ;;' for name, one in parsers[::-1]]
+    cases = [f'    "{name} "*) words="{" ".join(_words(of))}" ;;' for name, of in parsers[::-1]]
     commands = " ".join(name for name, _ in parsers if " " not in name)
     if options.shell == "zsh":
         print("autoload -U +X compinit bashcompinit && compinit && bashcompinit")
@@ -45,10 +45,10 @@ def subcommands(
     """Yield name, help line and parser of each command and subcommand."""
     for action in above._actions:
         if isinstance(action, argparse._SubParsersAction):
-            lines = {one.dest: one.help or "" for one in action._choices_actions}
-            for name, one in action.choices.items():
-                yield one.prog.removeprefix("sceneprint "), lines[name], one
-                yield from subcommands(one)
+            lines = {choice.dest: choice.help or "" for choice in action._choices_actions}
+            for name, command in action.choices.items():
+                yield command.prog.removeprefix("sceneprint "), lines[name], command
+                yield from subcommands(command)
 
 
 def _words(command: argparse.ArgumentParser) -> Iterator[str]:

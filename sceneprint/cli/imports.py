@@ -226,7 +226,7 @@ _MOST_WEAK = 5
 
 def axis_or_up(text: str) -> Axis | list[float]:
     """Parse an axis of a file, or an up vector in the axes of a sensor."""
-    axis = next((one for one in get_args(Axis) if one == text), None)
+    axis = next((axis for axis in get_args(Axis) if axis == text), None)
     return up_of(text) if axis is None else axis
 
 

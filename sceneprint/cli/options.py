@@ -380,7 +380,7 @@ def ended_by_signals() -> Iterator[None]:
         raise KeyboardInterrupt
 
     # Leave SIGHUP ignored by `nohup`.
-    caught = [one for one in _ENDING if signal.getsignal(one) is signal.SIG_DFL]
+    caught = [end for end in _ENDING if signal.getsignal(end) is signal.SIG_DFL]
     for number in caught:
         signal.signal(number, end)
     try:

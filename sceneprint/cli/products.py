@@ -274,7 +274,7 @@ def _coverage_lines(coverage: Coverage) -> list[str]:
         who = "the frame itself" if view.frame_id is None else view.frame_id
         rank = "" if view.rank is None else f"rank {view.rank}, {view.strength}"
         lines.append(f"  {who:34} {rank:18} +{view.added_m2:6.2f} m2  {total:7.2f}".rstrip())
-    lines += [f"  skipped: {one.frame_id}: {one_line(one.reason)}" for one in coverage.left_out]
+    lines += [f"  skipped: {view.frame_id}: {one_line(view.reason)}" for view in coverage.left_out]
     kind = f"{coverage.triangles} triangles" if coverage.triangles else "a cloud"
     lines.append(f"  {coverage.points} points, {kind}, voxels of {1000 * coverage.voxel_m:.0f} mm")
     return lines

@@ -186,7 +186,7 @@ def _answer_scene(
     scene: Scene | None, references: Sequence[FrameReference]
 ) -> Callable[[FrameReference, Answer, str], None]:
     """Return a function that adds an answer and its text to the scene; no-op without a scene."""
-    places = {one.path: place for place, one in enumerate(references)}
+    places = {reference.path: place for place, reference in enumerate(references)}
     stamps = stamps_of(references)
 
     def add(reference: FrameReference, answer: Answer, text: str) -> None:
@@ -484,8 +484,8 @@ def _frames_before(
     run = reference.name.rpartition("/")[0]
     frames = [frame for frame in every if frame.name.rpartition("/")[0] == run]
     place = [frame.path for frame in frames].index(reference.path)
-    posed = [(one, pose) for one in frames[max(place - _FARTHEST_BACK, 0) : place + 1]
-             if (pose := _pose_or_none(one)) is not None]  # fmt: skip
+    posed = [(frame, pose) for frame in frames[max(place - _FARTHEST_BACK, 0) : place + 1]
+             if (pose := _pose_or_none(frame)) is not None]  # fmt: skip
     return [posed[i][0] for i in spaced_views([pose for _, pose in posed], most)[:-1]]
 
 

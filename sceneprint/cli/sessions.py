@@ -86,9 +86,9 @@ def run_sessions(options: argparse.Namespace) -> int:
 def _delete_session(client: Client, options: argparse.Namespace) -> None:
     name = one_line(options.session)
     if not options.yes:
-        of = [one for one in client.sessions(options.map) if one.session == options.session]
-        of = [one for one in of if options.robot in (None, one.robot)]
-        n_frames = sum(sum(one.frames.values()) for one in of)
+        of = [run for run in client.sessions(options.map) if run.session == options.session]
+        of = [session for session in of if options.robot in (None, session.robot)]
+        n_frames = sum(sum(session.frames.values()) for session in of)
         raise InvalidRequest(
             f"This would delete session {name} and its {n_frames} frames. Add --yes to confirm."
         )

@@ -67,7 +67,7 @@ def run_sign(options: argparse.Namespace) -> int:
             model = {name: getattr(signer.model, name) for name in names}
             index = {"model": model, "frames": entries}
             write_whole(out / "signatures.json", (json.dumps(index, indent=1) + "\n").encode())
-    times = sorted(one["milliseconds"] for one in entries if one["signed"])
+    times = sorted(entry["milliseconds"] for entry in entries if entry["signed"])
     median = f", median {times[len(times) // 2]:.0f} ms" if times else ""
     print_error(
         f"{len(times)} of {len(entries)} frames signed{median}; {signer.model.signature_bytes} "

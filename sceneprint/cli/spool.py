@@ -77,7 +77,7 @@ def run_spool(options: argparse.Namespace) -> int:
 def _add(options: argparse.Namespace) -> int:
     """Add frames to the spool; return 2 if a frame cannot be read."""
     sequences = sequences_of(options.paths, options)
-    frames = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
+    frames = [(run, frame) for run in sequences for frame in run.frames[:: options.every]]
     new, there, errors = 0, 0, []
     with Spool(options.spool, options.most_bytes) as spool:
         before = spool.status()
@@ -111,7 +111,7 @@ def _status(spool: Spool, options: argparse.Namespace) -> int:
     now = spool.status()
     if options.json:
         oldest = None if now.oldest is None else now.oldest.isoformat()
-        reasons = [{"name": one.name, "reason": one.reason} for one in spool.refusals()]
+        reasons = [{"name": refusal.name, "reason": refusal.reason} for refusal in spool.refusals()]
         print(json.dumps(asdict(now) | {"oldest": oldest, "refusals": reasons}))
         return 0
     age = ""

@@ -300,7 +300,7 @@ def run_upload(options: argparse.Namespace) -> int:
     archives = [path for path in options.paths if is_archive_file(path)]
     paths = [path for path in options.paths if path not in archives]
     sequences = sequences_of(paths, options)
-    frames = [(one, frame) for one in sequences for frame in one.frames[:: options.every]]
+    frames = [(run, frame) for run in sequences for frame in run.frames[:: options.every]]
     tally, start, late = Tally(), time.perf_counter(), False
     with open_client(options) as client:
         _ensure_map(client, options)
@@ -369,9 +369,9 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
             "uses that of its matches. The service joins those that reliably show one place"
         )
         if len(two) == 2:
-            options = " ".join(f"--session {shlex.quote(str(one.session))}" for one in two)
-            if two[0].session == two[1].session and all(one.robot for one in two):
-                options += "".join(f" --robot {shlex.quote(str(one.robot))}" for one in two)
+            options = " ".join(f"--session {shlex.quote(str(session.session))}" for session in two)
+            if two[0].session == two[1].session and all(session.robot for session in two):
+                options += "".join(f" --robot {shlex.quote(str(session.robot))}" for session in two)
             line += (
                 f"; `sceneprint make association {now.name} {options}` does so at once, or "
                 "explains why not"
@@ -396,7 +396,7 @@ def summary_of(
         elif frame.name in failed:
             without["not indexed"] += 1
     sequences = dict.fromkeys(sequence for sequence, _ in frames)
-    notes = [one_line(one.note) for one in sequences if one.note and not one.layout.is_export]
+    notes = [one_line(run.note) for run in sequences if run.note and not run.layout.is_export]
     return upload_summary(len(frames), without, tally.ranges, notes)
 
 
@@ -478,7 +478,7 @@ def _send_all(
 ) -> None:
     """Upload all frames concurrently; stop if the service fails."""
     pool = ThreadPoolExecutor(options.parallel, thread_name_prefix="upload")
-    sent = {pool.submit(_send, client, options, *one): one[1].name for one in frames}
+    sent = {pool.submit(_send, client, options, *pair): pair[1].name for pair in frames}
     try:
         with tqdm(total=len(sent), desc="upload", unit="frame", disable=None) as bar:
             for future in as_completed(tuple(sent)):

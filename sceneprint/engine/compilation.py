@@ -75,7 +75,7 @@ def compile_kernels(
         # compile clouds last, since they reuse kernels of the other parts; each process writes one
         # byte per compiled kernel to the file
         with os.fdopen(os.memfd_create("compiled kernels"), "wb") as compiled:
-            for group in ([one for one in absent if one != "clouds"], ["clouds"]):
+            for group in ([part for part in absent if part != "clouds"], ["clouds"]):
                 commands = {part: (part, str(cache_dir)) for part in group if part in absent}
                 if _run(commands, environment, compiled, report, stop):
                     return

@@ -90,7 +90,7 @@ class Signers:
     def warm(self) -> None:
         """Load the kernels and the tables of all models in use."""
         with self.database.read() as connection:
-            used = {one for row in list_maps(connection) for one in models_of(row)}
+            used = {model_id for row in list_maps(connection) for model_id in models_of(row)}
         for model_id in used:
             try:
                 warm(self(model_id))

@@ -68,7 +68,7 @@ def living_rows(connection: Connection, row: MapRow) -> dict[str, FrameRow]:
     """Return all frames of a map, except deleted frames, by id."""
     own = frames.c.map_number == row.number, frames.c.state != FrameState.DELETED
     rows = connection.execute(select(frames).where(*own)).mappings()
-    return {one["id"]: frame_row(one) for one in rows}
+    return {frame["id"]: frame_row(frame) for frame in rows}
 
 
 def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
@@ -128,7 +128,5 @@ def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame
     job |= {"map_number": row.number, "state": JobState.SUCCEEDED, "attempts": 1}
     job |= dict.fromkeys(("created_at", "run_after", "started_at", "finished_at"), at)
     ids = [uuid.uuid4().hex for _ in numbers]
-    done = [
-        job | {"id": one, "frame_number": number} for one, number in zip(ids, numbers, strict=True)
-    ]
+    done = [job | {"id": job_id, "frame_number": n} for job_id, n in zip(ids, numbers, strict=True)]
     connection.execute(insert(jobs), done)

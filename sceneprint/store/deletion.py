@@ -94,9 +94,9 @@ def delete_frames(
     rows = connection.execute(statement).all()
     if not rows:
         return []
-    living = [one.number for one in rows]
+    living = [frame.number for frame in rows]
     cancel_jobs(connection, jobs.c.frame_number.in_(living))
-    redundant = [one.number for one in rows if one.state == FrameState.REDUNDANT]
+    redundant = [frame.number for frame in rows if frame.state == FrameState.REDUNDANT]
     add_usage(connection, row.number, len(redundant) - len(rows), 0)
     # one revision per frame, because readers continue after their last revision
     last = next_revision(connection, row.number, len(living))
@@ -112,7 +112,7 @@ def delete_frames(
     data = {} if reason is None else {"reason": reason}
     record_events(
         connection,
-        [event_values("frame.deleted", row.name, one.id, None, data) for one in rows],
+        [event_values("frame.deleted", row.name, frame.id, None, data) for frame in rows],
     )
     # purge redundant frames: without uploads, they cannot be restored
     return purge_frames(connection, row.number, living if deletion is None else redundant)
@@ -187,7 +187,7 @@ def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = Tru
         if lacking <= 0 or not oldest:
             break
         before = accumulate((held for _, held, _ in oldest), initial=0)
-        numbers = [one[0] for one, freed in zip(oldest, before, strict=False) if freed < lacking]
+        numbers = [old[0] for old, freed in zip(oldest, before, strict=False) if freed < lacking]
         blobs += purge_frames(connection, row.number, numbers)
     return blobs
 
@@ -434,7 +434,7 @@ def _unreferred() -> list[ColumnElement[bool]]:
         select(table.c.frame_number).where(table.c.frame_number == frames.c.number)
         for table in (surface_frames, surface_touches)
     )
-    return [frames.c.deletion.is_(None), *(not_(one.exists()) for one in (unfinished, *shown))]
+    return [frames.c.deletion.is_(None), *(not_(rows.exists()) for rows in (unfinished, *shown))]
 
 
 def _remove_rows(connection: Connection, numbers: Sequence[int]) -> None:

@@ -276,10 +276,10 @@ def _insert_frames(
         tag = func.json_array_elements_text(lacking.c.tags)
         rows = select(new.c.number, tag).select_from(inserted)
         others.append(insert(frame_tags).from_select(["frame_number", "tag"], rows))
-    for name in (one for one in _OPTIONAL if one in tables):
+    for name in (name for name in _OPTIONAL if name in tables):
         present = lacking.c[f"{name}_{_OPTIONAL[name]}"].is_not(None)
         others.append(_insert_rows(name, tables, constants, lacking, inserted, present))
-    return select(new.c.id).add_cte(*(one.cte(f"other_{i}") for i, one in enumerate(others)))
+    return select(new.c.id).add_cte(*(table.cte(f"other_{i}") for i, table in enumerate(others)))
 
 
 _Tables = dict[str, tuple[Table, tuple[str, ...]]]

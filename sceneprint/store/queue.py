@@ -262,7 +262,7 @@ def due_in_s(connection: Connection) -> float | None:
     """Return the seconds until the next job is due, without a lock; None if no job is queued."""
     waiting = select(func.min(jobs.c.run_after)).where(jobs.c.state == JobState.QUEUED)
     silent = select(func.min(jobs.c.leased_until)).where(jobs.c.state == JobState.RUNNING)
-    scalars = [connection.execute(one).scalar() for one in (waiting, silent)]
+    scalars = [connection.execute(due).scalar() for due in (waiting, silent)]
     times = [time for time in scalars if time is not None]
     return min(times) - read_clock(connection) if times else None
 
@@ -294,8 +294,8 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
     waiting = _waiting(at)
     silent = jobs.c.state == JobState.RUNNING, _lease_over(at)
     place = None
-    for one in _tenants_due(connection, *waiting):  # continue if all jobs of a tenant are locked
-        place = _lock_first(connection, one.turn, *waiting, jobs.c.tenant == one.tenant)
+    for tenant in _tenants_due(connection, *waiting):  # continue if all jobs of a tenant are locked
+        place = _lock_first(connection, tenant.turn, *waiting, jobs.c.tenant == tenant.tenant)
         if place is not None:
             break
     # prefer a job with an expired lease if it precedes; there are few such jobs
@@ -365,7 +365,7 @@ def _place(row: Row[*tuple[Any, ...]], turn: int) -> _Place:
 
 
 def _latest(*turns: int | None) -> int:
-    return max(one or 0 for one in turns)
+    return max(turn or 0 for turn in turns)
 
 
 def _is_upkeep(tenant: str, priority: int) -> bool:
@@ -430,9 +430,9 @@ def _tenants_due(connection: Connection, *due: ColumnElement[bool]) -> list[_Ten
 def has_waiting_before(connection: Connection, held: JobRow) -> bool:
     """Return whether a waiting job precedes the next slice of a running job."""
     return any(
-        one.tenant != held.tenant or one.priority > held.priority
-        for one in _tenants_due(connection, *_waiting(now(connection)))
-        if not one.upkeep
+        tenant.tenant != held.tenant or tenant.priority > held.priority
+        for tenant in _tenants_due(connection, *_waiting(now(connection)))
+        if not tenant.upkeep
     )
 
 
@@ -785,7 +785,7 @@ def remove_parts(
     for one in removed:
         if one.name == ARCHIVE:
             _count_archive(connection, job_number, -one.bytes)
-    return [one.blob for one in removed]
+    return [removal.blob for removal in removed]
 
 
 def replace_result(connection: Connection, job: JobRow, result: dict[str, Any]) -> JobRow:

@@ -167,7 +167,7 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
                jobs.c.state == JobState.FAILED)
         .order_by(jobs.c.number)
     )  # fmt: skip
-    rejected = {one.number: one for one in failed}
+    rejected = {row.number: row for row in failed}
     for number, one in rejected.items():
         set_state(connection, number, FrameState.REJECTED, one.error)
         # new revisions, since readers and indexes may still have the frame from an earlier switch
@@ -185,7 +185,7 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
     record_event(
         connection, "map.reencoded", row.name, model=row.next_model_id, before=row.model_id
     )
-    return [one.id for one in rejected.values()]
+    return [frame.id for frame in rejected.values()]
 
 
 def models_of(row: MapRow) -> tuple[str, ...]:

@@ -212,11 +212,11 @@ def put_signatures(connection: Connection, new: Sequence[tuple[int, StoredSignat
     """Insert signatures by frame number; the frames must lack signatures of these models."""
     rows = [
         {
-            "frame_number": number, "model_id": one.model_id, "vector": one.vector,
-            "checksum": crc32(one.vector), "geometry": one.geometry,
-            "n_patches": list(one.n_patches), "n_pairs": list(one.n_pairs),
+            "frame_number": number, "model_id": signature.model_id, "vector": signature.vector,
+            "checksum": crc32(signature.vector), "geometry": signature.geometry,
+            "n_patches": list(signature.n_patches), "n_pairs": list(signature.n_pairs),
         }
-        for number, one in new
+        for number, signature in new
     ]  # fmt: skip
     connection.execute(insert(signatures), rows)
 
@@ -240,7 +240,7 @@ def changes_since(
         ).all()  # fmt: skip
         if not rows:
             return
-        yield [_change(*one) for one in rows]
+        yield [_change(*columns) for columns in rows]
         revision = rows[-1].revision
 
 

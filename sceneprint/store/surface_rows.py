@@ -407,8 +407,8 @@ class LevelTotals:
 def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
     """Return the totals of the published tiles by parent frame and level."""
     c = surface_tiles.c
-    lows = [func.min(one) for one in (c.low_x, c.low_y, c.low_z)]
-    highs = [func.max(one) for one in (c.high_x, c.high_y, c.high_z)]
+    lows = [func.min(column) for column in (c.low_x, c.low_y, c.low_z)]
+    highs = [func.max(column) for column in (c.high_x, c.high_y, c.high_z)]
     statement = (
         select(c.parent, c.level, func.count(), func.sum(c.cells), *lows, *highs)
         .where(c.map_number == map_number, c.blob.is_not(None))
@@ -483,7 +483,7 @@ def write_tile(
         return int(connection.execute(new.returning(c.number)).scalar_one()), []
     connection.execute(update(surface_tiles).where(c.number == before.number).values(**values))
     left = {values.get(name, getattr(before, name)) for name in ("blob", "draft")}
-    return before.number, [one for one in (before.blob, before.draft) if one and one not in left]
+    return before.number, [b for b in (before.blob, before.draft) if b and b not in left]
 
 
 def remove_tiles(connection: Connection, tiles: Sequence[TileRow]) -> list[str]:

@@ -248,7 +248,7 @@ def models(here: Here, caller: Sender) -> Page[ModelInfo]:
     """List the models for maps (the presets, and all models that maps have or had)."""
     models = here.catalogue.list_all(lambda name: caller.may("read", name))
     if not caller.reads_every:  # do not reveal models of unreadable maps
-        models = [one for one in models if one.preset or one.maps]
+        models = [model for model in models if model.preset or model.maps]
     return Page[ModelInfo](items=models)
 
 

@@ -268,7 +268,7 @@ _WRITTEN = {
 def _described_import() -> dict[str, Any]:
     schema_of = ImportOptions.model_json_schema(ref_template="#/components/schemas/{model}")
     own = schema_of["properties"]
-    base = {one["name"]: one for one in bodies.parameters() if one["name"].startswith("base")}
+    base = {p["name"]: p for p in bodies.parameters() if p["name"].startswith("base")}
     text = "ImportOptions as JSON, instead of the parameters below."
     parameters = [bodies.query_parameter("options", {"type": "string"}, text)]
     for name in _PARAMETERS:

@@ -42,7 +42,7 @@ async def create_map(request: Request, here: Here, caller: Sender, response: Res
 def list_maps(here: Here, caller: Sender) -> Page[Map]:
     """List the maps that the key may read, sorted by name."""
     records = map_lifecycle.get_maps(here.context.store)
-    return Page[Map](items=[one for one in records if caller.may("read", one.name)])
+    return Page[Map](items=[record for record in records if caller.may("read", record.name)])
 
 
 @router.get("/{map_name}", responses=refusals(404), dependencies=[Depends(may_read)])

@@ -127,14 +127,14 @@ def query_operation(kind: type[BaseModel], named: Mapping[str, Any], required: l
     required : names of the fields that JSON must have
     """
     own = kind.model_json_schema(ref_template=TEMPLATE)["properties"]
-    texts = {n: bodies.as_text(one) for n, one in own.items() if n not in bodies.FRAME_PARTS}
+    texts = {n: bodies.as_text(schema) for n, schema in own.items() if n not in bodies.FRAME_PARTS}
     # Generated clients send the default, as text if the field may be a text or a list.
     own["stages"]["default"] = texts["stages"]["default"]
     needed = sorted({*bodies.FRAME_PARTS, *(name for name in required if name in texts)})
     body = bodies.form_body(bodies.FRAME_PARTS | texts, needed, "meta")
     sent = {"type": "object", "required": required, "properties": {**named, **own}}
     body["content"] |= {bodies.JSON: {"schema": sent}, **bodies.content()}
-    options = [bodies.option_parameter(name, one) for name, one in texts.items()]
+    options = [bodies.option_parameter(name, text) for name, text in texts.items()]
     return {"requestBody": body, "parameters": bodies.parameters() + options}
 
 
@@ -150,7 +150,7 @@ def sequence_body(kind: type[BaseModel], most: int) -> dict[str, Any]:
             "type": "array", "items": bodies.META,
             "description": "One object for each frame, with its odometry `pose`.",
         },
-        **{name: bodies.as_text(one) for name, one in own.items()},
+        **{name: bodies.as_text(schema) for name, schema in own.items()},
     }  # fmt: skip
     return {"requestBody": bodies.form_body(properties, ["frame", "metas"], "metas")}
 
@@ -351,7 +351,7 @@ async def localize_sequence(
         answer = await run_query(
             here, log, since,
             lambda: here.queries.sequence(
-                map_name, [(one.data, one.meta) for one in sent.read()], query, since, log
+                map_name, [(part.data, part.meta) for part in sent.read()], query, since, log
             ),
         )  # fmt: skip
     return localization_of(answer)
@@ -441,7 +441,7 @@ def _body() -> dict[str, Any]:
     file = {**bodies.FILE, "description": "A depth image as PNG or NPY."}
     meta = {"type": "string", "contentMediaType": bodies.JSON, "contentSchema": bodies.META}
     parts = {"a": file, "meta_a": meta, "b": file, "meta_b": meta}
-    body = bodies.form_body(parts | {name: bodies.as_text(one) for name, one in own.items()}, [])
+    body = bodies.form_body(parts | {n: bodies.as_text(s) for n, s in own.items()}, [])
     body["content"][bodies.JSON] = {
         "schema": {
             "type": "object", "required": ["frame_a", "frame_b"], "properties": own,

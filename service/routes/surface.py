@@ -175,7 +175,7 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != count or not all(abs(one) <= FARTHEST_M for one in numbers):  # false for NaN
+    if len(numbers) != count or not all(abs(x) <= FARTHEST_M for x in numbers):  # false for NaN
         raise InvalidRequest(
             f"`{name}` is {text!r:.80}. Specify {count} numbers in metres, separated by commas.",
             ((name, f"not {count} numbers"),),

@@ -84,7 +84,7 @@ def anchors(indexes: Path) -> frozenset[int]:
         return frozenset()
     folders = [folder for folder in indexes.iterdir() if is_index_folder(folder.name)]
     read = [_read(path) for folder in folders for _, path in manifests(folder)]
-    numbers = [anchor_number(one.anchor) for one in read if one is not None]
+    numbers = [anchor_number(manifest.anchor) for manifest in read if manifest is not None]
     return frozenset(number for number in numbers if number is not None)
 
 
@@ -150,7 +150,7 @@ def _of_database(database: Database) -> int | None:
     path = database.file
     if path is None:
         return None
-    return sum(_size(one) for one in (path, path.with_name(path.name + "-wal")))
+    return sum(_size(file) for file in (path, path.with_name(path.name + "-wal")))
 
 
 def _of_objects(store: Store) -> int:
@@ -419,7 +419,8 @@ class Statistics:
 
     def _sizes_of_map(self, connection: Connection, row: MapRow) -> Sizes:
         now = time.monotonic()
-        recent = {n: one for n, one in list(self._sizes_of.items()) if now - one[0] <= MEASURED_S}
+        cached = list(self._sizes_of.items())
+        recent = {n: entry for n, entry in cached if now - entry[0] <= MEASURED_S}
         if row.number not in recent:
             measured = sizes_of_map(connection, self._store, self._settings.indexes, row)
             recent[row.number] = now, measured

@@ -418,7 +418,7 @@ class Imports:
                 raise queue.unknown_job(job_id)
             rows = queue.items_of(connection, job.number, first, limit + 1)
         more = str(first + limit) if len(rows) > limit else None
-        return Page[ImportItem](items=[ImportItem(**one) for one in rows[:limit]], next_cursor=more)
+        return Page[ImportItem](items=[ImportItem(**row) for row in rows[:limit]], next_cursor=more)
 
     def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Run a slice of an import: add at least one block of frames."""

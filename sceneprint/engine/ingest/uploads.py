@@ -367,9 +367,9 @@ class Uploads:
         again = False
         if ready:
             outcomes, again = self._write(row, ready, outcomes, once, fence)
-        if any(one is not None and one.new for one in outcomes) and not again:
+        if any(outcome is not None and outcome.new for outcome in outcomes) and not again:
             self._bell.ring()
-        return [one for one in outcomes if one is not None], again
+        return [outcome for outcome in outcomes if outcome is not None], again
 
     def _prepared(self, upload: Upload) -> _Prepared:
         if upload.frame_id is not None:

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 ROUNDS = 10
 #: Size of a response in bytes from which no further part is added.
 MOST_BYTES = 32 << 20
-_NAMES = [one.name for one in COLUMNS]
+_NAMES = [column.name for column in COLUMNS]
 
 
 def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes, int]]:
@@ -245,7 +245,7 @@ def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
         if row is None:
             return {}
         return {
-            digest: {one[0]: one for one in read_rows(data, _NAMES)}
+            digest: {row[0]: row for row in read_rows(data, _NAMES)}
             for digest, data, _ in copy_parts(connection, row)
         }
 
@@ -305,7 +305,7 @@ def _write(
         store_model(connection, head.model_id, head.model, model)
         row = _prepare_map(store, connection, head, blobs)
         existing = living_rows(connection, row)
-        deleted = [one for name, one in existing.items() if name not in rows]
+        deleted = [frame for name, frame in existing.items() if name not in rows]
         renewed = [
             existing[copy.id] for copy in written
             if copy.id in existing and existing[copy.id].content_id != copy.values["content_id"]
@@ -336,9 +336,9 @@ def _copied(head: MapCopy, row: Row) -> CopiedFrame:
         column.name: json.loads(x) if isinstance(column.type, JSON) and x is not None else x
         for column, x in zip(COLUMNS[1:], cells, strict=True)
     }
-    own = (values[one] for one in ("vector", "geometry", "n_patches", "n_pairs"))
+    own = (values[name] for name in ("vector", "geometry", "n_patches", "n_pairs"))
     signature = StoredSignature(head.model_id, *own)
-    return CopiedFrame(name, {one: values[one] for one in COPIED_COLUMNS}, signature)
+    return CopiedFrame(name, {name: values[name] for name in COPIED_COLUMNS}, signature)
 
 
 def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:

@@ -460,7 +460,7 @@ class Catalogue:
         shipped = [_preset(name) for name in PRESETS]
         by_id |= {model.id: model for model in shipped}
         ids = [model.id for model in shipped]
-        rest = sorted((one for one in by_id.values() if one.id not in ids), key=lambda m: m.label)
+        rest = sorted((m for m in by_id.values() if m.id not in ids), key=lambda m: m.label)
         return [
             _model_record(
                 model,
@@ -490,11 +490,11 @@ class Catalogue:
             return _preset(name)
         with self._database.read() as connection:
             rows = list_maps(connection)
-            every = [*(_preset(one) for one in PRESETS), *self._stored(connection)]
+            every = [*(_preset(name) for name in PRESETS), *self._stored(connection)]
         if may_read is not None:
             pairs = [(row.model_id, row.next_model_id) for row in rows if may_read(row.name)]
             visible = {model_id for pair in pairs for model_id in pair}
-            every = [one for i, one in enumerate(every) if i < len(PRESETS) or one.id in visible]
+            every = [m for i, m in enumerate(every) if i < len(PRESETS) or m.id in visible]
         for model in every:
             if name in (model.id, model.label):
                 return model

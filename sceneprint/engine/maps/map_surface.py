@@ -153,10 +153,10 @@ class MapSurfaces:
         more = "~".join(map(str, rows[limit - 1].place)) if len(rows) > limit else None
         items = [
             SurfaceTile(
-                column=one.tile_x, row=one.tile_y, floor=one.tile_z, cells=one.cells,
-                bytes=one.cells * CELL.itemsize, digest=one.digest,
+                column=record.tile_x, row=record.tile_y, floor=record.tile_z, cells=record.cells,
+                bytes=record.cells * CELL.itemsize, digest=record.digest,
             )
-            for one in rows[:limit]
+            for record in rows[:limit]
         ]  # fmt: skip
         return Page[SurfaceTile](items=items, next_cursor=more)
 
@@ -290,9 +290,11 @@ class MapSurfaces:
             name = _parent_name(surface, parent)
             record = None
             if surface is not None:
-                record = next((one for one in surface.parents if one["parent_frame"] == name), None)
+                record = next((p for p in surface.parents if p["parent_frame"] == name), None)
             totals = [
-                one for one in stored.level_totals(connection, row.number) if one.parent == name
+                total
+                for total in stored.level_totals(connection, row.number)
+                if total.parent == name
             ]
         if surface is None or record is None or not totals:
             raise NotFound(

@@ -61,7 +61,7 @@ def delete_selection(
             row = find_map(connection, map_name)
             block = _selected(connection, row, selection, last, AT_ONCE)
             deletion = deletion or tombstones.begin(row)
-            numbers = [one.number for one in block]
+            numbers = [frame.number for frame in block]
             blobs = delete_frames(connection, row, numbers, deletion=deletion)
             last = numbers[-1] if numbers else last
             left = _count(connection, row, selection, last)
@@ -157,7 +157,7 @@ def _selected(
         frames.c.state != FrameState.DELETED, frames.c.number > after,
     )  # fmt: skip
     rows = connection.execute(statement.order_by(frames.c.number).limit(limit)).mappings()
-    return [frame_row(one) for one in rows]
+    return [frame_row(frame) for frame in rows]
 
 
 def _count(connection: Connection, row: MapRow, selection: FrameSelection, after: int) -> int:

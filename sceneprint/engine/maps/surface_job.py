@@ -225,7 +225,7 @@ class SurfaceHandler:
                 except DamagedBlob:
                     return _restart(surface, progress, [(tile.parent, tile.place)])
                 sums[tile.parent, tile.place] = [np.frombuffer(data, CELL_SUM)]
-        numbers, over = [one.number for one in tiles], False
+        numbers, over = [tile.number for tile in tiles], False
         sessions = _Sessions(surface.sessions)
         while not over:
             with self._store.database.read() as connection:
@@ -391,12 +391,12 @@ class SurfaceHandler:
         """Store changed tiles of a coarser level in `done`; return their cells by coarser tile."""
         groups: dict[_Key, dict[TilePlace, Cells]] = {}
         for (parent, place), cells in parts.items():
-            x, y, z = (one // FACTOR for one in place)
+            x, y, z = (value // FACTOR for value in place)
             groups.setdefault((parent, (x, y, z)), {})[place] = cells
         with self._store.database.read() as connection:
             before = {
-                (one.parent, one.place): one
-                for one in _tiles_of(connection, surface, groups, level)
+                (tile.parent, tile.place): tile
+                for tile in _tiles_of(connection, surface, groups, level)
             }
         above: dict[_Key, Cells] = {}
         for key, changed in groups.items():

@@ -190,7 +190,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         order = {number: i for i, number in enumerate(ranking.indices.tolist())}
         accepted = sorted(
             (match for match in matches if match.validation.status == "accepted"),
-            key=lambda one: order[one.index],
+            key=lambda match: order[match.index],
         )
         return [
             _item(number, match)
@@ -280,8 +280,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             result = self.require_success(job, "join")
             if job.map_number is not None and undo_joins(connection, job.map_number, job.id):
                 joins = [
-                    one if one["root"] is None else one | {"root": None, "undone": True}
-                    for one in result["joins"]
+                    join if join["root"] is None else join | {"root": None, "undone": True}
+                    for join in result["joins"]
                 ]
                 job = replace_result(connection, job, result | {"joins": joins})
                 record_event(connection, "association.undone", map_name, None, job.id)

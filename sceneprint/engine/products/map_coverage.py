@@ -134,7 +134,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
             return []
         item = outcome_of(answer, stop, request)
         with self._store.database.read() as connection:
-            look_alikes = [living_frame(connection, row.number, one) for one in item["look_alikes"]]
+            look_alikes = [living_frame(connection, row.number, n) for n in item["look_alikes"]]
         item["look_alikes"] = [frame.number for frame in look_alikes if frame is not None]
         return [{"frame": number} | item]
 
@@ -198,7 +198,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         """
 
         def records(connection: Connection, block: list[dict[str, Any]]) -> list[CoverageFrame]:
-            named = {one for item in block for one in (item["frame"], *item["look_alikes"])}
+            named = {number for item in block for number in (item["frame"], *item["look_alikes"])}
             stops = path_frames(connection, named)
             return [
                 _frame_record(item, stops)

@@ -154,7 +154,7 @@ class IndexPlace:
         if self._store is None:
             return True
         prefix = self._prefix(row)
-        sizes = {one.key: one.size for one in self._list(row)}
+        sizes = {entry.key: entry.size for entry in self._list(row)}
         for name, size in manifest.files:
             if sizes.get(f"{prefix}{name}") != size:
                 self._store.put_file(f"{prefix}{name}", self.folder(row) / name)
@@ -175,7 +175,7 @@ class IndexPlace:
             return
         now = max(entry.changed_at for entry in listed)  # by the clock of the object store
         before = math.inf if clean else now - GRACE_S
-        fetchable = [one for one, after in pairwise(numbered) if after.changed_at >= before]
+        fetchable = [entry for entry, after in pairwise(numbered) if after.changed_at >= before]
         needed = set[str]()
         for one in (*fetchable, numbered[-1]):
             manifest = self._read(one)
@@ -207,7 +207,7 @@ class IndexPlace:
             return True
         manifest = None if head is None else self.sync(row)
         number = None if manifest is None else manifest.number
-        return [one for one, _ in manifests(folder)] == [number] or clear(folder, but=number)
+        return [number for number, _ in manifests(folder)] == [number] or clear(folder, but=number)
 
     def sweep(self, *, now: bool = False) -> None:
         """Remove indexes of deleted maps from the object store, at intervals, on one host at a
@@ -224,7 +224,7 @@ class IndexPlace:
         if not now and last is not None and time.time() - last.changed_at < 0.45 * self._purge_s:
             return
         self._store.put(_SWEPT, b"")
-        keys = [one.key for one in self._store.list(_FOLDER)]
+        keys = [entry.key for entry in self._store.list(_FOLDER)]
         known = self._known()
         self._delete(
             key for key in keys
@@ -248,7 +248,7 @@ class IndexPlace:
         return {self.folder(row).name: row for row in rows}
 
     def _folders(self) -> list[Path]:
-        return [one for one in self._indexes.glob("*") if is_index_folder(one.name)]
+        return [folder for folder in self._indexes.glob("*") if is_index_folder(folder.name)]
 
     def want(self, row: MapRow, version: IndexVersion | None) -> None:
         """Check for a newer index of a queried map, at intervals, and download it in the

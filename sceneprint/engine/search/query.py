@@ -112,9 +112,9 @@ def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
     except UnknownMap:
         return None
     pairs = list(zip(rows_now, rows, strict=True))
-    if any(one.number != row.number for one, row in pairs):
+    if any(current.number != row.number for current, row in pairs):
         return None
-    return rows_now if any(one.model_id != row.model_id for one, row in pairs) else None
+    return rows_now if any(current.model_id != row.model_id for current, row in pairs) else None
 
 
 #: A stored frame, or the bytes and metadata of an upload.
@@ -206,7 +206,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
 
 def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
     """Return the names of the two sensor frames, with the ids `a` and `b` if the ids are equal."""
-    ids = [x if one.frame is None else one.frame[1] for x, one in (("a", a), ("b", b))]
+    ids = [x if side.frame is None else side.frame[1] for x, side in (("a", a), ("b", b))]
     if ids[0] == ids[1]:
         ids = ["a", "b"]
     return sensor_frame(ids[0], a.kind), sensor_frame(ids[1], b.kind)
@@ -271,7 +271,7 @@ class Queries:
             decoders = self._store.decoders
             *before, last = [prepare_upload(*frame, signer, query, decoders) for frame in frames]
             earlier = [
-                SequenceFrame(one, inverse(_odometry(last)) @ _odometry(one)) for one in before
+                SequenceFrame(each, inverse(_odometry(last)) @ _odometry(each)) for each in before
             ]
             return self.answer(rows, last, query, deadline, earlier, sent)
 
@@ -345,9 +345,9 @@ class Queries:
         """Answer a prepared query with the current state of its maps, and log it; see `answer`."""
         database = self._store.database
         with database.read() as connection:
-            rows = find_maps(connection, [one.name for one in expected])
-            for row, one in zip(rows, expected, strict=True):
-                if row.number != one.number:
+            rows = find_maps(connection, [former.name for former in expected])
+            for row, former in zip(rows, expected, strict=True):
+                if row.number != former.number:
                     raise UnknownMap(
                         f"Map {row.name!r} was deleted and created again during the query. Send "
                         "the query again."

@@ -396,7 +396,7 @@ def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
         distance=int(distance[0]),
         similarity=float(similarity(distance, case.model.unrelated_distance)[0]),
         rank=rank,
-        of=sum(one.passed for one in case.searched.parts),
+        of=sum(part.passed for part in case.searched.parts),
         shortlisted=not missed,
         ranked=bool(at),
         selected=selected,
@@ -427,9 +427,9 @@ def _locate_frame(case: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSea
         raise missing
     return min(
         candidates,
-        key=lambda one: (
-            one[1].state != FrameState.INDEXED,
-            own is not None and one[1].number == own[0],
+        key=lambda pair: (
+            pair[1].state != FrameState.INDEXED,
+            own is not None and pair[1].number == own[0],
         ),
     )
 

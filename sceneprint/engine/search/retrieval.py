@@ -77,7 +77,7 @@ class Readers:
                 self._open[row.name] = (key, reader)
             self._open.move_to_end(row.name)
             # close the least recently queried readers, but never the current one
-            held_bytes = sum(one.bytes_held for _, one in self._open.values())
+            held_bytes = sum(reader.bytes_held for _, reader in self._open.values())
             while len(self._open) > 1 and held_bytes > HELD_BYTES:
                 _, (_, oldest) = self._open.popitem(last=False)
                 held_bytes -= oldest.bytes_held

@@ -327,7 +327,7 @@ def _near_frames(
 ) -> dict[int, PlacedFrame]:
     """Return searchable frames in a parent frame near the poses `at` (n, 4, 4), by frame number."""
     number, _, name = parent.partition(" ")
-    part = next(one for one in searched.parts if one.place.row.number == int(number))
+    part = next(part for part in searched.parts if part.place.row.number == int(number))
     cells = np.unique(np.round(at[:, :3, 3] / p.cell), axis=0, return_index=True)[1]
     frames: dict[int, PlacedFrame] = {}
     with store.database.read() as connection:

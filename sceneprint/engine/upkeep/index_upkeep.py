@@ -425,8 +425,9 @@ def _blocks(
 ) -> Iterator[tuple[NDArray[np.int64], Bytes]]:
     """Yield keys and signatures since a revision; add damaged frames to `damaged`."""
     for block in changes_since(connection, row, since):
-        damaged += [one.number for one in block if one.vector is None and not one.deleted]
-        signed = [(one.number, one.vector) for one in block if one.vector is not None]
+        lost = [change for change in block if change.vector is None and not change.deleted]
+        damaged += [change.number for change in lost]
+        signed = [(change.number, change.vector) for change in block if change.vector is not None]
         if signed:
             rows = np.stack([np.frombuffer(vector, np.uint8) for _, vector in signed])
             yield np.array([number for number, _ in signed], np.int64), rows

@@ -248,7 +248,7 @@ class Purging:
         purged = Purged(
             blobs=attempt(lambda: collect_doomed_blobs(self._store, before, seconds))
             + attempt(lambda: collect_quarantined(self._store, self._quarantine)),
-            products=sum(attempt(one.forget) for one in self._products),
+            products=sum(attempt(product.forget) for product in self._products),
             answers=attempt(self._log.purge),
             indexes=attempt(partial(self._upkeep.sweep, now=before is None))
             + sum(attempt(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]

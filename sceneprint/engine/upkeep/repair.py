@@ -80,7 +80,7 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
             return 0
         with store.database.write() as connection:
             due = _due(connection, due, model_id)
-            ids = {one.number: one.id for one in frames_of(connection, due).values()}
+            ids = {frame.number: frame.id for frame in frames_of(connection, due).values()}
             for number in due:
                 job = enqueue(connection, REENCODE, number, PRIORITY, model_id)
                 record_event(connection, "frame.damaged", row.name, ids[number], job.id)

@@ -103,7 +103,7 @@ def _job_files() -> Select[Any]:
 
 def _tiles(blob: Column[str]) -> Select[Any]:
     c = surface_tiles.c
-    x, y, z, level = (cast(one, Text) for one in (c.tile_x, c.tile_y, c.tile_z, c.level))
+    x, y, z, level = (cast(column, Text) for column in (c.tile_x, c.tile_y, c.tile_z, c.level))
     return (
         select(c.number, blob, maps.c.name, x + "," + y + "," + z + " of level " + level)
         .join(maps, maps.c.number == c.map_number)
@@ -207,21 +207,21 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
     kind : key of `_KINDS`
     """
     blobs = folder.store.blobs
-    for one in read_rows(folder, numbers, partial(_read, kind)):
-        if isinstance(one, tuple):
+    for row in read_rows(folder, numbers, partial(_read, kind)):
+        if isinstance(row, tuple):
             continue  # `check_rows` reports it
         folder.counts["blobs"] += 1
-        folder.counts["bytes"] += 0 if folder.quick else blobs.size(one.digest) or 0
-        condition = blobs.condition(one.digest, quick=folder.quick)
-        recovered = _is_recovered(one, condition) and not folder.quick
+        folder.counts["bytes"] += 0 if folder.quick else blobs.size(row.digest) or 0
+        condition = blobs.condition(row.digest, quick=folder.quick)
+        recovered = _is_recovered(row, condition) and not folder.quick
         if condition == "sound" and not recovered:
             continue
         with folder.store.database.read() as connection:
-            if _current_reference(connection, one) is None:  # the row was deleted
+            if _current_reference(connection, row) is None:  # the row was deleted
                 continue
         finding = partial(
-            Finding, what=one.what, map=one.map, frame_id=one.frame_id,
-            path=blobs.place(one.digest),
+            Finding, what=row.what, map=row.map, frame_id=row.frame_id,
+            path=blobs.place(row.digest),
         )  # fmt: skip
         means = _KINDS[kind].means
         if recovered:
@@ -229,9 +229,9 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
                 kind="found-upload", severity="leftover",
                 means="the frame's reason says that the upload is lost, but it exists",
                 would="clear the reason, and sign the frame if it failed for that reason",
-                repair=partial(_repair, folder, one),
+                repair=partial(_repair, folder, row),
             )  # fmt: skip
-        elif condition == "missing" and (one.on_its_way or is_known_loss(one.reason)):
+        elif condition == "missing" and (row.on_its_way or is_known_loss(row.reason)):
             yield finding(
                 kind=f"missing-{kind}", severity="note", means=f"{means}; the loss is recorded"
             )
@@ -239,7 +239,7 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
             move = "move the file to the quarantine, and " if condition == "damaged" else ""
             yield finding(
                 kind=f"{condition}-{kind}", severity="damage", means=means,
-                would=move + _KINDS[kind].would, repair=partial(_repair, folder, one),
+                would=move + _KINDS[kind].would, repair=partial(_repair, folder, row),
             )  # fmt: skip
 
 

@@ -84,7 +84,7 @@ def check_database(folder: Folder) -> Iterator[Finding]:
         yield from (damaged_database(" ".join(line.split())) for line in lines if line != "ok")
     keys = [] if folder.quick else [
         key for table in metadata.sorted_tables
-        for key in sorted(table.foreign_key_constraints, key=lambda one: str(one.name))
+        for key in sorted(table.foreign_key_constraints, key=lambda foreign: str(foreign.name))
     ]  # fmt: skip
     for done, key in enumerate(keys):
         folder.progress("database", done, len(keys))
@@ -187,10 +187,10 @@ class _CheckedFrame:
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
     """Check the rows of some frames, and yield findings of inconsistent or damaged rows."""
-    for one in read_rows(folder, numbers, partial(_read_frames, folder)):
+    for row in read_rows(folder, numbers, partial(_read_frames, folder)):
         folder.counts["frames"] += 1
-        if isinstance(one, tuple):
-            number, error = one
+        if isinstance(row, tuple):
+            number, error = row
             message = " ".join(str(error).split())
             yield Finding(
                 "unreadable-row", f"frame number {number}", "damage",
@@ -198,22 +198,22 @@ def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
                 "restore a backup; other frames are not affected",
             )  # fmt: skip
             continue
-        folder.counts["signatures"] += len(one.signed)
+        folder.counts["signatures"] += len(row.signed)
         for kind, fault in _FAULTS.items():
-            if fault.is_found(one):
+            if fault.is_found(row):
                 yield Finding(
-                    kind, f"frame {one.frame.id} of map {one.map.name}",
+                    kind, f"frame {row.frame.id} of map {row.map.name}",
                     "leftover" if kind == "stray-signature" else "damage",
-                    fault.means, fault.would, map=one.map.name, frame_id=one.frame.id,
-                    repair=partial(_repair_row, folder, one.frame.number, fault),
+                    fault.means, fault.would, map=row.map.name, frame_id=row.frame.id,
+                    repair=partial(_repair_row, folder, row.frame.number, fault),
                 )  # fmt: skip
 
 
 def _repair_row(folder: Folder, number: int, fault: _Fault) -> str:
     with folder.store.database.write() as connection:
-        for one in _read_frames(folder, connection, [number]):  # read the row again
-            if fault.is_found(one):
-                return fault.fix(folder, connection, one)
+        for checked in _read_frames(folder, connection, [number]):  # read the row again
+            if fault.is_found(checked):
+                return fault.fix(folder, connection, checked)
     return GONE
 
 
@@ -247,7 +247,7 @@ def _signatures(folder: Folder, numbers: list[int]) -> Select[Any]:
         return statement
     # read bytes, since damaged text columns of SQLite cannot be decoded
     raw = LargeBinary if folder.store.database.is_sqlite else Text
-    counts = (cast(one, raw) for one in (c.n_patches, c.n_pairs))
+    counts = (cast(column, raw) for column in (c.n_patches, c.n_pairs))
     return statement.add_columns(cast(c.vector, LargeBinary), c.checksum, *counts)
 
 
@@ -369,11 +369,11 @@ class _Fault:
 
 _FAULTS = {
     "frame-without-job": _Fault(
-        lambda one: one.frame.state in _BEING_SIGNED and not one.busy,
+        lambda checked: checked.frame.state in _BEING_SIGNED and not checked.busy,
         "it waits to be signed, but has no job", "queue a job", _queue,
     ),
     "frame-without-signature": _Fault(
-        lambda one: _is_indexed(one) and one.map.model_id not in one.signed,
+        lambda checked: _is_indexed(checked) and checked.map.model_id not in checked.signed,
         "it is indexed without a signature, so queries cannot find it",
         "sign it again from its upload", _sign,
     ),
@@ -390,7 +390,7 @@ _FAULTS = {
         "copy them from the frame", _write_derived,
     ),
     "revision-ahead": _Fault(
-        lambda one: (one.frame.revision or 0) > one.map.revision,
+        lambda checked: (checked.frame.revision or 0) > checked.map.revision,
         "its revision is greater than its map's", "assign the map's next revision",
         _assign_revision,
     ),

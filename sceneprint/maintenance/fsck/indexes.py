@@ -76,7 +76,8 @@ def _differing_frames(folder: Folder, row: MapRow, index: IndexVersion) -> Itera
         keys = np.array([each.number for each in block], np.int64)
         held = version.has(keys)
         rows = version.vectors_of(keys[held])
-        indexed = {key: one.tobytes() for key, one in zip(keys[held].tolist(), rows, strict=True)}
+        pairs = zip(keys[held].tolist(), rows, strict=True)
+        indexed = {key: vector.tobytes() for key, vector in pairs}
         for number, frame_id in block:
             # `check_rows` reports damage in the database
             if number in stored and indexed.get(number) != stored[number]:

@@ -283,8 +283,8 @@ class Objects:
                 page = next(pages, None)
             if page is None:
                 return
-            for one in page:
-                yield ListedObject(one["path"], one["size"], one["last_modified"].timestamp())
+            for entry in page:
+                yield ListedObject(entry["path"], entry["size"], entry["last_modified"].timestamp())
 
     def delete(self, *keys: str, seconds: float = math.inf, once: bool = False) -> None:
         """Remove objects; ignore missing objects.

@@ -313,7 +313,7 @@ class ObjectBlobs(Blobs):
 
     def digests(self) -> Iterator[str]:
         """See `Blobs.digests`."""
-        return (one.digest for one in self.entries() if one.digest is not None)
+        return (entry.digest for entry in self.entries() if entry.digest is not None)
 
     def entries(self) -> Iterator[BlobEntry]:
         """Yield all objects of the blob storage, page by page.
@@ -321,11 +321,11 @@ class ObjectBlobs(Blobs):
         Stores do not list incomplete uploads of killed writers. Configure the lifecycle rules of
         the bucket to abort them after a day.
         """
-        for one in self.objects.list(FOLDER):
-            name = one.key.rpartition("/")[2]
-            own = DIGEST.fullmatch(name) and one.key == _key(name)
-            place = f"{self.objects.url}/{one.key}"
-            yield BlobEntry(place, name if own else None, one.changed_at)
+        for entry in self.objects.list(FOLDER):
+            name = entry.key.rpartition("/")[2]
+            own = DIGEST.fullmatch(name) and entry.key == _key(name)
+            place = f"{self.objects.url}/{entry.key}"
+            yield BlobEntry(place, name if own else None, entry.changed_at)
 
     def check(self) -> None:
         """See `Blobs.check`."""
