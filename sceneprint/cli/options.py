@@ -380,7 +380,7 @@ def ended_by_signals() -> Iterator[None]:
         raise KeyboardInterrupt
 
     # Leave SIGHUP ignored by `nohup`.
-    caught = [end for end in _ENDING if signal.getsignal(end) is signal.SIG_DFL]
+    caught = [number for number in _ENDING if signal.getsignal(number) is signal.SIG_DFL]
     for number in caught:
         signal.signal(number, end)
     try:

@@ -245,7 +245,7 @@ def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
         if row is None:
             return {}
         return {
-            digest: {row[0]: row for row in read_rows(data, _NAMES)}
+            digest: {cells[0]: cells for cells in read_rows(data, _NAMES)}
             for digest, data, _ in copy_parts(connection, row)
         }
 
