@@ -150,7 +150,7 @@ def test_what_was_uploaded_into_the_copy_is_not_lost(
         robot.pull()
     robot.service.delete_map(MAP)
     robot.service.create_map(MAP, model="depth")
-    with pytest.raises(Conflict, match="uploaded into the copy"):
+    with pytest.raises(Conflict, match="has 1 uploaded frames"):
         robot.pull()
     with Client.embedded(robot.folder) as client:
         assert [one.frame_id for one in client.frames(MAP)] == [own]
