@@ -222,8 +222,8 @@ class QueryLog:
             self.tidy(now=True)
         return True
 
-    def _write_file(self, one: _Waiting) -> None:
-        if one.answer is None or one.row.bytes:  # stored by an earlier attempt
+    def _write_file(self, entry: _Waiting) -> None:
+        if entry.answer is None or entry.row.bytes:  # stored by an earlier attempt
             return
         data = encode_answer(entry.answer)
         if len(data) > self._room:

@@ -233,9 +233,9 @@ def uncertainty_record(
         return None
     free = [
         FreeDirection(
-            translation=vector(one.translation.tolist()),
-            rotation=vector(one.rotation.tolist()),
-            deviation=one.deviation,
+            translation=vector(direction.translation.tolist()),
+            rotation=vector(direction.rotation.tolist()),
+            deviation=direction.deviation,
         )
         for direction in free_directions(covariance, p)
     ]
