@@ -316,7 +316,7 @@ def _write(
         for one in written:
             if not store.blobs.holds(one.signature.geometry):
                 raise DamagedBlob(
-                    f"The artifact {copy.signature.geometry[:12]} was removed during the pull. "
+                    f"The artifact {one.signature.geometry[:12]} was removed during the pull. "
                     "Pull the map again."
                 )
             if one.id in remaining:
