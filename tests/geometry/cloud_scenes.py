@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from sceneprint.types import Cloud, Floats
+from sceneprint.types import Cloud
 
 #: Walls of the room relative to the viewpoint: x, y, z from -> to, metres.
 LOW, HIGH = np.array([-2.0, -1.6, -1.1]), np.array([2.6, 1.9, 1.4])
 
 
-def directions(n: int, seed: int = 0, half_deg: float = 180.0) -> Floats:
+def directions(n, seed=0, half_deg=180.0):
     """Return unit vectors (n, 3), uniform within an angle of the x axis."""
     rng = np.random.default_rng(seed)
     x = rng.uniform(np.cos(np.radians(half_deg)), 1.0, n)
@@ -19,7 +19,7 @@ def directions(n: int, seed: int = 0, half_deg: float = 180.0) -> Floats:
     return np.column_stack([x, flat * np.cos(turn), flat * np.sin(turn)])
 
 
-def in_room(rays: Floats) -> tuple[Floats, Floats]:
+def in_room(rays):
     """Return the points where rays meet the walls, and the normals there, (n, 3) each."""
     with np.errstate(divide="ignore"):
         reach = np.where(rays > 0, HIGH / rays, LOW / rays)
@@ -30,19 +30,18 @@ def in_room(rays: Floats) -> tuple[Floats, Floats]:
     return rays * reach[row, wall][:, None], normals
 
 
-def room(n: int = 40_000, seed: int = 0, half_deg: float = 180.0) -> Cloud:
+def room(n=40_000, seed=0, half_deg=180.0):
     """Return an exact cloud of the room around the viewpoint."""
     return Cloud(in_room(directions(n, seed, half_deg))[0].astype(np.float32))
 
 
-def off_walls(points: Floats) -> Floats:
+def off_walls(points):
     """Return the distances of points from the nearest wall, metres."""
     gaps = np.concatenate([points - LOW, HIGH - points], axis=-1)
-    result: Floats = np.abs(gaps).min(axis=-1)
-    return result
+    return np.abs(gaps).min(axis=-1)
 
 
-def rotation(seed: int) -> Floats:
+def rotation(seed):
     """Return a uniformly random rotation (3, 3)."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
@@ -50,10 +49,10 @@ def rotation(seed: int) -> Floats:
     return np.asarray(q, float)
 
 
-def shuffled(cloud: Cloud, seed: int = 1) -> Cloud:
+def shuffled(cloud, seed=1):
     order = np.random.default_rng(seed).permutation(len(cloud.points))
     return Cloud(cloud.points[order], cloud.has_viewpoint, cloud.name)
 
 
-def turned(cloud: Cloud, R: Floats) -> Cloud:
+def turned(cloud, R):
     return Cloud((cloud.points @ R.T).astype(np.float32), cloud.has_viewpoint, cloud.name)

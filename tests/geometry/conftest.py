@@ -4,37 +4,34 @@ from __future__ import annotations
 
 from importlib import util
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 
-def beside(name: str) -> ModuleType:
+def beside(name):
     """Return the module `name` of this folder, which importlib mode does not put on the path."""
     path = Path(__file__).resolve().with_name(f"{name}.py")
     spec = util.spec_from_file_location(f"geometry_{name}", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
 @pytest.fixture(scope="session")
-def goldens() -> ModuleType:
+def goldens():
     return beside("goldens")
 
 
 @pytest.fixture(scope="session")
-def validation_goldens() -> ModuleType:
+def validation_goldens():
     return beside("validation_goldens")
 
 
 @pytest.fixture(scope="session")
-def scenes() -> ModuleType:
+def scenes():
     return beside("scenes")
 
 
 @pytest.fixture(scope="session")
-def cloud_scenes() -> ModuleType:
+def cloud_scenes():
     return beside("cloud_scenes")

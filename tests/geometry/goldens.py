@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from types import ModuleType
 
 import numpy as np
 
 from sceneprint.geometry.signature.mixture import Mixture
-from sceneprint.types import Floats, Patches
+from sceneprint.types import Patches
 
 
-def two_patches(l_mu: Floats, n_mu: Floats, l_alpha: Floats, n_alpha: Floats) -> Patches:
+def two_patches(l_mu, n_mu, l_alpha, n_alpha):
     return Patches(
         np.array([l_mu, l_alpha]),
         np.array([n_mu, n_alpha]),
@@ -21,7 +20,7 @@ def two_patches(l_mu: Floats, n_mu: Floats, l_alpha: Floats, n_alpha: Floats) ->
     )
 
 
-def from_invariants(d: float, theta_mu: float, theta_alpha: float, phi: float) -> Patches:
+def from_invariants(d, theta_mu, theta_alpha, phi):
     """Return two patches with u = x, v = y, w = z and the given invariants."""
     n_mu = [math.cos(theta_mu), math.sin(theta_mu), 0.0]
     s = math.sin(theta_alpha)
@@ -29,7 +28,7 @@ def from_invariants(d: float, theta_mu: float, theta_alpha: float, phi: float) -
     return two_patches(np.zeros(3), np.array(n_mu), np.array([d, 0.0, 0.0]), np.array(n_alpha))
 
 
-def check_eq1(module: ModuleType) -> None:
+def check_eq1(module):
     """Check two pairs in which no term of Eq. (1) is zero and every sign occurs both ways."""
     p = module.PropertyParameters(
         radius=10.0, angular_tolerance=math.radians(10), colinearity=0.999
@@ -72,7 +71,7 @@ def check_eq1(module: ModuleType) -> None:
     )  # fmt: skip
 
 
-def check_r1(module: ModuleType) -> None:
+def check_r1(module):
     """Check reading R1: the robust sign is 0 within 10 degrees of perpendicular, and not beyond.
 
     With d = 2 and the angles 90 - 9.9 or 90 - 10.1 degrees to u, v or w, the four signs are
@@ -93,7 +92,7 @@ def check_r1(module: ModuleType) -> None:
         assert f[0, 9:].tolist() == [value, 0.0, 2.0, value]
 
 
-def check_eq2(module: ModuleType) -> None:
+def check_eq2(module):
     """Check two pairs, two components and two dimensions with given posteriors.
 
     f = (1, 2), (3, -1) with pi = (.2, .8), (.6, .4); p = (.36, .64), whose roots are .6, .8;

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sceneprint.types import Floats, Intrinsics, Patches, Surface
@@ -12,7 +11,7 @@ from sceneprint.types import Floats, Intrinsics, Patches, Surface
 CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
 
 
-def rays(camera: Intrinsics) -> Floats:
+def rays(camera):
     """Return directions (h, w, 3) with z = 1, by the pinhole equation."""
     y, x = np.mgrid[: camera.height, : camera.width]
     return np.dstack(
@@ -20,24 +19,22 @@ def rays(camera: Intrinsics) -> Floats:
     )
 
 
-def plane(camera: Intrinsics, normal: Floats, point: Floats) -> Floats:
+def plane(camera, normal, point):
     """Return 1 / z of the plane through `point`, 0 where it is not in front of the camera."""
     q: Floats = rays(camera) @ normal / float(np.dot(normal, point))
     return np.maximum(q, 0.0)
 
 
-def unit(*v: float) -> Floats:
-    result: Floats = np.array(v) / np.linalg.norm(v)
-    return result
+def unit(*v):
+    return np.array(v) / np.linalg.norm(v)
 
 
-def degrees_between(a: Floats, b: Floats) -> Floats:
+def degrees_between(a, b):
     """Return the angle of unit vectors in degrees, more accurate than arccos at small angles."""
-    result: Floats = np.degrees(2 * np.arcsin(np.linalg.norm(a - b, axis=-1).clip(0, 2) / 2))
-    return result
+    return np.degrees(2 * np.arcsin(np.linalg.norm(a - b, axis=-1).clip(0, 2) / 2))
 
 
-def corner(camera: Intrinsics = CAMERA) -> tuple[Surface, NDArray[np.int64]]:
+def corner(camera=CAMERA):
     """Return an exact corner of a room, seen from inside, and the plane of each pixel."""
     axes = Rotation.from_euler("xyz", [32, -40, 8], degrees=True).as_matrix().T
     apex = np.array([0.1, 0.0, 2.5])
@@ -48,7 +45,7 @@ def corner(camera: Intrinsics = CAMERA) -> tuple[Surface, NDArray[np.int64]]:
     return lifted(camera, q.max(axis=0), normals[seen]), seen
 
 
-def lifted(camera: Intrinsics, q: Floats, normals: Floats) -> Surface:
+def lifted(camera, q, normals):
     """Return the surface with exact inverse depths and normals; 0 is missing."""
     valid = q > 0
     z = np.where(valid, 1 / np.where(valid, q, 1.0), 0.0)
@@ -66,7 +63,7 @@ def lifted(camera: Intrinsics, q: Floats, normals: Floats) -> Surface:
     )
 
 
-def random_patches(rng: np.random.Generator, n: int, extent: float = 2.0) -> Patches:
+def random_patches(rng, n, extent=2.0):
     normals = rng.normal(size=(n, 3))
     return Patches(
         rng.uniform(-extent, extent, (n, 3)),
@@ -77,7 +74,7 @@ def random_patches(rng: np.random.Generator, n: int, extent: float = 2.0) -> Pat
     )
 
 
-def room(rng: np.random.Generator, n: int = 110) -> Patches:
+def room(rng, n=110):
     """Return patches on the walls of a room and of boxes in it, with normals off by 2 degrees."""
     size = np.array([rng.uniform(2.5, 6), rng.uniform(2.5, 6), 2.5])
     boxes = [(np.zeros(3), size, -1.0)]
@@ -98,7 +95,7 @@ def room(rng: np.random.Generator, n: int = 110) -> Patches:
     return Patches(np.array(means), np.array(normals), np.ones(n), sizes, np.ones(n))
 
 
-def moved(patches: Patches, rotation: Rotation, translation: Floats) -> Patches:
+def moved(patches, rotation, translation):
     return Patches(
         rotation.apply(patches.means) + translation,
         rotation.apply(patches.normals),

@@ -28,7 +28,7 @@ P = AcceptanceParameters()
 GOOD = Evidence(0.01, 0.01, 0.6, 0.5, 0.01, 1e-3)
 
 
-def test_what_is_good_meets_no_objection() -> None:
+def test_what_is_good_meets_no_objection():
     assert objection(GOOD, P, "full") is None
     # overlap less five times the violations
     assert GOOD.total(P) == pytest.approx(0.55)
@@ -56,11 +56,8 @@ def test_what_is_good_meets_no_objection() -> None:
         ({"stiffness": 9e-6}, {"stiffness": 1.1e-5}, "ambiguous", "do not constrain one direction"),
     ],
 )  # fmt: skip
-def test_each_objection_has_its_threshold(
-    worse: dict[str, float], just: dict[str, float], status: str, reason: str
-) -> None:
+def test_each_objection_has_its_threshold(worse, just, status, reason):
     found = objection(replace(GOOD, **worse), P, "full")
-    assert found is not None
     assert found[0] == status
     assert reason in found[1]
     assert objection(replace(GOOD, **just), P, "full") is None
@@ -83,12 +80,9 @@ def test_each_objection_has_its_threshold(
         ({"planes": 5.4}, {"planes": 6.1}, "ambiguous", "only 5 distinct planes agree"),
     ],
 )  # fmt: skip
-def test_scans_are_held_to_more(
-    worse: dict[str, float], just: dict[str, float], status: str, reason: str
-) -> None:
+def test_scans_are_held_to_more(worse, just, status, reason):
     scans = preset_parameters("lidar")[0].validation.acceptance
     found = objection(replace(GOOD, **worse), scans, "full")
-    assert found is not None
     assert found[0] == status
     assert reason in found[1]
     assert objection(replace(GOOD, **just), scans, "full") is None
@@ -98,7 +92,7 @@ def test_scans_are_held_to_more(
     )
 
 
-def test_scans_may_share_little_but_not_against_free_space() -> None:
+def test_scans_may_share_little_but_not_against_free_space():
     scans = preset_parameters("lidar")[0].validation.acceptance
     little = replace(GOOD, overlap=0.06, plane_overlap=0.16, violations=0.0, planes=10.0)
     assert objection(little, scans, "full") is None
@@ -143,9 +137,7 @@ SPARSE = Evidence(0.01, 0.01, 0.15, 0.2, 0.004, 1e-3, planes=8.0, worst_violatio
         ({"violations": None}, {"violations": 0.0}),
     ],
 )
-def test_little_evidence_must_be_good_in_every_respect(
-    worse: dict[str, float], just: dict[str, float]
-) -> None:
+def test_little_evidence_must_be_good_in_every_respect(worse, just):
     assert sparse_evidence_suffices(SPARSE, 0.02, P)
     # the evidence that a match usually needs, it has not
     assert objection(SPARSE, P, "full") == ("rejected", "only 15% of the surfaces agree")
@@ -153,7 +145,7 @@ def test_little_evidence_must_be_good_in_every_respect(
     assert sparse_evidence_suffices(replace(SPARSE, **just), 0.02, P)
 
 
-def test_one_search_alone_needs_another_plane() -> None:
+def test_one_search_alone_needs_another_plane():
     assert sparse_evidence_suffices(replace(SPARSE, planes=6.1), 0.02, P, alone=True)
     assert not sparse_evidence_suffices(replace(SPARSE, planes=5.9), 0.02, P, alone=True)
 
@@ -172,27 +164,25 @@ APART = replace(SPARSE, residual_m=0.15, plane_overlap=0.25, planes=13.0)
         ({"plane_violations": 0.061}, {"plane_violations": 0.059}),
     ],
 )
-def test_refinements_that_settle_apart_need_many_planes(
-    worse: dict[str, float], just: dict[str, float]
-) -> None:
+def test_refinements_that_settle_apart_need_many_planes(worse, just):
     assert sparse_evidence_suffices(replace(APART, **just), 0.1, P, alone=True)
     assert not sparse_evidence_suffices(replace(APART, **worse), 0.1, P, alone=True)
     # two searches that disagree by as much have found two places
     assert not sparse_evidence_suffices(replace(APART, **just), 0.1, P)
 
 
-def test_little_evidence_must_fix_the_transform() -> None:
+def test_little_evidence_must_fix_the_transform():
     assert sparse_evidence_suffices(SPARSE, 0.044, P)
     assert not sparse_evidence_suffices(SPARSE, 0.046, P)
 
 
-def test_one_direction_alone_is_not_believed() -> None:
+def test_one_direction_alone_is_not_believed():
     alone = replace(GOOD, residual_m=math.inf, residual_rad=math.inf)
     found = objection(alone, P, "full")
     assert found == ("rejected", "only one of the two directions found a transform")
 
 
-def test_a_large_residual_is_told_as_people_write_it() -> None:
+def test_a_large_residual_is_told_as_people_write_it():
     told = objection(replace(GOOD, residual_m=2.84, residual_rad=2.27), P, "full")
     assert told == ("rejected", "the two directions disagree by 2.8 m, 130 deg")
 
@@ -212,13 +202,11 @@ def test_a_large_residual_is_told_as_people_write_it() -> None:
         (0.0, {"violations": 0.061}, "accepted", "weak"),
     ],
 )
-def test_rivals_and_little_agreement_weaken(
-    ambiguity: float, changed: dict[str, float], status: str, strength: str | None
-) -> None:
+def test_rivals_and_little_agreement_weaken(ambiguity, changed, status, strength):
     assert belief(replace(GOOD, **changed), ambiguity, P)[:2] == (status, strength)
 
 
-def wall(z: float) -> Surface:
+def wall(z):
     """A wall square to the camera, which sees it in 40 x 30 pixels."""
     k = Intrinsics(40, 30, 40.0, 40.0, 19.5, 14.5)
     y, x = np.mgrid[:30, :40].astype(np.float32)
@@ -228,11 +216,11 @@ def wall(z: float) -> Surface:
     return Surface(points.astype(np.float32), normals, one > 0, one, k)
 
 
-def _frame(surface: Surface) -> Geometry:
+def _frame(surface):
     return Geometry(surface, NO_PATCHES, np.zeros((0, 8), np.uint8), "")
 
 
-def test_a_violation_costs_three_inliers() -> None:
+def test_a_violation_costs_three_inliers():
     p, seen = OverlapParameters(), wall(2.0)
     on, before = np.zeros((5, 6), np.float32), np.zeros((2, 6), np.float32)
     on[:, 2], before[:, 2] = 2.0, 1.0  # on the wall, and a metre before it

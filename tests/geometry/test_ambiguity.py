@@ -25,7 +25,7 @@ from sceneprint.geometry.validation.acceptance import (
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
+from sceneprint.types import DepthFrame, Geometry, Intrinsics, Patches, Surface
 from sceneprint_lab.synth import KINECT, take
 from sceneprint_lab.synth.dataset import room_and_rng
 from sceneprint_lab.synth.trajectories import trajectory
@@ -33,7 +33,7 @@ from sceneprint_lab.synth.trajectories import trajectory
 P = AmbiguityParameters()
 
 
-def on_planes(*planes: tuple[list[float], float, int, float]) -> Patches:
+def on_planes(*planes):
     """Patches in planes of these normals, offsets, numbers of patches and area of each."""
     rng = np.random.default_rng(0)
     means, normals, areas = [], [], []
@@ -55,13 +55,13 @@ ROOM = on_planes(
 )
 
 
-def turns(transforms: Floats) -> Floats:
+def turns(transforms):
     """Those that turn, as vectors of their axis times degrees."""
     vectors = np.degrees(Rotation.from_matrix(transforms[:, :3, :3]).as_rotvec())
     return vectors[np.linalg.norm(vectors, axis=1) > 1]
 
 
-def test_symmetries_are_motions_that_leave_a_main_plane_in_itself() -> None:
+def test_symmetries_are_motions_that_leave_a_main_plane_in_itself():
     found = symmetries(ROOM, P)
     floor, wall = ROOM.means[:40], ROOM.means[40:65]
     for T in found:
@@ -72,7 +72,7 @@ def test_symmetries_are_motions_that_leave_a_main_plane_in_itself() -> None:
         assert min(of_floor, of_wall) < 1e-9
 
 
-def test_quarter_turns_about_the_middle_of_each_plane() -> None:
+def test_quarter_turns_about_the_middle_of_each_plane():
     found = symmetries(ROOM, P)
     sizes = np.linalg.norm(turns(found), axis=1)
     # of the floor and of the wall, which are the two main directions; of the third none
@@ -90,7 +90,7 @@ def test_quarter_turns_about_the_middle_of_each_plane() -> None:
         np.testing.assert_allclose(T, power, atol=1e-9)
 
 
-def test_shifts_along_both_main_planes_go_both_ways() -> None:
+def test_shifts_along_both_main_planes_go_both_ways():
     found = symmetries(ROOM, P)  # a floor across y and a wall across z: a corridor along x
     shifts = np.array([T[:3, 3] for T in found if np.allclose(T[:3, :3], np.eye(3))])
     np.testing.assert_allclose(shifts[:, 1:], 0.0, atol=1e-12)
@@ -98,7 +98,7 @@ def test_shifts_along_both_main_planes_go_both_ways() -> None:
     np.testing.assert_allclose(np.sort(shifts[:, 0]), [*-steps[::-1], *steps], atol=1e-12)
 
 
-def test_planes_and_directions_are_taken_by_area() -> None:
+def test_planes_and_directions_are_taken_by_area():
     one = on_planes(([0, -1, 0], -1.0, 10, 0.1))
     assert len(turns(symmetries(one, P))) == 3
     # four steps of a stair, facing up or down: one direction, of which the largest three count
@@ -114,7 +114,7 @@ def test_planes_and_directions_are_taken_by_area() -> None:
     assert symmetries(blank, P).shape == (0, 4, 4)
 
 
-def test_plane_weights_by_hand() -> None:
+def test_plane_weights_by_hand():
     patches = on_planes(
         ([0, -1, 0], -1.4, 8, 1.0), ([0, 0, -1], -3.0, 2, 5.0), ([0, -1, 0], -0.7, 1, 1.0)
     )
@@ -131,7 +131,7 @@ def test_plane_weights_by_hand() -> None:
         np.testing.assert_allclose(plane_weights(two, P.planes), weight)
 
 
-def test_plane_view() -> None:
+def test_plane_view():
     nothing = np.zeros((2, 2, 3), np.float32)
     camera = Intrinsics(2, 2, 1.0, 1.0, 0.5, 0.5)
     seen = Surface(nothing, nothing, nothing[..., 0] > 0, nothing[..., 0], camera)
@@ -143,7 +143,7 @@ def test_plane_view() -> None:
     np.testing.assert_array_equal(points[:, 3:], ROOM.normals.astype(np.float32))
 
 
-def test_far_from_equals_the_difference() -> None:
+def test_far_from_equals_the_difference():
     rng = np.random.default_rng(1)
     T, others = np.eye(4), np.tile(np.eye(4), (300, 1, 1))
     T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
@@ -158,7 +158,7 @@ def test_far_from_equals_the_difference() -> None:
     assert select_rivals(T, T[None], P).shape == (0, 4, 4)
 
 
-def test_inverses() -> None:
+def test_inverses():
     rng = np.random.default_rng(2)
     transforms = np.tile(np.eye(4), (20, 1, 1))
     transforms[:, :3, :3] = Rotation.random(20, rng=rng).as_matrix()
@@ -170,7 +170,7 @@ def test_inverses() -> None:
         assert inverses(inverses(transforms))[0, i, j] == transforms[0, i, j]
 
 
-def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too() -> None:
+def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too():
     model, overlap_p = read_model("depth"), OverlapParameters()
     room, rng = room_and_rng(11, 0)
     poses = trajectory(room, 61, rng)[12:36:12]

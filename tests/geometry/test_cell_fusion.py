@@ -27,16 +27,14 @@ CELL_M = 0.05
 TILE_M = 64 * CELL_M
 
 
-def row(
-    key: int, at: tuple[int, int, int], views: int = 1, taken: float = 0.0, session: int = 0
-) -> Any:
+def row(key, at, views=1, taken=0.0, session=0):
     rows = np.zeros(1, CELL_SUM)
     rows["key"], rows["views"], rows["sums"] = key, views, at
     rows["taken"], rows["session"] = taken, session
     return rows
 
 
-def test_points_go_to_their_cells() -> None:
+def test_points_go_to_their_cells():
     points = np.array(
         [
             [0.01, 0.02, 0.03], [0.03, 0.02, 0.03],  # one cell: the mean at 0.02
@@ -55,7 +53,7 @@ def test_points_go_to_their_cells() -> None:
     assert found[1, 0, 0]["key"].tolist() == [63 * 64**2]
 
 
-def test_cells_are_those_of_one_point_after_the_other() -> None:
+def test_cells_are_those_of_one_point_after_the_other():
     points = np.random.default_rng(3).uniform(-4.0, 4.0, (4000, 3)).round(2)
     expected: dict[Any, list[Any]] = {}
     for point in points:
@@ -73,7 +71,7 @@ def test_cells_are_those_of_one_point_after_the_other() -> None:
     assert all((np.diff(rows["key"].astype(int)) > 0).all() for rows in found.values())
 
 
-def test_a_view_of_points_all_over_fills_few_tiles() -> None:
+def test_a_view_of_points_all_over_fills_few_tiles():
     far = (np.arange(2000.0)[:, None] + 0.5) * [TILE_M, 0.0, 0.0]
     twice = far[700:800] + np.array([0.0, 0.1, 0.0])
     found = view_cells(np.concatenate([far, twice]), CELL_M, ViewStamp(1, 0.0, 0))
@@ -81,7 +79,7 @@ def test_a_view_of_points_all_over_fills_few_tiles() -> None:
     assert sum(len(rows) for rows in found.values()) == MOST_TILES + 100  # the fullest are kept
 
 
-def test_views_fuse_in_any_order() -> None:
+def test_views_fuse_in_any_order():
     rng = np.random.default_rng(5)
     views = []
     for number, taken in enumerate([5.0, None, 9.0, 9.0, None]):
@@ -101,7 +99,7 @@ def test_views_fuse_in_any_order() -> None:
     assert len(fuse_cells([])) == 0
 
 
-def test_a_tile_as_it_is_given_out() -> None:
+def test_a_tile_as_it_is_given_out():
     rows = np.concatenate(
         [
             row(0, (0, 0, 0), 1, -np.inf, NO_SESSION),
@@ -118,7 +116,7 @@ def test_a_tile_as_it_is_given_out() -> None:
     assert set(encode_cells(rows, None)["taken"].tolist()) == {NO_TIME}
 
 
-def test_the_next_level_by_hand() -> None:
+def test_the_next_level_by_hand():
     """Cells 0 to 3 along x are one coarser cell, and cell 4 the next."""
     rows = np.concatenate(
         [
@@ -142,7 +140,7 @@ def test_the_next_level_by_hand() -> None:
 
 
 @pytest.mark.parametrize(("first", "last"), [(1000.0, 1000.0), (0.0, 1e6), (-5.0, 3e9)])
-def test_a_scale_of_times_has_room_on_both_sides(first: float, last: float) -> None:
+def test_a_scale_of_times_has_room_on_both_sides(first, last):
     scale = time_scale(first, last)
     span = last - first
     assert scale.holds(first, last + 2 * span)

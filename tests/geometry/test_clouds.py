@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from sceneprint.types import Cloud
 P = CloudParameters(minimum_points=3)
 
 
-def test_points_out_of_range_are_left_out() -> None:
+def test_points_out_of_range_are_left_out():
     ranges = np.array([0.29, 0.31, 1.0, 9.99, 10.01, 500.0])
     points = (ranges[:, None] * np.array([0.6, 0.0, -0.8])).astype(np.float32)
     np.testing.assert_array_equal(select_in_range(Cloud(points), P), points[1:4])
@@ -27,9 +26,7 @@ def test_points_out_of_range_are_left_out() -> None:
     ("factor", "says"),
     [(1000.0, "if the coordinates are millimetres, set 1000 units per metre"), (0.01, "units")],
 )
-def test_out_of_range_names_the_range_and_what_to_do(
-    cloud_scenes: ModuleType, factor: float, says: str
-) -> None:
+def test_out_of_range_names_the_range_and_what_to_do(cloud_scenes, factor, says):
     cloud = cloud_scenes.room(500)
     with pytest.raises(UselessFrame, match=r"0 of its 500 .* 0\.3 to 10 m.* median") as caught:
         select_in_range(Cloud(cloud.points * np.float32(factor), name="scan"), P)
@@ -38,12 +35,12 @@ def test_out_of_range_names_the_range_and_what_to_do(
     assert str(caught.value).startswith("scan: ")
 
 
-def test_too_few_points_are_none_of_the_range() -> None:
+def test_too_few_points_are_none_of_the_range():
     with pytest.raises(UselessFrame, match=r"10 points are too few .* at least 64"):
         select_in_range(Cloud(np.ones((10, 3), np.float32)), CloudParameters())
 
 
-def test_axes_are_eigenvectors_signed_by_skew(cloud_scenes: ModuleType) -> None:
+def test_axes_are_eigenvectors_signed_by_skew(cloud_scenes):
     points = cloud_scenes.room(5000).points
     axes = principal_axes(points)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
@@ -55,7 +52,7 @@ def test_axes_are_eigenvectors_signed_by_skew(cloud_scenes: ModuleType) -> None:
     assert ((points @ axes[:2].T) ** 3).sum(axis=0).min() > 0
 
 
-def test_axes_turn_with_the_cloud(cloud_scenes: ModuleType) -> None:
+def test_axes_turn_with_the_cloud(cloud_scenes):
     cloud = cloud_scenes.room(5000, half_deg=60)
     axes = principal_axes(cloud.points)
     for seed in range(5):
@@ -64,17 +61,17 @@ def test_axes_turn_with_the_cloud(cloud_scenes: ModuleType) -> None:
         np.testing.assert_allclose(turned, axes @ R.T, atol=1e-6)
 
 
-def test_axes_know_no_order(cloud_scenes: ModuleType) -> None:
+def test_axes_know_no_order(cloud_scenes):
     cloud = cloud_scenes.room(5000)
     there = principal_axes(cloud_scenes.shuffled(cloud).points)
     np.testing.assert_array_equal(there, principal_axes(cloud.points))
 
 
-def test_no_extent_has_the_given_axes() -> None:
+def test_no_extent_has_the_given_axes():
     np.testing.assert_array_equal(principal_axes(np.zeros((4, 3), np.float32)), np.eye(3))
 
 
-def test_defaults_never_change() -> None:
+def test_defaults_never_change():
     """Models without these numbers in their files were made with them."""
     assert replace(CloudParameters()) == CloudParameters(
         0.3, 10.0, 64, 1 / 146, 0.02, 5.2, 8.2, 1200, 600, 76800, 0.03, 3, 0.05, 0.006, 0.006,

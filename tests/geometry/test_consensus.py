@@ -3,53 +3,50 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration import alignment as module
 from sceneprint.geometry.registration.alignment import ConsensusParameters, consensus
 from sceneprint.geometry.rigid import inverse, pose_difference, transform_points
-from sceneprint.types import Floats, Ints32, Patches
 
 P = ConsensusParameters()
 
 
-def motion(rng: np.random.Generator) -> Floats:
+def motion(rng):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(0, 3, 3)
     return T
 
 
-def carried(patches: Patches, T: Floats) -> Patches:
+def carried(patches, T):
     return replace(
         patches, means=transform_points(T, patches.means), normals=patches.normals @ T[:3, :3].T
     )
 
 
-def mirrored(patches: Patches) -> Patches:
+def mirrored(patches):
     mirror = np.array([-1.0, 1.0, 1.0])
     return replace(patches, means=patches.means * mirror, normals=patches.normals * mirror)
 
 
-def with_outliers(rng: np.random.Generator, n: int, share: float) -> Ints32:
+def with_outliers(rng, n, share):
     """Patch i of the source is patch i of the target, but for a share of them."""
     wrong = rng.random(n) < share
     target = np.where(wrong, rng.integers(0, n, n), np.arange(n))
     return np.stack([np.arange(n), target], axis=1).astype(np.int32)
 
 
-def explained(a: Patches, b: Patches, pairs: Ints32, T: Floats) -> int:
+def explained(a, b, pairs, T):
     """How many correspondences a transform explains."""
     off = np.linalg.norm(transform_points(T, a.means[pairs[:, 0]]) - b.means[pairs[:, 1]], axis=1)
     cosine = (a.normals[pairs[:, 0]] @ T[:3, :3].T * b.normals[pairs[:, 1]]).sum(axis=1)
     return int(((off < P.inlier_distance) & (cosine > P.inlier_cosine)).sum())
 
 
-def graph(a: Patches, b: Patches, pairs: Ints32) -> tuple[NDArray[np.uint64], NDArray[np.bool_]]:
+def graph(a, b, pairs):
     """The compatibility graph as bits and as a matrix."""
     i, j = pairs.T
     bits = np.zeros((len(pairs), (len(pairs) + 63) // 64), np.uint64)
@@ -63,10 +60,10 @@ def graph(a: Patches, b: Patches, pairs: Ints32) -> tuple[NDArray[np.uint64], ND
     return bits, unpacked[:, : len(pairs)].astype(bool)
 
 
-def graph_oracle(a: Patches, b: Patches, pairs: Ints32) -> NDArray[np.bool_]:
+def graph_oracle(a, b, pairs):
     """The same graph from matrices of lengths, heights, angles and volumes."""
 
-    def invariants(x: Patches, index: Ints32) -> list[Floats]:
+    def invariants(x, index):
         p, n = x.means[index], x.normals[index]
         r = p[None] - p[:, None]
         height = np.einsum("ijk,ik->ij", r, n)
@@ -78,16 +75,15 @@ def graph_oracle(a: Patches, b: Patches, pairs: Ints32) -> NDArray[np.bool_]:
     length, height, back, angle, volume = (np.abs(x - y) for x, y in zip(one, other, strict=True))
     near = np.minimum(one[0], other[0]) >= P.minimum_distance
     fits = (length <= 0.12) & (height <= 0.12) & (back <= 0.12) & (angle <= 0.5) & (volume <= 0.24)
-    result: NDArray[np.bool_] = fits & near
-    return result
+    return fits & near
 
 
-def test_by_hand(validation_goldens: ModuleType) -> None:
+def test_by_hand(validation_goldens):
     validation_goldens.check_consensus(module)
 
 
 @pytest.mark.parametrize("n", [5, 64, 65, 130])
-def test_graph_equals_the_oracle(scenes: ModuleType, n: int) -> None:
+def test_graph_equals_the_oracle(scenes, n):
     rng = np.random.default_rng(n)
     a = scenes.room(rng, n)
     noisy = carried(a, motion(rng))
@@ -101,7 +97,7 @@ def test_graph_equals_the_oracle(scenes: ModuleType, n: int) -> None:
 
 
 @pytest.mark.parametrize("n", [3, 63, 64, 65, 200])
-def test_common_neighbours_equal_the_product_of_the_matrix(n: int) -> None:
+def test_common_neighbours_equal_the_product_of_the_matrix(n):
     rng = np.random.default_rng(n)
     matrix = rng.random((n, n)) < 0.7
     matrix = np.triu(matrix, 1) | np.triu(matrix, 1).T
@@ -114,7 +110,7 @@ def test_common_neighbours_equal_the_product_of_the_matrix(n: int) -> None:
 
 
 @pytest.mark.parametrize("most", [1, 4, 16, 40])
-def test_largest_are_in_the_order_of_a_stable_sort(most: int) -> None:
+def test_largest_are_in_the_order_of_a_stable_sort(most):
     rng = np.random.default_rng(most)
     for _ in range(50):
         row = rng.integers(0, 12, 40).astype(np.int32)
@@ -123,7 +119,7 @@ def test_largest_are_in_the_order_of_a_stable_sort(most: int) -> None:
         np.testing.assert_array_equal(order, np.argsort(-row, kind="stable")[:most])
 
 
-def test_fit_equals_scipys() -> None:
+def test_fit_equals_scipys():
     rng = np.random.default_rng(1)
     for _ in range(30):
         n = int(rng.integers(3, 40))
@@ -145,7 +141,7 @@ def test_fit_equals_scipys() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
-def test_the_motion_is_found_among_outliers(scenes: ModuleType, share: float) -> None:
+def test_the_motion_is_found_among_outliers(scenes, share):
     rng = np.random.default_rng(int(10 * share))
     for _ in range(3):
         a = scenes.random_patches(rng, 150)
@@ -156,7 +152,7 @@ def test_the_motion_is_found_among_outliers(scenes: ModuleType, share: float) ->
         np.testing.assert_allclose(found[0], T, atol=1e-6)
 
 
-def test_noise_is_averaged_out(scenes: ModuleType) -> None:
+def test_noise_is_averaged_out(scenes):
     rng = np.random.default_rng(2)
     a = scenes.random_patches(rng, 150)
     T = motion(rng)
@@ -172,21 +168,7 @@ def test_noise_is_averaged_out(scenes: ModuleType) -> None:
     assert metres < 0.05
 
 
-def test_every_hypothesis_is_a_motion(scenes: ModuleType) -> None:
-    rng = np.random.default_rng(3)
-    a, b = scenes.room(rng), scenes.room(rng)  # two rooms, and random correspondences
-    pairs = rng.integers(0, 110, (300, 2)).astype(np.int32)
-    found = consensus(a, b, pairs, P)
-    assert 5 <= len(found) <= P.n_seeds
-    assert np.isfinite(found).all()
-    for T in found:
-        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0, abs=1e-12)
-        assert T[3].tolist() == [0, 0, 0, 1]
-    assert consensus(a, b, pairs, replace(P, n_seeds=3)).tolist() == found[:3].tolist()
-
-
-def test_a_mirror_image_is_no_motion(scenes: ModuleType) -> None:
+def test_a_mirror_image_is_no_motion(scenes):
     rng = np.random.default_rng(4)
     a = scenes.random_patches(rng, 150)
     pairs = with_outliers(rng, 150, 0.0)
@@ -200,7 +182,7 @@ def test_a_mirror_image_is_no_motion(scenes: ModuleType) -> None:
     assert explained(a, mirrored(b), pairs, unmirrored[0]) == 150
 
 
-def test_moving_a_frame_moves_the_transforms(scenes: ModuleType) -> None:
+def test_moving_a_frame_moves_the_transforms(scenes):
     rng = np.random.default_rng(5)
     a = scenes.room(rng)
     b, pairs = carried(a, motion(rng)), with_outliers(rng, 110, 0.5)
@@ -211,7 +193,7 @@ def test_moving_a_frame_moves_the_transforms(scenes: ModuleType) -> None:
     np.testing.assert_allclose(consensus(carried(a, G), b, pairs, P), found @ inverse(G), atol=1e-9)
 
 
-def test_too_few_correspondences(scenes: ModuleType) -> None:
+def test_too_few_correspondences(scenes):
     a = scenes.random_patches(np.random.default_rng(6), 20)
     T = motion(np.random.default_rng(7))
     pairs = with_outliers(np.random.default_rng(8), 20, 0.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -12,18 +11,18 @@ from sceneprint.geometry.kernel import Cores, run_both
 
 
 @pytest.fixture
-def two() -> Iterator[Cores]:
+def two():
     cores = Cores(2)
     yield cores
     cores.close()
 
 
-def meeting() -> tuple[Callable[[], int], Callable[[], int]]:
+def meeting():
     """Two computations that only end if they run at once."""
     barrier = threading.Barrier(2)
 
-    def half(number: int) -> Callable[[], int]:
-        def run() -> int:
+    def half(number):
+        def run():
             barrier.wait(PATIENCE_S)
             return number
 
@@ -32,11 +31,11 @@ def meeting() -> tuple[Callable[[], int], Callable[[], int]]:
     return half(1), half(2)
 
 
-def threads_of(halves: int = 2) -> list[str]:
+def threads_of(halves=2):
     """Which threads run the halves."""
     names: list[str] = []
 
-    def note() -> None:
+    def note():
         names.append(threading.current_thread().name)
 
     run_both(note, note)
@@ -44,13 +43,13 @@ def threads_of(halves: int = 2) -> list[str]:
     return sorted(names)
 
 
-def test_halves_run_at_once_where_a_core_is_free(two: Cores) -> None:
+def test_halves_run_at_once_where_a_core_is_free(two):
     with two.shared():
         assert run_both(*meeting()) == (1, 2)
         assert run_both(lambda: run_both(lambda: 1, lambda: 2), lambda: 3) == ((1, 2), 3)
 
 
-def test_halves_run_in_turn_without_a_free_core(two: Cores) -> None:
+def test_halves_run_in_turn_without_a_free_core(two):
     own = threading.current_thread().name
     assert threads_of() == [own, own]  # not lent
     with two.shared():
@@ -65,12 +64,12 @@ def test_halves_run_in_turn_without_a_free_core(two: Cores) -> None:
     alone.close()
 
 
-def test_a_half_takes_no_core_of_its_own_half(two: Cores) -> None:
+def test_a_half_takes_no_core_of_its_own_half(two):
     """What a half calls runs in turn: it has one core, and the other half the other."""
     inner: list[tuple[str, list[str]]] = []
     barrier = threading.Barrier(2)
 
-    def half() -> None:
+    def half():
         barrier.wait(PATIENCE_S)
         inner.append((threading.current_thread().name, threads_of()))
         barrier.wait(PATIENCE_S)
@@ -82,14 +81,14 @@ def test_a_half_takes_no_core_of_its_own_half(two: Cores) -> None:
 
 
 @pytest.mark.parametrize("lent", [True, False])
-def test_what_a_half_raises_is_raised_and_the_core_is_free_again(two: Cores, lent: bool) -> None:
-    def fail(why: str) -> Callable[[], int]:
-        def run() -> int:
+def test_what_a_half_raises_is_raised_and_the_core_is_free_again(two, lent):
+    def fail(why):
+        def run():
             raise ValueError(why)
 
         return run
 
-    def ask(first: Callable[[], int], second: Callable[[], int]) -> tuple[int, int]:
+    def ask(first, second):
         if not lent:
             return run_both(first, second)
         with two.shared():

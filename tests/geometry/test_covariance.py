@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from sceneprint.geometry.registration.icp import (
     FINE,
     CovarianceParameters,
     Refinement,
-    SlidingDirection,
     adjoint,
     free_directions,
     fuse_votes,
@@ -27,10 +25,10 @@ from sceneprint.geometry.registration.icp import (
 )
 from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.rigid import average_poses, inverse
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Floats, Surface
+from sceneprint.types import DepthFrame, Floats
 from sceneprint_lab.synth import KINECT, KINECT_V1, take, trajectory
 from sceneprint_lab.synth.dataset import own_sensor, room_and_rng
 
@@ -62,7 +60,7 @@ class Vote:
     T_match_query: Floats
 
 
-def votes_of(seed: int, index: int, model: Model) -> list[Vote]:
+def votes_of(seed, index, model):
     """Accepted matches within one room."""
     room, rng = room_and_rng(seed, index)
     sensor = own_sensor(KINECT_V1, KINECT, rng)
@@ -80,17 +78,17 @@ def votes_of(seed: int, index: int, model: Model) -> list[Vote]:
     return found
 
 
-def near(error: Floats) -> bool:
+def near(error):
     """Whether it is an error, and not another place."""
     return bool(np.linalg.norm(error[:3]) < WRONG_M and np.linalg.norm(error[3:]) < WRONG_RAD)
 
 
-def square(error: Floats, covariance: Floats) -> float:
+def square(error, covariance):
     """Normalised error squared: on average as large as there are numbers in it."""
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def places(votes: list[Vote]) -> list[float]:
+def places(votes):
     """Normalised errors squared of the places that two or more votes agree on."""
     by_query: dict[tuple[int, int], list[Vote]] = defaultdict(list)
     for one in votes:
@@ -108,14 +106,14 @@ def places(votes: list[Vote]) -> list[float]:
     return found
 
 
-def posed(rng: np.random.Generator) -> Floats:
+def posed(rng):
     T = np.eye(4)
     T[:3, :3] = Rotation.random(rng=rng).as_matrix()
     T[:3, 3] = rng.normal(size=3)
     return T
 
 
-def with_error(T: Floats, error: Floats) -> Floats:
+def with_error(T, error):
     """The transform that is off by (x, y, z, rx, ry, rz), from the definition."""
     result = T.copy()
     result[:3, :3] = Rotation.from_rotvec(error[3:]).as_matrix() @ T[:3, :3]
@@ -123,13 +121,12 @@ def with_error(T: Floats, error: Floats) -> Floats:
     return result
 
 
-def some_covariance(rng: np.random.Generator, scale: float = 1.0) -> Floats:
+def some_covariance(rng, scale=1.0):
     root = rng.normal(size=(6, 6)) * scale
-    result: Floats = root @ root.T
-    return result
+    return root @ root.T
 
 
-def test_an_error_is_what_was_put_there() -> None:
+def test_an_error_is_what_was_put_there():
     rng = np.random.default_rng(1)
     T = posed(rng)
     for size in (0.0, 1e-12, 1e-6, 1e-2, 1.0):
@@ -139,7 +136,7 @@ def test_an_error_is_what_was_put_there() -> None:
         )
 
 
-def test_transport_against_monte_carlo() -> None:
+def test_transport_against_monte_carlo():
     rng = np.random.default_rng(2)
     T, before, after = posed(rng), posed(rng), posed(rng)
     S = some_covariance(rng, 2e-3)
@@ -157,7 +154,7 @@ def test_transport_against_monte_carlo() -> None:
         np.testing.assert_allclose(found / scale, expected / scale, atol=0.06)
 
 
-def test_transports_follow_each_other() -> None:
+def test_transports_follow_each_other():
     rng = np.random.default_rng(3)
     a, b = posed(rng), posed(rng)
     one = adjoint(b[:3, :3], b[:3, 3]) @ adjoint(a[:3, :3], a[:3, 3])
@@ -165,14 +162,14 @@ def test_transports_follow_each_other() -> None:
     np.testing.assert_allclose(one, both, atol=1e-12)
 
 
-def left_twist(T: Floats, true: Floats) -> Floats:
+def left_twist(T, true):
     """(turn, shift) with true = [exp(turn), shift] T, as refinement has it."""
     D = true @ np.linalg.inv(T)
     return np.concatenate([Rotation.from_matrix(D[:3, :3]).as_rotvec(), D[:3, 3]])
 
 
 @pytest.mark.parametrize("lost", [None, 0, 1])
-def test_a_pairs_covariance_from_the_definition(lost: int | None) -> None:
+def test_a_pairs_covariance_from_the_definition(lost):
     rng = np.random.default_rng(4)
     T, p = posed(rng), CovarianceParameters()
     refined = [Refinement(T, some_covariance(rng) + np.eye(6), 500, s) for s in (3e-5, 1e-5)]
@@ -193,7 +190,6 @@ def test_a_pairs_covariance_from_the_definition(lost: int | None) -> None:
     expected = np.linalg.inv(information / len(noise)) * np.mean(noise) / p.independent
     there, back = (None if i == lost else one for i, one in enumerate(refined))
     found = pair_covariance(there, back, T)
-    assert found is not None
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
     assert (found == found.T).all()
     # a radian may count as any number of metres: that only says what is free
@@ -201,11 +197,11 @@ def test_a_pairs_covariance_from_the_definition(lost: int | None) -> None:
     np.testing.assert_allclose(other, expected, rtol=1e-5, atol=1e-12)
 
 
-def test_no_refinement_no_covariance() -> None:
+def test_no_refinement_no_covariance():
     assert pair_covariance(None, None, np.eye(4)) is None
 
 
-def of_itself(surface: Surface) -> tuple[Floats, Floats]:
+def of_itself(surface):
     """Covariance of a surface laid on itself, and points all over it."""
     points = sample_points(surface, FINE.stride)
     one = refine(points, surface, np.eye(4), FINE)
@@ -214,25 +210,21 @@ def of_itself(surface: Surface) -> tuple[Floats, Floats]:
     return S, points.astype(float)
 
 
-def planes(
-    scenes: ModuleType, normals: list[Floats], places: list[Floats], farthest: float
-) -> Surface:
+def planes(scenes, normals, places, farthest):
     """What a camera at the origin sees inside these planes."""
     q = np.array([scenes.plane(scenes.CAMERA, n, p) for n, p in zip(normals, places, strict=True)])
     seen = q.argmax(axis=0)
     near = np.where(q.max(axis=0) > 1 / farthest, q.max(axis=0), 0.0)
-    surface: Surface = scenes.lifted(scenes.CAMERA, near, np.array(normals)[seen])
-    return surface
+    return scenes.lifted(scenes.CAMERA, near, np.array(normals)[seen])
 
 
-def displaced(free: SlidingDirection, points: Floats) -> Floats:
+def displaced(free, points):
     """How far the error moves each point along its normal, per unit of it."""
     moved = free.translation + np.cross(free.rotation, points[:, :3])
-    result: Floats = np.abs((moved * points[:, 3:]).sum(axis=1))
-    return result
+    return np.abs((moved * points[:, 3:]).sum(axis=1))
 
 
-def test_a_plane_leaves_three_directions_free(scenes: ModuleType) -> None:
+def test_a_plane_leaves_three_directions_free(scenes):
     normal = scenes.unit(0.3, -0.2, -1.0)
     S, points = of_itself(planes(scenes, [normal], [np.array([0.0, 0.0, 2.0])], 8.0))
     free = free_directions(S)
@@ -248,7 +240,7 @@ def test_a_plane_leaves_three_directions_free(scenes: ModuleType) -> None:
     np.testing.assert_allclose(np.cross(turn, normal), 0.0, atol=1e-3)
 
 
-def test_a_corridor_leaves_one_direction_free(scenes: ModuleType) -> None:
+def test_a_corridor_leaves_one_direction_free(scenes):
     along = scenes.unit(0.25, 0.1, 1.0)
     across = scenes.unit(*np.cross(along, [0.0, 1.0, 0.0]))
     up = np.cross(across, along)
@@ -260,13 +252,13 @@ def test_a_corridor_leaves_one_direction_free(scenes: ModuleType) -> None:
     assert displaced(one, points).max() < 1e-2
 
 
-def test_a_corner_holds_every_direction(scenes: ModuleType) -> None:
+def test_a_corner_holds_every_direction(scenes):
     S, _ = of_itself(scenes.corner()[0])
     assert free_directions(S) == ()
     assert np.sqrt(np.linalg.eigvalsh(S).max()) < 0.01
 
 
-def test_free_directions_by_hand() -> None:
+def test_free_directions_by_hand():
     S = np.diag([1.0, 4.0, 899.0, 1.0, 1.0, 1.0]) * 1e-4
     assert free_directions(S) == ()  # not quite 30 times the least
     (one,) = free_directions(np.diag([1.0, 4.0, 901.0, 1.0, 1.0, 1.0]) * 1e-4)
@@ -277,7 +269,7 @@ def test_free_directions_by_hand() -> None:
     assert first.deviation == pytest.approx(np.sqrt(3e-3))
 
 
-def test_what_a_radian_counts_says_what_is_free_and_not_how_far() -> None:
+def test_what_a_radian_counts_says_what_is_free_and_not_how_far():
     S = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 300.0]) * 1e-6
     assert free_directions(S) == ()
     (one,) = free_directions(S, replace(CovarianceParameters(), lever=2.0))
@@ -285,7 +277,7 @@ def test_what_a_radian_counts_says_what_is_free_and_not_how_far() -> None:
     assert one.deviation == pytest.approx(np.sqrt(3e-4))
 
 
-def test_a_place_from_its_votes() -> None:
+def test_a_place_from_its_votes():
     poses = np.repeat(np.eye(4)[None], 4, axis=0)
     poses[:, 0, 3] = (0.01, 0.02, 0.03, 5.0)  # the last is elsewhere
     covariances = np.array([np.diag([s] * 6) for s in (4e-4, 4e-4, 4e-4, 7.0)])
@@ -302,7 +294,7 @@ def test_a_place_from_its_votes() -> None:
     np.testing.assert_allclose(found, covariances[3], atol=1e-12)
 
 
-def test_votes_are_weighted_by_their_information() -> None:
+def test_votes_are_weighted_by_their_information():
     poses = np.repeat(np.eye(4)[None], 2, axis=0)
     poses[1, :3, 3] = (0.03, 0.03, 0.0)
     covariances = np.array([np.diag([1e-4, 4e-4, 1e-4] * 2), np.diag([2e-4, 2e-4, 1e-4] * 2)])
@@ -319,7 +311,7 @@ def test_votes_are_weighted_by_their_information() -> None:
     np.testing.assert_allclose(inflated.T[:2, 3], (0.03 / 5, 0.03 / 2), atol=1e-12)
 
 
-def test_the_covariance_of_fused_votes_is_that_of_their_errors() -> None:
+def test_the_covariance_of_fused_votes_is_that_of_their_errors():
     """Votes whose errors are half shared, half independent, in 4,000 repetitions."""
     rng = np.random.default_rng(6)
     roots = 0.01 * rng.normal(size=(3, 6, 6)) + 0.01 * np.eye(6)
@@ -344,7 +336,7 @@ def test_the_covariance_of_fused_votes_is_that_of_their_errors() -> None:
 
 
 @pytest.mark.thorough
-def test_errors_are_as_large_as_is_told() -> None:
+def test_errors_are_as_large_as_is_told():
     """On rooms that nothing was fitted to: seed 6303, where the scale is of 6101."""
     model = read_model("depth")
     votes = [one for room in (2, 3) for one in votes_of(6303, room, model) if near(one.error)]

@@ -10,37 +10,28 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.rigid import inverse, inverses, pose_difference
-from sceneprint.geometry.session_join import (
-    CycleParameters,
-    LoopEdges,
-    RobotPath,
-    judge_edges,
-    robot_path,
-)
-from sceneprint.types import Floats
+from sceneprint.geometry.session_join import CycleParameters, LoopEdges, judge_edges, robot_path
 
 
-def moved_by(rng: np.random.Generator, metres: float, degrees: float) -> Floats:
+def moved_by(rng, metres, degrees):
     T = np.eye(4)
     turn = Rotation.from_rotvec(rng.normal(0, math.radians(degrees), 3))
     T[:3, :3], T[:3, 3] = turn.as_matrix(), rng.normal(0, metres, 3)
     return T
 
 
-def walk(rng: np.random.Generator, n: int, metres: float = 0.05, degrees: float = 2.0) -> Floats:
+def walk(rng, n, metres=0.05, degrees=2.0):
     poses = [moved_by(rng, 1.0, 40.0)]
     for _ in range(n - 1):
         poses.append(poses[-1] @ moved_by(rng, metres, degrees))
     return np.array(poses)
 
 
-def a_run(poses: Floats, parents: list[int] | None = None) -> RobotPath:
+def a_run(poses, parents=None):
     return robot_path(poses, np.array(parents or [0] * len(poses), np.int64))
 
 
-def edges_between(
-    rng: np.random.Generator, here: Floats, there: Floats, n: int, metres: float, degrees: float
-) -> LoopEdges:
+def edges_between(rng, here, there, n, metres, degrees):
     """Edges of two walks through one world, each with an error."""
     source = np.sort(rng.integers(0, len(here), n))
     target = np.clip(source + rng.integers(-3, 4, n), 0, len(there) - 1)
@@ -50,9 +41,7 @@ def edges_between(
     return LoopEdges(source, target, np.array(true), weights)
 
 
-def oracle(
-    edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters
-) -> dict[tuple[int, int], bool]:
+def oracle(edges, source, target, p):
     """Pairs of edges near each other, and which close: one after the other, in matrices."""
     found = {}
     for e in range(len(edges)):
@@ -81,7 +70,7 @@ def oracle(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_loops_are_those_of_the_oracle(seed: int) -> None:
+def test_loops_are_those_of_the_oracle(seed):
     rng = np.random.default_rng(seed)
     here, there = walk(rng, 60), walk(rng, 60)
     edges = edges_between(rng, here, there, 40, 0.03, 2.0)
@@ -109,7 +98,7 @@ def test_loops_are_those_of_the_oracle(seed: int) -> None:
         assert (found.loops[e], found.closed[e]) == (len(own), sum(own))
 
 
-def test_wrong_edges_are_outvoted_and_right_ones_are_not() -> None:
+def test_wrong_edges_are_outvoted_and_right_ones_are_not():
     rng = np.random.default_rng(5)
     # the second run has another origin, and nobody knows where
     here, there = walk(rng, 120), walk(rng, 120)
@@ -124,7 +113,7 @@ def test_wrong_edges_are_outvoted_and_right_ones_are_not() -> None:
     assert set(np.flatnonzero(~found.accepted)) == set(wrong)
 
 
-def test_odometry_that_drifts_does_no_harm() -> None:
+def test_odometry_that_drifts_does_no_harm():
     rng = np.random.default_rng(6)
     true = walk(rng, 300, 0.04, 1.0)
     drifting = [true[0]]
@@ -148,7 +137,7 @@ def test_odometry_that_drifts_does_no_harm() -> None:
     ).accepted.all()
 
 
-def test_by_hand() -> None:
+def test_by_hand():
     """Three frames 10 cm apart on a line, seen again from there; one edge is 20 cm off."""
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 0, 3] = (0.0, 0.1, 0.2)
@@ -168,17 +157,17 @@ def test_by_hand() -> None:
     assert judge_edges(edges, a_run(poses), a_run(poses)).accepted.tolist() == [True, True, False]
 
 
-def line(*x: float) -> Floats:
+def line(*x):
     poses = np.tile(np.eye(4), (len(x), 1, 1))
     poses[:, 0, 3] = x
     return poses
 
 
-def test_an_edge_of_the_same_viewpoint_supports_nothing() -> None:
+def test_an_edge_of_the_same_viewpoint_supports_nothing():
     """Frames at 0 and 5 cm are one viewpoint, that at 20 cm is another one; all edges agree."""
     here = line(0.0, 0.05, 0.2)
 
-    def found(chosen: list[int], target: list[int], there: Floats) -> list[bool]:
+    def found(chosen, target, there):
         source, onto = np.array(chosen), np.array(target)
         transforms = inverses(there[onto]) @ here[source]
         edges = LoopEdges(source, onto, transforms, np.ones(len(source)))
@@ -199,7 +188,7 @@ def test_an_edge_of_the_same_viewpoint_supports_nothing() -> None:
     assert found([0, 1], [0, 1], turned) == [True, True]
 
 
-def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other() -> None:
+def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other():
     """Half a circle of 2 m radius about an object: each frame looks like that half a turn later."""
     angles = np.linspace(0.0, 2 * np.pi, 41)[:-1]
     poses = np.tile(np.eye(4), (40, 1, 1))
@@ -227,7 +216,7 @@ def test_no_odometry_drifts_from_one_side_of_an_object_to_the_other() -> None:
     assert judge_edges(alike, gap, gap, within_run=True).supported.all()
 
 
-def test_what_disagrees_supports_nothing() -> None:
+def test_what_disagrees_supports_nothing():
     here = line(0.0, 0.2)
     transforms = np.tile(np.eye(4), (2, 1, 1))
     transforms[1, 1, 3] = 0.5
@@ -237,14 +226,14 @@ def test_what_disagrees_supports_nothing() -> None:
     assert not found.supported.any()
 
 
-def test_lengths_are_multiples_of_the_scale() -> None:
+def test_lengths_are_multiples_of_the_scale():
     p, large = CycleParameters(), CycleParameters().scaled(5.0)
     lengths = [(p.close_m, large.close_m), (p.reach_m, large.reach_m), (p.view_m, large.view_m)]
     assert [b / a for a, b in lengths] == pytest.approx([5.0] * 3)
     assert (large.drift, large.close_rad) == (p.drift, p.close_rad)
 
 
-def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken() -> None:
+def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken():
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = (0.0, 0.1, 0.2, 0.3)
     every, transforms = np.arange(4), np.tile(np.eye(4), (4, 1, 1))
@@ -258,14 +247,14 @@ def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken() -> None
     assert found.loops.tolist() == [1, 1, 1, 1]
 
 
-def test_no_edges() -> None:
+def test_no_edges():
     run = a_run(np.tile(np.eye(4), (2, 1, 1)))
     none = np.empty(0, np.int64)
     found = judge_edges(LoopEdges(none, none, np.empty((0, 4, 4)), np.empty(0)), run, run)
     assert len(found.accepted) == len(found.loops) == len(found.closed) == 0
 
 
-def test_the_reach_is_shortened_rather_than_memory_taken() -> None:
+def test_the_reach_is_shortened_rather_than_memory_taken():
     rng = np.random.default_rng(8)
     here = walk(rng, 100)
     edges = edges_between(rng, here, here, 200, 0.001, 0.1)

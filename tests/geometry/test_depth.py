@@ -14,12 +14,10 @@ from sceneprint.geometry.surface.depth_image import (
     halvings,
     inverse_depth,
 )
-from sceneprint.types import DepthFrame, Floats32, Intrinsics
+from sceneprint.types import DepthFrame, Intrinsics
 
 
-def parameters(
-    *, focal_length_px: float = 10.0, maximum_pixels: int = 10**6, minimum_valid: int = 1
-) -> DepthParameters:
+def parameters(*, focal_length_px=10.0, maximum_pixels=10**6, minimum_valid=1):
     return DepthParameters(
         minimum_side=1,
         minimum_depth=0.5,
@@ -34,13 +32,13 @@ def parameters(
 KINECT = DepthParameters(focal_length_px=146.0, maximum_pixels=160 * 120 * 4)
 
 
-def frame(depth: Floats32, focal_length: float = 10.0) -> DepthFrame:
+def frame(depth, focal_length=10.0):
     height, width = depth.shape
     camera = Intrinsics(width, height, focal_length, focal_length, 0.0, 0.0)
     return DepthFrame(depth, camera, "kitchen/7")
 
 
-def test_two_by_two_by_hand() -> None:
+def test_two_by_two_by_hand():
     # one block per case: depth in metres -> what is left of its four samples
     blocks = {
         (2.00, 2.00, 2.00, 2.00): 1 / 2,
@@ -64,7 +62,7 @@ def test_two_by_two_by_hand() -> None:
     assert not q[1].any()
 
 
-def test_twice_halved_by_hand() -> None:
+def test_twice_halved_by_hand():
     # first halving of each 4 x 4 quarter: 1/2, 1/4, missing, 1/2.04; of these the second keeps
     # the nearest surface, 1/2 and 1/2.04 (not the 1/4 behind it)
     quarter = np.repeat(np.repeat([[2.0, 4.0], [0.0, 2.04]], 2, axis=0), 2, axis=1)
@@ -76,7 +74,7 @@ def test_twice_halved_by_hand() -> None:
     assert (camera.width, camera.height, camera.fx, camera.cy) == (2, 2, 10.0, -0.375)
 
 
-def test_halved_camera_sees_the_same_points() -> None:
+def test_halved_camera_sees_the_same_points():
     camera = Intrinsics(640, 481, 585.0, 570.0, 320.25, 239.5)
     half = halve_camera(camera)
     assert (half.width, half.height) == (320, 240)
@@ -101,12 +99,12 @@ def test_halved_camera_sees_the_same_points() -> None:
         (3, 3, 9000.0, 0),  # nothing below four pixels is halved
     ],
 )
-def test_number_of_halvings(width: int, height: int, focal_length: float, times: int) -> None:
+def test_number_of_halvings(width, height, focal_length, times):
     camera = Intrinsics(width, height, focal_length, focal_length, width / 2, height / 2)
     assert halvings(camera, KINECT) == times
 
 
-def test_map_is_bounded_whatever_the_sensor() -> None:
+def test_map_is_bounded_whatever_the_sensor():
     for width, height, focal_length in ((2896, 2896, 50.0), (640, 480, 585.0), (3200, 2400, 3e3)):
         camera = Intrinsics(width, height, focal_length, focal_length, 0, 0)
         for _ in range(halvings(camera, KINECT)):
@@ -115,7 +113,7 @@ def test_map_is_bounded_whatever_the_sensor() -> None:
         assert camera.fx <= 146 * math.sqrt(2)
 
 
-def test_kinect_becomes_160_by_120() -> None:
+def test_kinect_becomes_160_by_120():
     depth = np.full((480, 640), 2.0, np.float32)
     q, camera = inverse_depth(
         DepthFrame(depth, Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)), KINECT
@@ -127,21 +125,21 @@ def test_kinect_becomes_160_by_120() -> None:
     assert camera.cx == (320.0 - 0.5 - 1.0) / 4  # ((320 - .5) / 2 - .5) / 2
 
 
-def test_masked_samples_never_enter() -> None:
+def test_masked_samples_never_enter():
     bad = [0.0, math.nan, math.inf, -math.inf, -2.0, 0.499, 8.001, 1e30]
     depth = np.array([[*bad, 0.5, 8.0, 2.0]], np.float32)
     q, _ = inverse_depth(frame(depth), parameters())
     assert q[0].tolist() == [0.0] * len(bad) + [2.0, 0.125, 0.5]
 
 
-def test_input_stays_as_it_was() -> None:
+def test_input_stays_as_it_was():
     depth = np.array([[np.nan, 2.0, -1.0, 99.0]] * 4, np.float32)
     copy = depth.copy()
     inverse_depth(frame(depth, 20.0), parameters())
     np.testing.assert_array_equal(depth, copy)
 
 
-def test_other_layouts_and_types_read_alike() -> None:
+def test_other_layouts_and_types_read_alike():
     depth = np.random.default_rng(0).uniform(0.3, 9.0, (12, 10)).astype(np.float32)
     expected, _ = inverse_depth(frame(depth, 20.0), parameters())
     transposed = np.asfortranarray(depth)
@@ -150,7 +148,7 @@ def test_other_layouts_and_types_read_alike() -> None:
         np.testing.assert_array_equal(q, expected)
 
 
-def test_odd_edges_fall_off() -> None:
+def test_odd_edges_fall_off():
     depth = np.full((5, 7), 2.0, np.float32)
     depth[4, :] = depth[:, 6] = 1.0  # the row and column that have no partner
     q, camera = inverse_depth(frame(depth, 20.0), parameters())
@@ -158,7 +156,7 @@ def test_odd_edges_fall_off() -> None:
     assert (camera.width, camera.height) == (3, 2)
 
 
-def test_useless_frames_say_why() -> None:
+def test_useless_frames_say_why():
     nothing = np.full((8, 8), np.nan, np.float32)
     nothing[:4] = 0.0
     with pytest.raises(UselessFrame, match=r"^kitchen/7: every depth sample is missing\."):
@@ -170,7 +168,7 @@ def test_useless_frames_say_why() -> None:
         inverse_depth(frame(millimetres), parameters())
 
 
-def test_minimum_number_of_valid_pixels() -> None:
+def test_minimum_number_of_valid_pixels():
     depth = np.zeros((8, 8), np.float32)
     depth[0, :5] = 2.0
     assert np.count_nonzero(inverse_depth(frame(depth), parameters(minimum_valid=5))[0]) == 5
@@ -178,7 +176,7 @@ def test_minimum_number_of_valid_pixels() -> None:
         inverse_depth(frame(depth), parameters(minimum_valid=6))
 
 
-def test_wrong_shape_is_the_callers_mistake() -> None:
+def test_wrong_shape_is_the_callers_mistake():
     camera = Intrinsics(8, 6, 10.0, 10.0, 0.0, 0.0)
     for shape in ((8, 6), (6, 8, 1), (48,)):
         with pytest.raises(ValueError, match=r"intrinsics are for \(6, 8\)"):
@@ -186,13 +184,13 @@ def test_wrong_shape_is_the_callers_mistake() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 2), (7, 400), (400, 7)])
-def test_images_too_thin_for_a_surface(shape: tuple[int, int]) -> None:
+def test_images_too_thin_for_a_surface(shape):
     thin = frame(np.ones(shape, np.float32))
     with pytest.raises(UselessFrame, match=rf"{shape[1]} x {shape[0]} samples.*at least 8 rows"):
         inverse_depth(thin, DepthParameters())
 
 
-def test_few_samples_in_range_are_not_blamed_on_the_scale() -> None:
+def test_few_samples_in_range_are_not_blamed_on_the_scale():
     few = np.zeros((8, 8), np.float32)
     few[0, :5] = 2.0
     with pytest.raises(UselessFrame, match=r"only 5 of its 5 .* shows more of the scene"):

@@ -18,18 +18,17 @@ from sceneprint.geometry.registration.overlap import (
 )
 from sceneprint.geometry.validation.acceptance import AmbiguityParameters, symmetries
 from sceneprint.pipeline import open_signer, prepare
-from sceneprint.types import DepthFrame
 
 
 class Frame:
     """Anything that a weak reference can be had of."""
 
 
-def test_a_frame_is_worked_out_once_for_each_of_the_other_arguments() -> None:
+def test_a_frame_is_worked_out_once_for_each_of_the_other_arguments():
     calls: list[tuple[int, int]] = []
 
     @cached_per_frame
-    def squared(frame: Frame, n: int, *, less: int = 0) -> list[int]:
+    def squared(frame, n, *, less=0):
         calls.append((n, less))
         return [n * n - less]
 
@@ -47,7 +46,7 @@ def test_a_frame_is_worked_out_once_for_each_of_the_other_arguments() -> None:
     assert gone() is None
 
 
-def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames: tuple[DepthFrame, ...]) -> None:
+def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames):
     """No result may hold the frame that it is kept with."""
     geometry = prepare(room_frames[0], open_signer("depth"))[1]
     made = (

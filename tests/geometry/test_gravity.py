@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -31,43 +32,40 @@ from sceneprint.geometry.rigid import (
 )
 from sceneprint.geometry.validation.acceptance import AmbiguityParameters, best_alternative
 from sceneprint.geometry.validation.validation import validate, validate_without_up
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint.types import DepthFrame
 from sceneprint_lab.synth import KINECT, symmetric_box, take, trajectory
 from sceneprint_lab.synth.dataset import room_and_rng
 from sceneprint_lab.synth.mesh import box
 
 Z = np.array([0.0, 0.0, 1.0])  #: up in the world of synthetic rooms
 P = GravityParameters()
-Views = list[tuple[Floats, Geometry]]
 
 
-def up_in(T: Floats) -> Floats:
+def up_in(T):
     """Up in a sensor of pose T."""
-    up: Floats = T[:3, :3].T @ Z
-    return up
+    return T[:3, :3].T @ Z
 
 
-def leaning(up: Floats, degrees: float, rng: np.random.Generator) -> Floats:
+def leaning(up, degrees, rng):
     """A direction that far off, any way."""
     aside = np.cross(up, rng.normal(size=3))
     aside /= np.linalg.norm(aside)
-    result: Floats = math.cos(math.radians(degrees)) * up + math.sin(math.radians(degrees)) * aside
-    return result
+    return math.cos(math.radians(degrees)) * up + math.sin(math.radians(degrees)) * aside
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
+def model():
     return read_model("depth")
 
 
 @pytest.fixture(scope="module")
-def rooms(model: Model) -> list[Views]:
-    """Four views of each of three furnished rooms, a fifth of the path apart."""
+def rooms(model):
+    """Four views of each of two furnished rooms, a fifth of the path apart."""
     made = []
-    for number in (0, 2, 3):
+    for number in (0, 2):
         room, rng = room_and_rng(11, number)
         poses = trajectory(room, 61, rng)[12:60:12]
         frames = [DepthFrame(take(room, T, KINECT, rng), KINECT) for T in poses]
@@ -76,14 +74,20 @@ def rooms(model: Model) -> list[Views]:
     return made
 
 
-def transforms(n: int, rng: np.random.Generator) -> Floats:
+@cache
+def without_ups(query, match):
+    """The validation where no up is known, computed once."""
+    return validate(query, match, 1)
+
+
+def transforms(n, rng):
     made = np.tile(np.eye(4), (n, 1, 1))
     made[:, :3, :3] = Rotation.random(n, rng=rng).as_matrix()
     made[:, :3, 3] = rng.normal(size=(n, 3))
     return made
 
 
-def test_tilts_by_hand() -> None:
+def test_tilts_by_hand():
     turns = np.tile(np.eye(4), (4, 1, 1))
     for i, (axis, degrees) in enumerate((("z", 70), ("x", 90), ("y", -20), ("x", 180))):
         turns[i, :3, :3] = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
@@ -97,7 +101,7 @@ def test_tilts_by_hand() -> None:
     assert tilt_of(None, (Z, Z)) is None
 
 
-def test_a_tilt_is_the_same_there_and_back_and_whatever_the_yaw() -> None:
+def test_a_tilt_is_the_same_there_and_back_and_whatever_the_yaw():
     rng = np.random.default_rng(3)
     made = transforms(50, rng)
     source, target = (one / np.linalg.norm(one) for one in rng.normal(size=(2, 3)))
@@ -112,7 +116,7 @@ def test_a_tilt_is_the_same_there_and_back_and_whatever_the_yaw() -> None:
         assert tilts(T[None], (source, up))[0] < 1e-12
 
 
-def test_correspondences_stand_at_one_angle_to_up() -> None:
+def test_correspondences_stand_at_one_angle_to_up():
     rng = np.random.default_rng(4)
     source, target = (rng.integers(0, 256, (n, 16), np.uint8) for n in (30, 40))
     normals = [Rotation.random(n, rng=rng).as_matrix()[:, 0] for n in (30, 40)]
@@ -135,12 +139,12 @@ def test_correspondences_stand_at_one_angle_to_up() -> None:
     assert correspondences(source, target, np.random.default_rng(0), p, none).shape == (0, 2)
 
 
-def test_an_exact_up_and_one_with_noise_lose_nothing(rooms: list[Views]) -> None:
+def test_an_exact_up_and_one_with_noise_lose_nothing(rooms):
     rng = np.random.default_rng(5)
     accepted = 0
     for views in rooms:
         for (T_query, query), (T_match, match) in pairwise(views):
-            before = validate(query, match, 1)
+            before = without_ups(query, match)
             true = inverse(T_match) @ T_query
             accepted += before.status == "accepted"
             for noise in (0.0, 0.5):
@@ -157,9 +161,9 @@ def test_an_exact_up_and_one_with_noise_lose_nothing(rooms: list[Views]) -> None
     assert accepted >= 6
 
 
-def test_one_up_alone_changes_nothing_for_depth_images(rooms: list[Views]) -> None:
+def test_one_up_alone_changes_nothing_for_depth_images(rooms):
     (T, query), (_, match) = rooms[0][:2]
-    before, told = validate(query, match, 1), validate(query, match, 1, ups=(up_in(T), None))
+    before, told = without_ups(query, match), validate(query, match, 1, ups=(up_in(T), None))
     assert (before.status, before.overlap, before.reason) == (
         told.status, told.overlap, told.reason,
     )  # fmt: skip
@@ -168,19 +172,18 @@ def test_one_up_alone_changes_nothing_for_depth_images(rooms: list[Views]) -> No
 
 
 @pytest.mark.parametrize("degrees", [20, 90])
-def test_a_wrong_up_gives_a_sentence_and_no_pose(rooms: list[Views], degrees: int) -> None:
+def test_a_wrong_up_gives_a_sentence_and_no_pose(rooms, degrees):
     rng, said = np.random.default_rng(6), 0
-    for views in rooms:
+    for views in rooms if degrees == 20 else rooms[:1]:
         for (T_query, query), (T_match, match) in pairwise(views):
             ups = leaning(up_in(T_query), degrees, rng), up_in(T_match)
             told = validate(query, match, 1, ups=ups)
             assert told.status != "accepted"
-            before = validate(query, match, 1)
+            before = without_ups(query, match)
             checked = validate_without_up(query, match, 1, None, ups)
             if before.strength != "strong":
                 assert checked is None
                 continue
-            assert checked is not None
             assert (checked.status, checked.strength, checked.covariance) == (
                 "rejected", None, None,
             )  # fmt: skip
@@ -188,15 +191,14 @@ def test_a_wrong_up_gives_a_sentence_and_no_pose(rooms: list[Views], degrees: in
             assert checked.tilt_rad == pytest.approx(math.radians(degrees), abs=math.radians(2))
             assert f"only if tilted by {math.degrees(checked.tilt_rad):.0f} deg" in checked.reason
             said += 1
-    assert said >= 5
+    assert said >= (5 if degrees == 20 else 2)
 
 
-def test_without_up_what_is_level_counts_as_ever(rooms: list[Views]) -> None:
+def test_without_up_what_is_level_counts_as_ever(rooms):
     (T_query, query), (T_match, match) = rooms[0][:2]
-    before = validate(query, match, 1)
+    before = without_ups(query, match)
     assert before.strength == "strong"
     checked = validate_without_up(query, match, 1, None, (up_in(T_query), up_in(T_match)))
-    assert checked is not None
     assert (checked.status, checked.strength) == ("accepted", "strong")
     assert (checked.T_match_query == before.T_match_query).all()
     blind = validate_without_up(query, match, 1, None, (up_in(T_query), None))
@@ -204,7 +206,7 @@ def test_without_up_what_is_level_counts_as_ever(rooms: list[Views]) -> None:
     assert (blind.status, blind.tilt_rad) == ("accepted", None)
 
 
-def test_a_frame_sees_that_its_own_up_is_wrong(rooms: list[Views]) -> None:
+def test_a_frame_sees_that_its_own_up_is_wrong(rooms):
     rng = np.random.default_rng(7)
     for views in rooms:
         T, seen = views[0]
@@ -213,7 +215,7 @@ def test_a_frame_sees_that_its_own_up_is_wrong(rooms: list[Views]) -> None:
         assert off == pytest.approx(math.radians(20), abs=math.radians(1.5))
 
 
-def test_a_rival_that_tilts_is_dropped(model: Model) -> None:
+def test_a_rival_that_tilts_is_dropped(model):
     # a chest as deep as it is high, that lies free: laid on its back it looks nearly the same
     deep, wide, high = 0.6, 0.9, 0.6
     scene = replace(symmetric_box(), mesh=box(deep, wide, high))
@@ -229,8 +231,6 @@ def test_a_rival_that_tilts_is_dropped(model: Model) -> None:
     query, match = (geometry_of(see(frame, model.parameters), model) for frame in frames)
     ups = up_in(T), up_in(T)
     without, level = validate(query, match), validate(query, match, ups=ups)
-    assert without.T_rival is not None
-    assert level.T_rival is not None
     assert math.degrees(tilts(without.T_rival[None], ups)[0]) == pytest.approx(90, abs=2)
     assert tilts(level.T_rival[None], ups)[0] < P.rival_tilt
     assert (without.ambiguity, level.ambiguity) == (
@@ -246,7 +246,7 @@ def test_a_rival_that_tilts_is_dropped(model: Model) -> None:
     assert found.tilted >= without.ambiguity - 0.01  # told apart, so that a wrong `up` is noticed
 
 
-def test_the_mean_of_directions_is_that_of_the_many() -> None:
+def test_the_mean_of_directions_is_that_of_the_many():
     rng, within = np.random.default_rng(8), math.radians(10)
     near = np.array([leaning(Z, 2, rng) for _ in range(5)])
     far = np.array([leaning(Z, 60, rng) for _ in range(3)])
@@ -256,6 +256,5 @@ def test_the_mean_of_directions_is_that_of_the_many() -> None:
     assert math.degrees(math.acos(found @ Z)) < 2
     assert mean_direction(np.array([Z, [1.0, 0, 0]]), within) is None  # one against one
     alone = mean_direction(Z[None], within)
-    assert alone is not None
     assert alone.tolist() == Z.tolist()
     assert mean_direction(np.empty((0, 3)), within) is None

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -15,14 +12,14 @@ from sceneprint.geometry.signature.segmentation import (
     hierarchy,
     segment,
 )
-from sceneprint.types import Floats, Hierarchy, Ints32, Surface
+from sceneprint.types import Surface
 
 
-def parameters(n_levels: int = 4, factor: float = 2.0) -> HierarchyParameters:
+def parameters(n_levels=4, factor=2.0):
     return HierarchyParameters(n_levels=n_levels, factor=factor, iterations=4, normal_weight=3.0)
 
 
-def corner(scenes: ModuleType) -> tuple[Surface, Ints32]:
+def corner(scenes):
     seen, _ = scenes.corner()
     seen.valid[5:12, 60:70] = False
     finest = segment(
@@ -35,7 +32,7 @@ def corner(scenes: ModuleType) -> tuple[Surface, Ints32]:
 
 
 @pytest.mark.parametrize("factor", [1.5, 2.0, 4.0])
-def test_counts_fall_by_the_factor(scenes: ModuleType, factor: float) -> None:
+def test_counts_fall_by_the_factor(scenes, factor):
     seen, finest = corner(scenes)
     n = int(finest.max()) + 1
     assert n > 100
@@ -50,11 +47,11 @@ def test_counts_fall_by_the_factor(scenes: ModuleType, factor: float) -> None:
     np.testing.assert_array_equal(result.labels[0], finest)
 
 
-def weighted_mean(values: Floats, areas: Floats) -> Floats:
+def weighted_mean(values, areas):
     return np.average(values, axis=0, weights=areas)
 
 
-def test_area_and_mean_stay(scenes: ModuleType) -> None:
+def test_area_and_mean_stay(scenes):
     result = hierarchy(*corner(scenes), parameters())
     finest = result.levels[0]
     for level in result.levels[1:]:
@@ -67,7 +64,7 @@ def test_area_and_mean_stay(scenes: ModuleType) -> None:
         np.testing.assert_allclose(np.linalg.norm(level.normals, axis=1), 1, rtol=1e-12)
 
 
-def test_coarse_patches_are_unions_of_finest(scenes: ModuleType) -> None:
+def test_coarse_patches_are_unions_of_finest(scenes):
     result = hierarchy(*corner(scenes), parameters())
     finest = result.labels[0]
     for level, labels in zip(result.levels[1:], result.labels[1:], strict=True):
@@ -81,7 +78,7 @@ def test_coarse_patches_are_unions_of_finest(scenes: ModuleType) -> None:
         np.testing.assert_allclose(level.areas, area, rtol=1e-9)
 
 
-def test_first_coarse_level_does_not_mix_walls(scenes: ModuleType) -> None:
+def test_first_coarse_level_does_not_mix_walls(scenes):
     seen, finest = corner(scenes)
     coarse = hierarchy(seen, finest, parameters(2, 2.0))
     at = finest >= 0
@@ -91,9 +88,7 @@ def test_first_coarse_level_does_not_mix_walls(scenes: ModuleType) -> None:
     assert (off < 5).mean() > 0.97
 
 
-def strip(
-    scenes: ModuleType, x: list[float], normals: list[list[float]], largest: float = 0.04
-) -> Hierarchy:
+def strip(scenes, x, normals, largest=0.04):
     """One row of pixels, each a patch of its own, halved once."""
     n = len(x)
     areas = np.full((1, n), 0.04, np.float32)
@@ -110,7 +105,7 @@ def strip(
     return hierarchy(seen, np.arange(n, dtype=np.int32)[None], parameters(2, 2.0))
 
 
-def test_two_clusters_by_hand(scenes: ModuleType) -> None:
+def test_two_clusters_by_hand(scenes):
     front, side = [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]
     # near and far: {0, .1} and {2, 2.1}, all facing alike
     labels = strip(scenes, [0.0, 2.1, 0.1, 2.0], [front] * 4).labels[1][0].tolist()
@@ -123,7 +118,7 @@ def test_two_clusters_by_hand(scenes: ModuleType) -> None:
     np.testing.assert_allclose(result.levels[1].normals[order], [front, side], atol=1e-7)
 
 
-def test_centres_move_by_hand(scenes: ModuleType) -> None:
+def test_centres_move_by_hand(scenes):
     # seeded at 0, the largest, and 10, the farthest: {0, 4.9} and {5.5, 10}. The largest holds
     # its centre at 0.45, the other moves to 7.75: 4.9 changes over
     result = strip(scenes, [0.0, 4.9, 5.5, 10.0], [[0.0, 0.0, -1.0]] * 4, largest=0.4)
@@ -132,42 +127,30 @@ def test_centres_move_by_hand(scenes: ModuleType) -> None:
     np.testing.assert_allclose(result.levels[1].means[labels[3], 0], 6.8, rtol=1e-6)
 
 
-def test_a_single_patch_stays_one(scenes: ModuleType) -> None:
+def test_a_single_patch_stays_one(scenes):
     result = strip(scenes, [0.3], [[0.0, 0.0, -1.0]])
     assert [len(level) for level in result.levels] == [1, 1]
     np.testing.assert_allclose(result.levels[1].means, [[0.3, 0.0, 2.0]], rtol=1e-6)
     np.testing.assert_array_equal(result.labels[1], [[0]])
 
 
-def test_deep_levels_never_fall_below_one(scenes: ModuleType) -> None:
+def test_deep_levels_never_fall_below_one(scenes):
     levels = hierarchy(*corner(scenes), parameters(4, 40.0)).levels
     assert [len(level) for level in levels[2:]] == [1, 1]
     assert levels[3].areas[0] == pytest.approx(levels[0].areas.sum(), rel=1e-12)
 
 
-def test_same_input_same_bytes(scenes: ModuleType) -> None:
-    first, second = (hierarchy(*corner(scenes), parameters()) for _ in range(2))
-    for a, b in zip(first.levels, second.levels, strict=True):
-        for values, again in ((a.means, b.means), (a.normals, b.normals), (a.areas, b.areas)):
-            assert values.tobytes() == again.tobytes()
-    for c, d in zip(first.labels, second.labels, strict=True):
-        np.testing.assert_array_equal(c, d)
-
-
-def naive_k_means(
-    patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
-) -> Ints32:
+def naive_k_means(patches, areas, n_clusters, scale, weight, iterations):
     """Every patch with every centre, in the order of operations that the kernel has."""
     x, y, z, nx, ny, nz = patches
     n = len(areas)
 
-    def distances(c: Floats) -> Floats:
+    def distances(c):
         dx, dy, dz = x - c[0], y - c[1], z - c[2]
         cosine = nx * c[3] + ny * c[4] + nz * c[5]
-        found: Floats = (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
-        return found
+        return (dx * dx + dy * dy + dz * dz) * scale + weight * (1.0 - cosine)
 
-    def assigned(centres: list[Floats]) -> Ints32:
+    def assigned(centres):
         nearest, labels = np.full(n, np.inf), np.zeros(n, np.int32)
         for c, centre in enumerate(centres):
             found = distances(centre)
@@ -199,9 +182,7 @@ def naive_k_means(
     [(1, 1, 3.0, 1), (8, 3, 3.0, 1), (131, 90, 3.0, 1), (131, 90, 0.0, 1), (200, 20, 0.3, 1),
      (96, 40, 3.0, 3), (96, 60, 3.0, 3)],
 )  # fmt: skip
-def test_patches_passed_over_are_those_too_far(
-    n: int, n_clusters: int, weight: float, copies: int
-) -> None:
+def test_patches_passed_over_are_those_too_far(n, n_clusters, weight, copies):
     """All comparisons give the same clusters; with equal distances, and centres without patches."""
     rng = np.random.default_rng(n + n_clusters)
     steps = rng.normal(0, 0.3, (n // copies, 3))
@@ -217,12 +198,12 @@ def test_patches_passed_over_are_those_too_far(
     assert len(np.unique(found)) <= min(n_clusters, n // copies)
 
 
-def test_most_patches_are_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_most_patches_are_passed_over(monkeypatch):
     """Of 400 along a line, 100 centres, and five rounds: without a compiler, to be counted."""
     compared = []
     nearer = module._move_nearer.function
 
-    def counted(*arguments: Any) -> None:
+    def counted(*arguments):
         compared.append(arguments[6] - arguments[5])
         nearer(*arguments)
 

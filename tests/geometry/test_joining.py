@@ -10,16 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.rigid import inverse, inverses, pose_difference
-from sceneprint.geometry.session_join import (
-    JoiningParameters,
-    Votes,
-    association_votes,
-    join_sessions,
-)
-from sceneprint.types import Floats
+from sceneprint.geometry.session_join import JoiningParameters, association_votes, join_sessions
 
 
-def rigid(rng: np.random.Generator, metres: float, degrees: float | None = None) -> Floats:
+def rigid(rng, metres, degrees=None):
     T = np.eye(4)
     if degrees is None:
         turn = Rotation.random(rng=rng)
@@ -29,10 +23,7 @@ def rigid(rng: np.random.Generator, metres: float, degrees: float | None = None)
     return T
 
 
-def seen(
-    rng: np.random.Generator, T_a_b: Floats, right: int, wrong: int,
-    metres: float = 0.01, degrees: float = 0.4,
-) -> Votes:  # fmt: skip
+def seen(rng, T_a_b, right, wrong, metres=0.01, degrees=0.4):
     """Frames of run b, 20 m from its origin, found again in run a; some of them wrongly."""
     n = right + wrong
     away = rigid(rng, 20.0)
@@ -50,14 +41,14 @@ def seen(
     )
 
 
-def at_places(votes: Votes, T: Floats, true: Floats) -> float:
+def at_places(votes, T, true):
     """Most that two transforms differ by where the frames are."""
     put, want = (votes.places @ one[:3, :3].T + one[:3, 3] for one in (T, true))
     return float(np.linalg.norm(put - want, axis=1).max())
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_known_transform_among_as_many_outliers(seed: int) -> None:
+def test_a_known_transform_among_as_many_outliers(seed):
     rng = np.random.default_rng(seed)
     true = rigid(rng, 10.0)
     votes = seen(rng, true, 30, 30)
@@ -72,21 +63,21 @@ def test_a_known_transform_among_as_many_outliers(seed: int) -> None:
     assert found.spread_m == pytest.approx(math.sqrt((inside**2).mean()))
 
 
-def place_of(point: Floats) -> Floats:
+def place_of(point):
     T = np.eye(4)
     T[:3, 3] = point
     return T
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_support_is_that_of_an_exhaustive_search(seed: int) -> None:
+def test_support_is_that_of_an_exhaustive_search(seed):
     """The largest set of votes that agree pairwise, of all sets there are."""
     rng = np.random.default_rng(100 + seed)
     true = rigid(rng, 5.0)
     votes = seen(rng, true, 6, 5, 0.01, 0.3)
     p = JoiningParameters()
 
-    def agree(i: int, j: int) -> bool:
+    def agree(i, j):
         a, b = votes.transforms[i], votes.transforms[j]
         places = [place_of(votes.places[k]) for k in (i, j)]
         near = all(pose_difference(a @ T, b @ T)[0] <= p.agree_m for T in places)
@@ -103,7 +94,7 @@ def test_support_is_that_of_an_exhaustive_search(seed: int) -> None:
     assert len(best) == 6
 
 
-def test_the_inverse_votes_for_the_inverse() -> None:
+def test_the_inverse_votes_for_the_inverse():
     rng = np.random.default_rng(1)
     true = rigid(rng, 10.0)
     b = np.array([rigid(rng, 1.0) for _ in range(12)])
@@ -118,7 +109,7 @@ def test_the_inverse_votes_for_the_inverse() -> None:
     np.testing.assert_allclose(back.T, inverse(true), atol=1e-9)
 
 
-def test_two_answers_with_as_many_votes_are_none() -> None:
+def test_two_answers_with_as_many_votes_are_none():
     rng = np.random.default_rng(2)
     b = np.array([rigid(rng, 1.0, 20.0) for _ in range(20)])
     first, second = rigid(rng, 3.0), rigid(rng, 3.0)
@@ -132,7 +123,7 @@ def test_two_answers_with_as_many_votes_are_none() -> None:
     assert join_sessions(association_votes(T, b, a, n, n, weights)).T is not None
 
 
-def test_too_few_votes_or_too_few_frames_are_none() -> None:
+def test_too_few_votes_or_too_few_frames_are_none():
     rng = np.random.default_rng(3)
     true = rigid(rng, 3.0)
     b = np.array([rigid(rng, 1.0, 20.0) for _ in range(12)])
@@ -149,7 +140,7 @@ def test_too_few_votes_or_too_few_frames_are_none() -> None:
         join_sessions(association_votes(T[:0], b[:0], a[:0], n[:0], n[:0], np.ones(0)))
 
 
-def test_many_frames_of_one_place_join_nothing() -> None:
+def test_many_frames_of_one_place_join_nothing():
     """A robot that stands still takes one view many times, and all are mistaken alike."""
     rng = np.random.default_rng(6)
     true, n = rigid(rng, 3.0), np.arange(30)
@@ -170,13 +161,13 @@ def test_many_frames_of_one_place_join_nothing() -> None:
         assert (found.T is None) is (expected[said] is None)
 
 
-def turned_by(degrees: float) -> Floats:
+def turned_by(degrees):
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     return T
 
 
-def test_a_frame_that_was_found_often_counts_once() -> None:
+def test_a_frame_that_was_found_often_counts_once():
     rng = np.random.default_rng(4)
     true, wrong = rigid(rng, 3.0), rigid(rng, 3.0)
     b = np.array([rigid(rng, 1.0, 20.0) for _ in range(20)])
@@ -191,7 +182,7 @@ def test_a_frame_that_was_found_often_counts_once() -> None:
     np.testing.assert_allclose(found.T, true, atol=1e-9)
 
 
-def test_many_votes_are_tried_by_lot_and_the_same_lot_again() -> None:
+def test_many_votes_are_tried_by_lot_and_the_same_lot_again():
     rng = np.random.default_rng(5)
     true = rigid(rng, 5.0)
     votes = seen(rng, true, 400, 400)

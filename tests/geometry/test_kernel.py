@@ -7,7 +7,6 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numba
 import numpy as np
@@ -20,7 +19,6 @@ from sceneprint.geometry import kernel_cache
 from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, prefetch
 from sceneprint.geometry.kernel_cache import runs_on
 from sceneprint.geometry.signature.pair_features import _count
-from sceneprint.types import Floats
 
 #: What numba compiles for: its words for the system, the processor and its features.
 HOST = cpu_target.target_context.codegen().magic_tuple()
@@ -58,7 +56,7 @@ print(outer(5.0), sum(outer.stats.cache_hits.values()))
 """
 
 
-def run(folder: Path) -> tuple[float, int]:
+def run(folder):
     """What the outermost gives of 5, and how often it was loaded and not compiled."""
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
     environment.pop("NUMBA_CACHE_DIR", None)
@@ -71,7 +69,7 @@ def run(folder: Path) -> tuple[float, int]:
 
 
 @pytest.mark.thorough
-def test_a_caller_is_built_anew_with_what_it_is_made_of(tmp_path: Path) -> None:
+def test_a_caller_is_built_anew_with_what_it_is_made_of(tmp_path):
     """A kernel two files away, or a number of another file, which numba does not look at."""
     (tmp_path / "inner.py").write_text(INNER.format(number="NUMBER = 10.0", twice="x * 2"))
     (tmp_path / "middle.py").write_text(MIDDLE)
@@ -93,7 +91,7 @@ print(len(marks), sorted(marks.items()))
 """
 
 
-def test_the_marks_are_the_same_in_every_process() -> None:
+def test_the_marks_are_the_same_in_every_process():
     """Or each would compile for itself: no address and no order may be in them.
 
     Neither that of a set nor that in which kernels are first used.
@@ -124,7 +122,7 @@ print(value, sum(thrice.stats.cache_hits.values()), before, there, folder)
 """
 
 
-def called(folder: Path, **environment: str) -> tuple[float, int, bool, bool, str]:
+def called(folder, **environment):
     """What `ALONE` gives, how often it was loaded, if its code was there before, after; where."""
     done = subprocess.run(
         [sys.executable, "-c", "import alone"],
@@ -135,8 +133,9 @@ def called(folder: Path, **environment: str) -> tuple[float, int, bool, bool, st
     return float(value), int(hits), before == "True", there == "True", place
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(not runs_on(HOST[2]), reason="an older processor, or none of x86")
-def test_code_that_was_brought_is_found_wherever_own_code_is_kept(tmp_path: Path) -> None:
+def test_code_that_was_brought_is_found_wherever_own_code_is_kept(tmp_path):
     """As that of a wheel: compiled for any processor of a kind, in a folder that nobody writes."""
     (tmp_path / "alone.py").write_text(ALONE)
     own, brought = str(tmp_path / "own"), str(tmp_path / "__pycache__")
@@ -154,19 +153,19 @@ def test_code_that_was_brought_is_found_wherever_own_code_is_kept(tmp_path: Path
     assert called(tmp_path, **here)[:3] == (20.0, 0, False)
 
 
-def test_what_a_processor_needs_for_code_that_was_brought() -> None:
+def test_what_a_processor_needs_for_code_that_was_brought():
     assert runs_on(TARGET_FEATURES)
     assert runs_on(f"+adx,{TARGET_FEATURES},-avx512bw")
     assert not runs_on(TARGET_FEATURES.replace("+avx2", "-avx2"))
     assert not runs_on("")
 
 
-def second(table: Floats, row: int) -> float:
+def second(table, row):
     prefetch(table, row)
     return float(table[row, 1])
 
 
-def test_a_row_is_asked_for_and_nothing_else_happens() -> None:
+def test_a_row_is_asked_for_and_nothing_else_happens():
     compiled = numba.njit(second)
     table = np.arange(6.0).reshape(3, 2)
     for row in (0, 2, np.int32(1), np.uint64(1)):
@@ -175,22 +174,22 @@ def test_a_row_is_asked_for_and_nothing_else_happens() -> None:
         assert text.count("call void @llvm.prefetch") == 2
 
 
-def test_what_asks_for_a_row_is_part_of_the_mark(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_asks_for_a_row_is_part_of_the_mark(monkeypatch):
     mark = kernel_module._constant_text(prefetch, "a.module")
     assert mark == kernel_module._code_text(kernel_cache._prefetch_row.__code__)
 
-    def nothing(_context: Any, table: Any, row: Any) -> Any:
+    def nothing(_context, table, row):
         return numba.types.void(table, row), lambda context, *_: context.get_dummy_value()
 
     monkeypatch.setattr(kernel_cache, "prefetch_row", intrinsic(nothing))
     assert kernel_module._constant_text(prefetch, "a.module") not in ("", mark)
 
 
-def test_kernels_import_numba_when_they_are_called() -> None:
+def test_kernels_import_numba_when_they_are_called():
     code = "import sys, sceneprint.pipeline; print({'numba', 'llvmlite'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "set()\n"
 
 
-def test_a_kernel_is_pickled_by_its_name() -> None:
+def test_a_kernel_is_pickled_by_its_name():
     assert pickle.loads(pickle.dumps(_count)) is _count

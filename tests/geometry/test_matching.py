@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.registration.patch_descriptors import MatchingParameters, correspondences
-from sceneprint.types import Bytes, Ints32
 
 
-def oracle(source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int) -> list[list[int]]:
+def oracle(source, target, drawn, n_nearest):
     """The pairs by a stable sort of all squared distances."""
     pairs = []
     for i in drawn.tolist():
@@ -19,7 +18,7 @@ def oracle(source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int) -> list[
 
 
 @pytest.mark.parametrize("levels", [256, 2])
-def test_equals_the_oracle(levels: int) -> None:
+def test_equals_the_oracle(levels):
     # of two levels in four bytes there are 16 descriptors: nearly all distances are ties
     rng = np.random.default_rng(levels)
     for length in (1, 4, 128):
@@ -32,7 +31,7 @@ def test_equals_the_oracle(levels: int) -> None:
         assert found.tolist() == oracle(source, target, drawn, 4)
 
 
-def test_distances_do_not_wrap() -> None:
+def test_distances_do_not_wrap():
     # 1024 bytes, each 255 apart: the largest there is; 200 apart would be nearer modulo 2^16
     source = np.zeros((1, 1024), np.uint8)
     target = np.array([[255] * 1024, [200] * 1024, [201] * 1024, [1] * 1024], np.uint8)
@@ -40,7 +39,7 @@ def test_distances_do_not_wrap() -> None:
     assert found[:, 1].tolist() == [3, 1, 2, 0]
 
 
-def test_each_source_is_drawn_once_at_random() -> None:
+def test_each_source_is_drawn_once_at_random():
     descriptors = np.arange(50, dtype=np.uint8)[:, None]
     p = MatchingParameters(10, 1)
     draws = [
@@ -57,7 +56,7 @@ def test_each_source_is_drawn_once_at_random() -> None:
     assert set(seen[:, 0].tolist()) == set(range(50))
 
 
-def test_fewer_patches_than_wanted() -> None:
+def test_fewer_patches_than_wanted():
     rng = np.random.default_rng(4)
     source, target = rng.integers(0, 256, (5, 8), np.uint8), rng.integers(0, 256, (2, 8), np.uint8)
     found = correspondences(source, target, rng, MatchingParameters(100, 3))
@@ -67,7 +66,7 @@ def test_fewer_patches_than_wanted() -> None:
     assert correspondences(source, none, rng, MatchingParameters()).shape == (0, 2)
 
 
-def test_descriptors_of_two_lengths() -> None:
+def test_descriptors_of_two_lengths():
     a, b = np.zeros((3, 8), np.uint8), np.zeros((3, 9), np.uint8)
     with pytest.raises(ValueError, match="lengths, 8 and 9 bytes"):
         correspondences(a, b, np.random.default_rng(0), MatchingParameters())

@@ -7,23 +7,21 @@ import pytest
 
 from sceneprint.geometry.surface.cloud import hash_key
 from sceneprint.geometry.surface.voxels import (
-    Links,
     fit_inverse_planes,
     fit_planes,
     least_axis,
     link_points,
 )
-from sceneprint.types import Floats
 
 
-def of(links: Links) -> list[set[int]]:
+def of(links):
     return [
         set(links.indices[a:b].tolist())
         for a, b in zip(links.offsets[:-1], links.offsets[1:], strict=True)
     ]
 
 
-def naive(places: Floats, heights: Floats) -> list[set[int]]:
+def naive(places, heights):
     near = np.linalg.norm(places[:, None] - places[None], axis=2) < 1
     near &= np.abs(heights[:, None] - heights[None]) < 1
     np.fill_diagonal(near, False)
@@ -31,7 +29,7 @@ def naive(places: Floats, heights: Floats) -> list[set[int]]:
 
 
 @pytest.mark.parametrize("spread", [0.5, 3.0, 400_000.0])
-def test_links_are_all_pairs_that_are_near(spread: float) -> None:
+def test_links_are_all_pairs_that_are_near(spread):
     rng = np.random.default_rng(3)
     seeds = rng.uniform(-spread, spread, (12, 3))
     places = np.repeat(seeds, 20, axis=0) + rng.normal(size=(240, 3))
@@ -39,7 +37,7 @@ def test_links_are_all_pairs_that_are_near(spread: float) -> None:
     assert of(link_points(places, heights)) == naive(places, heights)
 
 
-def test_cells_that_share_a_slot_do_so_under_one_secret_only() -> None:
+def test_cells_that_share_a_slot_do_so_under_one_secret_only():
     """Nobody can know which cells make a table slow; what is found does not depend on it."""
     keys, mask = np.arange(200_000, dtype=np.int64) << 21, (1 << 20) - 1
     same = [int(key) for key in keys if hash_key(key, 5) & mask < 1 << 12]
@@ -47,7 +45,7 @@ def test_cells_that_share_a_slot_do_so_under_one_secret_only() -> None:
     assert len({hash_key(key, 77) & mask for key in same}) > 0.98 * len(same)
 
 
-def test_links_do_not_depend_on_the_secret(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_links_do_not_depend_on_the_secret(monkeypatch):
     places = np.random.default_rng(5).uniform(-4, 4, (500, 3))
     made = []
     for secret in (0, 2**61 + 12345):
@@ -57,11 +55,11 @@ def test_links_do_not_depend_on_the_secret(monkeypatch: pytest.MonkeyPatch) -> N
     assert made[0].indices.tobytes() == made[1].indices.tobytes()
 
 
-def test_no_points_no_links() -> None:
+def test_no_points_no_links():
     assert len(link_points(np.empty((0, 3)), np.empty(0)).indices) == 0
 
 
-def test_links_among_those_kept() -> None:
+def test_links_among_those_kept():
     rng = np.random.default_rng(4)
     places = rng.uniform(-1.5, 1.5, (80, 3))
     links = link_points(places, np.zeros(80))
@@ -75,7 +73,7 @@ def test_links_among_those_kept() -> None:
     assert of(links.select(keep, held)) == wanted
 
 
-def test_surfaces_one_behind_the_other_do_not_touch() -> None:
+def test_surfaces_one_behind_the_other_do_not_touch():
     x = np.arange(10) * 0.1
     front = np.column_stack([x, np.zeros(10), np.zeros(10)])
     behind = front + np.array([0, 0, 0.2])
@@ -92,7 +90,7 @@ def test_surfaces_one_behind_the_other_do_not_touch() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_least_axis_is_the_eigenvector_of_the_least(seed: int) -> None:
+def test_least_axis_is_the_eigenvector_of_the_least(seed):
     half = np.random.default_rng(seed).normal(size=(3, 3)) * [1.0, 0.3, 1e-3]
     m = half @ half.T
     values, vectors = np.linalg.eigh(m)
@@ -102,7 +100,7 @@ def test_least_axis_is_the_eigenvector_of_the_least(seed: int) -> None:
     assert abs(axis @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-9)
 
 
-def test_facing_normals_are_numpys_components() -> None:
+def test_facing_normals_are_numpys_components():
     rng = np.random.default_rng(6)
     places = rng.uniform(-2, 2, (400, 3)) * [1, 1, 0.02] + [0, 0, 5]
     links = link_points(places, np.zeros(400))
@@ -122,7 +120,7 @@ def test_facing_normals_are_numpys_components() -> None:
     assert (np.abs(normals[:, 2]) > 0.99).mean() > 0.9
 
 
-def test_seen_planes_are_exact_beside_a_step() -> None:
+def test_seen_planes_are_exact_beside_a_step():
     y, z = (one.reshape(-1) for one in np.meshgrid(np.arange(-1, 1, 0.05), np.arange(-1, 1, 0.05)))
     left, right = np.array([0.3, 0.02, -0.1]), np.array([0.25, 0.0, 0.0])  # a of a . p = 1
     rays = np.column_stack([np.full(len(y), 3.0), y, z])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,7 +12,7 @@ from sceneprint.geometry.surface.depth_image import (
     fit_surface,
     inverse_depth,
 )
-from sceneprint.types import DepthFrame, Floats, Floats32, Intrinsics, Surface
+from sceneprint.types import DepthFrame, Intrinsics
 
 PARAMETERS = NormalParameters(
     radius_px=3,
@@ -27,20 +25,19 @@ PARAMETERS = NormalParameters(
 KINECT = Intrinsics(160, 120, 146.25, 146.25, 79.5, 59.5)
 
 
-def fit(q: Floats | Floats32, camera: Intrinsics, p: NormalParameters = PARAMETERS) -> Surface:
+def fit(q, camera, p=PARAMETERS):
     return fit_surface(np.ascontiguousarray(q, np.float32), camera, p)
 
 
-def tilted(degrees: float, about: float) -> Floats:
+def tilted(degrees, about):
     """A normal towards the sensor, leaning by so much in the direction `about`."""
     turn = Rotation.from_euler("zx", [about, degrees], degrees=True)
-    normal: Floats = -turn.inv().apply([0.0, 0.0, 1.0])
-    return normal
+    return -turn.inv().apply([0.0, 0.0, 1.0])
 
 
 @pytest.mark.parametrize("distance", [0.5, 2.0, 6.0])
 @pytest.mark.parametrize(("tilt", "about"), [(0, 0), (30, 20), (50, 200), (60, 110)])
-def test_planes_are_exact(scenes: ModuleType, distance: float, tilt: float, about: float) -> None:
+def test_planes_are_exact(scenes, distance, tilt, about):
     normal, point = tilted(tilt, about), np.array([0.0, 0.0, distance])
     q = scenes.plane(KINECT, normal, point)
     seen = fit(q, KINECT)
@@ -60,7 +57,7 @@ def test_planes_are_exact(scenes: ModuleType, distance: float, tilt: float, abou
     assert np.abs(sideways).max() < 1e-5
 
 
-def test_normals_are_unit_and_face_the_sensor(scenes: ModuleType) -> None:
+def test_normals_are_unit_and_face_the_sensor(scenes):
     rng = np.random.default_rng(0)
     smooth = scenes.plane(KINECT, tilted(40, 70), np.array([0, 0, 2.0]))
     seen = fit(smooth * (1 + 0.02 * rng.normal(size=smooth.shape)), KINECT)
@@ -73,7 +70,7 @@ def test_normals_are_unit_and_face_the_sensor(scenes: ModuleType) -> None:
     assert not seen.areas[~at].any()
 
 
-def test_step_edge_does_not_bleed(scenes: ModuleType) -> None:
+def test_step_edge_does_not_bleed(scenes):
     # walls at 1.5 and 2.0 m, the nearer on the left: exact up to the last column before the edge
     q = np.full((120, 160), 1 / 2.0)
     q[:, :70] = 1 / 1.5
@@ -83,7 +80,7 @@ def test_step_edge_does_not_bleed(scenes: ModuleType) -> None:
     np.testing.assert_allclose(1 / seen.points[..., 2], q, rtol=1e-5)
 
 
-def test_crease_is_sharp(scenes: ModuleType) -> None:
+def test_crease_is_sharp(scenes):
     # two walls that meet in a vertical edge 2 m ahead, leaning 45 degrees each
     left, right = scenes.unit(1, 0, -1), scenes.unit(-1, 0, -1)
     edge = np.array([0.0, 0.0, 2.0])
@@ -99,7 +96,7 @@ def test_crease_is_sharp(scenes: ModuleType) -> None:
     assert off[away].max() < 0.05
 
 
-def kinect_noise(q: Floats, camera: Intrinsics, rng: np.random.Generator) -> Floats32:
+def kinect_noise(q, camera, rng):
     """Depth of a structured-light sensor: disparity off by 0.1 px, in steps of 1/8 px."""
     per_disparity = 1 / (camera.fx * 0.075)  # 1/m for a pixel, over a baseline of 75 mm
     disparity = np.rint((q / per_disparity + rng.normal(0, 0.1, q.shape)) * 8) / 8
@@ -107,7 +104,7 @@ def kinect_noise(q: Floats, camera: Intrinsics, rng: np.random.Generator) -> Flo
 
 
 @pytest.mark.parametrize(("tilt", "bound"), [(10, 1.0), (45, 0.65)])
-def test_noise_of_a_kinect_at_two_metres(scenes: ModuleType, tilt: float, bound: float) -> None:
+def test_noise_of_a_kinect_at_two_metres(scenes, tilt, bound):
     camera = Intrinsics(640, 480, 585.0, 585.0, 319.5, 239.5)
     normal = tilted(tilt, 33)
     depth = kinect_noise(
@@ -125,7 +122,7 @@ def test_noise_of_a_kinect_at_two_metres(scenes: ModuleType, tilt: float, bound:
     assert np.median(off) < bound  # measured, over three seeds: 0.84-0.88 and 0.52-0.55
 
 
-def test_sphere(scenes: ModuleType) -> None:
+def test_sphere(scenes):
     centre, radius = np.array([0.1, -0.1, 2.0]), 0.6
     rays = scenes.rays(KINECT)
     # |t ray - centre| = radius, the nearer root
@@ -146,17 +143,14 @@ def test_sphere(scenes: ModuleType) -> None:
     assert np.abs(distance - radius).max() < 0.002  # 0.0014: the fit cuts the cap off
 
 
-def on_plane(u: float, v: float, camera: Intrinsics, normal: Floats, point: Floats) -> Floats:
+def on_plane(u, v, camera, normal, point):
     ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
-    result: Floats = ray * (normal @ point) / (normal @ ray)
-    return result
+    return ray * (normal @ point) / (normal @ ray)
 
 
 @pytest.mark.parametrize(("tilt", "about"), [(0, 0), (35, 0), (50, 130)])
 @pytest.mark.parametrize("block", [(60, 40, 100, 80), (2, 3, 30, 25), (5, 5, 155, 115)])
-def test_areas_sum_to_the_rectangle(
-    scenes: ModuleType, tilt: float, about: float, block: tuple[int, int, int, int]
-) -> None:
+def test_areas_sum_to_the_rectangle(scenes, tilt, about, block):
     normal, point = tilted(tilt, about), np.array([0.0, 0.0, 2.0])
     seen = fit(scenes.plane(KINECT, normal, point), KINECT)
     x0, y0, x1, y1 = block
@@ -170,7 +164,7 @@ def test_areas_sum_to_the_rectangle(
     assert seen.areas[y0:y1, x0:x1].sum(dtype=float) == pytest.approx(area, rel=2e-3)
 
 
-def test_grazing_surfaces_are_not_valid(scenes: ModuleType) -> None:
+def test_grazing_surfaces_are_not_valid(scenes):
     # a floor 0.5 m below; gates wide open, so that only the angle of incidence rejects
     floor = np.array([0.0, -1.0, 0.0])
     q = scenes.plane(KINECT, floor, np.array([0.0, 0.5, 0.0]))
@@ -186,7 +180,7 @@ def test_grazing_surfaces_are_not_valid(scenes: ModuleType) -> None:
     assert 0.2 < seen.valid.mean() < 0.4
 
 
-def test_too_few_samples_fix_no_plane() -> None:
+def test_too_few_samples_fix_no_plane():
     q = np.zeros((20, 20))
     q[3, :] = 0.5  # a line: no spread
     q[10:12, 10:14] = 0.5  # eight samples

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 
 from sceneprint.geometry.surface.depth_image import NormalParameters, fit_surface
-from sceneprint.types import Floats, Intrinsics
+from sceneprint.types import Intrinsics
 
 CAMERA = Intrinsics(26, 18, 40.0, 37.0, 12.0, 9.5)
 PARAMETERS = NormalParameters(
@@ -20,9 +18,7 @@ PARAMETERS = NormalParameters(
 )
 
 
-def one_fit(
-    q: Floats, y: int, x: int, radius: int, plane: Floats, gate: float
-) -> tuple[Floats, int, float]:
+def one_fit(q, y, x, radius, plane, gate):
     """Least squares over the window's samples near `plane`: (q, a, b), their number, spread."""
     samples = []
     for v in range(max(y - radius, 0), min(y + radius + 1, q.shape[0])):
@@ -38,7 +34,7 @@ def one_fit(
     return np.linalg.lstsq(design, s[:, 2], rcond=None)[0], len(s), spread
 
 
-def naive(q: Floats, y: int, x: int, p: NormalParameters) -> tuple[Floats, Floats] | None:
+def naive(q, y, x, p):
     """Point and normal of a pixel, or None."""
     if q[y, x] == 0:
         return None
@@ -59,7 +55,7 @@ def naive(q: Floats, y: int, x: int, p: NormalParameters) -> tuple[Floats, Float
     return ray / at, normal
 
 
-def test_equals_least_squares_pixel_by_pixel(scenes: ModuleType) -> None:
+def test_equals_least_squares_pixel_by_pixel(scenes):
     rng = np.random.default_rng(5)
     y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
     q = 0.5 + 0.08 * np.sin(x / 6 + 0.3) + 0.06 * np.cos(y / 5) + rng.normal(0, 8e-4, x.shape)

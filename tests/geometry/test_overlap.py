@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,12 +16,11 @@ from sceneprint.geometry.registration.overlap import (
     sample_points,
 )
 from sceneprint.geometry.surface import camera
-from sceneprint.types import Floats, Floats32, Surface
 
 P = OverlapParameters()
 
 
-def oracle(source: Floats32, target: Surface, T: Floats, p: OverlapParameters) -> tuple[int, int]:
+def oracle(source, target, T, p):
     """Inliers and violations, point after point."""
     k, inliers, violations = target.camera, 0, 0
     for row in source.astype(float):
@@ -51,7 +49,7 @@ def oracle(source: Floats32, target: Surface, T: Floats, p: OverlapParameters) -
     return inliers, violations
 
 
-def test_by_hand(validation_goldens: ModuleType) -> None:
+def test_by_hand(validation_goldens):
     validation_goldens.check_cameras(types)
     validation_goldens.check_projecting(camera)
     validation_goldens.check_targets(module)
@@ -60,7 +58,7 @@ def test_by_hand(validation_goldens: ModuleType) -> None:
     validation_goldens.check_sampling(module)
 
 
-def test_equals_the_oracle(scenes: ModuleType) -> None:
+def test_equals_the_oracle(scenes):
     rng = np.random.default_rng(0)
     corner, _ = scenes.corner()
     corner.points[10:20, 30:50] = corner.normals[10:20, 30:50] = 0.0
@@ -79,29 +77,8 @@ def test_equals_the_oracle(scenes: ModuleType) -> None:
     assert violations > 0.05 * 40 * len(source)
 
 
-def test_a_surface_agrees_with_itself(scenes: ModuleType) -> None:
-    corner, _ = scenes.corner()
-    found = overlap_counts(sample_points(corner, 2), corner, np.eye(4), P)
-    assert (found.inliers, found.violations) == (found.points, 0) == (1200, 0)
-
-
-def test_moving_into_and_out_of_the_room(scenes: ModuleType) -> None:
-    # 30 cm into the walls nothing is violated; as far off them nearly all of it
-    corner, _ = scenes.corner()
-    source = sample_points(corner, 2)
-    shift = np.eye(4)
-    shift[2, 3] = 0.3
-    behind = overlap_counts(source, corner, shift, P)
-    assert (behind.violations, behind.inliers) == (0, 0)
-    shift[2, 3] = -0.3
-    before = overlap_counts(source, corner, shift, P)
-    # the rest has left the image, is within the margin of a wall seen at a slant, or near an edge
-    assert before.violations > 0.6 * before.points  # measured: 0.63
-    assert before.inliers == 0
-
-
 @pytest.mark.parametrize("stride", [1, 2, 3, 5, 60, 200])
-def test_sampling_takes_the_middle_of_each_cell(scenes: ModuleType, stride: int) -> None:
+def test_sampling_takes_the_middle_of_each_cell(scenes, stride):
     corner, _ = scenes.corner()
     rows = sample_points(corner, stride)
     assert rows.flags["C_CONTIGUOUS"]
@@ -110,7 +87,7 @@ def test_sampling_takes_the_middle_of_each_cell(scenes: ModuleType, stride: int)
     assert len(rows) == len(range(stride // 2, 60, stride)) * len(range(stride // 2, 80, stride))
 
 
-def test_nothing_to_compare(scenes: ModuleType) -> None:
+def test_nothing_to_compare(scenes):
     corner, _ = scenes.corner()
     none = overlap_counts(np.empty((0, 6), np.float32), corner, np.eye(4), P)
     assert (none.points, none.inliers, none.violations) == (0, 0, 0)

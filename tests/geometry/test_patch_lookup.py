@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 
 from sceneprint.geometry.registration.overlap import sample_points
@@ -13,14 +11,14 @@ from sceneprint.geometry.signature.segmentation import (
     segment,
 )
 from sceneprint.geometry.validation.inspection import patches_at
-from sceneprint.types import Floats, Patches
+from sceneprint.types import Patches
 
 
-def unit(rows: Floats) -> Floats:
+def unit(rows):
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
 
 
-def test_it_is_the_nearest_that_fits() -> None:
+def test_it_is_the_nearest_that_fits():
     rng = np.random.default_rng(3)
     n, m = 40, 200
     areas = rng.uniform(0.01, 0.05, n)
@@ -39,7 +37,7 @@ def test_it_is_the_nearest_that_fits() -> None:
     assert 0 < (found < 0).sum() < m
 
 
-def test_it_is_nearly_the_segmentation(scenes: ModuleType) -> None:
+def test_it_is_nearly_the_segmentation(scenes):
     seen, _ = scenes.corner()
     labels = segment(seen, SegmentationParameters())
     found = patches_at(sample_points(seen, 1), extract_patches(seen, labels))
@@ -49,7 +47,7 @@ def test_it_is_nearly_the_segmentation(scenes: ModuleType) -> None:
     assert (found[told] == truth[told]).mean() > 0.8
 
 
-def test_no_patches_hold_no_points() -> None:
+def test_no_patches_hold_no_points():
     none = np.zeros((0, 3))
     patches = Patches(none, none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
     assert patches_at(np.ones((3, 6), np.float32), patches).tolist() == [-1, -1, -1]

@@ -24,16 +24,16 @@ from sceneprint.geometry.registration.plan_search import (
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.rigid import inverse, pose_difference, select_distinct, transform_points
 from sceneprint.geometry.validation.validation import validate as validate_pair
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import associate, geometry_of, validate
 from sceneprint.signing import see
-from sceneprint.types import Cloud, Floats, Sphere, Surface
+from sceneprint.types import Sphere, Surface
 from sceneprint_lab.synth import synthesise_survey
 
 P = PlanParameters(cell=0.5, voxel=0.2, height_step=0.25, height_range=15.0)
 
 
-def patch(corner: Floats, a: Floats, b: Floats, step: float = 0.2) -> tuple[Floats, Floats]:
+def patch(corner, a, b, step=0.2):
     """Points and normals of a parallelogram, which faces a x b."""
     u, v = np.linalg.norm(a), np.linalg.norm(b)
     s, t = np.meshgrid(np.arange(0.05, 1, step / u), np.arange(0.05, 1, step / v))
@@ -42,7 +42,7 @@ def patch(corner: Floats, a: Floats, b: Floats, step: float = 0.2) -> tuple[Floa
     return points, np.tile(normal, (len(points), 1))
 
 
-def building() -> tuple[Floats, Floats]:
+def building():
     """A hall of 16 m by 10 m with an alcove, a table and a pillar; no symmetry. z is up."""
     x, y, z = np.eye(3)
     parts = [
@@ -60,7 +60,7 @@ def building() -> tuple[Floats, Floats]:
     return np.concatenate([p for p, _ in parts]), np.concatenate([n for _, n in parts])
 
 
-def seen_from(T: Floats) -> Surface:
+def seen_from(T):
     """All of the building in a sensor's coordinates, as points in no order."""
     points, normals = building()
     points, normals = transform_points(inverse(T), points), normals @ T[:3, :3]
@@ -71,7 +71,7 @@ def seen_from(T: Floats) -> Surface:
     )  # fmt: skip
 
 
-def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0, roll: float = 0) -> Floats:
+def pose(x, y, z, yaw, pitch=0, roll=0):
     """Upright but for pitch and roll; angles in degrees."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix()
@@ -79,7 +79,7 @@ def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0, roll: float
     return T
 
 
-def nearest(found: Floats, true: Floats) -> tuple[float, float, int]:
+def nearest(found, true):
     """Metres and degrees of the hypothesis that is nearest to a transform, and its rank."""
     errors = [pose_difference(T, true) for T in found]
     best = min(range(len(errors)), key=lambda k: errors[k][0] + errors[k][1])
@@ -87,19 +87,19 @@ def nearest(found: Floats, true: Floats) -> tuple[float, float, int]:
 
 
 @pytest.mark.parametrize(("pitch", "roll"), [(0, 0), (20, -15), (-40, 10)])
-def test_up_is_what_floors_face_and_walls_stand_across(pitch: float, roll: float) -> None:
+def test_up_is_what_floors_face_and_walls_stand_across(pitch, roll):
     T = pose(5, 4, 1, 30, pitch, roll)
     surface = seen_from(T)
     up = dominant_up(surface.normals[0].astype(float), np.array([0.0, 0, 1]), P.tilt)
     assert up @ T[2, :3] == pytest.approx(1.0, abs=1e-6)  # the third row: world z in the sensor
 
 
-def test_without_a_normal_near_the_axis_up_is_the_axis() -> None:
+def test_without_a_normal_near_the_axis_up_is_the_axis():
     walls = np.tile([1.0, 0.0, 0.0], (50, 1))
     assert dominant_up(walls, np.array([0.0, 0, 1]), math.radians(50)).tolist() == [0, 0, 1]
 
 
-def test_a_known_up_is_taken_as_it_is() -> None:
+def test_a_known_up_is_taken_as_it_is():
     T = pose(5, 4, 1, 30, 20, 0)
     up = np.array([0.0, 0.6, 0.8])
     plan = draw_plan(seen_from(T), P, up=up)
@@ -108,14 +108,14 @@ def test_a_known_up_is_taken_as_it_is() -> None:
     assert np.linalg.det(plan.R) == pytest.approx(1.0)
 
 
-def test_heights_lay_floor_on_floor() -> None:
+def test_heights_lay_floor_on_floor():
     low, high = (draw_plan(seen_from(pose(5, 4, z, 0)), P) for z in (1.0, 2.5))
     assert _height_offsets(high, low, P)[0] == pytest.approx(1.5)
     assert _height_offsets(low, high, P)[0] == pytest.approx(-1.5)
 
 
 @pytest.mark.parametrize("yaw", [3, 90, 178])
-def test_the_true_transform_is_proposed(yaw: float) -> None:
+def test_the_true_transform_is_proposed(yaw):
     source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
     a, b = draw_plan(seen_from(source), P), draw_plan(seen_from(target), P)
     found = plan_hypotheses([(a, b)], P)
@@ -127,7 +127,7 @@ def test_the_true_transform_is_proposed(yaw: float) -> None:
     assert len(found) == P.n_kept * P.n_heights
 
 
-def test_slices_are_heights_above_the_lowest_point_of_the_neighbourhood() -> None:
+def test_slices_are_heights_above_the_lowest_point_of_the_neighbourhood():
     # cells of .5 m: slices end at .4, 1.2, 2.6 and 12 m above the ground, in squares of 4 m
     ground = [(1.0, 1.0, -1.5)]
     above = [(5.0, 5.0, z - 1.5) for z in (0.3, 0.5, 1.1, 1.3, 2.7, 11.9, 12.1)]
@@ -136,7 +136,7 @@ def test_slices_are_heights_above_the_lowest_point_of_the_neighbourhood() -> Non
     assert slices.tolist() == [0, 0, 1, 1, 2, 3, 3, 0, 0]
 
 
-def test_slices_are_drawn_as_roots_of_limited_counts() -> None:
+def test_slices_are_drawn_as_roots_of_limited_counts():
     rng = np.random.default_rng(0)
     points = rng.uniform(-9, 9, (3000, 3)).astype(np.float32)
     points[:40] = points[0]
@@ -154,7 +154,7 @@ def test_slices_are_drawn_as_roots_of_limited_counts() -> None:
     assert expected.max() > 3
 
 
-def test_a_half_turn_conjugates_the_spectrum_of_slices() -> None:
+def test_a_half_turn_conjugates_the_spectrum_of_slices():
     plan = draw_plan(seen_from(pose(4, 5, 1.2, 12)), P)
     before, after = (_slice_spectrum(plan, yaw, P) for yaw in (0.3, 0.3 + math.pi))
     assert np.abs(before).max() > 10
@@ -162,7 +162,7 @@ def test_a_half_turn_conjugates_the_spectrum_of_slices() -> None:
 
 
 @pytest.mark.parametrize("yaw", [3, 90, 178, 268])
-def test_slices_propose_the_true_transform(yaw: float) -> None:
+def test_slices_propose_the_true_transform(yaw):
     source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
     a, b = draw_plan(seen_from(source), P), draw_plan(seen_from(target), P)
     found = slice_hypotheses(a, b, P)
@@ -174,7 +174,7 @@ def test_slices_propose_the_true_transform(yaw: float) -> None:
     assert len(found) <= P.n_sliced * P.n_heights
 
 
-def test_a_scanner_on_its_side_is_found_by_the_other_axes() -> None:
+def test_a_scanner_on_its_side_is_found_by_the_other_axes():
     source, target = pose(4, 5, 1.2, 12, 0, 90), pose(10, 3, 2.0, 40)
     surfaces = seen_from(source), seen_from(target)
     true = inverse(target) @ source
@@ -186,7 +186,7 @@ def test_a_scanner_on_its_side_is_found_by_the_other_axes() -> None:
     assert degrees < 3.0
 
 
-def test_the_axis_of_a_range_image_is_its_pole() -> None:
+def test_the_axis_of_a_range_image_is_its_pole():
     surface = seen_from(pose(4, 5, 1.2, 0, 0, 90))
     sphere = Sphere(60, 16, 0.1, -math.pi, 0.5, pole=1)
     on_its_side = replace(surface, camera=sphere)
@@ -194,7 +194,7 @@ def test_the_axis_of_a_range_image_is_its_pole() -> None:
     np.testing.assert_allclose(up, [0, 1, 0], atol=1e-6)
 
 
-def test_distinct_by_hand() -> None:
+def test_distinct_by_hand():
     transforms = np.stack([pose(x, 0, 0, yaw) for x, yaw in ((0, 0), (0.4, 0), (0.4, 20), (2, 0))])
     assert select_distinct(transforms, np.array([3.0, 4, 1, 2]), 0.5, math.radians(10), 9) == [
         1,
@@ -206,22 +206,19 @@ def test_distinct_by_hand() -> None:
 
 
 @pytest.fixture(scope="module")
-def hall() -> tuple[Model, list[Cloud]]:
+def hall():
     """Two scans of a synthetic hall that are aligned where both scanners stand upright."""
     return read_model("lidar"), list(synthesise_survey(7100, 0, 2, kind="hall").clouds)
 
 
-def turned_cloud(cloud: Cloud, R: Floats) -> Cloud:
+def turned_cloud(cloud, R):
     """The same points as a scanner sees them that is turned in its mount."""
-    assert cloud.pose is not None
     T = cloud.pose.copy()
     T[:3, :3] = cloud.pose[:3, :3] @ R.T
     return replace(cloud, points=(cloud.points @ R.T).astype(np.float32), pose=T)
 
 
-def test_a_query_upside_down_is_found_when_nothing_else_is_accepted(
-    hall: tuple[Model, list[Cloud]],
-) -> None:
+def test_a_query_upside_down_is_found_when_nothing_else_is_accepted(hall):
     model, (first, second) = hall
     match, upright = (geometry_of(see(one, model.parameters), model) for one in (first, second))
     ranking = Ranking(np.array([0]), np.array([1]), np.array([0.5]))
@@ -246,7 +243,7 @@ def test_a_query_upside_down_is_found_when_nothing_else_is_accepted(
     assert told.status == "accepted"
 
 
-def test_two_scans_of_a_street_are_aligned_by_slices() -> None:
+def test_two_scans_of_a_street_are_aligned_by_slices():
     model = read_model("lidar")
     clouds = synthesise_survey(9019, 0, 2, kind="block").clouds
     match, query = (geometry_of(see(cloud, model.parameters), model) for cloud in clouds)

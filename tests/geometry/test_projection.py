@@ -7,19 +7,18 @@ import pytest
 
 from sceneprint.errors import TrainingError
 from sceneprint.geometry.signature.pair_features import Projection, fit_projection, project
-from sceneprint.types import Floats
 
 RNG_SEED = 11
 
 
-def correlated(n: int = 3000) -> Floats:
+def correlated(n=3000):
     """13 properties of very different scales, far from zero, that depend on one another."""
     rng = np.random.default_rng(RNG_SEED)
     mixing = rng.normal(size=(13, 13))
     return rng.normal(size=(n, 13)) @ mixing * np.logspace(-2, 2, 13) + rng.normal(size=13) * 10
 
 
-def test_project_by_hand() -> None:
+def test_project_by_hand():
     matrix = np.zeros((12, 13))
     matrix[0, 0], matrix[0, 12], matrix[3, 1] = 2.0, -1.0, 0.5
     projection = Projection(np.arange(13.0), matrix)
@@ -31,14 +30,7 @@ def test_project_by_hand() -> None:
     assert not np.delete(f, [0, 3], axis=1).any()
 
 
-def test_pca_whitens_its_training_data() -> None:
-    properties = correlated()
-    f = project(properties, fit_projection(properties, "pca"))
-    np.testing.assert_allclose(f.mean(axis=0), 0, atol=1e-9)
-    np.testing.assert_allclose(np.cov(f.T), np.eye(12), atol=1e-9)
-
-
-def test_pca_equals_an_eigendecomposition() -> None:
+def test_pca_equals_an_eigendecomposition():
     properties = correlated()
     projection = fit_projection(properties, "pca")
     values, vectors = np.linalg.eigh(np.corrcoef(properties.T))
@@ -53,7 +45,7 @@ def test_pca_equals_an_eigendecomposition() -> None:
 
 
 @pytest.mark.parametrize("method", ["pca", "ica"])
-def test_signs_are_fixed(method: str) -> None:
+def test_signs_are_fixed(method):
     # the largest weight of a row, on standardised properties, is positive; turning every
     # property over gives the same subspace with all of its signs decided anew
     properties = independent()[0]
@@ -65,21 +57,21 @@ def test_signs_are_fixed(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", ["pca", "ica"])
-def test_same_data_same_bytes(method: str) -> None:
+def test_same_data_same_bytes(method):
     properties = independent()[0]
     a, b = (fit_projection(properties, "pca" if method == "pca" else "ica", 5) for _ in range(2))
     assert a.matrix.tobytes() == b.matrix.tobytes()
     assert a.mean.tobytes() == b.mean.tobytes()
 
 
-def independent(n: int = 4000) -> tuple[Floats, Floats]:
+def independent(n=4000):
     """13 mixtures of 12 independent sources, and the sources: uniform ones and peaked ones."""
     rng = np.random.default_rng(RNG_SEED)
     sources = np.column_stack([rng.uniform(-1, 1, (n, 6)), rng.laplace(size=(n, 6))])
     return sources @ rng.normal(size=(12, 13)) + 4, sources
 
 
-def test_ica_finds_independent_sources() -> None:
+def test_ica_finds_independent_sources():
     properties, sources = independent()
     correlation = {}
     for method in ("pca", "ica"):
@@ -93,7 +85,7 @@ def test_ica_finds_independent_sources() -> None:
     assert correlation["pca"].max(axis=1).min() < 0.8
 
 
-def test_nothing_to_learn_from() -> None:
+def test_nothing_to_learn_from():
     properties = correlated(200)
     properties[:, 9] = 2.5
     with pytest.raises(TrainingError, match="200 training pairs leave a property without"):

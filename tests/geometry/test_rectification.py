@@ -19,7 +19,7 @@ CAMERA = Intrinsics(64, 48, 50.0, 52.0, 30.5, 24.25, LENS)
 QUOTIENT = replace(CAMERA, distortion=(0.1, 0.05, 0.0015, -0.0022, 0.012, 0.45, 0.12, 0.03))
 
 
-def seen(x: float, y: float, k: tuple[float, ...]) -> tuple[float, float]:
+def seen(x, y, k):
     """OpenCV's formula, written a second time from its documentation."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*k, *[0.0] * 4)[:8]
     r = math.hypot(x, y)
@@ -31,7 +31,7 @@ def seen(x: float, y: float, k: tuple[float, ...]) -> tuple[float, float]:
     )
 
 
-def true_ray(u: float, v: float, c: Intrinsics) -> tuple[float, float]:
+def true_ray(u, v, c):
     """Direction whose picture is (u, v), by a general solver."""
     target = ((u - c.cx) / c.fx, (v - c.cy) / c.fy)
     solution = least_squares(
@@ -40,7 +40,7 @@ def true_ray(u: float, v: float, c: Intrinsics) -> tuple[float, float]:
     return float(solution.x[0]), float(solution.x[1])
 
 
-def test_undistort_by_hand() -> None:
+def test_undistort_by_hand():
     # x = (u - 2) / 2; k1 = 1: x = 1/2 is seen at 1/2 (1 + 1/4) = 0.625, u = 3.25 -> 3;
     # x = 1 is seen at 2, u = 6, outside
     camera = Intrinsics(5, 1, 2.0, 2.0, 2.0, 0.0, (1.0, 0.0, 0.0, 0.0))
@@ -51,16 +51,8 @@ def test_undistort_by_hand() -> None:
     assert undistort(depth, camera).tolist() == [[0, 2, 3, 4, 0]]
 
 
-def test_tangential_order_by_hand() -> None:
-    # at x = 1/2, y = 0: p1 = 0.8 moves y to p1 / 4 = 0.2, p2 = 0.4 moves x to 1/2 + 3/4 p2 = 0.8
-    depth = np.arange(1, 82, dtype=np.float32).reshape(9, 9)
-    for k, column, row in (((0, 0, 0.8, 0), 6, 4.8), ((0, 0, 0, 0.4), 7.2, 4)):
-        camera = Intrinsics(9, 9, 4.0, 4.0, 4.0, 4.0, tuple(float(c) for c in k))
-        assert undistort(depth, camera)[4, 6] == depth[round(row), round(column)]
-
-
 @pytest.mark.parametrize("camera", [CAMERA, QUOTIENT])
-def test_undistort_equals_the_loop(camera: Intrinsics) -> None:
+def test_undistort_equals_the_loop(camera):
     numbers = np.arange(1, camera.width * camera.height + 1, dtype=np.float32)
     image = numbers.reshape(camera.height, camera.width)
     expected = np.zeros_like(image)
@@ -77,7 +69,7 @@ def test_undistort_equals_the_loop(camera: Intrinsics) -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, QUOTIENT])
-def test_a_plane_seen_through_a_lens_comes_back(camera: Intrinsics) -> None:
+def test_a_plane_seen_through_a_lens_comes_back(camera):
     """n . p = 2 is filmed as ranges through the lens; z must be right at each pixel."""
     normal, offset = np.array([0.3, -0.2, 0.933]), 2.0
     ranges = np.zeros((camera.height, camera.width), np.float32)
@@ -103,12 +95,7 @@ def test_a_plane_seen_through_a_lens_comes_back(camera: Intrinsics) -> None:
     assert (np.abs(z - expected) > 1.1 * change).mean() > 0.3
 
 
-def test_edges_are_not_mixed() -> None:
-    image = np.where(np.indices((48, 64))[1] < 30, 1.0, 5.0).astype(np.float32)
-    assert set(np.unique(undistort(image, CAMERA))) <= {0.0, 1.0, 5.0}
-
-
-def test_ray_to_axis_by_hand() -> None:
+def test_ray_to_axis_by_hand():
     # directions (-3/4, 0, 1), (0, 0, 1), (3/4, 0, 1) have lengths 5/4, 1, 5/4
     camera = Intrinsics(3, 1, 4.0, 4.0, 1.0, 0.0)
     wide = Intrinsics(3, 1, 4.0 / 3.0, 4.0, 1.0, 0.0)
@@ -120,7 +107,7 @@ def test_ray_to_axis_by_hand() -> None:
     )
 
 
-def test_no_distortion_changes_nothing() -> None:
+def test_no_distortion_changes_nothing():
     image = np.arange(12, dtype=np.float32).reshape(3, 4)
     for k in ((), (0.0,) * 4, (0.0,) * 5):
         result = undistort(image, Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.0, k))
@@ -133,7 +120,7 @@ def test_no_distortion_changes_nothing() -> None:
     "k",
     [(-0.8, 0, 0, 0), (-3.0, 0, 0, 0), (-1.0, 0.3, 0, 0), (0, 0, 0.4, -0.3), (-0.5, 0, 0.1, 0.1)],
 )
-def test_a_fold_leaves_no_ghosts(k: tuple[float, ...]) -> None:
+def test_a_fold_leaves_no_ghosts(k):
     """Each sample lands on one patch of pixels, never again on the far side of a fold."""
     camera = Intrinsics(80, 60, 30.0, 30.0, 39.5, 29.5, tuple(float(c) for c in k))
     image = np.arange(1, 80 * 60 + 1, dtype=np.float32).reshape(60, 80)
@@ -155,7 +142,7 @@ def test_a_fold_leaves_no_ghosts(k: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("k1", [-0.8, -3.0])
-def test_a_fold_has_rays_only_before_it(k1: float) -> None:
+def test_a_fold_has_rays_only_before_it(k1):
     """The picture of r ends at r = 1/sqrt(-3 k1), at 2/3 of it; beyond there is no ray."""
     camera = Intrinsics(81, 61, 60.0, 60.0, 40.0, 30.0, (k1, 0.0, 0.0, 0.0))
     z = ray_to_axis(np.ones((61, 81), np.float32), camera)
@@ -172,7 +159,7 @@ def test_a_fold_has_rays_only_before_it(k1: float) -> None:
         assert got == pytest.approx(1.0 / math.hypot(1.0, r), rel=1e-5)
 
 
-def test_nothing_is_taken_behind_a_pole() -> None:
+def test_nothing_is_taken_behind_a_pole():
     """1 / (1 - 4 r^2) has a pole at r = 1/2, beyond which it is negative."""
     lens = (0.0, 0.0, 0.0, 0.0, 0.0, -4.0, 0.0, 0.0)
     camera = Intrinsics(201, 3, 100.0, 100.0, 100.0, 1.0, lens)
@@ -181,7 +168,7 @@ def test_nothing_is_taken_behind_a_pole() -> None:
     np.testing.assert_allclose([seen_x.min(), seen_x.max()], [-0.39, 0.39])
 
 
-def test_nothing_is_taken_behind_a_narrow_fold() -> None:
+def test_nothing_is_taken_behind_a_narrow_fold():
     """Growth (1 - r^2 / a)(1 - r^2 / b) is negative for 0.51 < r < 0.53 and positive beyond."""
     a, b = 0.51**2, 0.53**2
     k1, k2 = -(1 / a + 1 / b) / 3, 1 / (a * b) / 5
@@ -201,9 +188,7 @@ centre = st.one_of(st.floats(-10, 20), st.floats(-1e7, 1e7))
 
 @settings(max_examples=50)
 @given(length, length, centre, centre, st.lists(coefficient, min_size=8, max_size=8))
-def test_any_camera_gives_samples_or_nothing(
-    fx: float, fy: float, cx: float, cy: float, k: list[float]
-) -> None:
+def test_any_camera_gives_samples_or_nothing(fx, fy, cx, cy, k):
     camera = Intrinsics(9, 7, fx, fy, cx, cy, tuple(k))
     image = np.linspace(1, 5, 63, dtype=np.float32).reshape(7, 9)
     z = ray_to_axis(image, camera)
@@ -212,7 +197,7 @@ def test_any_camera_gives_samples_or_nothing(
     assert np.isin(undistort(image, camera), [0.0, *image.ravel()]).all()
 
 
-def test_blocks_fit_together() -> None:
+def test_blocks_fit_together():
     """An image of more than one block: undistorted pixel by pixel as a shifted crop."""
     camera = Intrinsics(1024, 600, 900.0, 900.0, 512.0, 300.0, (-0.2, 0.05, 0.001, 0.001))
     image = np.arange(1, 1024 * 600 + 1, dtype=np.int64).reshape(600, 1024)
@@ -223,7 +208,7 @@ def test_blocks_fit_together() -> None:
         assert result[v, u] == image[row, column] % 65521
 
 
-def test_a_camera_is_prepared_once() -> None:
+def test_a_camera_is_prepared_once():
     camera = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, LENS)
     image = np.ones((480, 640), np.float32)
     undistort(ray_to_axis(image, camera), camera)
@@ -234,6 +219,6 @@ def test_a_camera_is_prepared_once() -> None:
 
 
 @pytest.mark.parametrize("function", [undistort, ray_to_axis])
-def test_a_wrong_size_is_the_callers_mistake(function) -> None:
+def test_a_wrong_size_is_the_callers_mistake(function):
     with pytest.raises(ValueError, match=r"shape \(48, 48\)"):
         function(np.ones((48, 48), np.float32), CAMERA)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, is_dataclass, replace
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.models import ModelParameters
 from sceneprint.models.model import POWERS, scale_lengths
-from sceneprint.pipeline import Signer, prepare, validate
+from sceneprint.pipeline import prepare, validate
 from sceneprint.types import Cloud
 
 #: Numbers that no scale changes; a new one belongs here or in POWERS.
@@ -54,7 +53,7 @@ BARE = {
 }  # fmt: skip
 
 
-def leaves(record: Any) -> list[tuple[Any, str]]:
+def leaves(record):
     found: list[tuple[Any, str]] = []
     for one in fields(record):
         value = getattr(record, one.name)
@@ -65,7 +64,7 @@ def leaves(record: Any) -> list[tuple[Any, str]]:
     return found
 
 
-def test_every_number_is_a_length_or_bare() -> None:
+def test_every_number_is_a_length_or_bare():
     unknown = [
         (kind.__name__, name)
         for kind, name in leaves(ModelParameters())
@@ -77,7 +76,7 @@ def test_every_number_is_a_length_or_bare() -> None:
         assert not set(powers) & BARE.get(kind.__name__, set())
 
 
-def test_scaled_by_hand() -> None:
+def test_scaled_by_hand():
     p = scale_lengths(ModelParameters(), 4.0)
     assert p.properties.radius == 12.0
     assert p.cloud.noise_gate == CloudParameters().noise_gate / 4
@@ -90,9 +89,7 @@ def test_scaled_by_hand() -> None:
     assert scale_lengths(p, 0.25) == ModelParameters()
 
 
-def test_a_larger_world_signs_and_validates_the_same(
-    cloud_scenes: ModuleType, small_signer: Signer
-) -> None:
+def test_a_larger_world_signs_and_validates_the_same(cloud_scenes, small_signer):
     """A power of two changes no digit of a float: so the bytes are the same."""
     model = small_signer.model
     small = replace(model.parameters, cloud=CloudParameters(voxel_angle=0.02, image_angle=0.02))
@@ -111,12 +108,19 @@ def test_a_larger_world_signs_and_validates_the_same(
     for (a, _), (b, _) in zip(*made, strict=True):
         assert a.n_patches == b.n_patches
         np.testing.assert_allclose(a.vector.astype(int), b.vector.astype(int), atol=1)
-    first = validate(made[0][0][1], made[0][1][1], 3, small.validation)
-    second = validate(made[1][0][1], made[1][1][1], 3, scale_lengths(small.validation, 8.0))
-    assert first.T_match_query is not None
-    assert second.T_match_query is not None
+    rivals_allowed = replace(small.validation.acceptance, ambiguous=9.0, ambiguous_share=9.0)
+    p = replace(small.validation, acceptance=rivals_allowed)
+    first = validate(made[0][0][1], made[0][1][1], 3, p)
+    second = validate(made[1][0][1], made[1][1][1], 3, scale_lengths(p, 8.0))
     assert (first.status, first.strength) == (second.status, second.strength)
     np.testing.assert_allclose(second.T_match_query[:3, :3], first.T_match_query[:3, :3], atol=1e-5)
     np.testing.assert_allclose(
         second.T_match_query[:3, 3], 8 * first.T_match_query[:3, 3], atol=1e-4
     )
+    for name in ("overlap", "plane_overlap", "violations", "ambiguity"):
+        assert getattr(second, name) == pytest.approx(getattr(first, name), abs=1e-3)
+    assert second.residual_m == pytest.approx(8 * first.residual_m, abs=1e-4)
+    assert first.covariance is not None
+    assert second.covariance is not None
+    size = np.sqrt(np.diag(second.covariance) / np.diag(first.covariance))
+    np.testing.assert_allclose(size, [8, 8, 8, 1, 1, 1], rtol=0.01)

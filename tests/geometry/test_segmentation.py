@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 import pytest
 
@@ -14,12 +12,10 @@ from sceneprint.geometry.signature.segmentation import (
     extract_patches,
     segment,
 )
-from sceneprint.types import Floats32, Ints32, Surface
+from sceneprint.types import Surface
 
 
-def parameters(
-    n_patches: int = 120, minimum_size: float = 0.15, minimum_pixels: int = 4
-) -> SegmentationParameters:
+def parameters(n_patches=120, minimum_size=0.15, minimum_pixels=4):
     return SegmentationParameters(
         n_patches=n_patches,
         iterations=5,
@@ -29,14 +25,13 @@ def parameters(
     )
 
 
-def wall(scenes: ModuleType, distance: float = 2.0) -> Surface:
+def wall(scenes, distance=2.0):
     towards = np.array([0.0, 0.0, -1.0])
     q = scenes.plane(scenes.CAMERA, towards, np.array([0.0, 0.0, distance]))
-    seen: Surface = scenes.lifted(scenes.CAMERA, q, np.broadcast_to(towards, (*q.shape, 3)))
-    return seen
+    return scenes.lifted(scenes.CAMERA, q, np.broadcast_to(towards, (*q.shape, 3)))
 
 
-def test_no_patch_mixes_two_planes(scenes: ModuleType) -> None:
+def test_no_patch_mixes_two_planes(scenes):
     seen, plane_of = scenes.corner()
     assert [int((plane_of == k).sum()) > 300 for k in range(3)] == [True] * 3
     labels = segment(seen, parameters())
@@ -48,7 +43,7 @@ def test_no_patch_mixes_two_planes(scenes: ModuleType) -> None:
         assert len(set(plane_of[labels == k])) == 1
 
 
-def test_every_pixel_is_in_a_patch_or_in_a_dropped_one(scenes: ModuleType) -> None:
+def test_every_pixel_is_in_a_patch_or_in_a_dropped_one(scenes):
     seen, _ = scenes.corner()
     seen.valid[20:30, 15:40] = False
     every = segment(seen, parameters(minimum_size=0.0, minimum_pixels=1))
@@ -65,7 +60,7 @@ def test_every_pixel_is_in_a_patch_or_in_a_dropped_one(scenes: ModuleType) -> No
     np.testing.assert_array_equal(few >= 0, seen.valid & (sizes[every] >= 15))
 
 
-def test_labels_have_no_gaps_and_follow_the_image(scenes: ModuleType) -> None:
+def test_labels_have_no_gaps_and_follow_the_image(scenes):
     seen = wall(scenes)
     labels = segment(seen, parameters(n_patches=48))
     assert labels.dtype == np.int32
@@ -81,7 +76,7 @@ def test_labels_have_no_gaps_and_follow_the_image(scenes: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("n_patches", [30, 120, 300])
-def test_number_and_extent_of_patches(scenes: ModuleType, n_patches: int) -> None:
+def test_number_and_extent_of_patches(scenes, n_patches):
     seen = wall(scenes)
     labels = segment(seen, parameters(n_patches))
     patches = extract_patches(seen, labels)
@@ -93,7 +88,7 @@ def test_number_and_extent_of_patches(scenes: ModuleType, n_patches: int) -> Non
     assert np.percentile(reach, 95) < 0.7 * spacing  # 0.62
 
 
-def test_patches_are_compact_on_slanted_walls(scenes: ModuleType) -> None:
+def test_patches_are_compact_on_slanted_walls(scenes):
     seen, _ = scenes.corner()
     labels = segment(seen, parameters())
     patches = extract_patches(seen, labels)
@@ -103,7 +98,7 @@ def test_patches_are_compact_on_slanted_walls(scenes: ModuleType) -> None:
     assert (reach / spacing).max() < 1.4  # measured: 1.22, where a wall leans away
 
 
-def test_patches_respect_depth_edges(scenes: ModuleType) -> None:
+def test_patches_respect_depth_edges(scenes):
     # one wall half a metre before the other, with the same normal: only position tells them apart
     towards = np.array([0.0, 0.0, -1.0])
     q = np.full((60, 80), 1 / 2.0)
@@ -113,7 +108,7 @@ def test_patches_respect_depth_edges(scenes: ModuleType) -> None:
     assert not set(labels[:, :37].ravel()) & set(labels[:, 37:].ravel())
 
 
-def test_kept_by_hand() -> None:
+def test_kept_by_hand():
     labels = np.array([[0, 1, -1, 2], [3, 3, 1, 0]], np.int32)
     result = compact_labels(labels, np.array([True, False, True, True]))
     assert result.tolist() == [[0, -1, -1, 1], [2, 2, -1, 0]]
@@ -123,7 +118,7 @@ def test_kept_by_hand() -> None:
     assert labels.tolist() == [[0, 1, -1, 2], [3, 3, 1, 0]]
 
 
-def test_patches_of_equals_the_loop(scenes: ModuleType) -> None:
+def test_patches_of_equals_the_loop(scenes):
     rng = np.random.default_rng(1)
     seen, _ = scenes.corner()
     labels = rng.integers(-1, 7, seen.valid.shape).astype(np.int32)
@@ -144,7 +139,7 @@ def test_patches_of_equals_the_loop(scenes: ModuleType) -> None:
         assert patches.sizes[k] == size
 
 
-def test_areas_weigh(scenes: ModuleType) -> None:
+def test_areas_weigh(scenes):
     # two pixels of areas 1 and 3, whose normals are at right angles
     seen = Surface(
         np.array([[[0, 0, 1], [4, 0, 1]]], np.float32),
@@ -159,7 +154,7 @@ def test_areas_weigh(scenes: ModuleType) -> None:
     assert (patches.areas.tolist(), patches.sizes.tolist()) == ([4.0], [2])
 
 
-def test_nothing_seen_gives_no_patch(scenes: ModuleType) -> None:
+def test_nothing_seen_gives_no_patch(scenes):
     seen = wall(scenes)
     seen.valid[:] = False
     labels = segment(seen, parameters())
@@ -167,9 +162,7 @@ def test_nothing_seen_gives_no_patch(scenes: ModuleType) -> None:
     assert len(extract_patches(seen, labels)) == 0
 
 
-def naive_assignment(
-    pixels: Floats32, centres: Floats32, spacing: float, weight: np.float32, columns: int
-) -> Ints32:
+def naive_assignment(pixels, centres, spacing, weight, columns):
     """The nearest of nine centres of each pixel, one after the other, the first of equals."""
     _, height, width = pixels.shape
     rows = len(centres) // columns
@@ -192,7 +185,7 @@ def naive_assignment(
 
 
 @pytest.mark.parametrize(("height", "width", "spacing"), [(31, 23, 4.3), (9, 40, 9.0), (20, 20, 1)])
-def test_pixels_get_the_nearest_of_nine_centres(height: int, width: int, spacing: float) -> None:
+def test_pixels_get_the_nearest_of_nine_centres(height, width, spacing):
     rng = np.random.default_rng(height)
     rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
     pixels = rng.normal(size=(6, height, width)).astype(np.float32)
@@ -206,7 +199,7 @@ def test_pixels_get_the_nearest_of_nine_centres(height: int, width: int, spacing
     assert len(np.unique(labels)) > 0.4 * len(centres)
 
 
-def test_centres_by_the_definition() -> None:
+def test_centres_by_the_definition():
     """Of labels with pixels, with none, with normals that cancel; beside numpy, bit by bit."""
     rng = np.random.default_rng(2)
     sums = rng.normal(size=(60, 8))

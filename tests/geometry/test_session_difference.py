@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import numpy as np
 
 from sceneprint.geometry.cells import (
     CHANGED,
     SAME,
     UNSEEN,
-    SessionCells,
     ViewStamp,
     cell_positions,
     cell_states,
@@ -22,7 +19,7 @@ from sceneprint.geometry.cells import (
 )
 from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.rigid import transform_points
-from sceneprint.types import Bytes, Floats, Intrinsics, Surface
+from sceneprint.types import Intrinsics
 from sceneprint_client.surface_encoding import NO_SESSION
 
 P = OverlapParameters()
@@ -33,18 +30,17 @@ WALL_M, BOX_M = 3.0, 2.0
 BOX = (slice(40, 80), slice(60, 100))
 
 
-def view(scenes: ModuleType, *, box: bool) -> Surface:
+def view(scenes, *, box):
     """A wall that faces the camera, with the front of a box before it, or without."""
     q = np.full((CAMERA.height, CAMERA.width), 1.0 / WALL_M)
     if box:
         q[BOX] = 1.0 / BOX_M
     normals = np.zeros((*q.shape, 3))
     normals[..., 2] = -1.0
-    found: Surface = scenes.lifted(CAMERA, q, normals)
-    return found
+    return scenes.lifted(CAMERA, q, normals)
 
 
-def poses(count: int) -> list[Floats]:
+def poses(count):
     """Sensors a centimetre apart, half a million metres from where the parent frame begins."""
     found = []
     for i in range(count):
@@ -54,7 +50,7 @@ def poses(count: int) -> list[Floats]:
     return found
 
 
-def cells_of(surface: Surface, sensors: list[Floats]) -> SessionCells:
+def cells_of(surface, sensors):
     points = surface.points[surface.valid].astype(np.float64)
     views = [
         view_cells(transform_points(T, points), CELL_M, ViewStamp(i, None, NO_SESSION))
@@ -63,7 +59,7 @@ def cells_of(surface: Surface, sensors: list[Floats]) -> SessionCells:
     return merge_views(merge_views({}, views[:1]), views[1:])
 
 
-def judged(cells: SessionCells, other: Surface, sensors: list[Floats]) -> tuple[Bytes, Floats]:
+def judged(cells, other, sensors):
     """States of cells by what sensors of the other session see, and their depths."""
     positions = cell_positions(cells, CELL_M)
     counts = empty_counts(len(positions))
@@ -72,9 +68,7 @@ def judged(cells: SessionCells, other: Surface, sensors: list[Floats]) -> tuple[
     return cell_states(counts, len(sensors)), positions[:, 2] - 30.0
 
 
-def test_a_box_that_was_added_is_new_and_the_wall_behind_it_is_not_gone(
-    scenes: ModuleType,
-) -> None:
+def test_a_box_that_was_added_is_new_and_the_wall_behind_it_is_not_gone(scenes):
     empty, full = view(scenes, box=False), view(scenes, box=True)
     sensors = poses(3)
     states, depths = judged(cells_of(full, sensors), empty, sensors)
@@ -89,16 +83,14 @@ def test_a_box_that_was_added_is_new_and_the_wall_behind_it_is_not_gone(
     assert (wall == SAME).sum() > 1000
 
 
-def test_a_room_that_stays_is_the_same(scenes: ModuleType) -> None:
+def test_a_room_that_stays_is_the_same(scenes):
     full, sensors = view(scenes, box=True), poses(3)
     states, _ = judged(cells_of(full, sensors), full, sensors)
     assert (states == SAME).mean() > 0.97
     assert not (states == CHANGED).any()
 
 
-def test_one_frame_of_several_is_not_enough_and_one_that_agrees_decides(
-    scenes: ModuleType,
-) -> None:
+def test_one_frame_of_several_is_not_enough_and_one_that_agrees_decides(scenes):
     empty, full = view(scenes, box=False), view(scenes, box=True)
     (sensor,) = poses(1)
     cells = cells_of(full, [sensor])
@@ -115,7 +107,7 @@ def test_one_frame_of_several_is_not_enough_and_one_that_agrees_decides(
     assert (cell_states(empty_counts(2), 0) == UNSEEN).all()
 
 
-def test_cells_lie_at_the_mean_of_what_frames_saw_in_them() -> None:
+def test_cells_lie_at_the_mean_of_what_frames_saw_in_them():
     points = np.array([[0.01, 0.0, 0.0], [0.03, 0.04, 0.0], [-0.01, 0.0, 0.2]])
     cells = merge_views({}, [view_cells(points, CELL_M, ViewStamp(0, None, NO_SESSION))])
     assert count_cells(cells) == 2

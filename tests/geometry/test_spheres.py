@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -19,18 +18,18 @@ from sceneprint.geometry.surface.range_image import (
     range_image,
     to_angles,
 )
-from sceneprint.types import Cloud, DepthFrame, Floats, Sphere
+from sceneprint.types import Cloud, Sphere
 
 P = CloudParameters(image_angle=0.02)
 
 
-def camera_of(cloud: Cloud, p: CloudParameters = P) -> Sphere:
+def camera_of(cloud, p=P):
     camera = range_image(cloud, p).camera
     assert isinstance(camera, Sphere)
     return camera
 
 
-def test_planes_are_exact(cloud_scenes: ModuleType) -> None:
+def test_planes_are_exact(cloud_scenes):
     surface = range_image(cloud_scenes.room(60_000), P)
     assert surface.valid.mean() > 0.93
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
@@ -49,7 +48,7 @@ def test_planes_are_exact(cloud_scenes: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("pole", [0, 1, 2])
-def test_pixels_are_where_the_camera_says(cloud_scenes: ModuleType, pole: int) -> None:
+def test_pixels_are_where_the_camera_says(cloud_scenes, pole):
     rays = cloud_scenes.directions(20_000)
     rays = rays[np.abs(rays[:, pole]) < 0.5]  # the pole is where nothing is
     surface = range_image(Cloud(cloud_scenes.in_room(rays)[0].astype(np.float32)), P)
@@ -67,7 +66,7 @@ def test_pixels_are_where_the_camera_says(cloud_scenes: ModuleType, pole: int) -
     np.testing.assert_allclose(directions(camera)[y, x], at, atol=1e-5)
 
 
-def test_cropped_to_what_is_seen(cloud_scenes: ModuleType) -> None:
+def test_cropped_to_what_is_seen(cloud_scenes):
     full = camera_of(cloud_scenes.room(60_000))
     assert full.is_closed
     assert full.width == 315
@@ -87,13 +86,13 @@ def test_cropped_to_what_is_seen(cloud_scenes: ModuleType) -> None:
     assert camera_of(Cloud(back)).width == pytest.approx(cone.width, abs=1)
 
 
-def test_pixels_grow_until_there_are_few_enough(cloud_scenes: ModuleType) -> None:
+def test_pixels_grow_until_there_are_few_enough(cloud_scenes):
     camera = camera_of(cloud_scenes.room(5000), replace(P, maximum_pixels=900))
     assert camera.width * camera.height <= 900
     assert camera.step > 0.04
 
 
-def wall(rows: Floats, columns: Floats, distance: Floats) -> Floats:
+def wall(rows, columns, distance):
     """Points at x = distance, at every azimuth of columns and elevation of rows."""
     azimuth, elevation = np.meshgrid(columns, rows)
     x = np.broadcast_to(distance[:, None], azimuth.shape)
@@ -101,7 +100,7 @@ def wall(rows: Floats, columns: Floats, distance: Floats) -> Floats:
     return np.stack([x, x * np.tan(azimuth), flat * np.tan(elevation)], axis=2).reshape(-1, 3)
 
 
-def test_the_nearest_surface_is_seen() -> None:
+def test_the_nearest_surface_is_seen():
     grid = np.arange(-0.3, 0.3, 0.008)
     near = wall(grid[:30], grid, np.full(30, 2.0))
     far = wall(grid, grid, np.full(len(grid), 2.5))
@@ -115,7 +114,7 @@ def test_the_nearest_surface_is_seen() -> None:
     np.testing.assert_allclose(x[: height // 3][surface.valid[: height // 3]], 2.5, rtol=1e-3)
 
 
-def test_gaps_between_rings_are_closed_on_one_plane_only() -> None:
+def test_gaps_between_rings_are_closed_on_one_plane_only():
     rings = np.arange(-5, 6) * 3 * P.image_angle  # two pixels between rings
     columns = np.arange(-0.5, 0.5, 0.01)
     one = range_image(Cloud(wall(rings, columns, np.full(11, 3.0)).astype(np.float32)), P)
@@ -134,7 +133,7 @@ def test_gaps_between_rings_are_closed_on_one_plane_only() -> None:
     assert (np.minimum(np.abs(x - 3), np.abs(x - 4)) < 1e-3).all()
 
 
-def test_points_where_the_image_begins_are_in_its_first_column() -> None:
+def test_points_where_the_image_begins_are_in_its_first_column():
     """At azimuth 0, the left edge of column 0 but for rounding: half a wall, from y = 0 on."""
     y, z = np.meshgrid(np.arange(0, 2, 0.01), np.arange(-0.6, 0.6, 0.01))
     for x in 2 + 0.01 * np.arange(60):
@@ -148,7 +147,7 @@ def test_points_where_the_image_begins_are_in_its_first_column() -> None:
         assert cosines.min() > np.cos(camera.step)
 
 
-def test_nobody_sees_through_a_wire() -> None:
+def test_nobody_sees_through_a_wire():
     """It is too narrow for a plane of its own, and the wall behind it is not invented there."""
     step = P.image_angle
     azimuth, elevation = np.meshgrid(
@@ -167,7 +166,7 @@ def test_nobody_sees_through_a_wire() -> None:
     assert inner[:, 3 : wire - 2].all()
 
 
-def test_any_order_gives_the_same_bytes(cloud_scenes: ModuleType) -> None:
+def test_any_order_gives_the_same_bytes(cloud_scenes):
     cloud = cloud_scenes.room(10_000)
     a, b = range_image(cloud, P), range_image(cloud_scenes.shuffled(cloud), P)
     assert a.camera == b.camera
@@ -175,13 +174,13 @@ def test_any_order_gives_the_same_bytes(cloud_scenes: ModuleType) -> None:
     assert a.normals.tobytes() == b.normals.tobytes()
 
 
-def test_points_in_one_direction_show_no_surface() -> None:
+def test_points_in_one_direction_show_no_surface():
     ray = np.linspace(1, 9, 5000)[:, None] * np.array([1.0, 0.1, 0.1])
     with pytest.raises(UselessFrame, match="1 pixels"):
         range_image(Cloud(ray.astype(np.float32)), P)
 
 
-def test_agrees_with_the_depth_image_it_is_of(room_frames: tuple[DepthFrame, ...]) -> None:
+def test_agrees_with_the_depth_image_it_is_of(room_frames):
     from sceneprint.models import ModelParameters
     from sceneprint.signing import see
 
@@ -211,7 +210,7 @@ def test_agrees_with_the_depth_image_it_is_of(room_frames: tuple[DepthFrame, ...
     assert np.median(np.abs(off)) < 0.002
 
 
-def test_rays_meet_planes_as_numpy_has_it() -> None:
+def test_rays_meet_planes_as_numpy_has_it():
     """To the bit, with pixels that show nothing, are grazed, or lie out of range."""
     rng, p = np.random.default_rng(3), replace(P, minimum_range=0.5, maximum_range=8.0)
     camera = Sphere(40, 20, 0.05, -1.0, 0.5, 2)
@@ -241,9 +240,7 @@ def test_rays_meet_planes_as_numpy_has_it() -> None:
 
 
 @pytest.mark.parametrize(("spread", "pole"), [((3, 3, 1), 2), ((1, 3, 3), 0), ((3, 1, 3), 1)])
-def test_the_pole_is_the_axis_that_fewest_points_are_near(
-    spread: tuple[float, float, float], pole: int
-) -> None:
+def test_the_pole_is_the_axis_that_fewest_points_are_near(spread, pole):
     points = (np.random.default_rng(1).normal(size=(5000, 3)) * spread).astype(np.float32)
     lengths = np.linalg.norm(points, axis=1)
     near = [(np.abs(points[:, c]) > np.cos(np.pi / 6) * lengths).sum() for c in range(3)]

@@ -13,13 +13,13 @@ from sceneprint.geometry.registration.plan_search import PlanParameters, draw_pl
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
 from sceneprint.geometry.validation.validation import refine_transform
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.types import Cloud, Floats32, Geometry
+from sceneprint.types import Cloud, Floats32
 
 
-def hall(at: tuple[float, float, float], turn: float = 0.0, half: float = math.pi) -> Cloud:
+def hall(at, turn=0.0, half=math.pi):
     """A hall of 30 x 20 x 6 m with three pillars, scanned from a place in it, without noise."""
     azimuth = np.linspace(-half, half, 900, endpoint=False)
     elevation = np.radians(np.linspace(-30, 30, 48))
@@ -43,18 +43,22 @@ def hall(at: tuple[float, float, float], turn: float = 0.0, half: float = math.p
 
 
 @pytest.fixture(scope="module")
-def lidar() -> Model:
+def lidar():
     return read_model("lidar")
 
 
-def geometry(cloud: Cloud, model: Model) -> Geometry:
+def geometry(cloud, model):
     return geometry_of(see(cloud, model.parameters), model)
 
 
-def test_points_lie_on_what_is_shown_and_evenly(lidar: Model) -> None:
-    surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
+@pytest.fixture(scope="module")
+def surface(lidar):
+    """What a scan of the hall shows."""
+    return geometry(hall((1.0, 0.5, 1.5)), lidar).surface
+
+
+def test_points_lie_on_what_is_shown_and_evenly(surface):
     spread = surface.spread
-    assert spread is not None
     assert SPREAD_POINTS * 0.8 < spread.points.shape[1] <= SPREAD_POINTS
     assert spread.valid.all()
     assert spread.camera is None
@@ -73,23 +77,21 @@ def test_points_lie_on_what_is_shown_and_evenly(lidar: Model) -> None:
     assert far > 1.5 * (shown[:, 0] < -14.9).mean()
 
 
-def test_the_order_of_a_cloud_changes_nothing(lidar: Model) -> None:
+def test_the_order_of_a_cloud_changes_nothing(lidar, surface):
     cloud = hall((1.0, 0.5, 1.5))
     shuffled = replace(cloud, points=np.random.default_rng(0).permutation(cloud.points))
-    one, other = (geometry(c, lidar).surface.spread for c in (cloud, shuffled))
-    assert one is not None
-    assert other is not None
+    one, other = surface.spread, geometry(shuffled, lidar).surface.spread
     assert one.points.tobytes() == other.points.tobytes()
     assert one.normals.tobytes() == other.normals.tobytes()
 
 
-def test_a_scan_that_sees_a_part_keeps_its_image_alone(lidar: Model) -> None:
-    surface = geometry(hall((1.0, 0.5, 1.5), half=1.0), lidar).surface
-    assert surface.spread is None
-    assert surface.fitted is surface
+def test_a_scan_that_sees_a_part_keeps_its_image_alone(lidar):
+    part = geometry(hall((1.0, 0.5, 1.5), half=1.0), lidar).surface
+    assert part.spread is None
+    assert part.fitted is part
 
 
-def test_where_finer_pixels_fix_no_plane_the_image_helps() -> None:
+def test_where_finer_pixels_fix_no_plane_the_image_helps():
     p = CloudParameters(image_angle=0.025, maximum_range=60.0, gap_px=0)
     rings = np.radians(np.arange(-15, 16, 1.5))
     cloud = hall((1.0, 0.5, 1.5))
@@ -100,9 +102,7 @@ def test_where_finer_pixels_fix_no_plane_the_image_helps() -> None:
     assert spread_points(sparse, image, p).points.shape[1] >= int(image.valid.sum())
 
 
-def test_as_many_are_counted_as_of_a_depth_image(lidar: Model) -> None:
-    surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
-    assert surface.spread is not None
+def test_as_many_are_counted_as_of_a_depth_image(surface):
     n = surface.spread.points.shape[1]
     assert len(sample_points(surface, 5)) == pytest.approx(n / round(25 * n / 19_200), abs=1)
     assert len(sample_points(surface, 2)) == pytest.approx(n / 2, abs=1)
@@ -110,15 +110,14 @@ def test_as_many_are_counted_as_of_a_depth_image(lidar: Model) -> None:
     assert len(thin_points(surface.spread, 100, 1.0).points[0]) <= 100
 
 
-def test_plans_are_of_the_points(lidar: Model) -> None:
-    surface = geometry(hall((1.0, 0.5, 1.5)), lidar).surface
+def test_plans_are_of_the_points(surface):
     plan = draw_plan(surface, PlanParameters(cell=0.5, voxel=0.4))
     assert surface.spread is not None
     alone = draw_plan(surface.spread, PlanParameters(cell=0.5, voxel=0.4))
     np.testing.assert_array_equal(plan.points, alone.points)
 
 
-def test_refinement_works_on_the_points(lidar: Model) -> None:
+def test_refinement_works_on_the_points(lidar):
     """From the truth, 14 m apart, where the image alone is 2 cm off or more."""
     places = (-7.0, -3.0, 1.5), (6.0, 2.0, 1.5)
     a, b = (geometry(hall(at), lidar) for at in places)
@@ -126,7 +125,6 @@ def test_refinement_works_on_the_points(lidar: Model) -> None:
     T[:3, 3] = np.array(places[0]) - np.array(places[1])
     fine = lidar.parameters.validation.alignment.fine
     found = refine_transform(a, b, T, fine)
-    assert found is not None
     assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 0.02
     plain = [replace(one, surface=replace(one.surface, spread=None)) for one in (a, b)]
     coarse = refine_transform(plain[0], plain[1], T, fine)
@@ -135,7 +133,7 @@ def test_refinement_works_on_the_points(lidar: Model) -> None:
 
 
 @pytest.mark.parametrize("at", [0.0, 3e5])
-def test_the_first_point_in_each_cube_is_kept(at: float) -> None:
+def test_the_first_point_in_each_cube_is_kept(at):
     """Beside sorting; on both sides of the origin and far from it, on the cubes' faces too."""
     rng = np.random.default_rng(5)
     points = np.concatenate(

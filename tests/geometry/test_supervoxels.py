@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,14 +14,14 @@ from sceneprint.geometry.signature.segmentation import (
     supervoxels,
 )
 from sceneprint.geometry.surface.cloud import CloudParameters
-from sceneprint.geometry.surface.voxels import Voxels, voxels
-from sceneprint.types import Cloud, Ints32
+from sceneprint.geometry.surface.voxels import voxels
+from sceneprint.types import Cloud
 
 P = CloudParameters(voxel_angle=0.03, voxel_size=0.06)
 S = SegmentationParameters()
 
 
-def parts(seen: Voxels, labels: Ints32) -> list[int]:
+def parts(seen, labels):
     """How many parts each patch is in, by a walk over its links."""
     found = []
     links = seen.links
@@ -42,7 +41,7 @@ def parts(seen: Voxels, labels: Ints32) -> list[int]:
 
 
 @pytest.mark.parametrize("has_viewpoint", [True, False])
-def test_voxels_lie_on_the_walls(cloud_scenes: ModuleType, has_viewpoint: bool) -> None:
+def test_voxels_lie_on_the_walls(cloud_scenes, has_viewpoint):
     cloud = replace(cloud_scenes.room(60_000), has_viewpoint=has_viewpoint)
     seen = voxels(cloud, P)
     points, normals = seen.points[0].astype(float), seen.normals[0]
@@ -57,9 +56,7 @@ def test_voxels_lie_on_the_walls(cloud_scenes: ModuleType, has_viewpoint: bool) 
 
 
 @pytest.mark.parametrize("has_viewpoint", [True, False])
-def test_patches_hang_together_and_respect_edges(
-    cloud_scenes: ModuleType, has_viewpoint: bool
-) -> None:
+def test_patches_hang_together_and_respect_edges(cloud_scenes, has_viewpoint):
     seen = voxels(replace(cloud_scenes.room(60_000), has_viewpoint=has_viewpoint), P)
     labels = supervoxels(seen, 5.0, 1000, S)
     assert (labels >= 0).mean() > 0.97
@@ -71,7 +68,7 @@ def test_patches_hang_together_and_respect_edges(
     assert patches.sizes.min() >= max(S.minimum_pixels, S.minimum_size * 25)
 
 
-def test_no_patch_crosses_a_gap() -> None:
+def test_no_patch_crosses_a_gap():
     grid = np.arange(-0.6, 0.6, 0.01)
     y, z = (one.reshape(-1) for one in np.meshgrid(grid, grid))
     # a board before a wall, 18 cm apart at 1.4 m
@@ -84,7 +81,7 @@ def test_no_patch_crosses_a_gap() -> None:
         assert np.ptp(depth[labels == k]) < 0.1
 
 
-def test_any_order_gives_the_same_bytes(cloud_scenes: ModuleType) -> None:
+def test_any_order_gives_the_same_bytes(cloud_scenes):
     cloud = cloud_scenes.room(20_000)
     for has_viewpoint in (True, False):
         a = voxels(replace(cloud, has_viewpoint=has_viewpoint), P)
@@ -94,7 +91,7 @@ def test_any_order_gives_the_same_bytes(cloud_scenes: ModuleType) -> None:
         assert supervoxels(a, 5.0, 1000, S).tobytes() == supervoxels(b, 5.0, 1000, S).tobytes()
 
 
-def test_patches_turn_with_the_cloud(cloud_scenes: ModuleType) -> None:
+def test_patches_turn_with_the_cloud(cloud_scenes):
     cloud = cloud_scenes.room(30_000, half_deg=70)
     R = cloud_scenes.rotation(3)
     made = []
@@ -109,7 +106,7 @@ def test_patches_turn_with_the_cloud(cloud_scenes: ModuleType) -> None:
     assert np.mean(nearest < 0.05) > 0.8
 
 
-def test_no_more_than_are_wanted(cloud_scenes: ModuleType) -> None:
+def test_no_more_than_are_wanted(cloud_scenes):
     cloud = cloud_scenes.room(30_000)
     few = replace(P, maximum_pixels=3000)
     for has_viewpoint in (True, False):
@@ -119,7 +116,7 @@ def test_no_more_than_are_wanted(cloud_scenes: ModuleType) -> None:
         assert 5 < supervoxels(seen, 2.0, 20, S).max() + 1 <= 20
 
 
-def test_voxels_grow_with_range(cloud_scenes: ModuleType) -> None:
+def test_voxels_grow_with_range(cloud_scenes):
     seen = voxels(cloud_scenes.room(30_000), P)
     ranges = np.linalg.norm(seen.points[0], axis=1)
     np.testing.assert_allclose(seen.sides, 0.03 * ranges, rtol=1e-5)
@@ -127,7 +124,7 @@ def test_voxels_grow_with_range(cloud_scenes: ModuleType) -> None:
     np.testing.assert_allclose(plain.sides, 0.06)
 
 
-def test_parts_that_never_become_few_enough_come_to_an_end() -> None:
+def test_parts_that_never_become_few_enough_come_to_an_end():
     """Plates apart from each other, more than may be patches, and no size too small for one."""
     side = np.linspace(0, 0.4, 14)
     plate = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)

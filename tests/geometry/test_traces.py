@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -29,25 +28,24 @@ from sceneprint.geometry.validation.inspection import (
     residuals,
     trace,
 )
-from sceneprint.types import Floats, Geometry, Patches, Surface
+from sceneprint.types import Geometry, Patches
 
 P = OverlapParameters(stride=3)
 
 
-def shifted(x: float = 0.0, z: float = 0.0) -> Floats:
+def shifted(x=0.0, z=0.0):
     T = np.eye(4)
     T[0, 3], T[2, 3] = x, z
     return T
 
 
-def wall(scenes: ModuleType, z: float) -> Surface:
+def wall(scenes, z):
     ahead = np.array([0.0, 0.0, -1.0])
     q = scenes.plane(scenes.CAMERA, ahead, np.array([0.0, 0.0, z]))
-    surface: Surface = scenes.lifted(scenes.CAMERA, q, np.broadcast_to(ahead, (*q.shape, 3)))
-    return surface
+    return scenes.lifted(scenes.CAMERA, q, np.broadcast_to(ahead, (*q.shape, 3)))
 
 
-def patches(*rows: tuple[float, ...]) -> Patches:
+def patches(*rows):
     """One for each x, y, z and, if its normal is not -z, the normal."""
     means = np.array([row[:3] for row in rows], float)
     normals = np.array([row[3:] or (0.0, 0.0, -1.0) for row in rows], float)
@@ -55,12 +53,12 @@ def patches(*rows: tuple[float, ...]) -> Patches:
     return Patches(means, normals, np.ones(n), np.ones(n, np.int32), np.ones(n))
 
 
-def framed(surface: Surface, of: Patches) -> Geometry:
+def framed(surface, of):
     return Geometry(surface, of, np.zeros((len(of), 4), np.uint8), "a" * 64)
 
 
 @pytest.mark.parametrize("T", [shifted(), shifted(0.04, 0.03), shifted(0.3, -0.3), shifted(z=9.0)])
-def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -> None:
+def test_every_point_is_judged_as_it_is_counted(scenes, T):
     seen, _ = scenes.corner()
     points = sample_points(seen, P.stride)
     counts, verdicts = overlap_counts(points, seen, T, P), point_verdicts(points, seen, T, P)
@@ -71,14 +69,14 @@ def test_every_point_is_judged_as_it_is_counted(scenes: ModuleType, T: Floats) -
         assert verdicts[i] == (AGREES if alone.inliers else VIOLATES if alone.violations else 0)
 
 
-def test_a_wall_before_a_wall(scenes: ModuleType) -> None:
+def test_a_wall_before_a_wall(scenes):
     near, far = wall(scenes, 1.5), wall(scenes, 2.0)
     assert set(point_verdicts(sample_points(near, 3), far, shifted(), P).tolist()) == {VIOLATES}
     assert set(point_verdicts(sample_points(far, 3), near, shifted(), P).tolist()) == {NEITHER}
 
 
 @pytest.mark.parametrize("tolerance", [0.05, 0.12])
-def test_residuals_by_hand(scenes: ModuleType, tolerance: float) -> None:
+def test_residuals_by_hand(scenes, tolerance):
     seen, p = wall(scenes, 2.0), OverlapParameters(stride=3, surface_tolerance=tolerance)
     points = sample_points(seen, 3)
     ahead = int(np.hypot(points[:, 0], points[:, 1]).argmin())
@@ -90,7 +88,7 @@ def test_residuals_by_hand(scenes: ModuleType, tolerance: float) -> None:
         assert residuals(points, seen, shifted(z=z), p)[ahead] == byte, z
 
 
-def test_residuals_agree_with_verdicts(scenes: ModuleType) -> None:
+def test_residuals_agree_with_verdicts(scenes):
     seen, _ = scenes.corner()
     points, T = sample_points(seen, 2), shifted(0.04, 0.03)
     told, verdicts = residuals(points, seen, T, P), point_verdicts(points, seen, T, P)
@@ -102,7 +100,7 @@ def test_residuals_agree_with_verdicts(scenes: ModuleType) -> None:
         assert ((told <= step) == (point_verdicts(points, seen, T, less) == AGREES)).all()
 
 
-def test_patches_coincide_with_each_others_nearest(scenes: ModuleType) -> None:
+def test_patches_coincide_with_each_others_nearest(scenes):
     T = shifted(1.0)
     query = patches(
         (0, 0, 2), (1, 0, 2), (1.05, 0, 2), (2, 0, 2), (3, 0, 2), (4, 0, 2, 0.6, 0.0, -0.8)
@@ -122,7 +120,7 @@ def test_patches_coincide_with_each_others_nearest(scenes: ModuleType) -> None:
     assert (nothing.pairs.shape, nothing.distances.shape) == ((0, 2), (0,))
 
 
-def test_overlays_are_coloured(scenes: ModuleType) -> None:
+def test_overlays_are_coloured(scenes):
     near, far = wall(scenes, 1.5), wall(scenes, 2.0)
     n = int(near.valid.sum())
     points, normals, colours = overlay(near, far, shifted(z=0.5))
@@ -140,7 +138,7 @@ def test_overlays_are_coloured(scenes: ModuleType) -> None:
     assert (colours[n:] == STEP_COLOURS[-2]).all()  # behind it
 
 
-def test_an_overlays_steps_are_of_the_models_tolerance(scenes: ModuleType) -> None:
+def test_an_overlays_steps_are_of_the_models_tolerance(scenes):
     seen = wall(scenes, 2.0)
     wide = OverlapParameters(surface_tolerance=0.12)
     for share, step in ((0.19, 0), (0.21, 1), (0.39, 1), (0.41, 2), (0.99, 2), (1.01, 3)):

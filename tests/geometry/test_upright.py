@@ -8,16 +8,13 @@ from itertools import product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sceneprint.geometry.surface.upright import (
-    Upright,
     dominant_directions,
     estimate_units,
     estimate_up,
     flat_pieces,
 )
-from sceneprint.types import Floats, Floats32, Ints32
 from sceneprint_lab.synth.dataset import room_and_rng, synthesise_survey
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -33,14 +30,14 @@ TURNS = {
 
 
 @cache
-def room(index: int) -> tuple[Floats32, Ints32]:
+def room(index):
     """A furnished room: vertices and triangles."""
     made, _ = room_and_rng(4242, index)
     return made.vertices, made.faces
 
 
 @cache
-def samples(index: int) -> Floats32:
+def samples(index):
     """Points spread evenly over the surface of a room."""
     vertices, faces = room(index)
     rng = np.random.default_rng(0)
@@ -55,59 +52,55 @@ def samples(index: int) -> Floats32:
 
 
 @cache
-def survey(index: int) -> Floats32:
+def survey(index):
     """The scans of a hall, a storey or a block, in one frame."""
     clouds = synthesise_survey(4242, index, 6).clouds
-    parts = []
-    for one in clouds:
-        assert one.pose is not None
-        parts.append(one.points @ one.pose[:3, :3].T + one.pose[:3, 3])
+    parts = [one.points @ one.pose[:3, :3].T + one.pose[:3, 3] for one in clouds]
     return np.concatenate(parts).astype(np.float32)
 
 
-def turned(points: Floats32, R: NDArray[np.float64]) -> Floats32:
+def turned(points, R):
     return (points.astype(np.float64) @ R.T).astype(np.float32)
 
 
-def angle(found: Upright, truth: Floats) -> float:
+def angle(found, truth):
     return math.degrees(math.acos(min(1.0, max(-1.0, float(found.up @ truth)))))
 
 
-@pytest.mark.parametrize("axis", TURNS)
-@pytest.mark.parametrize("index", [0, 4, 6, 7])
-def test_up_of_a_mesh_of_a_furnished_room(index: int, axis: str) -> None:
+@pytest.mark.parametrize(
+    ("index", "axis"), [(0, "z"), (0, "-x"), (4, "-z"), (4, "y"), (6, "-y"), (7, "x")]
+)
+def test_up_of_a_mesh_of_a_furnished_room(index, axis):
     vertices, faces = room(index)
     found = estimate_up(turned(vertices, TURNS[axis]), faces, Z)
     np.testing.assert_array_equal(found.up, TURNS[axis] @ Z)  # an axis is taken exactly
     assert found.is_clear
 
 
-@pytest.mark.parametrize("axis", TURNS)
-@pytest.mark.parametrize("index", [4, 6])
-def test_up_of_a_cloud_of_a_furnished_room(index: int, axis: str) -> None:
+@pytest.mark.parametrize(("index", "axis"), [(4, "-y"), (6, "x")])
+def test_up_of_a_cloud_of_a_furnished_room(index, axis):
     found = estimate_up(turned(samples(index), TURNS[axis]), None, Z)
     np.testing.assert_array_equal(found.up, TURNS[axis] @ Z)
     assert found.is_clear
 
 
-@pytest.mark.parametrize("axis", TURNS)
-@pytest.mark.parametrize("index", [1, 3, 6])
-def test_up_of_scans(index: int, axis: str) -> None:
+@pytest.mark.parametrize(("index", "axis"), [(1, "y"), (3, "-z"), (6, "-x")])
+def test_up_of_scans(index, axis):
     found = estimate_up(turned(survey(index), TURNS[axis]), None, Z)
     assert angle(found, TURNS[axis] @ Z) < 2.0
 
 
-def test_a_tilted_room_is_upright_along_its_walls() -> None:
+def test_a_tilted_room_is_upright_along_its_walls():
     tilt = math.radians(26)
     R = np.array(
         [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]
     )
-    for turn in TURNS.values():
+    for turn in (TURNS["z"], TURNS["-y"]):
         found = estimate_up(turned(samples(4), turn @ R), None, Z)
         assert angle(found, turn @ R @ Z) < 1.0
 
 
-def test_ground_that_slopes_leaves_the_usual_axis() -> None:
+def test_ground_that_slopes_leaves_the_usual_axis():
     slope = math.radians(5)
     R = np.array(
         [[math.cos(slope), 0, math.sin(slope)], [0, 1, 0], [-math.sin(slope), 0, math.cos(slope)]]
@@ -116,7 +109,7 @@ def test_ground_that_slopes_leaves_the_usual_axis() -> None:
     np.testing.assert_array_equal(found.up, Z)
 
 
-def test_an_empty_cube_is_as_usual_and_not_clear() -> None:
+def test_an_empty_cube_is_as_usual_and_not_clear():
     corners = np.array(list(product((-1, 1), repeat=3)), np.float32)
     faces = np.array(
         [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
@@ -129,7 +122,7 @@ def test_an_empty_cube_is_as_usual_and_not_clear() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2, 11, 500])
-def test_surfaces_that_show_nothing_are_as_usual(n: int) -> None:
+def test_surfaces_that_show_nothing_are_as_usual(n):
     spread = np.random.default_rng(0).normal(size=(n, 3)).astype(np.float32)
     for points in (spread, np.zeros((n, 3), np.float32), spread * np.array([1, 0, 0], np.float32)):
         found = estimate_up(points, None, Z)
@@ -137,7 +130,7 @@ def test_surfaces_that_show_nothing_are_as_usual(n: int) -> None:
         assert not (found.is_clear and n < 12)
 
 
-def test_dominant_directions_of_a_tilted_box_are_its_normals() -> None:
+def test_dominant_directions_of_a_tilted_box_are_its_normals():
     rng = np.random.default_rng(2)
     R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     points = rng.uniform(-1, 1, (60_000, 3)) * (6, 4, 3)
@@ -160,9 +153,7 @@ def test_dominant_directions_of_a_tilted_box_are_its_normals() -> None:
         ((0.4, 0.3, 0.2), 1),
     ],
 )  # fmt: skip
-def test_units_by_the_height_and_extent_of_a_place(
-    extent: tuple[float, float, float], units: int
-) -> None:
+def test_units_by_the_height_and_extent_of_a_place(extent, units):
     points = np.random.default_rng(1).uniform(-0.5, 0.5, (20_000, 3)) * extent / 0.98
-    for turn in TURNS.values():
+    for turn in (TURNS["z"], TURNS["-x"]):
         assert estimate_units(turned(points.astype(np.float32), turn), turn @ Z) == units

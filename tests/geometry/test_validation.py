@@ -6,6 +6,7 @@ import hashlib
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -15,42 +16,38 @@ from scipy.spatial.transform import Rotation
 from sceneprint import pipeline
 from sceneprint.errors import ModelMismatch
 from sceneprint.formats.artifact import read_geometry, write_geometry
-from sceneprint.geometry.registration.alignment import Alignment, align, frame_samples
+from sceneprint.geometry.registration.alignment import align, frame_samples
 from sceneprint.geometry.registration.overlap import overlap_counts, plane_agreement, sample_points
 from sceneprint.geometry.rigid import inverse, pose_difference
-from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
+from sceneprint.geometry.validation.acceptance import AcceptanceParameters
 from sceneprint.geometry.validation.validation import (
-    PairValidation,
     ValidationParameters,
     _decide,
     middle,
     refine_transform,
     validate,
 )
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Floats, Floats32, Geometry, Patches, Surface
+from sceneprint.types import DepthFrame, Patches, Surface
 from sceneprint_lab.synth import KINECT, symmetric_box, take, trajectory
 from sceneprint_lab.synth.dataset import room_and_rng
 from sceneprint_lab.synth.mesh import Ceiling, box, join, shell, walls_of
 from sceneprint_lab.synth.rooms import Room
 
-#: Views of a room, each with its pose, two or three decimetres and some twenty degrees apart.
-Views = list[tuple[Floats, Geometry]]
-
 
 @pytest.fixture(scope="module")
-def model() -> Model:
+def model():
     return read_model("paper")
 
 
-def geometry(model: Model, depth: Floats32) -> Geometry:
+def geometry(model, depth):
     return geometry_of(see(DepthFrame(depth, KINECT), model.parameters), model)
 
 
 @pytest.fixture(scope="module")
-def rooms(model: Model) -> list[Views]:
+def rooms(model):
     """Four views of each of three furnished rooms, as the demo takes them."""
     made = []
     for number in (0, 2, 3):
@@ -61,7 +58,7 @@ def rooms(model: Model) -> list[Views]:
 
 
 @pytest.fixture(scope="module")
-def pairs(rooms: list[Views]) -> list[tuple[Geometry, Geometry, Floats]]:
+def pairs(rooms):
     """Neighbouring views, and the transform between them."""
     return [
         (query, match, inverse(T_match) @ T_query)
@@ -70,7 +67,7 @@ def pairs(rooms: list[Views]) -> list[tuple[Geometry, Geometry, Floats]]:
     ]
 
 
-def sane(v: PairValidation) -> PairValidation:
+def sane(v):
     """The answer, once everything in it is seen to be a number that makes sense."""
     assert v.status in ("accepted", "ambiguous", "rejected")
     assert (v.strength is None) == (v.status != "accepted")
@@ -94,18 +91,24 @@ def sane(v: PairValidation) -> PairValidation:
     return v
 
 
-def content(v: PairValidation) -> tuple[object, ...]:
+@cache
+def answer(query, match):
+    """The usual validation of two frames, computed once."""
+    return sane(validate(query, match))
+
+
+def content(v):
     return tuple(x.tobytes() if isinstance(x, np.ndarray) else x for x in astuple(v))
 
 
-def off(v: PairValidation, T: Floats) -> tuple[float, float]:
+def off(v, T):
     """Metres and degrees from a transform."""
     assert v.T_match_query is not None
     metres, radians = pose_difference(v.T_match_query, T)
     return metres, math.degrees(radians)
 
 
-def flipped(g: Geometry, signs: tuple[float, float, float]) -> Geometry:
+def flipped(g, signs):
     """Everything with x or y, or both, the other way round, as another camera would see it."""
     s, k = g.surface, g.surface.camera
     f = np.array(signs, np.float32)
@@ -123,16 +126,16 @@ def flipped(g: Geometry, signs: tuple[float, float, float]) -> Geometry:
     return replace(g, surface=Surface(points, normals, valid, areas, camera), patches=patches)
 
 
-def few(g: Geometry, n: int) -> Geometry:
+def few(g, n):
     p = g.patches
     arrays = (p.means, p.normals, p.areas, p.sizes, p.coherences)
     return replace(g, patches=Patches(*(a[:n] for a in arrays)), descriptors=g.descriptors[:n])
 
 
-def test_the_true_transform_is_found(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+def test_the_true_transform_is_found(pairs):
     accepted = 0
     for query, match, T in pairs:
-        v = sane(validate(query, match))
+        v = answer(query, match)
         metres, degrees = off(v, T)
         assert metres < 0.05
         assert degrees < 5.0
@@ -142,8 +145,8 @@ def test_the_true_transform_is_found(pairs: list[tuple[Geometry, Geometry, Float
     assert accepted >= len(pairs) - 1  # measured: all
 
 
-def test_a_frame_lies_on_itself(rooms: list[Views]) -> None:
-    for _, frame in [view for views in rooms for view in views]:
+def test_a_frame_lies_on_itself(rooms):
+    for (_, frame), *_ in rooms:
         v = sane(validate(frame, frame))
         metres, degrees = off(v, np.eye(4))
         assert metres < 1e-3
@@ -152,9 +155,7 @@ def test_a_frame_lies_on_itself(rooms: list[Views]) -> None:
         assert (round(v.overlap, 2), v.violations) == (1.0, 0.0)
 
 
-def test_the_same_seed_gives_the_same_answer(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
+def test_the_same_seed_gives_the_same_answer(pairs):
     answers = [validate(q, m, seed) for q, m, _ in pairs[:3] for seed in (0, 5)]
     assert [answer.seed for answer in answers] == [0, 5] * 3  # the seed is echoed
     alone = [content(answer) for answer in answers]
@@ -166,21 +167,19 @@ def test_the_same_seed_gives_the_same_answer(
         assert one[3] != other[3]
 
 
-def test_seeds_agree_with_each_other(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+def test_seeds_agree_with_each_other(pairs):
     query, match, _ = pairs[0]
-    first = sane(validate(query, match, 0))
+    first = answer(query, match)
     assert first.T_match_query is not None
-    for seed in range(1, 6):
+    for seed in (1, 2):
         metres, degrees = off(sane(validate(query, match, seed)), first.T_match_query)
         assert metres < 5e-3
         assert degrees < 0.2
 
 
-def test_the_other_way_round_is_the_inverse(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
-    for query, match, _ in pairs:
-        there, back = sane(validate(query, match)), sane(validate(match, query))
+def test_the_other_way_round_is_the_inverse(pairs):
+    for query, match, _ in pairs[::3]:
+        there, back = answer(query, match), sane(validate(match, query))
         assert there.T_match_query is not None
         metres, degrees = off(back, inverse(there.T_match_query))
         assert metres < 0.01
@@ -188,12 +187,10 @@ def test_the_other_way_round_is_the_inverse(
         assert back.overlap == pytest.approx(there.overlap, abs=0.02)
 
 
-def test_a_camera_held_upside_down_turns_the_transform(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
+def test_a_camera_held_upside_down_turns_the_transform(pairs):
     R = np.diag([-1.0, -1.0, 1.0, 1.0])
-    for query, match, _ in pairs[:4]:
-        upright = sane(validate(query, match))
+    for query, match, _ in pairs[:2]:
+        upright = answer(query, match)
         assert upright.T_match_query is not None
         turned = sane(validate(flipped(query, (-1, -1, 1)), match))
         metres, degrees = off(turned, upright.T_match_query @ R)
@@ -205,7 +202,7 @@ def test_a_camera_held_upside_down_turns_the_transform(
         assert degrees < 0.3
 
 
-def looking(eye: tuple[float, float, float], at: tuple[float, float, float]) -> Floats:
+def looking(eye, at):
     """T_world_camera of a level camera at one point that looks at another."""
     forward = np.subtract(at, eye)
     forward /= np.linalg.norm(forward)
@@ -216,7 +213,7 @@ def looking(eye: tuple[float, float, float], at: tuple[float, float, float]) -> 
     return T
 
 
-def askew(rng: np.random.Generator) -> Room:
+def askew(rng):
     """Boxes lying anyhow between four walls at no right angles: nothing repeats or mirrors."""
     outline = np.array([(0, 0), (5, 0.6), (4.2, 4.5), (0.4, 3.0)])
     top = Ceiling(2.6, np.zeros(2))
@@ -228,12 +225,12 @@ def askew(rng: np.random.Generator) -> Room:
     return Room(join([shell(outline, walls_of(outline), top), *boxes]), outline, top)
 
 
-def test_a_mirror_image_is_not_believed(model: Model) -> None:
+def test_a_mirror_image_is_not_believed(model):
     # the descriptors are the same, so that only the consensus can tell. Not so in furnished rooms
     # at right angles: of those, a part is its own mirror image, walls and cupboards alike
     rng, middle_of_it = np.random.default_rng(1), (2.5, 2.1, 0.7)
     room = askew(rng)
-    for x, y, z in ((0.5, 0.5, 1.5), (4.0, 4.0, 1.2), (0.7, 2.8, 1.9)):
+    for x, y, z in ((0.5, 0.5, 1.5), (4.0, 4.0, 1.2)):
         depths = [
             take(room, looking((x + step, y, z), middle_of_it), KINECT, rng) for step in (0.0, 0.2)
         ]
@@ -243,14 +240,13 @@ def test_a_mirror_image_is_not_believed(model: Model) -> None:
         assert sane(validate(here, flipped(here, (-1, 1, 1)))).status != "accepted"
 
 
-def test_two_rooms_are_two_places(rooms: list[Views]) -> None:
-    for i, views in enumerate(rooms):
-        for others in rooms[i + 1 :]:
-            for (_, query), (_, match) in zip(views, others, strict=True):
-                assert sane(validate(query, match)).status != "accepted"
+def test_two_rooms_are_two_places(rooms):
+    for views, others in pairwise(rooms):
+        for (_, query), (_, match) in zip(views[:3], others[:3], strict=True):
+            assert sane(validate(query, match)).status != "accepted"
 
 
-def test_flat_walls_leave_directions_free(model: Model) -> None:
+def test_flat_walls_leave_directions_free(model):
     y, x = np.mgrid[:480, :640]
     at_2, at_3 = (np.full((480, 640), z, np.float32) for z in (2.0, 3.0))
     leaning = (2.0 + x / 1000 + y / 2000).astype(np.float32)
@@ -260,17 +256,7 @@ def test_flat_walls_leave_directions_free(model: Model) -> None:
             assert sane(validate(query, match)).status in ("ambiguous", "rejected")
 
 
-def test_sides_of_a_cube_are_not_told_apart(model: Model) -> None:
-    # a quarter turn about the cube: nothing in two views tells it from no turn at all
-    scene, rng = symmetric_box(), np.random.default_rng(0)
-    seen = []
-    for turn in (0.4, 0.4 + math.pi / 2):
-        T = looking((2.2 * math.sin(turn), -2.2 * math.cos(turn), 1.3), (0.0, 0.0, 0.3))
-        seen.append(geometry(model, take(scene, T, KINECT, rng)))
-    assert sane(validate(seen[0], seen[1])).status == "ambiguous"
-
-
-def test_too_few_patches(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+def test_too_few_patches(pairs):
     query, match, _ = pairs[0]
     for n in (0, 1, 9):
         for a, b in ((few(query, n), match), (query, few(match, n))):
@@ -281,16 +267,14 @@ def test_too_few_patches(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None
         assert "validation requires" not in sane(validate(few(query, n), match)).reason
 
 
-def test_patches_that_agree_on_nothing(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+def test_patches_that_agree_on_nothing(pairs):
     query, match, _ = pairs[0]
     one_place = replace(query.patches, means=np.zeros_like(query.patches.means))
     v = sane(validate(replace(query, patches=one_place), match))
     assert (v.status, v.T_match_query, v.inliers, v.overlap) == ("rejected", None, 0, 0.0)
 
 
-def test_what_was_not_seen_supports_nothing(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
+def test_what_was_not_seen_supports_nothing(pairs):
     query, match, _ = pairs[0]
     s = match.surface
     blank = Surface(
@@ -305,13 +289,11 @@ def test_what_was_not_seen_supports_nothing(
         assert (v.status, v.inliers) == ("rejected", 0)
 
 
-def test_the_papers_test_is_the_residual_alone(
-    pairs: list[tuple[Geometry, Geometry, Floats]], model: Model
-) -> None:
+def test_the_papers_test_is_the_residual_alone(pairs, model):
     query, match, _ = pairs[0]
     hard = AcceptanceParameters(evidence=2.0, sparse_evidence=2.0)
 
-    def judged(p: AcceptanceParameters, mode: Mode) -> PairValidation:
+    def judged(p, mode):
         return sane(validate(query, match, 0, ValidationParameters(acceptance=p), mode))
 
     full, paper = judged(hard, "full"), judged(hard, "paper")
@@ -331,13 +313,11 @@ def test_the_papers_test_is_the_residual_alone(
     assert sane(validate(wall, wall)).status == "ambiguous"
 
 
-def test_what_is_told_is_counted_under_the_transform_told(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
+def test_what_is_told_is_counted_under_the_transform_told(pairs):
     p, violated = ValidationParameters(), []
-    crossed = [(pairs[i][0], pairs[i - 1][1]) for i in range(len(pairs))]
+    crossed = [(pairs[i][0], pairs[i - 1][1]) for i in range(3)]
     for query, match in [(q, m) for q, m, _ in pairs] + crossed:
-        v = sane(validate(query, match))
+        v = answer(query, match)
         if v.T_match_query is None:
             continue
         a = overlap_counts(
@@ -353,7 +333,7 @@ def test_what_is_told_is_counted_under_the_transform_told(
     assert max(violated) > 10
 
 
-def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]) -> None:
+def test_where_the_directions_disagree_the_better_one_is_told(rooms):
     """Halfway between two places is neither of them; near each other it is better than both."""
     p, apart, met = ValidationParameters(), 0, 0
     couples = [(rooms[0][i][1], rooms[room][j][1]) for room in (0, 1) for i, j in ((0, 1), (3, 0))]
@@ -361,9 +341,7 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]
         a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
         there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
         back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
-        assert there is not None
-        assert back is not None
-        found = validate(query, match)
+        found = answer(query, match)
         told = np.stack([there.T, inverse(back.T)])
         assert found.T_match_query is not None
         if found.residual_m < 0.08 and found.residual_rad < math.radians(5):
@@ -386,18 +364,16 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms: list[Views]
     assert met >= 1
 
 
-def elsewhere(found: Alignment) -> Alignment:
+def elsewhere(found):
     """The same search, had it found a place a metre off and half a turn round."""
     T = np.diag([-1.0, 1.0, -1.0, 1.0])
     T[0, 3] = 1.0
     return replace(found, T=T @ found.T, others=found.others[:0])
 
 
-def test_what_one_search_alone_finds_is_judged_by_the_evidence(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
+def test_what_one_search_alone_finds_is_judged_by_the_evidence(pairs):
     p, accepted = ValidationParameters(), 0
-    for query, match, T in pairs:
+    for query, match, T in pairs[:3]:
         a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in (query, match))
         there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
         back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
@@ -423,21 +399,23 @@ def test_what_one_search_alone_finds_is_judged_by_the_evidence(
             assert found.residual_m <= p.acceptance.residual_m
             assert found.covariance is not None
             assert found.reason.endswith("planes, but only one direction found it")
-    assert accepted >= len(pairs)
+    assert accepted >= 3
 
 
-def test_of_two_places_that_both_explain_the_frames_neither_is_believed(model: Model) -> None:
-    """Each search finds another side of a cube: neither refutes what the other one found."""
+def test_sides_of_a_cube_are_not_told_apart(model):
+    """Nothing in two views tells a quarter turn about the cube from no turn at all."""
     scene, rng = symmetric_box(), np.random.default_rng(0)
-    # a cube on a floor does not fix a transform firmly: all but rivals is to speak for it
-    p = ValidationParameters(acceptance=AcceptanceParameters(sparse_deviation_m=1.0))
     seen = []
     for turn in (0.4, 0.4 + math.pi / 2):
         T = looking((2.2 * math.sin(turn), -2.2 * math.cos(turn), 1.3), (0.0, 0.0, 0.3))
         seen.append(geometry(model, take(scene, T, KINECT, rng)))
-    a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in seen)
-    v = validate(*seen)
+    v = sane(validate(*seen))
+    assert v.status == "ambiguous"
     assert v.T_rival is not None
+    # nor if each search finds another side: neither refutes what the other one found. A cube on
+    # a floor does not fix a transform firmly: all but rivals is to speak for it
+    p = ValidationParameters(acceptance=AcceptanceParameters(sparse_deviation_m=1.0))
+    a, b = (frame_samples(one, p.agreement.stride, p.rivals.planes) for one in seen)
     there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
     back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
     assert there is not None
@@ -450,7 +428,7 @@ def test_of_two_places_that_both_explain_the_frames_neither_is_believed(model: M
     assert _decide(a, b, *apart, 0, replace(p, acceptance=free), "full").status == "accepted"
 
 
-def test_a_free_direction_is_seen_without_rivals(model: Model) -> None:
+def test_a_free_direction_is_seen_without_rivals(model):
     wall = geometry(model, np.full((480, 640), 2.0, np.float32))
     blind = AcceptanceParameters(ambiguous=9.0, ambiguous_share=9.0, weak=9.0)
     v = sane(validate(wall, wall, 0, ValidationParameters(acceptance=blind)))
@@ -458,20 +436,20 @@ def test_a_free_direction_is_seen_without_rivals(model: Model) -> None:
     assert "do not constrain one direction" in v.reason
 
 
-def test_wrong_calls(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+def test_wrong_calls(pairs):
     query, match, _ = pairs[0]
     with pytest.raises(ValueError, match="mode 'other' does not exist"):
-        validate(query, match, mode="other")  # type: ignore[arg-type]
+        validate(query, match, mode="other")
     with pytest.raises(ValueError, match="lengths, 128 and 127 bytes"):
         validate(query, replace(match, descriptors=match.descriptors[:, :127]))
     with pytest.raises(ModelMismatch, match="Frames of different models cannot be compared"):
         pipeline.validate(query, replace(match, model_id="0" * 64))
 
 
-def test_frames_are_left_as_they_were(pairs: list[tuple[Geometry, Geometry, Floats]]) -> None:
+def test_frames_are_left_as_they_were(pairs):
     query, match, _ = pairs[0]
 
-    def digest() -> list[str]:
+    def digest():
         arrays = [
             array
             for g in (query, match)
@@ -487,11 +465,9 @@ def test_frames_are_left_as_they_were(pairs: list[tuple[Geometry, Geometry, Floa
     assert digest() == before
 
 
-def test_artifacts_from_disk_validate_alike(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
-    for query, match, _ in pairs[:4]:
-        fresh = sane(validate(query, match))
+def test_artifacts_from_disk_validate_alike(pairs):
+    for query, match, _ in pairs[:2]:
+        fresh = answer(query, match)
         assert fresh.T_match_query is not None
         stored = [read_geometry(write_geometry(g)) for g in (query, match)]
         v = sane(validate(stored[0], stored[1]))
@@ -501,9 +477,7 @@ def test_artifacts_from_disk_validate_alike(
         assert v.overlap == pytest.approx(fresh.overlap, abs=5e-3)
 
 
-def test_refined_at_the_truth_stays_there(
-    pairs: list[tuple[Geometry, Geometry, Floats]],
-) -> None:
+def test_refined_at_the_truth_stays_there(pairs):
     for query, match, T in pairs:
         found = refine_transform(query, match, T)
         assert found is not None
@@ -515,7 +489,7 @@ def test_refined_at_the_truth_stays_there(
     assert refine_transform(pairs[0][0], pairs[0][1], far) is None
 
 
-def test_middle_by_hand() -> None:
+def test_middle_by_hand():
     a, b = np.eye(4), np.eye(4)
     b[:3, :3] = Rotation.from_rotvec([0, 0, 0.2]).as_matrix()
     b[:3, 3] = 2, 4, 6

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -26,18 +25,14 @@ from sceneprint.geometry.validation.acceptance import (
     belief,
     objection,
 )
-from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters, validate
-from sceneprint.models import Model, read_model
-from sceneprint.models.model import scale_lengths
+from sceneprint.geometry.validation.validation import ValidationParameters, validate
+from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import Cloud, DepthFrame, Floats, Floats32, Geometry, Sphere
 from sceneprint_lab.synth import KINECT, take
 from sceneprint_lab.synth.dataset import room_and_rng
-from sceneprint_lab.synth.rooms import Room
 from sceneprint_lab.synth.trajectories import pose as looking
-
-Make = Callable[[Cloud | DepthFrame], Geometry]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +45,19 @@ class View:
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
+def model():
     return read_model("paper")
 
 
 @pytest.fixture(scope="module")
-def made(model: Model) -> Make:
-    def make(frame: Cloud | DepthFrame) -> Geometry:
+def made(model):
+    def make(frame):
         return read_geometry(write_geometry(geometry_of(see(frame, model.parameters), model)))
 
     return make
 
 
-def pose(x: float, y: float, yaw: float) -> Floats:
+def pose(x, y, yaw):
     """A sensor upright in a room, 1.2 m over its floor."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_euler("z", yaw, degrees=True).as_matrix()
@@ -70,7 +65,7 @@ def pose(x: float, y: float, yaw: float) -> Floats:
     return T
 
 
-def scanned(room: Room, T: Floats, rng: np.random.Generator) -> Floats32:
+def scanned(room, T, rng):
     """120 rings of 480 beams, from 45 degrees below to 45 above, good to a centimetre."""
     azimuth = np.linspace(-math.pi, math.pi, 480, endpoint=False)
     elevation = np.radians(np.linspace(-45, 45, 120))[:, None]
@@ -82,12 +77,11 @@ def scanned(room: Room, T: Floats, rng: np.random.Generator) -> Floats32:
     hits = room.caster.cast(np.broadcast_to(T[:3, 3], there.shape).astype(np.float32), there)
     met = hits.face >= 0
     ranges = hits.distance[met] + rng.normal(0, 0.01, int(met.sum()))
-    points: Floats32 = (rays[met] * ranges[:, None]).astype(np.float32)
-    return points
+    return (rays[met] * ranges[:, None]).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
-def rooms(made: Make) -> list[tuple[Room, list[View]]]:
+def rooms(made):
     """Two furnished rooms, scanned twice each, half a metre and 100 degrees apart."""
     found = []
     for number in (2, 5):
@@ -102,7 +96,7 @@ def rooms(made: Make) -> list[tuple[Room, list[View]]]:
 
 
 @pytest.fixture(scope="module")
-def fused(rooms: list[tuple[Room, list[View]]], made: Make) -> list[list[Geometry]]:
+def fused(rooms, made):
     """The same points in the room's coordinates, of nobody's view."""
     return [
         [
@@ -113,14 +107,14 @@ def fused(rooms: list[tuple[Room, list[View]]], made: Make) -> list[list[Geometr
     ]
 
 
-def off(v: PairValidation, T: Floats) -> tuple[float, float]:
+def off(v, T):
     """Metres and degrees from a transform."""
     assert v.T_match_query is not None, v.reason
     metres, radians = pose_difference(v.T_match_query, T)
     return metres, math.degrees(radians)
 
 
-def test_two_scans_of_a_room(rooms: list[tuple[Room, list[View]]]) -> None:
+def test_two_scans_of_a_room(rooms):
     for _, (query, match) in rooms:
         assert isinstance(query.scan.surface.camera, Sphere)
         v = validate(query.scan, match.scan)
@@ -136,12 +130,9 @@ def test_two_scans_of_a_room(rooms: list[tuple[Room, list[View]]]) -> None:
         assert np.linalg.eigvalsh(v.covariance)[0] > 0
 
 
-def test_a_turned_scan_turns_the_transform(
-    rooms: list[tuple[Room, list[View]]], made: Make
-) -> None:
+def test_a_turned_scan_turns_the_transform(rooms, made):
     _, (query, match) = rooms[0]
     before = validate(query.scan, match.scan)
-    assert before.T_match_query is not None
     for turn in Rotation.random(2, rng=np.random.default_rng(3)):
         R = turn.as_matrix()
         v = validate(made(Cloud((query.points @ R.T).astype(np.float32))), match.scan)
@@ -153,9 +144,7 @@ def test_a_turned_scan_turns_the_transform(
         assert (v.status, v.strength) == ("accepted", "strong")
 
 
-def test_other_rooms_and_mirror_images_are_rejected(
-    rooms: list[tuple[Room, list[View]]], made: Make
-) -> None:
+def test_other_rooms_and_mirror_images_are_rejected(rooms, made):
     for query, match in product(rooms[0][1], rooms[1][1]):
         assert validate(query.scan, match.scan).status != "accepted"
     _, (query, match) = rooms[0]
@@ -164,9 +153,7 @@ def test_other_rooms_and_mirror_images_are_rejected(
         assert validate(mirrored, one.scan).status != "accepted"
 
 
-def test_a_depth_image_beside_the_cloud_of_the_same_view(
-    rooms: list[tuple[Room, list[View]]], made: Make
-) -> None:
+def test_a_depth_image_beside_the_cloud_of_the_same_view(rooms, made):
     room, (first, _) = rooms[0]
     T = looking(np.array([first.T[0, 3], first.T[1, 3], 1.4, 0.4, -0.3, 0.0]))
     depth = take(room, T, KINECT, np.random.default_rng(1))
@@ -184,9 +171,7 @@ def test_a_depth_image_beside_the_cloud_of_the_same_view(
         assert v.overlap > 0.6
 
 
-def test_where_there_is_no_viewpoint_a_match_is_weak(
-    rooms: list[tuple[Room, list[View]]], fused: list[list[Geometry]]
-) -> None:
+def test_where_there_is_no_viewpoint_a_match_is_weak(rooms, fused):
     for query, match in fused:
         assert query.surface.camera is None
         v = validate(query, match)
@@ -219,9 +204,7 @@ def test_where_there_is_no_viewpoint_a_match_is_weak(
     assert (one_sided.status, one_sided.strength) == ("accepted", "weak")
 
 
-def test_what_is_found_by_place_does_not_depend_on_a_secret(
-    fused: list[list[Geometry]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_found_by_place_does_not_depend_on_a_secret(fused, monkeypatch):
     """Which points share a slot of the hash nobody can know: else a cloud could make it slow."""
     query, match = fused[0]
     points, made = sample_points(query.surface, 5), []
@@ -231,7 +214,6 @@ def test_what_is_found_by_place_does_not_depend_on_a_secret(
         surface = replace(match.surface)  # what is known of the other was made with its secret
         target = overlap_target(surface, p)
         refined = refine(points, surface, np.eye(4), FINE)
-        assert refined is not None
         inliers = agreements(points, surface, refined.T[None], p)[0, 0]
         assert inliers > 0.4 * len(points)
         made.append((target.heads.tobytes(), inliers, refined.T.tobytes()))
@@ -239,7 +221,7 @@ def test_what_is_found_by_place_does_not_depend_on_a_secret(
     assert made[0][1:] == made[1][1:]
 
 
-def test_an_empty_square_room_without_a_viewpoint_is_ambiguous(made: Make) -> None:
+def test_an_empty_square_room_without_a_viewpoint_is_ambiguous(made):
     rng = np.random.default_rng(4)
     clouds = []
     for _ in range(2):
@@ -253,39 +235,7 @@ def test_an_empty_square_room_without_a_viewpoint_is_ambiguous(made: Make) -> No
     assert v.ambiguity > 0.75 * v.plane_overlap or v.status == "rejected"
 
 
-def test_everything_five_times_as_large(
-    rooms: list[tuple[Room, list[View]]], made: Make, model: Model
-) -> None:
-    p = scale_lengths(model.parameters, 5.0)
-    large = replace(model, parameters=p)
-    _, views = rooms[1]
-    query, match = (
-        geometry_of(see(Cloud((view.points * 5).astype(np.float32)), p), large) for view in views
-    )
-    small = [geometry_of(see(Cloud(v.points), model.parameters), model) for v in views]
-    v, u = validate(query, match, 0, p.validation), validate(*small)
-    assert v.T_match_query is not None
-    assert u.T_match_query is not None
-    T = u.T_match_query.copy()
-    T[:3, 3] *= 5
-    metres, degrees = off(v, T)
-    # which points of a scan are kept turns on the last bits of their coordinates: with rays that
-    # differ by one, 0.8 to 3.3 mm, 0.004 to 0.022 deg, shares by 0.016 and deviations by 3.3 %
-    assert metres < 0.01
-    assert degrees < 0.05
-    assert (v.status, v.strength, v.reason) == (u.status, u.strength, u.reason)
-    for name in ("overlap", "plane_overlap", "violations", "ambiguity"):
-        assert getattr(v, name) == pytest.approx(getattr(u, name), abs=0.04)
-    assert v.residual_m == pytest.approx(5 * u.residual_m, abs=0.01)
-    assert v.covariance is not None
-    assert u.covariance is not None
-    size = np.sqrt(np.diag(v.covariance)) / np.sqrt(np.diag(u.covariance))
-    np.testing.assert_allclose(size, [5, 5, 5, 1, 1, 1], rtol=0.1)
-    # with the numbers of a room it is another thing
-    assert validate(query, match, 0).T_match_query is None or v.covariance[0, 0] > 0
-
-
-def test_without_evidence_of_free_space_more_must_agree() -> None:
+def test_without_evidence_of_free_space_more_must_agree():
     p = AcceptanceParameters(
         evidence=0.2, plane_overlap=0.15, strong=0.3, weak=0.05, ambiguous=0.14,
         ambiguous_share=0.5, blind_evidence=0.4, blind_plane_overlap=0.3,
@@ -297,7 +247,6 @@ def test_without_evidence_of_free_space_more_must_agree() -> None:
     for name, enough, too_little in (("overlap", 0.41, 0.39), ("plane_overlap", 0.31, 0.29)):
         assert objection(replace(blind, **{name: enough}), p, "full") is None
         against = objection(replace(blind, **{name: too_little}), p, "full")
-        assert against is not None
         assert against[0] == "rejected"
         assert objection(replace(seen, **{name: too_little}), p, "full") is None
     assert belief(seen, 0.0, p)[:2] == ("accepted", "strong")

@@ -10,7 +10,7 @@ import pytest
 
 from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.rigid import inverse, transform_points
-from sceneprint.geometry.views import Renderer, ViewParameters, choose_views, view_parameters
+from sceneprint.geometry.views import Renderer, choose_views, view_parameters
 from sceneprint.geometry.views.free_space import candidate_places, find_floors
 from sceneprint.geometry.views.plan import level_axes
 from sceneprint.geometry.views.raster import draw_triangles, pinhole
@@ -22,7 +22,7 @@ from sceneprint.geometry.views.samples import (
     surfels,
 )
 from sceneprint.models import read_model
-from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
+from sceneprint.types import Intrinsics, ReferenceSurface
 from sceneprint_lab.synth.dataset import room_and_rng
 
 CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
@@ -30,7 +30,7 @@ ROOM = np.array([6.0, 5.0, 2.5])
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def box(size: Floats, *, inwards: bool) -> tuple[Floats32, Ints32]:
+def box(size, *, inwards):
     """The corners and the triangles of a box from the origin; their fronts inside, or outside."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * size
     sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -38,12 +38,12 @@ def box(size: Floats, *, inwards: bool) -> tuple[Floats32, Ints32]:
     return corners.astype(np.float32), triangles[:, ::-1] if inwards else triangles
 
 
-def room(*, inwards: bool = True, up: Floats = UP) -> ReferenceSurface:
+def room(*, inwards=True, up=UP):
     points, triangles = box(ROOM, inwards=inwards)
     return ReferenceSurface(points, np.ascontiguousarray(triangles), np.zeros(3), up)
 
 
-def cloud_of_room(spacing: float = 0.04) -> ReferenceSurface:
+def cloud_of_room(spacing=0.04):
     """Points on the walls, the floor and the ceiling of the room, on a grid."""
     sheets = []
     for axis in range(3):
@@ -57,12 +57,12 @@ def cloud_of_room(spacing: float = 0.04) -> ReferenceSurface:
     return ReferenceSurface(points, None, np.zeros(3), UP)
 
 
-def depth_parameters(camera: Intrinsics = CAMERA) -> ViewParameters:
+def depth_parameters(camera=CAMERA):
     p = view_parameters(read_model("depth").parameters, camera)
     return replace(p, spacing=0.8, cell=0.15)
 
 
-def looking(place: tuple[float, float, float], yaw: float, pitch: float) -> Floats:
+def looking(place, yaw, pitch):
     """T_map_sensor of a camera in a place, z up."""
     flat = np.array([math.cos(yaw), math.sin(yaw), 0.0])
     ahead = math.cos(pitch) * flat + math.sin(pitch) * UP
@@ -73,7 +73,7 @@ def looking(place: tuple[float, float, float], yaw: float, pitch: float) -> Floa
     return T
 
 
-def depth_in_room(T: Floats, camera: Intrinsics) -> Floats:
+def depth_in_room(T, camera):
     """The depth (H, W) of the walls of the room, seen from inside: each ray leaves by the first."""
     rays = rays_of(camera).astype(float) @ T[:3, :3].T
     with np.errstate(divide="ignore"):
@@ -90,7 +90,7 @@ POSES = [
 
 @pytest.mark.parametrize("T", POSES)
 @pytest.mark.parametrize("inwards", [True, False])
-def test_a_view_of_a_mesh_shows_the_depth_of_its_walls(T: Floats, inwards: bool) -> None:
+def test_a_view_of_a_mesh_shows_the_depth_of_its_walls(T, inwards):
     # a mesh that is inside out is shown as well, as all of it is seen from behind
     seen = Renderer(room(inwards=inwards), depth_parameters()).view(T)
     assert seen.dtype == np.float32
@@ -98,7 +98,7 @@ def test_a_view_of_a_mesh_shows_the_depth_of_its_walls(T: Floats, inwards: bool)
 
 
 @pytest.mark.parametrize("T", POSES)
-def test_a_view_of_a_cloud_shows_the_depth_of_its_walls(T: Floats) -> None:
+def test_a_view_of_a_cloud_shows_the_depth_of_its_walls(T):
     seen, expected = Renderer(cloud_of_room(), depth_parameters()).view(T), depth_in_room(T, CAMERA)
     assert (seen > 0).mean() > 0.97
     error = np.abs(seen - expected)[seen > 0]
@@ -107,7 +107,7 @@ def test_a_view_of_a_cloud_shows_the_depth_of_its_walls(T: Floats) -> None:
     assert error.max() < 0.25
 
 
-def test_what_is_out_of_range_is_missing() -> None:
+def test_what_is_out_of_range_is_missing():
     T, p = POSES[0], depth_parameters()
     expected = depth_in_room(T, CAMERA)
     seen = Renderer(room(), replace(p, nearest=1.6, farthest=3.0)).view(T)
@@ -117,7 +117,7 @@ def test_what_is_out_of_range_is_missing() -> None:
     assert 0 < within.mean() < 1
 
 
-def test_a_nearer_surface_hides_what_is_behind_it_in_a_cloud_as_in_a_mesh() -> None:
+def test_a_nearer_surface_hides_what_is_behind_it_in_a_cloud_as_in_a_mesh():
     grid = np.stack(np.meshgrid(np.arange(-2, 2, 0.03), np.arange(-2, 2, 0.03)), axis=-1)
     wall = np.column_stack([np.full(grid[..., 0].size, 3.0), grid.reshape(-1, 2)])
     board = wall[np.abs(wall[:, 1:]).max(axis=1) < 0.5] - (1.0, 0.0, 0.0)
@@ -129,7 +129,7 @@ def test_a_nearer_surface_hides_what_is_behind_it_in_a_cloud_as_in_a_mesh() -> N
     np.testing.assert_allclose(seen[(rays > 0.27) & (rays < 0.4)], 3.0, atol=1e-4)
 
 
-def test_a_surface_that_is_seen_from_behind_is_missing_and_hides_what_is_behind_it() -> None:
+def test_a_surface_that_is_seen_from_behind_is_missing_and_hides_what_is_behind_it():
     # a wall whose front faces the camera; before a third of it a board that turns its back
     wall = np.array([[3, -3, -3], [3, -3, 3], [3, 3, 3], [3, 3, -3]], np.float32)
     board = np.array([[2, -0.3, -0.3], [2, 0.3, -0.3], [2, 0.3, 0.3], [2, -0.3, 0.3]], np.float32)
@@ -141,7 +141,7 @@ def test_a_surface_that_is_seen_from_behind_is_missing_and_hides_what_is_behind_
     np.testing.assert_allclose(seen[rays > 0.151], 3.0, rtol=1e-5)
 
 
-def test_a_scanner_sees_all_around() -> None:
+def test_a_scanner_sees_all_around():
     p = replace(view_parameters(read_model("lidar").parameters), nearest=0.1)
     T = looking((2.0, 3.0, 1.0), 0.7, 0.1)
     points = transform_points(T, Renderer(room(), p).view(T).astype(float))
@@ -161,7 +161,7 @@ def test_a_scanner_sees_all_around() -> None:
     assert counts.min() > 5
 
 
-def test_triangles_are_drawn_as_rays_meet_them() -> None:
+def test_triangles_are_drawn_as_rays_meet_them():
     rng = np.random.default_rng(5)
     # some behind the camera, some across its plane
     middles = rng.uniform(-2, 2, (60, 1, 3)) + np.array([0, 0, 1.5])
@@ -189,7 +189,7 @@ def test_triangles_are_drawn_as_rays_meet_them() -> None:
     assert (back.ravel()[seen] == behind[seen]).all()
 
 
-def test_no_ray_passes_between_two_triangles() -> None:
+def test_no_ray_passes_between_two_triangles():
     rng = np.random.default_rng(6)
     heights = rng.uniform(1.0, 1.4, (40, 40))
     x, y = np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.5, 1.5, 40))
@@ -204,7 +204,7 @@ def test_no_ray_passes_between_two_triangles() -> None:
     assert np.isfinite(depth).all()
 
 
-def test_blocks_out_of_view_hold_nothing_that_is_seen() -> None:
+def test_blocks_out_of_view_hold_nothing_that_is_seen():
     rng = np.random.default_rng(7)
     points = rng.uniform(-6, 6, (4000, 3)).astype(np.float32)
     extents = rng.uniform(0, 0.2, 4000).astype(np.float32)
@@ -220,7 +220,7 @@ def test_blocks_out_of_view_hold_nothing_that_is_seen() -> None:
     assert len(kept) < 2000
 
 
-def test_points_of_a_cell_become_their_mean() -> None:
+def test_points_of_a_cell_become_their_mean():
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [2.5, 0.0, 0.0]], np.float32)
     found = average_cells(points, 1.0)
     # cells are counted from the least corner
@@ -228,7 +228,7 @@ def test_points_of_a_cell_become_their_mean() -> None:
     assert len(found) == 2
 
 
-def test_the_normal_of_a_plane_of_points() -> None:
+def test_the_normal_of_a_plane_of_points():
     rng = np.random.default_rng(8)
     flat = rng.uniform(-1, 1, (3000, 2))
     points = np.column_stack([flat, 0.5 * flat[:, 0]]).astype(np.float32)
@@ -241,7 +241,7 @@ def test_the_normal_of_a_plane_of_points() -> None:
     assert (project_to_planes(scattered, 0.3)[1] == 0).all(axis=1).mean() > 0.9
 
 
-def test_both_sides_of_a_thin_wall_are_pieces_of_their_own() -> None:
+def test_both_sides_of_a_thin_wall_are_pieces_of_their_own():
     points, triangles = box(np.array([2.0, 0.02, 2.0]), inwards=False)
     pieces = surfels(ReferenceSurface(points, triangles, np.zeros(3), UP), 0.2, 10_000)
     assert pieces.one_sided
@@ -250,7 +250,7 @@ def test_both_sides_of_a_thin_wall_are_pieces_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("inwards", [True, False])
-def test_cameras_stand_in_the_room_at_their_heights(inwards: bool) -> None:
+def test_cameras_stand_in_the_room_at_their_heights(inwards):
     p = replace(depth_parameters(), heights=(0.5, 1.5))
     plan = choose_views(room(inwards=inwards), p)
     assert len(plan.poses) > 10
@@ -266,7 +266,7 @@ def test_cameras_stand_in_the_room_at_their_heights(inwards: bool) -> None:
         assert T[2, 1] < 0
 
 
-def test_a_table_is_no_floor() -> None:
+def test_a_table_is_no_floor():
     # walls alone, and a table as large as a third of the room
     points, triangles = box(ROOM, inwards=True)
     upright = np.ptp(points[triangles][..., 2], axis=1) > 0
@@ -280,7 +280,7 @@ def test_a_table_is_no_floor() -> None:
     assert heights.max() > 1.5
 
 
-def test_ground_beside_a_slope_is_a_floor_to_a_scanner() -> None:
+def test_ground_beside_a_slope_is_a_floor_to_a_scanner():
     """A field of 24 x 12 m, a wall behind it, and a bank of 45 degrees that falls 12 m from it."""
     x, y = (one.ravel() for one in np.meshgrid(np.arange(0, 24, 0.2), np.arange(0, 24, 0.2)))
     field = np.column_stack([x, y, np.minimum(12.0 - y, 0.0)])
@@ -296,7 +296,7 @@ def test_ground_beside_a_slope_is_a_floor_to_a_scanner() -> None:
     assert find_floors(surfels(surface, p.cell, 10_000), 2 * p.spacing).lowest is None
 
 
-def test_scanners_stand_in_the_room_whose_cloud_has_no_sides() -> None:
+def test_scanners_stand_in_the_room_whose_cloud_has_no_sides():
     p = view_parameters(read_model("lidar").parameters)
     cloud = cloud_of_room(0.1)
     # ground outside, seen through a door
@@ -311,7 +311,7 @@ def test_scanners_stand_in_the_room_whose_cloud_has_no_sides() -> None:
     np.testing.assert_allclose(places[:, 2], 1.0, atol=0.05)
 
 
-def test_a_scanner_stands_on_both_sides_of_a_partition() -> None:
+def test_a_scanner_stands_on_both_sides_of_a_partition():
     """A room of 12 x 8 m, and across it a wall of 5 m whose only front faces away from y = 0."""
     points, triangles = box(np.array([12.0, 8.0, 3.0]), inwards=True)
     wall = np.array([[3, 4, 0], [8, 4, 0], [8, 4, 3], [3, 4, 3]], np.float32)
@@ -327,7 +327,7 @@ def test_a_scanner_stands_on_both_sides_of_a_partition() -> None:
     assert (places < (12.0, 8.0, 3.0)).all()
 
 
-def test_places_of_a_cloud_have_floor_below_them() -> None:
+def test_places_of_a_cloud_have_floor_below_them():
     """A floor of 4 x 4 m and, 4 m beside it, a wall: nothing is known of what lies between."""
     a, b = (one.ravel() for one in np.meshgrid(np.arange(0.0, 4.0, 0.1), np.arange(0.0, 4.0, 0.1)))
     floor = np.column_stack([a, b, np.zeros(a.size)])
@@ -341,7 +341,7 @@ def test_places_of_a_cloud_have_floor_below_them() -> None:
     np.testing.assert_allclose(places[:, 2], 1.0, atol=0.02)
 
 
-def test_up_may_be_any_axis_and_the_same_views_are_chosen_each_time() -> None:
+def test_up_may_be_any_axis_and_the_same_views_are_chosen_each_time():
     up = np.array([0.0, -1.0, 0.0])
     axes = level_axes(up)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
@@ -361,7 +361,7 @@ def test_up_may_be_any_axis_and_the_same_views_are_chosen_each_time() -> None:
     assert (heights < ROOM[2] - 0.3).all()
 
 
-def test_views_cover_a_furnished_room_from_free_places() -> None:
+def test_views_cover_a_furnished_room_from_free_places():
     scene, _ = room_and_rng(53, 1)
     surface = ReferenceSurface(scene.vertices, scene.faces, np.zeros(3), UP)
     p = replace(depth_parameters(), spacing=0.6)
@@ -377,7 +377,7 @@ def test_views_cover_a_furnished_room_from_free_places() -> None:
     assert others.sum() > 500
 
 
-def _seen(renderer: Renderer, poses: Floats, points: Floats) -> np.ndarray:
+def _seen(renderer, poses, points):
     """Which points some view shows, 3 m away at most."""
     seen = np.zeros(len(points), bool)
     for T in poses:
@@ -391,7 +391,7 @@ def _seen(renderer: Renderer, poses: Floats, points: Floats) -> np.ndarray:
     return seen
 
 
-def test_stray_points_far_away_change_little() -> None:
+def test_stray_points_far_away_change_little():
     cloud, p = cloud_of_room(0.1), replace(depth_parameters(), cell=0.2, spacing=1.0)
     stray = np.array([[5e5, 0, 0], [0, -3e5, 2e5]], np.float32)
     plan = choose_views(replace(cloud, points=np.concatenate([cloud.points, stray])), p)
@@ -401,7 +401,7 @@ def test_stray_points_far_away_change_little() -> None:
     assert (places < ROOM).all()
 
 
-def test_a_surface_without_free_space_has_no_views() -> None:
+def test_a_surface_without_free_space_has_no_views():
     points = np.random.default_rng(9).uniform(0, 0.2, (500, 3)).astype(np.float32)
     plan = choose_views(ReferenceSurface(points, None, np.zeros(3), UP), depth_parameters())
     assert plan.poses.shape == (0, 4, 4)
@@ -411,7 +411,7 @@ def test_a_surface_without_free_space_has_no_views() -> None:
         assert choose_views(empty, depth_parameters()).poses.shape == (0, 4, 4)
 
 
-def test_parameters_follow_the_model() -> None:
+def test_parameters_follow_the_model():
     depth, lidar = (view_parameters(read_model(n).parameters) for n in ("depth", "lidar"))
     assert depth.camera is not None
     assert lidar.camera is None

@@ -14,22 +14,22 @@ from sceneprint.types import Intrinsics, Patches, Surface
 ONES = np.ones((2, 3))
 
 
-def patches(sizes: list[int], coherences: list[float]) -> Patches:
+def patches(sizes, coherences):
     return Patches(ONES, ONES, np.ones(2), np.array(sizes, np.int32), np.array(coherences))
 
 
-def test_by_hand() -> None:
+def test_by_hand():
     # sqrt(4) * 1^3 = 2 and sqrt(36) * 0.5^3 = 0.75, over their mean of 1.375
     weights = patch_weights(patches([4, 36], [1.0, 0.5]), WeightParameters(0.5, 3.0))
     np.testing.assert_allclose(weights, [2 / 1.375, 0.75 / 1.375], rtol=1e-12)
 
 
-def test_exponents_of_zero_give_the_papers_equal_pairs() -> None:
+def test_exponents_of_zero_give_the_papers_equal_pairs():
     weights = patch_weights(patches([4, 36], [1.0, 0.5]), WeightParameters(0.0, 0.0))
     np.testing.assert_array_equal(weights, [1.0, 1.0])
 
 
-def test_coherence_is_the_length_of_the_mean_normal() -> None:
+def test_coherence_is_the_length_of_the_mean_normal():
     """Patch 0 is flat; patch 1 has normals 90 degrees apart, seen over areas of 3 and 1."""
     normals = np.array([[[0, 0, -1], [0, 0, -1], [0, 0, -1], [1, 0, 0]]], np.float32)
     surface = Surface(
