@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.engine.products.product import Products
 from sceneprint.engine.search import local_index
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.formats.dataset import decode_frame, write_depth_png
 from sceneprint.geometry.signature.fisher_vector import Whitening
-from sceneprint.models import Model
-from sceneprint.pipeline import Signature, Signer, open_signer, prepare
+from sceneprint.pipeline import open_signer, prepare
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
 from sceneprint.store.tables import events, jobs
-from sceneprint.types import DepthFrame, Floats, Geometry
+from sceneprint.types import DepthFrame, Floats
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
-from sceneprint_lab.synth import SynthRoom
 from tests.whole_engine import Engine
 
 
@@ -43,22 +38,21 @@ class Upload:
 class Between:
     """A deadline that is never reached, with a callback at each check."""
 
-    def __init__(self, do: Callable[[], object]) -> None:
+    def __init__(self, do):
         self._do = do
 
-    def __call__(self) -> bool:
+    def __call__(self):
         self._do()
         return False
 
 
 @pytest.fixture(scope="session")
-def make_upload(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Upload]:
+def make_upload(tmp_path_factory):
     path = tmp_path_factory.mktemp("upload") / "depth.png"
 
-    def make(frame: DepthFrame, room: str, **more: object) -> Upload:
+    def make(frame, room, **more):
         write_depth_png(path, frame.depth, 1000.0)
         data, k, pose = path.read_bytes(), frame.intrinsics, frame.pose
-        assert pose is not None
         camera = CameraIntrinsics(
             width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy
         )
@@ -70,21 +64,19 @@ def make_upload(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Uploa
 
 
 @pytest.fixture(scope="session")
-def uploads(
-    make_upload: Callable[..., Upload], room_views: Callable[..., SynthRoom]
-) -> tuple[Upload, ...]:
+def uploads(make_upload, room_views):
     """Six views along a path in each of two rooms."""
     rooms = [room_views(21, i, 6, along_path=True) for i in range(2)]
     return tuple(make_upload(frame, room.name) for room in rooms for frame in room.frames)
 
 
 @pytest.fixture(scope="session")
-def signer() -> Signer:
+def signer():
     return open_signer("depth")
 
 
 @pytest.fixture(scope="session")
-def whitened_model(small_model: Model) -> Model:
+def whitened_model(small_model):
     """The small model with whitened signatures of 64 bytes, which are compared by L2."""
     axes = np.random.default_rng(1).integers(-127, 128, (64, small_model.signature_bytes))
     ones = np.ones(64)
@@ -97,18 +89,18 @@ def whitened_model(small_model: Model) -> Model:
 
 
 @pytest.fixture(scope="session")
-def prepared(uploads: tuple[Upload, ...], signer: Signer) -> list[tuple[Signature, Geometry]]:
+def prepared(uploads, signer):
     """The library's signatures of the uploads, with decoded artifacts."""
     made = [prepare(each.frame, signer) for each in uploads]
     return [(signature, read_geometry(write_geometry(seen))) for signature, seen in made]
 
 
 @pytest.fixture
-def make_engine(tmp_path: Path) -> Iterator[Callable[..., Engine]]:
+def make_engine(tmp_path):
     """A function that opens engines on a data folder; all are closed after the test."""
     opened: list[Engine] = []
 
-    def make(folder: Path = tmp_path / "data", **more: object) -> Engine:
+    def make(folder=tmp_path / "data", **more):
         opened.append(Engine(Settings.model_validate({"data_dir": folder} | more)))
         return opened[-1]
 
@@ -118,10 +110,10 @@ def make_engine(tmp_path: Path) -> Iterator[Callable[..., Engine]]:
 
 
 @pytest.fixture(scope="session")
-def work_off() -> Callable[[Engine], list[JobState | None]]:
+def work_off():
     """A function that runs all due jobs and returns their states."""
 
-    def work(engine: Engine) -> list[JobState | None]:
+    def work(engine):
         states = []
         while (claimed := engine.claim("w")) is not None:
             states.append(engine.run(claimed))
@@ -131,13 +123,10 @@ def work_off() -> Callable[[Engine], list[JobState | None]]:
 
 
 @pytest.fixture(scope="session")
-def signed_folder(
-    once: Callable[[str, Callable[[Path], object]], Path], uploads: tuple[Upload, ...],
-    work_off: Callable[[Engine], list[JobState | None]],
-) -> Path:  # fmt: skip
+def signed_folder(once, uploads, work_off):
     """A read-only data folder of all processes, whose map `hall` has all signed uploads."""
 
-    def make(folder: Path) -> None:
+    def make(folder):
         with Engine(Settings(data_dir=folder)) as engine:
             engine.create_map(NewMap(name="hall", model="depth"))
             for each in uploads:
@@ -148,25 +137,25 @@ def signed_folder(
 
 
 @pytest.fixture
-def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
+def _always_look(monkeypatch):
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
 
 
 @pytest.fixture
-def data(signed_folder: Path, tmp_path: Path) -> Path:
+def data(signed_folder, tmp_path):
     """A writable copy of `signed_folder`."""
     return Path(shutil.copytree(signed_folder, tmp_path / "data"))
 
 
 @pytest.fixture
-def full(data: Path, make_engine: Callable[..., Engine]) -> Engine:
+def full(data, make_engine):
     """An engine on a copy of `signed_folder`."""
     del data
     return make_engine()
 
 
 @pytest.fixture
-def empty(make_engine: Callable[..., Engine]) -> Engine:
+def empty(make_engine):
     """An engine with the empty map `hall`."""
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="depth"))
@@ -174,10 +163,10 @@ def empty(make_engine: Callable[..., Engine]) -> Engine:
 
 
 @pytest.fixture(scope="session")
-def put_back() -> Callable[[Path, Path], None]:
+def put_back():
     """A function that restores an open data folder from a copy, except its indexes."""
 
-    def put(copy: Path, data: Path) -> None:
+    def put(copy, data):
         shutil.rmtree(copy / "index", ignore_errors=True)
         (data / "index").rename(copy / "index")
         shutil.rmtree(data)
@@ -187,16 +176,16 @@ def put_back() -> Callable[[Path, Path], None]:
 
 
 @pytest.fixture(scope="session")
-def ids() -> Callable[[Engine], list[str]]:
+def ids():
     """A function that returns the ids of the frames of `hall` in order of arrival."""
     return lambda engine: [frame.frame_id for frame in engine.list_frames("hall").items]
 
 
 @pytest.fixture(scope="session")
-def told() -> Callable[[Engine], list[str]]:
+def told():
     """A function that returns the kinds of all events in order."""
 
-    def tell(engine: Engine) -> list[str]:
+    def tell(engine):
         number_events(engine.store.database)
         with engine.store.database.read() as connection:
             return list(
@@ -207,10 +196,10 @@ def told() -> Callable[[Engine], list[str]]:
 
 
 @pytest.fixture(scope="session")
-def due_now() -> Callable[..., None]:
+def due_now():
     """A function that makes all jobs due, by ending leases and delays."""
 
-    def turn(engine: Engine) -> None:
+    def turn(engine):
         with engine.store.database.write() as connection:
             connection.execute(update(jobs).values(run_after=0.0))
             running = jobs.c.leased_until.is_not(None)
@@ -220,13 +209,13 @@ def due_now() -> Callable[..., None]:
 
 
 @pytest.fixture(scope="session")
-def each_slice_lost_once(due_now: Callable[[Engine], None]) -> Callable[..., int]:
+def each_slice_lost_once(due_now):
     """A function that runs a product's job in steps, with a worker that dies after each one.
 
     It returns the number of slices.
     """
 
-    def work(engine: Engine, products: Products[Any, Any], job_id: str) -> int:
+    def work(engine, products, job_id):
         slices = 0
         while not products.get("hall", job_id).state.over:
             lost = engine.claim("dies")
@@ -241,7 +230,6 @@ def each_slice_lost_once(due_now: Callable[[Engine], None]) -> Callable[..., int
             engine.jobs._tasks._store_result(again, second)
             slices += 1
             progress = products.get("hall", job_id).progress
-            assert progress is not None
             assert progress.done == min(slices, progress.total or 0)
         return slices
 

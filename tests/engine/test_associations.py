@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,16 +23,14 @@ from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import PathFrame
 from sceneprint.store.parent_joins import ParentJoin, join_parent, posed_runs
 from sceneprint.store.tables import events, frames, job_items, jobs
-from sceneprint.types import Floats
 from sceneprint_client.api import Filter, JobState, NewMap
-from sceneprint_client.api.sessions import Association, NewAssociation
-from sceneprint_lab.synth import SynthRoom
+from sceneprint_client.api.sessions import NewAssociation
 from tests.whole_engine import Engine
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 
 
-def origin(seed: int) -> Floats:
+def origin(seed):
     rng = np.random.default_rng(seed)
     u, _, vt = np.linalg.svd(rng.normal(size=(3, 3)))
     T = np.eye(4)
@@ -48,10 +43,7 @@ ORIGINS = {"ann/a": origin(1), "bob/b": origin(2)}
 
 
 @pytest.fixture(scope="session")
-def two_runs(
-    tmp_path_factory: pytest.TempPathFactory, make_upload: Callable[..., Any],
-    work_off: Callable[[Engine], list[JobState | None]], room_views: Callable[..., SynthRoom],
-) -> Path:  # fmt: skip
+def two_runs(tmp_path_factory, make_upload, work_off, room_views):
     """A map `hall`: even frames of a path are ann's run a, odd ones bob's run b."""
     folder = tmp_path_factory.mktemp("runs") / "data"
     room = room_views(21, 0, 12, along_path=True)
@@ -71,19 +63,19 @@ def two_runs(
 
 
 @pytest.fixture
-def engine(two_runs: Path, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+def engine(two_runs, tmp_path, make_engine):
     shutil.copytree(two_runs, tmp_path / "data")
     return make_engine()
 
 
-def done(engine: Engine, work_off: Callable[[Engine], Any], **asked: Any) -> Association:
+def done(engine, work_off, **asked):
     begun = engine.associations.begin("hall", NewAssociation.model_validate(asked))
     assert begun.state is JobState.QUEUED
     work_off(engine)
     return engine.associations.get("hall", begun.job_id)
 
 
-def stored(engine: Engine, job_id: str) -> list[Any]:
+def stored(engine, job_id):
     """Everything that a job found."""
     with engine.store.database.read() as connection:
         own = select(jobs.c.number).where(jobs.c.id == job_id).scalar_subquery()
@@ -91,13 +83,11 @@ def stored(engine: Engine, job_id: str) -> list[Any]:
         return list(connection.execute(asked.order_by(job_items.c.number)).scalars())
 
 
-def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+def test_two_robots_maps_are_joined(engine, work_off):
     told = done(engine, work_off, sessions=["a", "b"])
     assert told.state is JobState.SUCCEEDED
-    assert told.progress is not None
     assert (told.progress.done, told.progress.total) == (6, 6)
     result = told.result
-    assert result is not None
     assert result.frames == 6
     assert result.edges >= 12
     assert (result.consistent, result.inconsistent, result.unchecked) == (result.edges, 0, 0)
@@ -109,7 +99,6 @@ def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine],
     with engine.store.database.read() as connection:
         assert {one.parent for one in posed_runs(connection, 1)} == {"ann/a", "bob/b"}
     assert "all within 0.0" in join.reason
-    assert join.transform is not None
     told_between = (join.transform.parent_frame, join.transform.child_frame)
     assert told_between == ("bob/b", "ann/a")
     # x_b = T_b_room T_room_a x_a
@@ -125,10 +114,8 @@ def test_two_robots_maps_are_joined(engine: Engine, work_off: Callable[[Engine],
     assert data["edges"] == result.edges
 
 
-def test_parent_frames_are_associated_unasked(
-    engine: Engine, work_off: Callable[[Engine], Any]
-) -> None:
-    def look(*, auto: bool = True) -> list[NewAssociation]:
+def test_parent_frames_are_associated_unasked(engine, work_off):
+    def look(*, auto=True):
         """What a process asks for that looks for the first time."""
         before = {one.job_id for one in engine.associations.list_all("hall").items}
         joins = {"join_sessions": "auto" if auto else "on_request"}
@@ -161,13 +148,12 @@ def test_parent_frames_are_associated_unasked(
     assert look() == []
 
 
-def pose_of(engine: Engine, frame_id: str) -> Floats:
+def pose_of(engine, frame_id):
     pose = engine.get_frame("hall", frame_id).pose
-    assert pose is not None
     return np.array(pose.matrix)
 
 
-def test_edges_hold_against_the_truth(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+def test_edges_hold_against_the_truth(engine, work_off):
     told = done(engine, work_off, sessions=["a", "b"], k=2)
     edges = engine.associations.edges("hall", told.job_id).items
     assert [edge.number for edge in edges] == list(range(len(edges)))
@@ -187,7 +173,7 @@ def test_edges_hold_against_the_truth(engine: Engine, work_off: Callable[[Engine
     assert max(counted) == 2
 
 
-def test_pages_and_filters_of_edges(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+def test_pages_and_filters_of_edges(engine, work_off):
     name = done(engine, work_off, sessions=["a", "b"]).job_id
     every = engine.associations.edges("hall", name).items
     found, cursor = [], None
@@ -211,8 +197,8 @@ def test_pages_and_filters_of_edges(engine: Engine, work_off: Callable[[Engine],
 
 
 def test_a_slice_that_was_lost_is_done_again_with_the_same_edges(
-    engine: Engine, work_off: Callable[[Engine], Any], each_slice_lost_once: Callable[..., int]
-) -> None:
+    engine, work_off, each_slice_lost_once
+):
     whole = done(engine, work_off, sessions=["a", "b"])
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     assert each_slice_lost_once(engine, engine.associations, begun.job_id) == 7  # one concludes
@@ -221,9 +207,7 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_edges(
     assert stored(engine, told.job_id) == stored(engine, whole.job_id)
 
 
-def concluded(
-    here: list[float], there: list[float], off: dict[int, float], scale: float = 1.0
-) -> tuple[list[bool | None], dict[str, int], list[dict[str, Any]]]:
+def concluded(here, there, off, scale=1.0):
     """Edges of the frames of two runs at some metres along a line, in their order; `off` by so
     many metres.
     """
@@ -249,7 +233,7 @@ def concluded(
     return [one["consistent"] for one in told], counts, joins
 
 
-def test_an_edge_needs_a_second_one_from_elsewhere() -> None:
+def test_an_edge_needs_a_second_one_from_elsewhere():
     # a robot that stands still: all agree, and nothing supports them
     told, counts, (join,) = concluded([0.0, 0.02, 0.04], [0.0, 0.01, 0.02], {})
     assert told == [None, None, None]
@@ -265,7 +249,7 @@ def test_an_edge_needs_a_second_one_from_elsewhere() -> None:
     assert counts == {"consistent": 0, "inconsistent": 1, "unchecked": 1}
 
 
-def test_the_join_supports_edges_that_no_loop_reaches() -> None:
+def test_the_join_supports_edges_that_no_loop_reaches():
     far = [0.0, 3.0, 6.0, 9.0, 12.0]
     told, counts, (join,) = concluded(far, far, {3: 2.0})
     assert join["support"] == 4
@@ -276,9 +260,7 @@ def test_the_join_supports_edges_that_no_loop_reaches() -> None:
     assert concluded(far[:2], far[:2], {}, 5.0)[0] == [True, True]
 
 
-def test_loop_closures_are_with_frames_long_before(
-    engine: Engine, work_off: Callable[[Engine], Any]
-) -> None:
+def test_loop_closures_are_with_frames_long_before(engine, work_off):
     order = [frame.frame_id for frame in engine.list_frames("hall").items if frame.session == "a"]
     told = done(engine, work_off, sessions=["a"], apart=2)
     pairs = [
@@ -287,7 +269,6 @@ def test_loop_closures_are_with_frames_long_before(
     ]
     assert pairs
     assert min(i - j for i, j in pairs) == 2
-    assert told.result is not None
     assert told.result.joins == []
     # frames are two seconds apart: more than 4 s are three of them
     timed = done(engine, work_off, sessions=["a"], not_within_s=4.0)
@@ -297,14 +278,13 @@ def test_loop_closures_are_with_frames_long_before(
     ]
     assert min(i - j for i, j in pairs) == 3
     none = done(engine, work_off, sessions=["a"])  # 100 apart, and there are six
-    assert none.result is not None
     assert (none.result.edges, none.result.frames, none.result.validated) == (0, 6, 0)
 
 
 @pytest.mark.parametrize("sessions", [["a", "b"], ["b", "a"]])
 def test_graphs(
-    engine: Engine, work_off: Callable[[Engine], Any], sessions: list[str]
-) -> None:  # the frame of ann is that of the graph, whichever way the join leads
+    engine, work_off, sessions
+):  # the frame of ann is that of the graph, whichever way the join leads
     name = done(engine, work_off, sessions=sessions).job_id
     whole = json.loads(engine.associations.graph("hall", name, "json", odometry=True))
     edges = len(engine.associations.edges("hall", name).items)
@@ -332,7 +312,7 @@ def test_graphs(
     np.testing.assert_allclose([row[1:4] for row in rows], in_time[:, :3, 3], atol=1e-9)
 
 
-def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]) -> None:
+def test_deleted_frames_vanish(engine, work_off):
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     handler = engine.associations.run_slice
     task = engine.claim("w")
@@ -349,7 +329,6 @@ def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]
         engine.associations.graph("hall", name)
     work_off(engine)
     told = engine.associations.get("hall", name)
-    assert told.result is not None
     assert told.result.skipped == 1
     gone = {later[3], before[0].to_frame}
     edges = engine.associations.edges("hall", name).items
@@ -360,7 +339,7 @@ def test_deleted_frames_vanish(engine: Engine, work_off: Callable[[Engine], Any]
     assert not gone & {vertex["frame_id"] for vertex in whole["vertices"]}
 
 
-def test_a_job_that_is_removed_while_a_worker_runs_it_leaves_nothing(engine: Engine) -> None:
+def test_a_job_that_is_removed_while_a_worker_runs_it_leaves_nothing(engine):
     begun = engine.associations.begin("hall", NewAssociation(sessions=["b"]))
     task = engine.claim("w")
     assert isinstance(task, LongJob)
@@ -381,33 +360,27 @@ def test_a_job_that_is_removed_while_a_worker_runs_it_leaves_nothing(engine: Eng
         ({"sessions": ["a"], "filter": Filter(robot=["bob"])}, "no indexed frame"),
     ],
 )
-def test_what_cannot_be_associated(engine: Engine, asked: dict[str, Any], words: str) -> None:
+def test_what_cannot_be_associated(engine, asked, words):
     with pytest.raises(InvalidRequest, match=words):
         engine.associations.begin("hall", NewAssociation(**asked))
 
 
-def test_a_session_of_two_robots_needs_a_name(
-    engine: Engine, work_off: Callable[[Engine], Any]
-) -> None:
+def test_a_session_of_two_robots_needs_a_name(engine, work_off):
     with engine.store.database.write() as connection:
         connection.execute(update(frames).values(session="same"))
     with pytest.raises(InvalidRequest, match="several robots: 'ann, bob'"):
         engine.associations.begin("hall", NewAssociation(sessions=["same"]))
     told = done(engine, work_off, sessions=["same", "same"], robots=["ann", "bob"], k=1)
-    assert told.result is not None
     (join,) = told.result.joins
     assert (join.from_robot, join.to_robot, join.from_session) == ("ann", "bob", "same")
 
 
-def test_too_many_frames_are_refused_in_words(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_frames_are_refused_in_words(engine, monkeypatch):
     monkeypatch.setattr(associations, "MOST_FRAMES", 8)
     with pytest.raises(InvalidRequest, match="12 frames, but an association can have at most 8"):
         engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     late = Filter(captured_after=BEGIN + timedelta(seconds=4))
     begun = engine.associations.begin("hall", NewAssociation(sessions=["a", "b"], filter=late))
-    assert begun.progress is not None
     assert begun.progress.total == 4
 
 
@@ -422,13 +395,13 @@ def test_too_many_frames_are_refused_in_words(
         ({"sessions": ["a"], "k": 11}, "less than or equal to 10"),
     ],
 )
-def test_what_makes_no_sense(asked: dict[str, Any], words: str) -> None:
+def test_what_makes_no_sense(asked, words):
     with pytest.raises(ValueError, match=words):
         NewAssociation.model_validate(asked)
     assert NewAssociation(sessions=["a", "a"], robots=["ann", "bob"])
 
 
-def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine: Engine) -> None:
+def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine):
     engine.associations.begin("hall", NewAssociation(sessions=["a", "b"]))
     task = engine.claim("w")
     assert isinstance(task, LongJob)

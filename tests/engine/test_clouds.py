@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,19 +19,16 @@ from sceneprint.geometry.validation.acceptance import Evidence, belief, objectio
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.pipeline import open_signer, sign
 from sceneprint.store.tables import frames
-from sceneprint.types import DepthFrame, Floats
 from sceneprint_client.api import FrameMeta, JobState, Query
 from sceneprint_client.api.query import ValidationOptions
 from sceneprint_client.api.surface import NewReconstruction
-from tests.whole_engine import Engine
 
-WorkOff = Callable[[Engine], list[JobState | None]]
 #: Where clouds were seen from, metres in their own coordinates.
 VIEWPOINT = np.array((2.0, -1.0, 0.5))
 HERE = LocalDecoders(1)
 
 
-def points_of(frame: DepthFrame) -> Floats:
+def points_of(frame):
     """What a depth image sees, in its optical frame."""
     depth, k = frame.depth[::2, ::2].astype(float), frame.intrinsics
     y, x = np.nonzero(depth)
@@ -42,42 +37,42 @@ def points_of(frame: DepthFrame) -> Floats:
     return points.astype(np.float32).astype(float)
 
 
-def kitti(points: Floats) -> bytes:
+def kitti(points):
     rows = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
     return rows.astype("<f4").tobytes()
 
 
-def said(**more: Any) -> FrameMeta:
+def said(**more):
     return FrameMeta.model_validate(more)
 
 
-def vector(engine: Engine, frame_id: str) -> bytes:
+def vector(engine, frame_id):
     return engine.outputs.vector("hall", frame_id).make()
 
 
-def lose(engine: Engine, frame_id: str) -> None:
+def lose(engine, frame_id):
     """Remove the upload of a frame from the disk."""
     with engine.store.database.read() as connection:
         asked = select(frames.c.blob).where(frames.c.id == frame_id)
         engine.store.blobs.path(connection.execute(asked).scalar_one()).unlink()
 
 
-def test_what_could_not_be_read_again_is_not_let_in() -> None:
+def test_what_could_not_be_read_again_is_not_let_in():
     """A format that only its caller knows is lost with him."""
     odd = write_ply(np.eye(3)[np.arange(12) % 3]).replace(b"ply\n", b"ply\t\n", 1)
     with pytest.raises(UnreadableCloud, match="does not have the magic bytes"):
         read_upload(odd, said(format="ply"), HERE)
 
 
-def test_minus_nought_is_no_other_viewpoint() -> None:
+def test_minus_nought_is_no_other_viewpoint():
     data = write_ply(np.eye(3)[np.arange(12) % 3])
     mine = read_upload(data, said(viewpoint={"x": -0.0, "y": 0, "z": -0.0}), HERE)
     assert content_id(mine) == content_id(read_upload(data, said(), HERE))
 
 
 def test_a_lost_cloud_comes_again_packed_otherwise_and_is_signed_with_another_model(
-    empty: Engine, uploads: Any, work_off: WorkOff
-) -> None:
+    empty, uploads, work_off
+):
     points = points_of(uploads[0].frame)
     place = dict(zip("xyz", VIEWPOINT, strict=True))
     sent = (1000.0 * (points + VIEWPOINT)).astype(np.float32).astype(float)
@@ -102,7 +97,7 @@ def test_a_lost_cloud_comes_again_packed_otherwise_and_is_signed_with_another_mo
         assert vector(empty, one) == sign(frame, signer).vector.tobytes()
 
 
-def test_what_a_caller_asks_of_matches_is_asked_without_free_space_too() -> None:
+def test_what_a_caller_asks_of_matches_is_asked_without_free_space_too():
     blind = Evidence(0.0, 0.0, overlap=0.5, plane_overlap=0.5, violations=None, stiffness=1.0)
     usual = ValidationParameters()
     assert objection(blind, thresholds(None, usual)[0].acceptance, "full") is None
@@ -111,16 +106,13 @@ def test_what_a_caller_asks_of_matches_is_asked_without_free_space_too() -> None
     ):  # fmt: skip
         p, mode = thresholds(ValidationOptions.model_validate(asked), usual)
         found = objection(blind, p.acceptance, mode)
-        assert found is not None
         assert why in found[1]
     p, _ = thresholds(ValidationOptions(ambiguous_share=0.1), usual)
     assert belief(blind, 0.1, usual.acceptance)[0] == "accepted"
     assert belief(blind, 0.1, p.acceptance)[0] == "ambiguous"
 
 
-def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(
-    empty: Engine, uploads: Any, work_off: WorkOff
-) -> None:
+def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(empty, uploads, work_off):
     points = write_ply(points_of(uploads[0].frame))
     frame_id = empty.add_frame("hall", points, said(viewpoint=None))[0].frame_id
     image_id = empty.add_frame("hall", uploads[1].data, uploads[1].meta)[0].frame_id
@@ -134,7 +126,6 @@ def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(
     told = {one.frame_id: one.reason for one in answer.explanations or ()}
     assert "violations unknown" in told[frame_id]
     details = empty.inspection.match(answer.query_id, frame_id)
-    assert details.query is not None
     assert details.query.violations == []
     assert len(details.query.inliers) > 100
     for colour in ("source", "normal", "residual"):
@@ -145,8 +136,8 @@ def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(
 
 @pytest.mark.usefixtures("with_open3d")
 def test_a_cloud_that_cannot_be_unpacked_here_costs_no_reconstruction(
-    empty: Engine, uploads: Any, work_off: WorkOff, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    empty, uploads, work_off, monkeypatch
+):
     """It would not be fused anyway, so nobody needs to read it."""
     laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=0, version="1.2")

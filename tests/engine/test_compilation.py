@@ -26,12 +26,12 @@ SLOW, FAILING = "import time; time.sleep(60)", "raise SystemExit(3)"
 
 
 @pytest.fixture
-def told_to(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
+def told_to(monkeypatch):
     """Has every part missing, and the first argument run in place of what compiles it."""
     started: list[subprocess.Popen[bytes]] = []
     begin = subprocess.Popen
 
-    def instead(command: list[str], **given: object) -> subprocess.Popen[bytes]:
+    def instead(command, **given):
         program = SLOW if command[4] == "slow" else FAILING
         started.append(begin([sys.executable, "-c", program]))
         return started[-1]
@@ -41,9 +41,7 @@ def told_to(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
     return started
 
 
-def test_who_is_told_to_stop_leaves_no_process(
-    told_to: list[subprocess.Popen[bytes]],
-) -> None:
+def test_who_is_told_to_stop_leaves_no_process(told_to):
     stop, said = threading.Event(), list[str]()
     threading.Timer(0.3, stop.set).start()
     compile_kernels(Path("slow"), DEPTH, said.append, stop)
@@ -51,9 +49,7 @@ def test_who_is_told_to_stop_leaves_no_process(
     assert len(said) == 1  # nothing is finished
 
 
-def test_a_process_that_fails_is_told_of_and_costs_no_more(
-    told_to: list[subprocess.Popen[bytes]],
-) -> None:
+def test_a_process_that_fails_is_told_of_and_costs_no_more(told_to):
     said: list[str] = []
     compile_kernels(Path("failing"), ALL, said.append)
     assert len(told_to) == 3
@@ -71,9 +67,7 @@ def test_a_process_that_fails_is_told_of_and_costs_no_more(
         ("nehalem", ("nehalem", None)),
     ],
 )
-def test_code_is_for_all_processors_unless_one_is_named(
-    monkeypatch: pytest.MonkeyPatch, named: str | None, expected: tuple[str, str | None]
-) -> None:
+def test_code_is_for_all_processors_unless_one_is_named(monkeypatch, named, expected):
     if named is None:
         monkeypatch.delenv("NUMBA_CPU_NAME", raising=False)
     else:
@@ -81,7 +75,7 @@ def test_code_is_for_all_processors_unless_one_is_named(
     monkeypatch.delenv("NUMBA_CPU_FEATURES", raising=False)
     begin, found = subprocess.Popen, []
 
-    def instead(command: list[str], *, env: dict[str, str], **_: object) -> subprocess.Popen[bytes]:
+    def instead(command, *, env, **_):
         found.append((env["NUMBA_CPU_NAME"], env.get("NUMBA_CPU_FEATURES")))
         return begin([sys.executable, "-c", ""])
 
@@ -91,7 +85,7 @@ def test_code_is_for_all_processors_unless_one_is_named(
     assert found == [expected, expected]
 
 
-def test_the_corner_is_what_signing_leaves_of_it() -> None:
+def test_the_corner_is_what_signing_leaves_of_it():
     """Or validation would be compiled for another kind of geometry than it gets."""
     kept = files("sceneprint.engine").joinpath("corner.artifact").read_bytes()
     model = read_model("depth")
@@ -116,9 +110,7 @@ print(sum(sum(one._cache_misses.values()) for one in ours),
 
 
 @pytest.mark.thorough
-def test_whoever_comes_after_compiles_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_whoever_comes_after_compiles_nothing(tmp_path, monkeypatch):
     """But for what both processes compile: each writes the list of it, and one may be lost."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "numba"))
     program = (

@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,12 +25,10 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import events, job_items, jobs
 from sceneprint.types import Floats
 from sceneprint_client.api import JobState, NewMap
-from sceneprint_client.api.coverage import CoverageFrame, MapCoverage, NewMapCoverage
-from sceneprint_lab.synth import SynthRoom
+from sceneprint_client.api.coverage import NewMapCoverage
 from tests.whole_engine import Engine
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
-WorkOff = Callable[[Engine], list[JobState | None]]
 #: How far the room that equals the first one is from it, metres.
 APART_M = 10.0
 
@@ -62,10 +58,7 @@ class Rooms:
 
 
 @pytest.fixture(scope="session")
-def rooms(
-    tmp_path_factory: pytest.TempPathFactory, uploads: Any, make_upload: Callable[..., Any],
-    work_off: WorkOff, room_views: Callable[..., SynthRoom],
-) -> Rooms:  # fmt: skip
+def rooms(tmp_path_factory, uploads, make_upload, work_off, room_views):
     """A map `hall`: five frames of a room in session a, five of a room equal to it in session b,
     and four of another room in session c, a second apart. The first two share a parent frame.
 
@@ -78,7 +71,7 @@ def rooms(
         for name in ("hall", "pair"):
             engine.create_map(NewMap(name=name, model="depth"))
 
-        def add(name: str, frame: Any, room: str, session: str) -> None:
+        def add(name, frame, room, session):
             second = 5 * len(positions) if name == "pair" else len(positions)
             made = make_upload(
                 frame, room, session=session, robot="ann",
@@ -106,29 +99,26 @@ def rooms(
 
 
 @pytest.fixture
-def engine(rooms: Rooms, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+def engine(rooms, tmp_path, make_engine):
     shutil.copytree(rooms.folder, tmp_path / "data")
     return make_engine()
 
 
-def measured(
-    engine: Engine, work_off: WorkOff, map_name: str = "hall", **asked: Any
-) -> MapCoverage:
+def measured(engine, work_off, map_name="hall", **asked):
     begun = engine.coverage.begin(map_name, NewMapCoverage.model_validate(asked))
     assert begun.state is JobState.QUEUED
     assert work_off(engine)[-1] is JobState.SUCCEEDED
     return engine.coverage.get(map_name, begun.job_id)
 
 
-def frames_of(engine: Engine, told: MapCoverage) -> list[CoverageFrame]:
+def frames_of(engine, told):
     return engine.coverage.frames(told.map, told.job_id).items
 
 
-def test_equal_rooms_are_ambiguous_and_linked(engine: Engine, rooms: Rooms) -> None:
+def test_equal_rooms_are_ambiguous_and_linked(engine, rooms):
     told = engine.coverage.get("hall", rooms.whole)
     assert told.state is JobState.SUCCEEDED
     result = told.result
-    assert result is not None
     assert (result.frames, result.skipped, result.map_frames) == (14, 0, 14)
     assert (result.found, result.ambiguous, result.wrong, result.not_found) == (4, 10, 0, 0)
     assert (result.unchecked, result.revision, result.last_revision) == (0, 14, 14)
@@ -155,9 +145,8 @@ def test_equal_rooms_are_ambiguous_and_linked(engine: Engine, rooms: Rooms) -> N
     assert data == result.model_dump(mode="json")
 
 
-def test_cells_count_the_frames_taken_in_them(engine: Engine, rooms: Rooms) -> None:
+def test_cells_count_the_frames_taken_in_them(engine, rooms):
     plans = engine.coverage.get("hall", rooms.whole).plans
-    assert plans is not None
     assert [plan.parent_frame for plan in plans] == list(rooms.parents)
     assert {plan.up_from for plan in plans} == {"cameras"}
     for plan, positions in zip(plans, (rooms.positions[:10], rooms.positions[10:]), strict=True):
@@ -169,13 +158,10 @@ def test_cells_count_the_frames_taken_in_them(engine: Engine, rooms: Rooms) -> N
         assert {place: getattr(cell, outcome) for place, cell in cells.items()} == expected
 
 
-def test_an_answer_in_another_parent_frame_is_not_checked(
-    engine: Engine, work_off: WorkOff, rooms: Rooms
-) -> None:
+def test_an_answer_in_another_parent_frame_is_not_checked(engine, work_off, rooms):
     mine = [one for one in engine.list_frames("hall").items if one.session == "c"]
     edit_frame(engine.store, "hall", mine[0].frame_id, {"pose": {"parent_frame": "elsewhere"}})
     told = measured(engine, work_off, session="c", not_within_s=0.0)
-    assert told.result is not None
     assert (told.result.frames, told.result.found, told.result.unchecked) == (4, 3, 1)
     assert told.plans is not None
     of_parent = {one.parent_frame: one.cells for one in told.plans}
@@ -183,11 +169,8 @@ def test_an_answer_in_another_parent_frame_is_not_checked(
     assert sum(one.unchecked for one in of_parent["elsewhere"]) == 1
 
 
-def test_only_another_session_of_an_equal_room_gives_wrong_poses(
-    engine: Engine, work_off: WorkOff, rooms: Rooms
-) -> None:
+def test_only_another_session_of_an_equal_room_gives_wrong_poses(engine, work_off, rooms):
     told = engine.coverage.get("hall", rooms.later_day)
-    assert told.result is not None
     assert (told.result.frames, told.result.wrong) == (5, 5)
     frames = frames_of(engine, told)
     by_id = {one.frame_id: one for one in engine.list_frames("hall").items}
@@ -203,31 +186,26 @@ def test_only_another_session_of_an_equal_room_gives_wrong_poses(
     assert rest.items == frames[3:]
     assert engine.coverage.frames("hall", told.job_id, outcome="found").items == []
     wide = measured(engine, work_off, **LATER_DAY, every=5, tolerance_m=APART_M + 1)
-    assert wide.result is not None
     assert (wide.result.frames, wide.result.found) == (1, 1)
 
 
-def test_a_duplicate_is_left_out_with_the_frames_around_it(
-    engine: Engine, work_off: WorkOff
-) -> None:
+def test_a_duplicate_is_left_out_with_the_frames_around_it(engine, work_off):
     """Two frames of one place, five seconds apart: each finds the other, unless it is left out."""
     near = measured(engine, work_off, "pair", not_within_s=0.0)
-    assert near.result is not None
     assert (near.result.frames, near.result.found) == (2, 2)
     for left_out in ({"not_within_s": 4.9}, {"not_within_s": 5.1}, {"other_sessions": True}):
         told = measured(engine, work_off, "pair", **left_out)
-        assert told.result is not None
         kept = left_out == {"not_within_s": 4.9}
         assert (told.result.found, told.result.not_found) == ((2, 0) if kept else (0, 2))
         if not kept:
             assert {frame.cause for frame in frames_of(engine, told)} == {"no_frames"}
 
 
-def test_every_nth_frame_and_at_most_so_many(engine: Engine) -> None:
+def test_every_nth_frame_and_at_most_so_many(engine):
     frames = [(one.session, one.frame_id) for one in engine.list_frames("hall").items]
     order = [frame_id for _, frame_id in sorted(frames, key=lambda one: one[0] or "")]
 
-    def chosen(**asked: Any) -> list[str]:
+    def chosen(**asked):
         with engine.store.database.read() as connection:
             row = find_map(connection, "hall")
             numbers = frames_to_query(connection, row, NewMapCoverage.model_validate(asked))
@@ -241,12 +219,12 @@ def test_every_nth_frame_and_at_most_so_many(engine: Engine) -> None:
     assert chosen(every=2, most=100) == order[::2]
 
 
-def at_once() -> bool:
+def at_once():
     """The end of a slice after its first step."""
     return True
 
 
-def stored(engine: Engine, job_id: str) -> list[Any]:
+def stored(engine, job_id):
     with engine.store.database.read() as connection:
         own = select(jobs.c.number).where(jobs.c.id == job_id).scalar_subquery()
         asked = select(job_items.c.data).where(job_items.c.job_number == own)
@@ -254,8 +232,8 @@ def stored(engine: Engine, job_id: str) -> list[Any]:
 
 
 def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
-    engine: Engine, work_off: WorkOff, each_slice_lost_once: Callable[..., int]
-) -> None:
+    engine, work_off, each_slice_lost_once
+):
     asked = {"every": 5, "not_within_s": 0.0}  # a frame of each room
     whole = measured(engine, work_off, **asked)
     begun = engine.coverage.begin("hall", NewMapCoverage.model_validate(asked))
@@ -265,9 +243,7 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
     assert stored(engine, told.job_id) == stored(engine, whole.job_id)
 
 
-def test_an_upload_goes_before_the_next_slice(
-    engine: Engine, work_off: WorkOff, uploads: Any
-) -> None:
+def test_an_upload_goes_before_the_next_slice(engine, work_off, uploads):
     engine.coverage.begin("hall", NewMapCoverage(session="c"))
     handler = engine.coverage.run_slice
     task = engine.claim("w")
@@ -280,7 +256,7 @@ def test_an_upload_goes_before_the_next_slice(
     assert isinstance(engine.claim("w"), LongJob)
 
 
-def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, rooms: Rooms) -> None:
+def test_cells_that_became_better_are_told(engine, work_off, rooms):
     how = WHOLE | {"session": "a"}
     before = measured(engine, work_off, **how)
     for frame in engine.list_frames("hall").items:
@@ -314,9 +290,7 @@ def test_cells_that_became_better_are_told(engine: Engine, work_off: WorkOff, ro
             engine.coverage.changes("hall", other, before.job_id)
 
 
-def test_what_cannot_be_measured_is_refused(
-    engine: Engine, work_off: WorkOff, rooms: Rooms
-) -> None:
+def test_what_cannot_be_measured_is_refused(engine, work_off, rooms):
     with pytest.raises(UnknownMap):
         engine.coverage.begin("none", NewMapCoverage())
     with pytest.raises(InvalidRequest, match="no indexed frame of session 'z'"):
@@ -333,9 +307,7 @@ def test_what_cannot_be_measured_is_refused(
     assert work_off(engine) == []
 
 
-def test_frames_that_went_meanwhile_are_skipped(
-    engine: Engine, work_off: WorkOff, due_now: Callable[[Engine], None]
-) -> None:
+def test_frames_that_went_meanwhile_are_skipped(engine, work_off, due_now):
     begun = engine.coverage.begin("hall", NewMapCoverage(session="c", not_within_s=0.0))
     task = engine.claim("w")
     assert isinstance(task, LongJob)
@@ -346,6 +318,5 @@ def test_frames_that_went_meanwhile_are_skipped(
     due_now(engine)
     work_off(engine)
     told = engine.coverage.get("hall", begun.job_id)
-    assert told.result is not None
     assert (told.result.frames, told.result.skipped, told.result.found) == (3, 1, 3)
     assert told.result.last_revision == told.result.revision + 1

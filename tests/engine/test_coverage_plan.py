@@ -16,27 +16,23 @@ from sceneprint.engine.maps.map_plans import (
     plan_changes,
 )
 from sceneprint.engine.search.up_vectors import PlanAxes, plan_axes, upright
-from sceneprint_client.api.coverage import (
-    CoverageCell,
-    CoverageOutcome,
-    CoveragePlan,
-)
+from sceneprint_client.api.coverage import CoverageCell, CoveragePlan
 
 LEVEL = PlanAxes(np.eye(3)[:2], "map")
 
 
-def cell(column: int, row: int, frames: int = 0, **counts: int) -> CoverageCell:
+def cell(column, row, frames=0, **counts):
     known = {"found": 0, "wrong": 0, "ambiguous": 0, "not_found": 0} | counts
     return CoverageCell(column=column, row=row, frames=frames, **known)
 
 
-def plan(*cells: CoverageCell, parent: str = "map") -> CoveragePlan:
+def plan(*cells, parent="map"):
     return CoveragePlan(
         parent_frame=parent, x_axis=[1, 0, 0], y_axis=[0, 1, 0], up_from="map", cells=list(cells)
     )
 
 
-def queried(*given: tuple[float, float, CoverageOutcome]) -> list[QueriedPosition]:
+def queried(*given):
     return [QueriedPosition(np.array([x, y, 7.0]), outcome) for x, y, outcome in given]
 
 
@@ -49,15 +45,13 @@ def queried(*given: tuple[float, float, CoverageOutcome]) -> list[QueriedPositio
         ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ],
 )
-def test_a_plan_is_seen_from_above(
-    up: tuple[float, ...], right: tuple[float, ...], top: tuple[float, ...]
-) -> None:
+def test_a_plan_is_seen_from_above(up, right, top):
     axes = plan_axes(np.array(up, float))
     np.testing.assert_allclose(axes, [right, top], atol=1e-12)
     np.testing.assert_allclose(np.cross(*axes), up, atol=1e-12)  # and is no mirror image
 
 
-def test_a_tilted_plan_has_level_axes() -> None:
+def test_a_tilted_plan_has_level_axes():
     up = np.array([0.1, -0.2, 0.97])
     up /= np.linalg.norm(up)
     axes = plan_axes(up)
@@ -66,7 +60,7 @@ def test_a_tilted_plan_has_level_axes() -> None:
     assert axes[0, 0] > 0.9
 
 
-def test_sensors_are_held_upright() -> None:
+def test_sensors_are_held_upright():
     camera = np.eye(4)  # x right, y down, z ahead, in a world whose z is up
     camera[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     down = np.eye(4)  # looking at the floor: its -y points ahead
@@ -76,13 +70,13 @@ def test_sensors_are_held_upright() -> None:
     np.testing.assert_array_equal(upright(np.eye(4)[None], [True]), [0, 0, 1])
 
 
-def test_about_twenty_cells_lie_along_a_plan() -> None:
+def test_about_twenty_cells_lie_along_a_plan():
     widths = [cell_width(extent) for extent in (0.0, 4.0, 9.0, 20.0, 41.0, 95.0, 210.0, 1e6)]
     assert widths == [0.25, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 50_000.0]
     assert all(narrow <= wide for narrow, wide in pairwise(widths))
 
 
-def test_frames_are_counted_by_cell() -> None:
+def test_frames_are_counted_by_cell():
     taken = {"map": np.array([[0.1, 0.1, 0.0], [0.9, 0.2, 9.0], [-0.1, 0.1, 0.0], [5.0, 5.0, 0.0]])}
     asked = {
         "map": queried((0.1, 0.1, "found"), (0.9, 0.2, "wrong"), (-0.1, 0.1, "ambiguous")),
@@ -98,7 +92,7 @@ def test_frames_are_counted_by_cell() -> None:
     assert coverage_plans({}, taken, {}, None)[0] == []
 
 
-def test_a_pose_far_beyond_all_sense_has_a_cell() -> None:
+def test_a_pose_far_beyond_all_sense_has_a_cell():
     taken = {"map": np.array([[1e300, 0.0, 0.0], [-1e300, 0.0, 0.0], [0.0, 0.0, 0.0]])}
     asked = {"map": queried((0.0, 0.0, "found"))}
     (one,), cell_m = coverage_plans(asked, taken, {"map": LEVEL}, None)
@@ -106,7 +100,7 @@ def test_a_pose_far_beyond_all_sense_has_a_cell() -> None:
     assert [cell.column for cell in one.cells] == [-(2**52), 0, 2**52]
 
 
-def test_cells_widen_where_there_would_be_too_many() -> None:
+def test_cells_widen_where_there_would_be_too_many():
     side = np.arange(150.0)
     grid = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
     asked = {"map": queried((0.0, 0.0, "found"))}
@@ -116,7 +110,7 @@ def test_cells_widen_where_there_would_be_too_many() -> None:
     assert {cell.frames for cell in one.cells} == {4}
 
 
-def test_two_results_are_compared_cell_by_cell() -> None:
+def test_two_results_are_compared_cell_by_cell():
     before = [
         plan(
             cell(0, 0, 9, found=1, not_found=1), cell(1, 0, 9, found=2), cell(2, 0, 9, ambiguous=3),

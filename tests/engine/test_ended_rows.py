@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import event, insert, select, update
@@ -19,38 +16,35 @@ from sceneprint.store.deletion import DAY_S, maps_with_ended
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, jobs, maps, surface_frames
 from sceneprint_client.api import FrameState, Query
-from tests.whole_engine import Engine
 
-Make = Callable[..., Engine]
-Ids = Callable[[Engine], list[str]]
 DAYS = 7.0
 ALL = Query(stages=("retrieve",), k=50)
 pytestmark = pytest.mark.usefixtures("_always_look")
 
 
-def after(engine: Engine, days: float) -> int:
+def after(engine, days):
     """What retention removes so many days from now."""
     return Retention(engine.store, DAYS).run(time.time() + DAY_S * days)
 
 
-def rows(engine: Engine) -> list[tuple[str, str]]:
+def rows(engine):
     """Id and state of all frames that have a row."""
     with engine.store.database.read() as connection:
         found = connection.execute(select(frames.c.id, frames.c.state).order_by(frames.c.number))
         return [(one[0], one[1]) for one in found]
 
 
-def found(engine: Engine, uploads: Any) -> list[str]:
+def found(engine, uploads):
     answer = engine.queries.upload(["hall"], uploads[2].data, uploads[2].meta, ALL)
     return sorted(match.frame_id for match in answer.matches)
 
 
-def pruned(engine: Engine) -> int:
+def pruned(engine):
     with engine.store.database.read() as connection:
         return find_map(connection, "hall").pruned_revision
 
 
-def ended_ago(engine: Engine, state: FrameState) -> list[float | None]:
+def ended_ago(engine, state):
     """How many seconds ago frames in a state ended."""
     with engine.store.database.read() as connection:
         of = select(frames.c.ended_at).where(frames.c.state == state)
@@ -58,9 +52,7 @@ def ended_ago(engine: Engine, state: FrameState) -> list[float | None]:
     return [None if at is None else time.time() - at for at in ended]
 
 
-def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(
-    full: Engine, ids: Ids
-) -> None:
+def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(full, ids):
     full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
     names, use = ids(full), full.get_map("hall").used_frames
     with full.store.database.read() as connection:
@@ -86,7 +78,7 @@ def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(
     assert after(full, 1000) == 0  # the living stay
 
 
-def test_a_frame_that_can_be_restored_keeps_its_row(full: Engine, ids: Ids) -> None:
+def test_a_frame_that_can_be_restored_keeps_its_row(full, ids):
     name = ids(full)[0]
     full.delete_frame("hall", name)
     assert after(full, 2 * DAYS) == 0
@@ -97,7 +89,7 @@ def test_a_frame_that_can_be_restored_keeps_its_row(full: Engine, ids: Ids) -> N
 
 
 @pytest.mark.parametrize("needed", ["job", "surface"])
-def test_a_row_that_is_needed_stays(full: Engine, ids: Ids, needed: str) -> None:
+def test_a_row_that_is_needed_stays(full, ids, needed):
     full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
     full.delete_frame("hall", ids(full)[0])
     with full.store.database.write() as connection:
@@ -116,9 +108,7 @@ def test_a_row_that_is_needed_stays(full: Engine, ids: Ids, needed: str) -> None
     assert pruned(full) == 0
 
 
-def test_a_redundant_frame_goes_and_is_judged_anew_when_it_comes_again(
-    full: Engine, uploads: Any, work_off: Any
-) -> None:
+def test_a_redundant_frame_goes_and_is_judged_anew_when_it_comes_again(full, uploads, work_off):
     camera = uploads[0].meta.intrinsics.model_copy(update={"cx": uploads[0].meta.intrinsics.cx + 1})
     meta = uploads[0].meta.model_copy(update={"intrinsics": camera})
     first, _ = full.add_frame("hall", uploads[0].data, meta, if_novel=0.9)
@@ -135,9 +125,7 @@ def test_a_redundant_frame_goes_and_is_judged_anew_when_it_comes_again(
 
 
 @pytest.mark.parametrize("tail_frames", [3, 100], ids=["index", "no index"])
-def test_a_reader_that_missed_deletions_begins_anew(
-    data: Path, make_engine: Make, uploads: Any, ids: Ids, tail_frames: int
-) -> None:
+def test_a_reader_that_missed_deletions_begins_anew(data, make_engine, uploads, ids, tail_frames):
     reader, builder = (make_engine(data, unindexed_frames=tail_frames) for _ in range(2))
     assert builder.publish_due() == (tail_frames == 3)
     names = ids(builder)
@@ -152,9 +140,7 @@ def test_a_reader_that_missed_deletions_begins_anew(
         assert engine.view("hall")[2].size == 10
 
 
-def test_an_index_is_published_before_it_would_be_too_old(
-    data: Path, make_engine: Make, uploads: Any, ids: Ids
-) -> None:
+def test_an_index_is_published_before_it_would_be_too_old(data, make_engine, uploads, ids):
     """Of ten thousand frames, one deletion would else be no reason for a year."""
     engine = make_engine(data, unindexed_frames=5, deleted_rows_days=DAYS)
     assert engine.publish_due() == 1
@@ -171,14 +157,11 @@ def test_an_index_is_published_before_it_would_be_too_old(
     assert late.publish_due() == 0
     assert after(late, DAYS) == 1
     version = make_engine(data, unindexed_frames=5).view("hall")[2].version
-    assert version is not None
     assert version.revision == pruned(late)
     assert found(late, uploads) == sorted(set(names) - {names[4]})
 
 
-def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(
-    data: Path, make_engine: Make, ids: Ids
-) -> None:
+def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(data, make_engine, ids):
     """On a node that was off meanwhile: its index is built anew, as nobody knows what went."""
     engine = make_engine(data, unindexed_frames=11)
     assert engine.publish_due() == 1
@@ -197,7 +180,7 @@ def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(
     assert engine.purging.now().indexes == 0
 
 
-def test_rows_that_are_due_are_found_by_an_index(full: Engine, ids: Ids) -> None:
+def test_rows_that_are_due_are_found_by_an_index(full, ids):
     asked: list[str] = []
     database = full.store.database
     with database.read() as connection:

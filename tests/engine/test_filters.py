@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
@@ -15,11 +14,8 @@ from sceneprint.geometry.retrieval.ranking import ranking_size
 from sceneprint.store import maps as stored_maps
 from sceneprint.store.maps import add_frame
 from sceneprint.store.signatures import StoredSignature, index_frame
-from sceneprint_client.api import Answer, Filter, NewMap, Query
-from tests.whole_engine import Engine
+from sceneprint_client.api import Filter, NewMap, Query
 
-Make = Callable[..., Engine]
-Ids = Callable[[Engine], list[str]]
 START = datetime(2026, 11, 16, 9, 30, tzinfo=UTC)
 
 
@@ -37,7 +33,7 @@ class Known:
     place: tuple[int, ...]
 
 
-def fill(engine: Engine, count: int, seed: int, name: str = "hall") -> list[Known]:
+def fill(engine, count, seed, name="hall"):
     """Index frames of random metadata; places and times are round, so that bounds are met."""
     rng = np.random.default_rng(seed)
     made = []
@@ -79,7 +75,7 @@ def fill(engine: Engine, count: int, seed: int, name: str = "hall") -> list[Know
     return made
 
 
-def passes(one: Known, wanted: Filter, own: Known) -> bool:
+def passes(one, wanted, own):
     """By the sentences of `Filter`, condition by condition."""
     if wanted.robot is not None and one.robot not in wanted.robot:
         return False
@@ -107,7 +103,7 @@ def passes(one: Known, wanted: Filter, own: Known) -> bool:
     return one.id not in wanted.exclude_frames
 
 
-def ranked(frames: list[Known], own: Known, wanted: Filter) -> list[tuple[str, int]]:
+def ranked(frames, own, wanted):
     """The oracle: all that pass, nearest first, ties as they came."""
     found = [
         (int(((one.vector.astype(int) - own.vector) ** 2).sum()), i, one.id)
@@ -117,7 +113,7 @@ def ranked(frames: list[Known], own: Known, wanted: Filter) -> list[tuple[str, i
     return [(frame_id, distance) for distance, _, frame_id in sorted(found)]
 
 
-def hold(answer: Answer, frames: list[Known], own: Known, wanted: Filter) -> int:
+def hold(answer, frames, own, wanted):
     """Compare an answer with the oracle; returns how many frames passed."""
     expected = ranked(frames, own, wanted)
     counts = answer.counts
@@ -128,7 +124,7 @@ def hold(answer: Answer, frames: list[Known], own: Known, wanted: Filter) -> int
     return len(expected)
 
 
-def draw(rng: np.random.Generator, frames: list[Known]) -> Filter:
+def draw(rng, frames):
     """A filter of one to three conditions."""
     seconds = [int(one) for one in sorted(rng.integers(0, 60, 2))]
     corners = np.sort(rng.integers(-2, 3, (2, 3)), axis=0).tolist()
@@ -150,13 +146,13 @@ def draw(rng: np.random.Generator, frames: list[Known]) -> Filter:
     return Filter.model_validate({name: given[name] for name in chosen})
 
 
-def ask(engine: Engine, own: Known, wanted: Filter, *, exact: bool = False) -> Answer:
+def ask(engine, own, wanted, *, exact=False):
     query = Query(stages=("retrieve",), k=50, filter=wanted, exact=exact)
     return engine.query_frame("hall", own.id, query)
 
 
 @pytest.mark.parametrize("published", [False, True])
-def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: bool) -> None:
+def test_a_filter_leaves_what_plain_python_leaves(make_engine, published):
     """With a tail alone and with a version; frames come and go; another map is beside it."""
     engine = make_engine(unindexed_frames=50)
     for name in ("hall", "other"):
@@ -183,7 +179,7 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine: Make, published: 
     assert hold(ask(engine, frames[0], everything), frames, frames[0], everything) > 100
 
 
-def test_each_condition_alone(make_engine: Make) -> None:
+def test_each_condition_alone(make_engine):
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="depth"))
     frames = fill(engine, 100, 5)
@@ -227,9 +223,7 @@ def test_each_condition_alone(make_engine: Make) -> None:
         assert hold(ask(engine, own, wanted), frames, own, wanted) == 0
 
 
-def test_what_does_not_pass_is_neither_matched_nor_located_by(
-    full: Engine, uploads: Any, ids: Ids
-) -> None:
+def test_what_does_not_pass_is_neither_matched_nor_located_by(full, uploads, ids):
     """All stages, of an uploaded frame: the other room's frames are as good as not there."""
     asked, names = uploads[8], ids(full)
     for wanted in (
@@ -259,9 +253,7 @@ def test_what_does_not_pass_is_neither_matched_nor_located_by(
         }  # fmt: skip
 
 
-def test_who_asks_to_keep_away_from_itself_says_where_it_is(
-    full: Engine, uploads: Any, ids: Ids, make_engine: Make
-) -> None:
+def test_who_asks_to_keep_away_from_itself_says_where_it_is(full, uploads, ids, make_engine):
     query = Query(stages=("retrieve",), filter=Filter(not_within_s=5))
     needed = "needed by filter.not_within_s"
     with pytest.raises(InvalidRequest, match="no session and no captured_at") as caught:
@@ -277,9 +269,7 @@ def test_who_asks_to_keep_away_from_itself_says_where_it_is(
     assert full.queries.upload(["hall"], uploads[0].data, whole, query).counts.passed == 12
 
 
-def test_frames_between_view_and_filter_do_no_harm(
-    make_engine: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_between_view_and_filter_do_no_harm(make_engine, monkeypatch):
     """One is deleted, and one indexed, after the view was made and before the filter is asked."""
     from sceneprint.engine.search import retrieval
 
@@ -288,7 +278,7 @@ def test_frames_between_view_and_filter_do_no_harm(
     frames = fill(engine, 20, 6)
     passing, gone = retrieval.passing_frames, frames[3]
 
-    def late(*given: Any) -> Any:
+    def late(*given):
         monkeypatch.setattr(retrieval, "passing_frames", passing)
         engine.delete_frame("hall", gone.id)
         fill(engine, 5, 7)
@@ -300,7 +290,7 @@ def test_frames_between_view_and_filter_do_no_harm(
     assert [m.frame_id for m in answer.matches] == [i for i, _ in ranked(left, frames[0], Filter())]
     assert (answer.counts.map, answer.counts.passed) == (19, 18)
 
-    def early(*given: Any) -> Any:
+    def early(*given):
         numbers = passing(*given)
         engine.delete_frame("hall", frames[4].id)
         return numbers

@@ -97,7 +97,7 @@ def test_what_it_would_do_is_told_and_not_done(aged, ids):
 
 
 def test_a_store_without_a_turn_is_asked_again_later(aged, ids, monkeypatch):
-    def locked(*_: object) -> None:
+    def locked(*_):
         raise StoreLocked("somebody writes")
 
     edit_map(aged.store, "hall", {"retention_days": 3})

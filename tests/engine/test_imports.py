@@ -6,10 +6,8 @@ import io
 import json
 import os
 import tarfile
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -24,13 +22,12 @@ from sceneprint.formats.archive import Archive
 from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.maps import MapUsage, counted_usage, find_map
 from sceneprint.store.queue import MAXIMUM_FAILURES, files_of
-from sceneprint_client.api import Job, JobState, NewMap
+from sceneprint_client.api import JobState, NewMap
 from sceneprint_client.api.frames import ImportOptions, UploadSummary, pooled_range
 from tests.engine.conftest import Between
-from tests.whole_engine import Engine
 
 
-def packed(uploads: Any) -> bytes:
+def packed(uploads):
     made = io.BytesIO()
     camera = uploads[0].meta.intrinsics.model_dump(exclude={"distortion"})
     with tarfile.open(fileobj=made, mode="w:gz") as archive:
@@ -43,14 +40,14 @@ def packed(uploads: Any) -> bytes:
     return made.getvalue()
 
 
-def begun(engine: Engine, data: bytes, map_name: str = "hall") -> Job:
+def begun(engine, data, map_name="hall"):
     with engine.imports.receive(map_name, ImportOptions()) as receiver:
         receiver.write(data)
         archive = receiver.end()
     return engine.imports.begin(map_name, archive, ImportOptions())[0]
 
 
-def claimed(engine: Engine) -> LongJob:
+def claimed(engine):
     while True:  # frames that wait to be signed are left waiting
         work = engine.claim("test")
         if isinstance(work, LongJob):
@@ -58,9 +55,7 @@ def claimed(engine: Engine) -> LongJob:
         assert work is not None
 
 
-def test_a_slice_that_was_lost_is_done_again(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slice_that_was_lost_is_done_again(empty, uploads, monkeypatch):
     monkeypatch.setattr(archive_import, "_AT_ONCE", 2)
     job = begun(empty, packed(uploads[:5]))
     task = claimed(empty)
@@ -74,7 +69,6 @@ def test_a_slice_that_was_lost_is_done_again(
     assert [one["frame_id"] for one in again.items] == [one["frame_id"] for one in lost.items]
     assert empty.run(task) == JobState.SUCCEEDED  # there is time for all now
     told = empty.get_job(job.job_id)
-    assert told.result is not None
     summary = UploadSummary.model_validate(told.result.pop("summary"))
     assert told.result == {
         "sequences": 1, "received": 3, "there": 2, "refused": 0, "ignored": 0,
@@ -84,7 +78,6 @@ def test_a_slice_that_was_lost_is_done_again(
     assert list(summary.without_pose.values()) == [5]
     items = empty.imports.items("hall", job.job_id).items
     depth = pooled_range(one.samples for one in items if one.samples is not None)
-    assert depth is not None
     assert summary.depth == depth
     assert depth.count == sum(one.samples.count for one in items if one.samples is not None)
     page = empty.imports.items("hall", job.job_id, limit=3)
@@ -94,9 +87,7 @@ def test_a_slice_that_was_lost_is_done_again(
     assert len(empty.list_frames("hall").items) == 5
 
 
-def test_large_frames_are_not_in_memory_together(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_frames_are_not_in_memory_together(empty, uploads, monkeypatch):
     """Sixteen clouds of 512 MiB each would be more than a worker may take."""
     sizes = [len(one.data) for one in uploads[:3]]
     begun(empty, packed(uploads[:3]))
@@ -108,9 +99,7 @@ def test_large_frames_are_not_in_memory_together(
     assert taken == [1, 2, 3]
 
 
-def test_an_archive_stays_until_its_import_is_over_and_no_longer(
-    empty: Engine, uploads: Any
-) -> None:
+def test_an_archive_stays_until_its_import_is_over_and_no_longer(empty, uploads):
     data = packed(uploads[:1])
     begun(empty, data)
     task = claimed(empty)
@@ -128,7 +117,7 @@ def test_an_archive_stays_until_its_import_is_over_and_no_longer(
     assert not empty.store.blobs.holds(file.blob)
 
 
-def test_nothing_is_left_of_an_archive_that_was_refused(empty: Engine, uploads: Any) -> None:
+def test_nothing_is_left_of_an_archive_that_was_refused(empty, uploads):
     before = sorted(empty.store.blobs.digests())
     with pytest.raises(UnknownMap):
         begun(empty, packed(uploads[:1]), "nowhere")
@@ -142,9 +131,7 @@ def test_nothing_is_left_of_an_archive_that_was_refused(empty: Engine, uploads: 
     assert list(empty.settings.blob_dir.glob(".*")) == []
 
 
-def test_a_cancelled_import_takes_no_frame_more(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cancelled_import_takes_no_frame_more(empty, uploads, monkeypatch):
     monkeypatch.setattr(archive_import, "_AT_ONCE", 2)
     job = begun(empty, packed(uploads[:4]))
     between = Between(lambda: cancel(empty.store, job.job_id))
@@ -155,12 +142,12 @@ def test_a_cancelled_import_takes_no_frame_more(
 
 
 def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    empty, uploads, monkeypatch
+):
     monkeypatch.setattr(archive_import, "_AT_ONCE", 2)
     begun(empty, packed(uploads[:4]))
 
-    def make_anew() -> None:
+    def make_anew():
         empty.delete_map("hall")
         empty.create_map(NewMap(name="hall", model="depth"))
 
@@ -171,7 +158,7 @@ def test_a_map_that_is_made_anew_takes_nothing_of_an_import_into_the_one_before(
     assert list(empty.store.blobs.digests()) == []
 
 
-def zeros(megabytes: int, name: str) -> bytes:
+def zeros(megabytes, name):
     """Return a compressed archive of a few kilobytes with a member of zeros."""
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w:gz", compresslevel=1) as archive:
@@ -181,7 +168,7 @@ def zeros(megabytes: int, name: str) -> bytes:
     return made.getvalue()
 
 
-def bytes_on_disk(engine: Engine) -> int:
+def bytes_on_disk(engine):
     """Return the size of all files below the folder of blobs, unfinished ones too."""
     return sum(
         os.lstat(Path(folder, name)).st_size
@@ -191,7 +178,7 @@ def bytes_on_disk(engine: Engine) -> int:
     )
 
 
-def counted(engine: Engine, map_name: str = "hall") -> int:
+def counted(engine, map_name="hall"):
     """Return the bytes that a map is counted to hold, which a count over its rows confirms."""
     with engine.store.database.read() as connection:
         row = find_map(connection, map_name)
@@ -202,9 +189,7 @@ def counted(engine: Engine, map_name: str = "hall") -> int:
 QUOTA = 8 << 20
 
 
-def test_archives_take_no_more_disk_than_the_quota_of_their_map(
-    empty: Engine, uploads: Any
-) -> None:
+def test_archives_take_no_more_disk_than_the_quota_of_their_map(empty, uploads):
     """Archives of compressed zeros, sent one after another and all at once."""
     edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
     most = QUOTA * 11 // 10
@@ -238,9 +223,7 @@ def test_archives_take_no_more_disk_than_the_quota_of_their_map(
     begun(empty, zeros(7, "last"))  # what was refused or not kept takes no room
 
 
-def test_two_services_do_not_share_the_room_of_one_archive(
-    empty: Engine, make_engine: Callable[..., Engine]
-) -> None:
+def test_two_services_do_not_share_the_room_of_one_archive(empty, make_engine):
     """Neither sees what the other is receiving: the second import is refused when it begins."""
     edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
     with ExitStack() as both:
@@ -258,7 +241,7 @@ def test_two_services_do_not_share_the_room_of_one_archive(
     assert counted(empty) == bytes_on_disk(empty) == files[0].bytes
 
 
-def test_an_archive_counts_until_its_import_is_over(empty: Engine, uploads: Any) -> None:
+def test_an_archive_counts_until_its_import_is_over(empty, uploads):
     edit_map(empty.store, "hall", {"quota_bytes": QUOTA})
     begun(empty, packed(uploads[:2]))
     [archive] = empty.store.blobs.digests()
@@ -272,8 +255,8 @@ def test_an_archive_counts_until_its_import_is_over(empty: Engine, uploads: Any)
 
 
 def test_the_archive_of_an_import_whose_worker_died_goes_at_the_next_upkeep(
-    empty: Engine, uploads: Any, due_now: Callable[..., None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    empty, uploads, due_now, monkeypatch
+):
     monkeypatch.setattr(archive_import, "TIDY_S", 0.0)
     job = begun(empty, packed(uploads[:1]))
     for _ in range(MAXIMUM_FAILURES):
@@ -292,9 +275,7 @@ def test_the_archive_of_an_import_whose_worker_died_goes_at_the_next_upkeep(
     assert "Send it again" in str(empty.get_job(job.job_id).error)
 
 
-def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
-    empty: Engine, uploads: Any
-) -> None:
+def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(empty, uploads):
     with empty.imports.receive("hall", ImportOptions()) as receiver:
         receiver.write(packed(uploads[:1]))
         archive = receiver.end()
@@ -304,18 +285,16 @@ def test_an_archive_that_was_swept_before_its_job_was_there_is_not_acknowledged(
     assert list(list_jobs(empty.store).items) == []
 
 
-def test_a_frame_that_memory_does_not_do_for_costs_no_other(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_that_memory_does_not_do_for_costs_no_other(empty, uploads, monkeypatch):
     """One that cannot be read out of the archive, and one that cannot be decoded beside others."""
     read, decode, asked = Archive.data_of, uploading.read_upload, []
 
-    def data_of(archive: Archive, reference: Any) -> bytes:
+    def data_of(archive, reference):
         if archive.name_of(reference) == "run/0.png":
             raise MemoryError
         return read(archive, reference)
 
-    def decoded(data: bytes, meta: Any, decoders: Any) -> Any:
+    def decoded(data, meta, decoders):
         asked.append(data)
         if data == uploads[2].data:
             raise MemoryError
@@ -329,6 +308,5 @@ def test_a_frame_that_memory_does_not_do_for_costs_no_other(
     assert [one.status for one in items] == [422, 202, 422, 202]
     assert len(asked) == 5  # two of three together, then each alone
     for refused in (items[0], items[2]):
-        assert refused.problem is not None
         assert "needs more memory than a worker may use" in refused.problem.detail
     assert len(empty.list_frames("hall").items) == 2

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,21 +16,19 @@ from sceneprint.index.index_version import newest
 from sceneprint.models import read_model
 from sceneprint.store.signatures import SignatureChange
 from sceneprint_client.api import Query
-from tests.whole_engine import Engine
 
-Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
 #: Bytes of a signature.
 LENGTH = read_model("depth").signature_bytes
 pytestmark = pytest.mark.usefixtures("_always_look")
 
 
-def ask(engine: Engine, uploads: Any) -> tuple[list[tuple[str, int]], int]:
+def ask(engine, uploads):
     answer = engine.queries.upload(["hall"], uploads[2].data, uploads[2].meta, ALL)
     return [(match.frame_id, match.distance) for match in answer.matches], answer.index_version
 
 
-def until_healed(engine: Engine) -> int:
+def until_healed(engine):
     """Versions that upkeep publishes until a round of verifying is over."""
     published = 0
     for _ in range(20):
@@ -40,16 +36,14 @@ def until_healed(engine: Engine) -> int:
     return published
 
 
-def flip(path: Path, position: int) -> None:
+def flip(path, position):
     data = bytearray(path.read_bytes())
     data[position] ^= 1 << position % 8
     path.write_bytes(data)
 
 
 @pytest.mark.parametrize("kind", ["faiss", "keys", "json"])
-def test_a_flipped_byte_of_an_index_is_found_and_healed(
-    data: Path, make_engine: Make, uploads: Any, kind: str
-) -> None:
+def test_a_flipped_byte_of_an_index_is_found_and_healed(data, make_engine, uploads, kind):
     builder = make_engine(data, unindexed_frames=1, index_check_interval_s=1)
     served = make_engine(data)  # holds the index open all the time
     wanted, _ = ask(make_engine(data), uploads)
@@ -63,15 +57,12 @@ def test_a_flipped_byte_of_an_index_is_found_and_healed(
     assert until_healed(again) == 0
     folder = next(data.glob("index/hall-*"))
     sound = newest(folder, served.get_map("hall").model_id, LENGTH)
-    assert sound is not None
     assert (sound.number, len(sound)) == (2, 12)
     for engine in (served, make_engine(data)):
         assert ask(engine, uploads) == (wanted, 2)
 
 
-def test_who_scrubs_leaves_a_mark_and_nobody_else_does_for_a_while(
-    data: Path, make_engine: Make
-) -> None:
+def test_who_scrubs_leaves_a_mark_and_nobody_else_does_for_a_while(data, make_engine):
     engine = make_engine(
         data, unindexed_frames=1, index_check_interval_s=3600
     )  # which holds it open
@@ -83,9 +74,7 @@ def test_who_scrubs_leaves_a_mark_and_nobody_else_does_for_a_while(
     assert until_healed(make_engine(data, unindexed_frames=1, index_check_interval_s=3600)) == 1
 
 
-def test_rebuilding_makes_the_same_index_from_nothing(
-    data: Path, make_engine: Make, uploads: Any
-) -> None:
+def test_rebuilding_makes_the_same_index_from_nothing(data, make_engine, uploads):
     engine = make_engine(data, unindexed_frames=1)
     wanted, _ = ask(engine, uploads)
     assert engine.publish_due() == 1
@@ -96,7 +85,7 @@ def test_rebuilding_makes_the_same_index_from_nothing(
     assert ask(engine, uploads) == (wanted, 2)
 
 
-def test_a_frame_signed_anew_is_found_once_with_its_new_signature() -> None:
+def test_a_frame_signed_anew_is_found_once_with_its_new_signature():
     tail = AppendBuffer(4, Path("unused"))
     tail.append(SignatureChange(7, "", 1, None), np.full(4, 1, np.uint8))
     tail.append(SignatureChange(8, "", 2, None), np.full(4, 2, np.uint8))
@@ -110,9 +99,7 @@ def test_a_frame_signed_anew_is_found_once_with_its_new_signature() -> None:
 
 
 @pytest.mark.parametrize("in_memory", [10**9, 0])
-def test_a_tail_in_a_file_is_as_one_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_memory: int
-) -> None:
+def test_a_tail_in_a_file_is_as_one_in_memory(tmp_path, monkeypatch, in_memory):
     monkeypatch.setattr(local_index, "IN_MEMORY", in_memory)
     rows = np.random.default_rng(3).integers(0, 256, (300, 50), np.uint8)
     tail, views = AppendBuffer(50, tmp_path / "index"), []
@@ -130,9 +117,7 @@ def test_a_tail_in_a_file_is_as_one_in_memory(
     assert list(tmp_path.glob("index/*")) == []  # nothing to be left behind
 
 
-def test_a_damaged_index_is_read_once_and_not_with_every_query(
-    data: Path, make_engine: Make, uploads: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_index_is_read_once_and_not_with_every_query(data, make_engine, uploads, caplog):
     assert make_engine(data, unindexed_frames=1).publish_due() == 1
     (path,) = data.glob("index/hall-*/*.faiss")
     flip(path, path.stat().st_size - 5 * LENGTH)
@@ -147,15 +132,13 @@ def test_a_damaged_index_is_read_once_and_not_with_every_query(
     assert ask(engine, uploads)[1] == 1
 
 
-def test_what_is_out_of_reach_for_a_moment_is_not_removed(
-    data: Path, make_engine: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_out_of_reach_for_a_moment_is_not_removed(data, make_engine, monkeypatch):
     assert make_engine(data, unindexed_frames=1).publish_due() == 1
     (folder,) = data.glob("index/hall-*")
     before = sorted(path.name for path in folder.iterdir())
     real = Path.open
 
-    def no_descriptor(path: Path, *given: Any, **more: Any) -> Any:
+    def no_descriptor(path, *given, **more):
         if path.suffix == ".faiss":
             raise OSError(24, "Too many open files")
         return real(path, *given, **more)
@@ -165,14 +148,12 @@ def test_what_is_out_of_reach_for_a_moment_is_not_removed(
     assert sorted(path.name for path in folder.iterdir()) == before
 
 
-def test_a_tail_that_finds_no_room_is_as_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_tail_that_finds_no_room_is_as_it_was(tmp_path, monkeypatch):
     tail, row = AppendBuffer(50, tmp_path), np.ones(50, np.uint8)
     for i in range(64):
         tail.append(SignatureChange(i, "", i + 1, None), row)
 
-    def full(*_: object) -> None:
+    def full(*_):
         raise UnusableStore("no room")
 
     with monkeypatch.context() as patch:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import pytest
 from sqlalchemy import update
@@ -15,40 +13,33 @@ from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
 from sceneprint.errors import CannotRetry, JobOver, UnknownJob
 from sceneprint.store import queue
 from sceneprint.store.queue import count_jobs, read_clock
-from sceneprint.store.tables import JobRow, jobs
+from sceneprint.store.tables import jobs
 from sceneprint_client.api import FrameState, JobState, NewMap
-from tests.whole_engine import Engine
-
-DueNow = Callable[[Engine], None]
-Told = Callable[[Engine], list[str]]
-WorkOff = Callable[[Engine], list[JobState | None]]
 
 
-def row(engine: Engine, job_id: str) -> JobRow:
+def row(engine, job_id):
     with engine.store.database.read() as connection:
         return queue.find_job(connection, job_id)
 
 
-def due(engine: Engine) -> float:
+def due(engine):
     found = engine.jobs.due_in_s()
     assert found is not None
     return found
 
 
-def claimed(engine: Engine) -> working.Work:
+def claimed(engine):
     work = engine.claim("w")
     assert work is not None
     return work
 
 
-def die(engine: Engine, work: working.Work, *, counts: bool = True) -> JobState | None:
+def die(engine, work, *, counts=True):
     held = work.job
     return worker_died(engine.store, held.id, held.token, "signal 11", "Fatal", counts=counts)
 
 
-def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
-    empty: Engine, uploads: Any, told: Told, work_off: WorkOff
-) -> None:
+def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(empty, uploads, told, work_off):
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta, 7)
     cancelled = cancel(empty.store, added.job_id)
     assert (cancelled.state, cancelled.priority) == (JobState.CANCELLED, 7)
@@ -80,7 +71,7 @@ def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(
             ask("nobody")
 
 
-def test_what_is_cancelled_while_it_is_signed_is_not_stored(empty: Engine, uploads: Any) -> None:
+def test_what_is_cancelled_while_it_is_signed_is_not_stored(empty, uploads):
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work = claimed(empty)
     assert cancel(empty.store, added.job_id).state == JobState.CANCELLED
@@ -90,9 +81,7 @@ def test_what_is_cancelled_while_it_is_signed_is_not_stored(empty: Engine, uploa
     assert len(list(empty.store.blobs.digests())) == 1  # the upload, and no artifact
 
 
-def test_what_cannot_be_signed_again_is_refused_with_the_reason(
-    empty: Engine, uploads: Any
-) -> None:
+def test_what_cannot_be_signed_again_is_refused_with_the_reason(empty, uploads):
     lost, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     gone, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta)
     cancel(empty.store, lost.job_id)
@@ -106,9 +95,7 @@ def test_what_cannot_be_signed_again_is_refused_with_the_reason(
         empty.retry_job(gone.job_id)
 
 
-def test_all_dead_jobs_are_tried_again_page_by_page(
-    empty: Engine, uploads: Any, due_now: DueNow
-) -> None:
+def test_all_dead_jobs_are_tried_again_page_by_page(empty, uploads, due_now):
     added = [empty.add_frame("hall", one.data, one.meta)[0] for one in uploads[:4]]
     for _ in added:
         while die(empty, claimed(empty)) != JobState.DEAD:
@@ -144,9 +131,7 @@ def test_all_dead_jobs_are_tried_again_page_by_page(
     assert empty.retry_dead_jobs(map_names=("elsewhere",)).refused == []
 
 
-def test_a_job_whose_worker_dies_is_tried_again_thrice(
-    empty: Engine, uploads: Any, due_now: DueNow, told: Told
-) -> None:
+def test_a_job_whose_worker_dies_is_tried_again_thrice(empty, uploads, due_now, told):
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     for failures, pause in ((1, 2.0), (2, 8.0)):
         work = claimed(empty)
@@ -172,22 +157,7 @@ def test_a_job_whose_worker_dies_is_tried_again_thrice(
     assert empty.claim("w") is None
 
 
-def test_deaths_and_breakdowns_count_alike(
-    empty: Engine, uploads: Any, due_now: DueNow, work_off: WorkOff
-) -> None:
-    added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
-    assert die(empty, claimed(empty)) == JobState.QUEUED
-    empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
-    due_now(empty)
-    assert work_off(empty) == [JobState.QUEUED]
-    due_now(empty)
-    assert die(empty, claimed(empty)) == JobState.DEAD
-    assert row(empty, added.job_id).attempts == 3
-
-
-def test_to_be_killed_from_outside_is_no_fault_of_the_job(
-    empty: Engine, uploads: Any, due_now: DueNow
-) -> None:
+def test_to_be_killed_from_outside_is_no_fault_of_the_job(empty, uploads, due_now):
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     for attempt in range(1, 10):
         before = time.time()
@@ -200,9 +170,7 @@ def test_to_be_killed_from_outside_is_no_fault_of_the_job(
     assert empty.get_frame("hall", added.frame_id).reason == "signal 11"
 
 
-def test_a_death_counts_where_another_has_the_job_by_now(
-    empty: Engine, uploads: Any, due_now: DueNow
-) -> None:
+def test_a_death_counts_where_another_has_the_job_by_now(empty, uploads, due_now):
     """A frame that hangs every worker longer than its lease is given up all the same."""
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     works = []
@@ -222,9 +190,7 @@ def test_a_death_counts_where_another_has_the_job_by_now(
     assert empty.get_frame("hall", added.frame_id).state == FrameState.FAILED
 
 
-def test_a_breakdown_counts_the_deaths_since_it_was_claimed(
-    empty: Engine, uploads: Any, due_now: DueNow
-) -> None:
+def test_a_breakdown_counts_the_deaths_since_it_was_claimed(empty, uploads, due_now):
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     works = []
     for _ in range(3):
@@ -236,7 +202,7 @@ def test_a_breakdown_counts_the_deaths_since_it_was_claimed(
     assert empty.get_frame("hall", added.frame_id).state == FrameState.FAILED
 
 
-def test_a_death_over_what_is_gone_changes_nothing(empty: Engine, uploads: Any, told: Told) -> None:
+def test_a_death_over_what_is_gone_changes_nothing(empty, uploads, told):
     cancelled, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work = claimed(empty)
     cancel(empty.store, cancelled.job_id)
@@ -249,9 +215,7 @@ def test_a_death_over_what_is_gone_changes_nothing(empty: Engine, uploads: Any, 
     assert told(empty)[-1] == "map.deleted"
 
 
-def test_only_what_nobody_raised_on_purpose_makes_a_process_unsound(
-    empty: Engine, uploads: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_what_nobody_raised_on_purpose_makes_a_process_unsound(empty, uploads, monkeypatch):
     unsound: list[str] = []
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
@@ -261,16 +225,14 @@ def test_only_what_nobody_raised_on_purpose_makes_a_process_unsound(
     monkeypatch.setattr(working, "prepare", lambda *_: {}[0])
     added, _ = empty.add_frame("hall", uploads[2].data, uploads[2].meta)
 
-    def note() -> None:
+    def note():
         unsound.append(str(row(empty, added.job_id).error))  # it is stored by then
 
     assert empty.run(claimed(empty), note) == JobState.QUEUED
     assert unsound == ["KeyError: 0"]
 
 
-def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
-    empty: Engine, uploads: Any, work_off: WorkOff
-) -> None:
+def test_a_job_that_signs_again_leaves_the_frame_as_it_is(empty, uploads, work_off):
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     empty.reencode("hall", "paper")
@@ -284,7 +246,7 @@ def test_a_job_that_signs_again_leaves_the_frame_as_it_is(
     assert empty.get_frame("hall", added.frame_id).state == FrameState.INDEXED
 
 
-def test_when_there_is_something_to_do_next(empty: Engine, uploads: Any) -> None:
+def test_when_there_is_something_to_do_next(empty, uploads):
     assert empty.jobs.due_in_s() is None
     for one in uploads[:3]:
         empty.add_frame("hall", one.data, one.meta)

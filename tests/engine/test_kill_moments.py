@@ -9,9 +9,7 @@ import random
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -82,16 +80,14 @@ for line in sys.stdin:
 class ChildKiller:
     """Children that do one kind of work, each killed at a random moment."""
 
-    def __init__(self, process: subprocess.Popen[str], seed: int) -> None:
+    def __init__(self, process, seed):
         self._process, self._rng = process, random.Random(seed)
         self._longest_s = 0.05
         self.unfinished = 0
 
-    def kill_one(self) -> list[str]:
+    def kill_one(self):
         """Let a child work and kill it; return the frames that it deleted."""
         commands, said = self._process.stdin, self._process.stdout
-        assert commands is not None
-        assert said is not None
         commands.write("born\n")
         assert said.readline() == "begun\n"
         time.sleep(self._rng.uniform(0, self._longest_s))
@@ -106,7 +102,7 @@ class ChildKiller:
 
 
 @contextmanager
-def children(kind: str, folder: Path, service: Path, seed: int) -> Iterator[ChildKiller]:
+def children(kind, folder, service, seed):
     with subprocess.Popen(
         [sys.executable, "-c", CHILDREN, kind, str(folder), str(service)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
@@ -117,16 +113,16 @@ def children(kind: str, folder: Path, service: Path, seed: int) -> Iterator[Chil
             process.kill()
 
 
-def settings_of(folder: Path) -> Settings:
+def settings_of(folder):
     given = {"database_url": None, "data_dir": folder, "undo_window_s": 0, "unindexed_frames": 1}
     return Settings.model_validate(given)
 
 
-def ids_of(engine: Engine) -> set[str]:
+def ids_of(engine):
     return {one.frame_id for one in engine.list_frames("hall").items}
 
 
-def add(engine: Engine, one: Upload) -> str:
+def add(engine, one):
     """Add a frame and have it signed."""
     added, _ = engine.add_frame("hall", one.data, one.meta)
     work = engine.claim("w")
@@ -135,7 +131,7 @@ def add(engine: Engine, one: Upload) -> str:
     return added.frame_id
 
 
-def vectors(engine: Engine) -> dict[str, bytes]:
+def vectors(engine):
     with engine.store.database.read() as connection:
         found = connection.exec_driver_sql(
             "SELECT id, vector FROM frames JOIN signatures ON number = frame_number"
@@ -143,7 +139,7 @@ def vectors(engine: Engine) -> dict[str, bytes]:
         return {name: bytes(vector) for name, vector in found}
 
 
-def check(folder: Path, frames: set[str], gone: list[bytes], blobs: int) -> None:
+def check(folder, frames, gone, blobs):
     """See that a store that is opened again holds some frames, and nothing of others.
 
     Parameters
@@ -171,7 +167,7 @@ def check(folder: Path, frames: set[str], gone: list[bytes], blobs: int) -> None
 
 
 @pytest.mark.parametrize("kind", ["publish", "purge"])
-def test_publication_and_purge(kind: str, uploads: tuple[Upload, ...], tmp_path: Path) -> None:
+def test_publication_and_purge(kind, uploads, tmp_path):
     folder, spare, known = tmp_path / "data", list(uploads), dict[str, Upload]()
     with children(kind, folder, folder, seed=7) as killer:
         for _ in range(KILLS):
@@ -195,7 +191,7 @@ def test_publication_and_purge(kind: str, uploads: tuple[Upload, ...], tmp_path:
     assert killer.unfinished > KILLS // 4
 
 
-def test_pull(uploads: tuple[Upload, ...], tmp_path: Path) -> None:
+def test_pull(uploads, tmp_path):
     service, robot = tmp_path / "service", tmp_path / "robot"
     robot.mkdir()
     spare, before, early = list(uploads), set[str](), 0

@@ -6,8 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 from sqlalchemy import select
@@ -15,7 +13,6 @@ from sqlalchemy import select
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.store.tables import jobs, signatures
 from sceneprint_client.api import FrameState, JobState, Query
-from tests.whole_engine import Engine
 
 #: Works as a worker does, and stands still at a step of which it tells.
 WORKER = """
@@ -39,7 +36,7 @@ engine.run(engine.claim("doomed"))
 """
 
 
-def lease(engine: Engine) -> float:
+def lease(engine):
     with engine.store.database.read() as connection:
         until = connection.execute(select(jobs.c.leased_until)).scalar_one()
     assert until is not None
@@ -50,16 +47,14 @@ def lease(engine: Engine) -> float:
     ("step", "when", "artifact"), [("write_geometry", "after", 0), ("_store", "before", 1)]
 )
 def test_what_a_killed_worker_had_in_hand_is_done_once_by_another(
-    empty: Engine, uploads: Any, told: Callable[[Engine], list[str]],
-    step: str, when: str, artifact: int,
-) -> None:  # fmt: skip
+    empty, uploads, told, step, when, artifact
+):
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     folder = str(empty.settings.data_dir)
     with subprocess.Popen(
         [sys.executable, "-c", WORKER, folder, step, when], stdout=subprocess.PIPE, text=True
     ) as worker:
         try:
-            assert worker.stdout is not None
             assert worker.stdout.readline() == f"{step}\n"
             if step == "write_geometry":  # while it works it keeps the job
                 renewed, begun = {lease(empty)}, time.monotonic()

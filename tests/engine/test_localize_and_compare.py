@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -13,16 +10,11 @@ from sceneprint.engine.search.response import uncertainty_record
 from sceneprint.errors import InvalidRequest, UnknownFrame
 from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.models import read_model
-from sceneprint.pipeline import Signature, distance, validate
-from sceneprint.types import Geometry
-from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query, Similarity
-from tests.whole_engine import Engine
-
-Prepared = list[tuple[Signature, Geometry]]
-Ids = Callable[[Engine], list[str]]
+from sceneprint.pipeline import distance, validate
+from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query
 
 
-def test_a_localization_is_the_answer_in_short(full: Engine, ids: Ids) -> None:
+def test_a_localization_is_the_answer_in_short(full, ids):
     answer = full.query_frame("hall", ids(full)[8], Query())
     there = localization_of(answer)
     assert (there.status, there.map, there.strength) == ("found", "hall", "strong")
@@ -40,9 +32,7 @@ def test_a_localization_is_the_answer_in_short(full: Engine, ids: Ids) -> None:
         assert getattr(there, field) == getattr(answer, field)
 
 
-def test_what_is_found_without_a_pose_has_the_transform_to_its_match(
-    empty: Engine, uploads: Any, work_off: Any
-) -> None:
+def test_what_is_found_without_a_pose_has_the_transform_to_its_match(empty, uploads, work_off):
     bare = uploads[0].meta.model_copy(update={"pose": None})
     empty.add_frame("hall", uploads[0].data, bare)
     work_off(empty)
@@ -53,8 +43,8 @@ def test_what_is_found_without_a_pose_has_the_transform_to_its_match(
     assert np.linalg.norm(np.array(there.best.transform.matrix)[:3, 3] - T[:3, 3]) < 0.05
 
 
-def test_what_is_not_found_says_why(full: Engine, empty: Engine, uploads: Any, ids: Ids) -> None:
-    def ask(**how: Any) -> Any:
+def test_what_is_not_found_says_why(full, empty, uploads, ids):
+    def ask(**how):
         query = Query.model_validate({"keep": False, **how})
         return localization_of(full.query_frame("hall", ids(full)[0], query))
 
@@ -79,16 +69,14 @@ def test_what_is_not_found_says_why(full: Engine, empty: Engine, uploads: Any, i
         check_localizes(Query(stages=("retrieve", "diversify")))
 
 
-def timeless(one: Similarity) -> Any:
+def timeless(one):
     return one.model_copy(update={"milliseconds": {}, "a": None, "b": None, "transform": None})
 
 
-def test_two_frames_are_compared_as_the_library_does(
-    full: Engine, uploads: Any, prepared: Prepared, ids: Ids
-) -> None:
+def test_two_frames_are_compared_as_the_library_does(full, uploads, prepared, ids):
     names = ids(full)
 
-    def side(i: int, stored: bool) -> Any:
+    def side(i, stored):
         if stored:
             return NamedFrame(map="hall", frame_id=names[i])
         return uploads[i].data, uploads[i].meta
@@ -128,9 +116,7 @@ def test_two_frames_are_compared_as_the_library_does(
     )
 
 
-def test_frames_that_cannot_be_compared(
-    full: Engine, uploads: Any, work_off: Any, ids: Ids
-) -> None:
+def test_frames_that_cannot_be_compared(full, uploads, work_off, ids):
     full.create_map(NewMap(name="big", model="paper"))
     big, _ = full.add_frame("big", uploads[0].data, uploads[0].meta)
     other = NamedFrame(map="big", frame_id=big.frame_id)
@@ -146,14 +132,12 @@ def test_frames_that_cannot_be_compared(
         full.queries.compare(NamedFrame(map="hall", frame_id="x"), sent, Comparison())
 
 
-def test_what_is_free_is_told_by_the_numbers_of_the_model() -> None:
+def test_what_is_free_is_told_by_the_numbers_of_the_model():
     """A radian counts five metres in a hall, and one in a room."""
     S = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 300.0]) * 1e-6
     room, hall = (read_model(one).parameters.validation.covariance for one in ("paper", "lidar"))
     held = uncertainty_record(S, PAIR_METHOD, room)
     free = uncertainty_record(S, PAIR_METHOD, hall)
-    assert held is not None
-    assert free is not None
     assert (held.degenerate, held.covariance) == ([], free.covariance)
     [one] = free.degenerate
     assert (one.rotation.z, one.translation.z) == (1.0, 0.0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,13 +16,11 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle import rows
 from sceneprint.engine.maps import map_copy
-from sceneprint.engine.maps.map_copy import PulledMap, pull_map
+from sceneprint.engine.maps.map_copy import pull_map
 from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, NotFound, UnknownMap
 from sceneprint.store import open_store
-from sceneprint.types import DepthFrame
 from sceneprint_client import Client
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
-from sceneprint_lab.synth import SynthRoom
 
 pytestmark = pytest.mark.sqlite_only("a robot's copy is a folder")
 
@@ -33,16 +30,16 @@ OF_THE_QUERY = ("query_id", "milliseconds")
 
 
 @pytest.fixture(scope="module")
-def walk(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
+def walk(room_views):
     return room_views(5, 1, 24, along_path=True).frames[:16]
 
 
-def camera_of(view: DepthFrame) -> CameraIntrinsics:
+def camera_of(view):
     k = view.intrinsics
     return CameraIntrinsics(width=k.width, height=k.height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
 
 
-def upload(client: Client, views: tuple[DepthFrame, ...], name: str = MAP) -> list[str]:
+def upload(client, views, name=MAP):
     ids = []
     for number, view in enumerate(views):
         pose = GivenPose(parent_frame="room", matrix=np.array(view.pose).tolist())
@@ -57,7 +54,7 @@ def upload(client: Client, views: tuple[DepthFrame, ...], name: str = MAP) -> li
     return ids
 
 
-def answers(client: Client, views: tuple[DepthFrame, ...]) -> list[dict[str, Any]]:
+def answers(client, views):
     """All that is answered to each view, and what is told of the map's frames."""
     asked = [client.query(MAP, one.depth, camera_of(one), explain=True) for one in views]
     told = [one.model_dump(mode="json") for one in asked]
@@ -77,27 +74,25 @@ class Robot:
     service: Client
     folder: Path
 
-    def pull(self, name: str = MAP) -> PulledMap:
+    def pull(self, name=MAP):
         database = f"sqlite:///{self.folder}/sceneprint.db"
         with closing(open_store(database, self.folder / "blobs")) as store:
             return pull_map(self.service, store, name)
 
-    def answers(self, views: tuple[DepthFrame, ...]) -> list[dict[str, Any]]:
+    def answers(self, views):
         with Client.embedded(self.folder) as client:
             return answers(client, views)
 
 
 @pytest.fixture
-def robot(tmp_path: Path) -> Iterator[Robot]:
+def robot(tmp_path):
     with ExitStack() as stack:
         service = stack.enter_context(Client.embedded(tmp_path / "service"))
         (tmp_path / "robot").mkdir()
         yield Robot(service, tmp_path / "robot")
 
 
-def test_a_pulled_map_answers_as_the_service_and_follows_it(
-    robot: Robot, walk: tuple[DepthFrame, ...]
-) -> None:
+def test_a_pulled_map_answers_as_the_service_and_follows_it(robot, walk):
     service, asked = robot.service, walk[1:8:3]
     with pytest.raises(UnknownMap):
         robot.pull()
@@ -139,9 +134,7 @@ def test_a_pulled_map_answers_as_the_service_and_follows_it(
     assert robot.answers(asked) == answers(service, asked)
 
 
-def test_what_was_uploaded_into_the_copy_is_not_lost(
-    robot: Robot, walk: tuple[DepthFrame, ...]
-) -> None:
+def test_what_was_uploaded_into_the_copy_is_not_lost(robot, walk):
     robot.service.create_map(MAP, model="depth")
     robot.pull()
     with Client.embedded(robot.folder) as client:
@@ -184,9 +177,7 @@ with Client.embedded(service) as client, closing(store):
 
 
 @pytest.mark.thorough
-def test_a_killed_pull_leaves_the_copy_and_goes_on(
-    robot: Robot, walk: tuple[DepthFrame, ...], tmp_path: Path
-) -> None:
+def test_a_killed_pull_leaves_the_copy_and_goes_on(robot, walk, tmp_path):
     service, asked = robot.service, walk[1:4:2]
     service.create_map(MAP, model="depth")
     upload(service, walk[:2])
@@ -194,7 +185,7 @@ def test_a_killed_pull_leaves_the_copy_and_goes_on(
     before = robot.answers(asked)
     upload(service, walk[2:6])
 
-    def kill(what: str, count: int) -> None:
+    def kill(what, count):
         given = [tmp_path / "service", robot.folder, what, str(count)]
         ran = subprocess.run([sys.executable, "-c", CHILD, *given], check=False)
         assert ran.returncode == -signal.SIGKILL
@@ -207,9 +198,7 @@ def test_a_killed_pull_leaves_the_copy_and_goes_on(
     assert robot.answers(asked) == answers(service, asked)
 
 
-def test_a_copy_is_one_state_of_a_map_that_changes(
-    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_copy_is_one_state_of_a_map_that_changes(robot, walk, monkeypatch):
     """Parts that do not fit into one answer come with the next, whatever has changed by then."""
     service = robot.service
     service.create_map(MAP, model="depth")
@@ -218,7 +207,7 @@ def test_a_copy_is_one_state_of_a_map_that_changes(
     monkeypatch.setattr(map_copy, "MOST_BYTES", 1)  # and one of them in each answer
     ask, answered = service.map_copy, list[Any]()
 
-    def changing(*arguments: Any) -> Any:
+    def changing(*arguments):
         answered.append(ask(*arguments))
         if len(answered) == 2:
             service.delete_frame(MAP, ids[0])
@@ -240,15 +229,13 @@ def test_a_copy_is_one_state_of_a_map_that_changes(
     assert answered[-1][1] == {}  # the copy's own parts are those of the service
 
 
-def test_a_frame_that_goes_before_its_artifact_is_passed_over(
-    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_that_goes_before_its_artifact_is_passed_over(robot, walk, monkeypatch):
     service = robot.service
     service.create_map(MAP, model="depth")
     ids = upload(service, walk[:2])
     read = service.copied_artifact
 
-    def gone(*given: Any) -> bytes:
+    def gone(*given):
         if service.frame(MAP, ids[0]).state == "indexed":
             service.delete_frame(MAP, ids[0])
         return read(*given)
@@ -258,13 +245,11 @@ def test_a_frame_that_goes_before_its_artifact_is_passed_over(
     assert (found.frames, found.written, found.revision) == (1, 1, 3)
 
 
-def test_artifacts_that_are_away_end_the_pull(
-    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_artifacts_that_are_away_end_the_pull(robot, walk, monkeypatch):
     robot.service.create_map(MAP, model="depth")
     upload(robot.service, walk[:1])
 
-    def away(*_: Any) -> bytes:
+    def away(*_):
         raise NotFound("no such artifact")
 
     monkeypatch.setattr(robot.service, "copied_artifact", away)
@@ -272,14 +257,12 @@ def test_artifacts_that_are_away_end_the_pull(
         robot.pull()
 
 
-def test_other_bytes_than_were_named_are_refused(
-    robot: Robot, walk: tuple[DepthFrame, ...], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_bytes_than_were_named_are_refused(robot, walk, monkeypatch):
     robot.service.create_map(MAP, model="depth")
     upload(robot.service, walk[:1])
     read = robot.service.map_copy
 
-    def other(*arguments: Any) -> Any:
+    def other(*arguments):
         head, parts = read(*arguments)
         return head, dict.fromkeys(parts, b"other")
 
@@ -292,7 +275,7 @@ def test_other_bytes_than_were_named_are_refused(
         assert list(client.maps()) == []
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+def test_a_folder_of_something_else_is_refused(tmp_path):
     map_copy.claim_folder(tmp_path / "new")
     (tmp_path / "new" / "sceneprint.db").touch()
     map_copy.claim_folder(tmp_path / "new")  # which is one already
@@ -306,7 +289,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
             map_copy.claim_folder(folder)
 
 
-def test_edits_of_the_map_follow(robot: Robot) -> None:
+def test_edits_of_the_map_follow(robot):
     robot.service.create_map(MAP, model="depth")
     robot.pull()
     robot.service.edit_map(MAP, {"title": "The hall", "up": [0.0, 0.0, 1.0]})

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +12,7 @@ from pydantic import ValidationError
 from sceneprint.engine.ingest import map_import
 from sceneprint.engine.ingest.map_import import StoredSurface, weak_areas
 from sceneprint.engine.jobs.lifecycle import cancel
-from sceneprint.engine.jobs.tasks import LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.search.query import localization_of
 from sceneprint.errors import InvalidRequest, LostLease, QuotaExceeded, UnreadableCloud
@@ -23,7 +20,7 @@ from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import files_of
 from sceneprint.types import ReferenceSurface
-from sceneprint_client.api import FrameState, Job, JobState, NewMap, Query
+from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
 from sceneprint_lab.synth.rooms import make_room
 from tests.engine.conftest import Between
@@ -33,13 +30,13 @@ from tests.whole_engine import Engine
 CAMERA = {"fx": 146.0, "fy": 146.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}
 
 
-def options_of(**more: Any) -> ImportOptions:
+def options_of(**more):
     """Options of the import of `room.ply`, with a small camera at one height."""
     usual = {"as": "map", "name": "room.ply", "up": "z", "camera": CAMERA, "heights": [1.0]}
     return ImportOptions.model_validate({**usual, **more})
 
 
-def begun(engine: Engine, data: bytes, **more: Any) -> Job:
+def begun(engine, data, **more):
     options = options_of(**more)
     with engine.imports.receive("hall", options) as receiver:
         for start in range(0, len(data), 100_000):
@@ -48,7 +45,7 @@ def begun(engine: Engine, data: bytes, **more: Any) -> Job:
     return engine.imports.begin("hall", file, options)[0]
 
 
-def claimed(engine: Engine) -> LongJob:
+def claimed(engine):
     while True:  # views that wait to be signed are left waiting
         work = engine.claim("test")
         if isinstance(work, LongJob):
@@ -56,23 +53,23 @@ def claimed(engine: Engine) -> LongJob:
         assert work is not None
 
 
-def slice_of(engine: Engine, task: LongJob, is_over: Callable[[], bool]) -> SliceResult:
+def slice_of(engine, task, is_over):
     """What a slice of the import comes to, if it is never stored: its worker dies."""
     return engine.jobs.handlers["import-map"](task, is_over)
 
 
-def used_bytes(engine: Engine) -> int:
+def used_bytes(engine):
     with engine.store.database.read() as connection:
         return find_map(connection, "hall").used_bytes
 
 
 @pytest.fixture(scope="session")
-def chosen_folder(once: Callable[[str, Callable[[Path], object]], Path], room_mesh: bytes) -> Path:
+def chosen_folder(once, room_mesh):
     """A data folder in which the import of a room has its viewpoints, and no view yet. Only to be
     copied.
     """
 
-    def make(folder: Path) -> None:
+    def make(folder):
         with Engine(Settings(data_dir=folder)) as engine:
             engine.create_map(NewMap(name="hall", model="depth"))
             begun(engine, room_mesh, tags=["given"], robot="r1")
@@ -83,15 +80,13 @@ def chosen_folder(once: Callable[[str, Callable[[Path], object]], Path], room_me
 
 
 @pytest.fixture
-def chosen(chosen_folder: Path, tmp_path: Path, make_engine: Callable[..., Engine]) -> Engine:
+def chosen(chosen_folder, tmp_path, make_engine):
     """An engine on a copy of `chosen_folder`."""
     shutil.copytree(chosen_folder, tmp_path / "data")
     return make_engine()
 
 
-def test_a_room_becomes_a_map_in_which_it_is_found(
-    chosen: Engine, due_now: Callable[..., None]
-) -> None:
+def test_a_room_becomes_a_map_in_which_it_is_found(chosen, due_now):
     phases, state = list[str](), None
     while state != JobState.SUCCEEDED:
         work = chosen.claim("test")
@@ -108,14 +103,11 @@ def test_a_room_becomes_a_map_in_which_it_is_found(
     assert list(dict.fromkeys(phases)) == ["render", "sign", "test"]
     done = chosen.get_job(job_id)
     result, progress = MapImportResult.model_validate(done.result), done.progress
-    assert progress is not None
     frames = chosen.list_frames("hall", limit=1000).items
     assert result.views == sum(one.state == FrameState.INDEXED for one in frames) > 0
     assert (result.session, result.parent_frame) == ("room", "r1/room")
     for one in frames:
         assert one.tags == ["given", "virtual"]
-        assert one.pose is not None
-        assert one.up is not None
         assert one.pose.parent_frame == "r1/room"
         # up in the sensor, turned by the pose, is that of the file
         up = np.array(one.pose.matrix)[:3, :3] @ [one.up.x, one.up.y, one.up.z]
@@ -130,14 +122,12 @@ def test_a_room_becomes_a_map_in_which_it_is_found(
     # most frames that bear a pose out are read beside the one candidate
     query = Query(candidates=1, keep=False)
     there = localization_of(chosen.query_frame("hall", frames[0].frame_id, query))
-    assert (there.evidence or there.alternatives[0].evidence).rendered  # type: ignore[union-attr]
+    assert (there.evidence or there.alternatives[0].evidence).rendered
     items = chosen.imports.items("hall", job_id, limit=1000).items
     assert {one.frame_id for one in items} - {None} == {one.frame_id for one in frames}
 
 
-def test_a_slice_that_was_lost_adds_nothing_twice(
-    chosen: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slice_that_was_lost_adds_nothing_twice(chosen, monkeypatch):
     monkeypatch.setattr(map_import, "_AT_ONCE", 3)
     task = claimed(chosen)
     lost = slice_of(chosen, task, lambda: True)
@@ -153,9 +143,7 @@ def test_a_slice_that_was_lost_adds_nothing_twice(
     assert [one.name for one in chosen.list_frames("hall", limit=1000).items] == names
 
 
-def test_the_same_view_in_two_sessions_is_two_frames(
-    chosen: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_view_in_two_sessions_is_two_frames(chosen, monkeypatch):
     monkeypatch.setattr(map_import, "_AT_ONCE", 2)
     task = claimed(chosen)
     data = {**task.job.data, "session": "annex"}
@@ -165,9 +153,7 @@ def test_the_same_view_in_two_sessions_is_two_frames(
     assert len({one["frame_id"] for items in added for one in items}) == 4
 
 
-def test_a_cancelled_import_adds_no_view_more(
-    chosen: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cancelled_import_adds_no_view_more(chosen, monkeypatch):
     monkeypatch.setattr(map_import, "_AT_ONCE", 2)
     task = claimed(chosen)
     with chosen.store.database.read() as connection:
@@ -182,11 +168,11 @@ def test_a_cancelled_import_adds_no_view_more(
 
 
 def test_a_map_that_is_made_anew_takes_no_view_of_an_import_into_the_one_before(
-    chosen: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    chosen, monkeypatch
+):
     monkeypatch.setattr(map_import, "_AT_ONCE", 2)
 
-    def make_anew() -> None:
+    def make_anew():
         chosen.delete_map("hall")
         chosen.create_map(NewMap(name="hall", model="depth"))
 
@@ -196,9 +182,7 @@ def test_a_map_that_is_made_anew_takes_no_view_of_an_import_into_the_one_before(
     assert list(chosen.store.blobs.digests()) == []
 
 
-def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(
-    chosen: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(chosen, monkeypatch):
     monkeypatch.setattr("sceneprint.engine.ingest.archive_import.TIDY_S", 0.0)
     task = claimed(chosen)
     edit_map(chosen.store, "hall", {"quota_frames": 1})
@@ -216,7 +200,7 @@ def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(
     assert (used_bytes(chosen), list(chosen.store.blobs.digests())) == (0, [])
 
 
-def test_a_surface_needs_room_beyond_that_of_its_file(empty: Engine) -> None:
+def test_a_surface_needs_room_beyond_that_of_its_file(empty):
     """A PLY of text with short numbers, whose points are larger as arrays."""
     rows = "".join(f"{x} {y} {z}\n" for x in range(9) for y in range(9) for z in range(9))
     data = "ply\nformat ascii 1.0\nelement vertex 729\nproperty float x\nproperty float y\n"
@@ -232,7 +216,7 @@ def test_a_surface_needs_room_beyond_that_of_its_file(empty: Engine) -> None:
 FAR = np.array([431_000.25, 5_411_000.5, 300.0])
 
 
-def room_at(place: Any) -> bytes:
+def room_at(place):
     """The room as an OBJ file, whose numbers have as many digits as they need."""
     room = make_room(np.random.default_rng(3))
     corners = "".join(
@@ -242,10 +226,10 @@ def room_at(place: Any) -> bytes:
 
 
 @pytest.mark.thorough
-def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
+def test_files_in_one_parent_frame_need_one_offset(empty):
     """Each would have its own middle as its offset, and views of one would lie in the other."""
 
-    def slices(place: Any, name: str, count: int, **more: Any) -> LongJob:
+    def slices(place, name, count, **more):
         job = begun(empty, room_at(place), name=name, parent_frame="district", **more)
         for _ in range(count):
             task = claimed(empty)
@@ -255,7 +239,7 @@ def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
             cancel(empty.store, job.job_id)
         return task
 
-    def places() -> dict[str, Any]:
+    def places():
         return {
             one.name: np.array(one.pose.matrix)[:3, 3]
             for one in empty.list_frames("hall", limit=1000).items
@@ -284,7 +268,7 @@ def test_files_in_one_parent_frame_need_one_offset(empty: Engine) -> None:
     assert empty.get_job(again.job.id).error is None
 
 
-def test_files_that_are_no_map_are_refused(empty: Engine, room_mesh: bytes) -> None:
+def test_files_that_are_no_map_are_refused(empty, room_mesh):
     for data in (b"", b"no map at all", b"PK\x03\x04" + bytes(600)):
         with pytest.raises((UnreadableCloud, InvalidRequest)):
             begun(empty, data, name="room")
@@ -313,12 +297,12 @@ def test_files_that_are_no_map_are_refused(empty: Engine, room_mesh: bytes) -> N
         ({"camera": CAMERA}, "camera: applies only"),
     ],
 )
-def test_options_of_another_import_are_errors(fields: dict[str, Any], message: str) -> None:
+def test_options_of_another_import_are_errors(fields, message):
     with pytest.raises(ValidationError, match=message):
         ImportOptions.model_validate(fields)
 
 
-def test_weak_areas_are_where_most_views_are_lost() -> None:
+def test_weak_areas_are_where_most_views_are_lost():
     """Views along x, 1 m apart: of ten at x = 0 all are found, of four at x = 9 one."""
     points = np.zeros((3, 3), np.float32)
     surface = ReferenceSurface(points, None, np.zeros(3), np.array([0.0, 0.0, 1.0]))

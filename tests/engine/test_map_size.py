@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,12 +15,9 @@ from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap
 from sceneprint_client.api.listing import Run
-from tests.whole_engine import Engine
-
-Ids = Callable[[Engine], list[str]]
 
 
-def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_map_is_weighed(full, ids, monkeypatch):
     full.create_map(NewMap(name="shop", model="depth"))
     full.rebuild_index("hall")
     names = ids(full)
@@ -58,9 +53,7 @@ def test_a_map_is_weighed(full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatc
     assert told.database == sum(one[1] for one in held[1:])
 
 
-def test_a_long_trajectory_is_thinned(
-    full: Engine, ids: Ids, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_trajectory_is_thinned(full, ids, tmp_path, monkeypatch):
     from sceneprint.engine.maps import map_frames
 
     names = ids(full)
@@ -92,5 +85,5 @@ def test_a_long_trajectory_is_thinned(
     assert "# poses: 6; frames left out: 1" in trajectory_file(whole)
 
 
-def _files(folder: Path) -> list[Path]:
+def _files(folder):
     return [path for path in folder.rglob("*") if path.is_file()]

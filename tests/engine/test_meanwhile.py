@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
@@ -16,19 +14,15 @@ from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import UnknownMap
 from sceneprint.pipeline import associate
 from sceneprint_client.api import NewMap, Query
-from tests.whole_engine import Engine
 
-Ids = Callable[[Engine], list[str]]
 R = Query(stages=("retrieve",), k=50)
 
 
-def test_what_is_deleted_while_a_query_runs_is_not_told(
-    full: Engine, uploads: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_deleted_while_a_query_runs_is_not_told(full, uploads, ids, monkeypatch):
     names, search = ids(full), local_index.search
     gone = [names[6], names[1]]
 
-    def then_delete(*given: Any, **more: Any) -> Any:
+    def then_delete(*given, **more):
         hits = search(*given, **more)
         if gone:
             full.delete_frame("hall", gone.pop())
@@ -42,9 +36,7 @@ def test_what_is_deleted_while_a_query_runs_is_not_told(
     assert gone == []
 
 
-def test_a_frame_deleted_after_it_was_asked_for_is_answered(
-    empty: Engine, uploads: Any, work_off: Any, ids: Ids
-) -> None:
+def test_a_frame_deleted_after_it_was_asked_for_is_answered(empty, uploads, work_off, ids):
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     (name,) = ids(empty)
@@ -55,9 +47,7 @@ def test_a_frame_deleted_after_it_was_asked_for_is_answered(
     assert (answer.status, answer.matches, answer.counts.map) == ("not_found", [], 0)
 
 
-def test_a_map_made_anew_while_it_was_asked_is_not_answered_for(
-    empty: Engine, uploads: Any, work_off: Any, ids: Ids
-) -> None:
+def test_a_map_made_anew_while_it_was_asked_is_not_answered_for(empty, uploads, work_off, ids):
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     row = empty.row("hall")
@@ -69,13 +59,13 @@ def test_a_map_made_anew_while_it_was_asked_is_not_answered_for(
 
 
 def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
-    empty: Engine, uploads: Any, work_off: Any, ids: Ids, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    empty, uploads, work_off, ids, monkeypatch
+):
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     work_off(empty)
     (name,) = ids(empty)
 
-    def then_delete(*arguments: Any, **named: Any) -> Any:
+    def then_delete(*arguments, **named):
         found = associate(*arguments, **named)
         assert [match.validation.status for match in found] == ["accepted"]
         empty.delete_frame("hall", name)
@@ -88,9 +78,8 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
 
 
 def test_queries_beside_deletions_and_publishing_see_one_state(
-    full: Engine, make_engine: Callable[..., Engine], uploads: Any, ids: Ids,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    full, make_engine, uploads, ids, monkeypatch
+):
     """Frames go one by one, from the last: every answer has the first n, rightly ranked."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     engine, builder = make_engine(unindexed_frames=1), make_engine(unindexed_frames=1)
@@ -98,7 +87,7 @@ def test_queries_beside_deletions_and_publishing_see_one_state(
     whole = [(m.frame_id, m.distance) for m in full.query_frame("hall", names[0], R).matches]
     over, raised, sizes = threading.Event(), [], [[] for _ in range(4)]
 
-    def work(seen: list[int]) -> None:
+    def work(seen):
         try:
             while not over.is_set():
                 answer = engine.query_frame("hall", names[0], R)
@@ -135,9 +124,8 @@ def test_queries_beside_deletions_and_publishing_see_one_state(
 
 
 def test_what_is_deleted_while_an_index_is_published_stays_deleted(
-    full: Engine, make_engine: Callable[..., Engine], uploads: Any, ids: Ids, work_off: Any,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    full, make_engine, uploads, ids, work_off, monkeypatch
+):
     """The version holds it, and readers have heard of its end but never of its beginning."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     reader, builder = make_engine(unindexed_frames=5), make_engine(unindexed_frames=5)
@@ -150,7 +138,7 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
     gone = full.add_frame("hall", uploads[3].data, given)[0].frame_id
     work_off(full)
 
-    def slowly(*given: Any, **more: Any) -> Any:
+    def slowly(*given, **more):
         full.delete_frame("hall", gone)
         assert len(reader.query_frame("hall", names[0], R).matches) == 11
         return publish(*given, **more)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,24 +10,21 @@ import pytest
 from benchmarks.indexed_frames import fill
 from sceneprint.engine.search import local_index
 from sceneprint.geometry.retrieval.ranking import distances
-from sceneprint.models import Model
 from sceneprint.settings import Settings
-from sceneprint.types import Bytes
-from sceneprint_client.api import Answer, NamedFrame, Query
+from sceneprint_client.api import NamedFrame, Query
 from tests.whole_engine import Engine
 
-Node = Callable[..., Engine]
 #: Frames of both maps, and bytes of a signature.
 SIZES, LENGTH = {"hall": 300, "yard": 200}, 64
 
 
 @pytest.fixture
-def node(store_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Node]:
+def node(store_url, tmp_path, monkeypatch):
     """Nodes with indexes of their own on one database; they always look for a newer index."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     opened: list[Engine] = []
 
-    def engine(name: str) -> Engine:
+    def engine(name):
         values = {
             "data_dir": tmp_path / "data", "index_dir": tmp_path / name, "database_url": store_url,
             "unindexed_frames": 10, "decoders": 0,
@@ -45,27 +39,26 @@ def node(store_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
 
 
 @pytest.fixture(scope="module")
-def places() -> dict[str, Bytes]:
+def places():
     """Signatures of both maps."""
     return {name: drawn(n, LENGTH, seed=i) for i, (name, n) in enumerate(SIZES.items())}
 
 
-def drawn(n: int, length: int, seed: int) -> Bytes:
-    found: Bytes = np.random.default_rng(seed).integers(0, 256, (n, length), np.uint8)
-    return found
+def drawn(n, length, seed):
+    return np.random.default_rng(seed).integers(0, 256, (n, length), np.uint8)
 
 
-def ask(engine: Engine, frame: str, maps: list[str]) -> Answer:
+def ask(engine, frame, maps):
     query = Query(stages=("retrieve",), k=10, keep=False)
     named = NamedFrame(map=frame.rpartition("-")[0], frame_id=frame)
     return engine.queries.stored(maps, named, query)
 
 
-def found(answer: Answer) -> list[tuple[str, int]]:
+def found(answer):
     return [(one.frame_id, one.distance) for one in answer.matches]
 
 
-def nearest(places: dict[str, Bytes], frame: str, metric: Any = "l2") -> list[tuple[str, int]]:
+def nearest(places, frame, metric="l2"):
     """The ten nearest frames of all maps: all compared; equal ones in the order they came."""
     home, _, number = frame.rpartition("-")
     query = places[home][int(number) - 1]
@@ -79,11 +72,11 @@ def nearest(places: dict[str, Bytes], frame: str, metric: Any = "l2") -> list[tu
 
 
 @contextmanager
-def rows_read(engine: Engine) -> Iterator[list[int]]:
+def rows_read(engine):
     """Count the signatures that are read for a map, by statement."""
     read: list[int] = []
 
-    def changes(connection: Any, row: Any, revision: int, limit: int = 256) -> Iterator[Any]:
+    def changes(connection, row, revision, limit=256):
         for block in real(connection, row, revision, limit):
             read.append(len(block))
             yield block
@@ -95,8 +88,8 @@ def rows_read(engine: Engine) -> Iterator[list[int]]:
 
 
 def test_signatures_are_read_once_and_compared_exactly_until_there_is_an_index(
-    node: Node, places: dict[str, Bytes], whitened_model: Model
-) -> None:
+    node, places, whitened_model
+):
     worker, service = node("worker"), node("service")
     for name, made in places.items():
         fill(worker.store.database, name, whitened_model, made)
@@ -118,8 +111,8 @@ def test_signatures_are_read_once_and_compared_exactly_until_there_is_an_index(
 
 
 def test_a_node_that_is_far_behind_begins_with_the_newest_index(
-    node: Node, places: dict[str, Bytes], whitened_model: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    node, places, whitened_model, monkeypatch
+):
     monkeypatch.setattr(local_index, "READ_MOST", 50)
     worker, service = node("shared"), node("shared")
     made = places["hall"]
@@ -134,9 +127,7 @@ def test_a_node_that_is_far_behind_begins_with_the_newest_index(
     assert found(answer) == nearest({"hall": made}, "hall-7")
 
 
-def test_maps_of_psi_are_compared_whole_by_l1_without_an_index(
-    node: Node, small_model: Model
-) -> None:
+def test_maps_of_psi_are_compared_whole_by_l1_without_an_index(node, small_model):
     engine = node("alone")
     made = drawn(100, small_model.signature_bytes, seed=4)
     fill(engine.store.database, "old", small_model, made)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,26 +15,21 @@ from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.signature_job import find_nearest
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.errors import InvalidRequest
-from sceneprint.pipeline import Signature, Signer
 from sceneprint.store import maps as stored_maps
 from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import events, signatures
-from sceneprint.types import Geometry
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.base import NOVEL, novelty_of
 from tests.whole_engine import Engine
 
-Make = Callable[..., Engine]
-WorkOff = Callable[[Engine], list[JobState | None]]
 Told = Callable[[Engine], list[str]]
-Prepared = list[tuple[Signature, Geometry]]
 
 
 @pytest.fixture
-def share(prepared: Prepared, signer: Signer) -> Callable[[int, int], float]:
+def share(prepared, signer):
     """How far two of the uploads are apart, as a share of unrelated frames."""
 
-    def of(i: int, j: int) -> float:
+    def of(i, j):
         a, b = (prepared[k][0].vector.astype(np.int64) for k in (i, j))
         return float(np.sqrt(((a - b) ** 2).sum() / signer.model.unrelated_distance))
 
@@ -43,10 +37,10 @@ def share(prepared: Prepared, signer: Signer) -> Callable[[int, int], float]:
 
 
 @pytest.fixture
-def send(uploads: Any, work_off: WorkOff) -> Callable[..., Any]:
+def send(uploads, work_off):
     """Upload one of the uploads, sign it, and return the frame."""
 
-    def run(engine: Engine, which: int, if_novel: float | None = None, name: str = "hall") -> Any:
+    def run(engine, which, if_novel=None, name="hall"):
         added, new = engine.add_frame(
             name, uploads[which].data, uploads[which].meta, if_novel=if_novel
         )
@@ -57,20 +51,18 @@ def send(uploads: Any, work_off: WorkOff) -> Callable[..., Any]:
     return run
 
 
-def found(engine: Engine, uploads: Any) -> set[str]:
+def found(engine, uploads):
     query = Query(stages=("retrieve",), k=50)
     answer = engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, query)
     return {match.frame_id for match in answer.matches}
 
 
-def rows(engine: Engine) -> int:
+def rows(engine):
     with engine.store.database.read() as connection:
         return len(connection.execute(select(signatures.c.frame_number)).all())
 
 
-def test_a_frame_whose_place_the_map_has_is_not_kept(
-    empty: Engine, uploads: Any, send: Any, share: Any, told: Told
-) -> None:
+def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share, told):
     near, far = share(0, 1), share(0, 7)
     assert 0 < near < far
     between = (near + far) / 2
@@ -105,9 +97,7 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(
     assert unconditional.state == FrameState.INDEXED
 
 
-def test_the_nearest_frame_decides_and_must_be_farther(
-    empty: Engine, uploads: Any, send: Any, share: Any
-) -> None:
+def test_the_nearest_frame_decides_and_must_be_farther(empty, uploads, send, share):
     for which in (6, 1, 7):
         assert send(empty, which).state == FrameState.INDEXED
     nearest = min(share(0, which) for which in (6, 1, 7))
@@ -118,9 +108,7 @@ def test_the_nearest_frame_decides_and_must_be_farther(
     assert (again.state, again.frame_id) == (FrameState.INDEXED, not_kept.frame_id)
 
 
-def test_what_is_gone_is_no_place_and_a_frame_may_come_again(
-    empty: Engine, uploads: Any, send: Any
-) -> None:
+def test_what_is_gone_is_no_place_and_a_frame_may_come_again(empty, uploads, send):
     """The same frame with the same id and another job, once the map has lost what was near."""
     first = send(empty, 0)
     blob_count = len(list(empty.store.blobs.digests()))
@@ -140,7 +128,7 @@ def test_what_is_gone_is_no_place_and_a_frame_may_come_again(
     assert (added.frame_id, added.state, new) == (kept.frame_id, FrameState.INDEXED, False)
 
 
-def test_another_map_has_other_places(empty: Engine, uploads: Any, send: Any) -> None:
+def test_another_map_has_other_places(empty, uploads, send):
     empty.create_map(NewMap(name="other", model="depth"))
     send(empty, 0)
     assert send(empty, 1, 1.0, "other").state == FrameState.INDEXED
@@ -150,14 +138,13 @@ def test_another_map_has_other_places(empty: Engine, uploads: Any, send: Any) ->
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "kept"),
-    [(1.0, None, True), (1.0, 0.01, True), (0.01, 1.0, True), (None, 1.0, True), (1.0, 1.0, False)],
-)
-@pytest.mark.parametrize("claimed", [False, True])
+    ("first", "second", "kept", "claimed"),
+    [(1.0, None, True, False), (1.0, None, True, True), (1.0, 0.01, True, True),
+     (0.01, 1.0, True, False), (None, 1.0, True, False), (1.0, 1.0, False, True)],
+)  # fmt: skip
 def test_who_sends_it_without_the_condition_is_not_let_down(
-    empty: Engine, uploads: Any, send: Any, work_off: WorkOff, first: float | None,
-    second: float | None, kept: bool, claimed: bool,
-) -> None:  # fmt: skip
+    empty, uploads, send, work_off, first, second, kept, claimed
+):
     """Told that it is there, waiting or being signed: then the weaker condition counts."""
     send(empty, 0)
     frame, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta, if_novel=first)
@@ -170,9 +157,7 @@ def test_who_sends_it_without_the_condition_is_not_let_down(
     assert empty.get_frame("hall", frame.frame_id).state == state
 
 
-def test_of_two_that_are_signed_at_once_one_is_kept(
-    make_engine: Make, uploads: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkeypatch):
     """Two workers look at an empty map, and only then either stores what it made."""
     engines = [make_engine(), make_engine()]
     engines[0].create_map(NewMap(name="hall", model="depth"))
@@ -180,9 +165,8 @@ def test_of_two_that_are_signed_at_once_one_is_kept(
         engines[0].add_frame("hall", uploads[which].data, uploads[which].meta, if_novel=1.0)
     looked = threading.Barrier(2)
 
-    def together(*given: Any) -> Any:
+    def together(*given):
         seen = find_nearest(*given)
-        assert seen is not None
         assert seen.nearest is None
         looked.wait(PATIENCE_S)
         return seen
@@ -207,15 +191,15 @@ def test_of_two_that_are_signed_at_once_one_is_kept(
 
 @pytest.mark.parametrize("left", [1, 7])
 def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
-    empty: Engine, uploads: Any, send: Any, share: Any, monkeypatch: pytest.MonkeyPatch, left: int
-) -> None:
+    empty, uploads, send, share, monkeypatch, left
+):
     nearest = send(empty, 2)
     other = send(empty, left)
     limit = (share(3, 1) + share(3, 7)) / 2
     assert share(3, 2) < share(3, 1) < limit < share(3, 7)
     looks = []
 
-    def interrupted(*given: Any) -> Any:
+    def interrupted(*given):
         looks.append(find_nearest(*given))
         if len(looks) == 1:
             empty.delete_frame("hall", nearest.frame_id)
@@ -231,9 +215,7 @@ def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
         assert frame.state == FrameState.INDEXED
 
 
-def test_signatures_of_another_model_are_not_compared(
-    empty: Engine, uploads: Any, send: Any, prepared: Prepared
-) -> None:
+def test_signatures_of_another_model_are_not_compared(empty, uploads, send, prepared):
     send(empty, 0)
     with empty.store.database.read() as connection:
         row = stored_maps.find_map(connection, "hall")
@@ -241,23 +223,18 @@ def test_signatures_of_another_model_are_not_compared(
     made = StoredSignature(row.model_id, vector, "00" * 32, [1], [1])
     database, readers = empty.store.database, empty.readers
     seen = find_nearest(database, readers, row, made)
-    assert seen is not None
     assert seen.nearest is not None
     assert find_nearest(database, readers, row, replace(made, model_id="ab" * 32)) is None
     assert find_nearest(database, readers, replace(row, number=99), made) is None
 
 
-@pytest.mark.parametrize(
-    ("given", "share"),
-    [(None, None), (False, None), ("false", None), ("False", None), (True, NOVEL), ("true", NOVEL),
-     ("True", NOVEL), (1, 1.0), ("0.25", 0.25), (0.1, 0.1)],
-)  # fmt: skip
-def test_what_may_be_asked(given: Any, share: float | None) -> None:
-    assert novelty_of(given) == share
-
-
-@pytest.mark.parametrize("given", [0, 0.0, "0", -0.1, 1.1, "nan", float("inf"), "yes", ""])
-def test_what_may_not_be_asked(given: Any) -> None:
-    with pytest.raises(InvalidRequest, match="above 0 and up to 1") as caught:
-        novelty_of(given)
-    assert [place for place, _ in caught.value.fields] == ["if_novel"]
+def test_what_may_be_asked():
+    for nothing in (None, False, "false", "False"):
+        assert novelty_of(nothing) is None
+    for usual in (True, "true", "True"):
+        assert novelty_of(usual) == NOVEL
+    assert [novelty_of(share) for share in (1, "0.25", 0.1)] == [1.0, 0.25, 0.1]
+    for wrong in (0, 0.0, "0", -0.1, 1.1, "nan", float("inf"), "yes", ""):
+        with pytest.raises(InvalidRequest, match="above 0 and up to 1") as caught:
+            novelty_of(wrong)
+        assert [place for place, _ in caught.value.fields] == ["if_novel"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from sceneprint.engine.maps.map_lifecycle import edit_frame
-from sceneprint.engine.search.answer import Outcome, answer_status
+from sceneprint.engine.search.answer import answer_status
 from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.verification import Validated, numbers_of
 from sceneprint.errors import InvalidPose, InvalidRequest
@@ -26,47 +25,42 @@ from sceneprint.localization import (
     views_of_rows,
 )
 from sceneprint.models import read_model
-from sceneprint.pipeline import PairMatch, Signature, Signer, associate, diversify, retrieve
+from sceneprint.pipeline import PairMatch, associate, diversify, retrieve
 from sceneprint.places import QueryFrame, model_parameters
 from sceneprint.store.maps import placed_frames
-from sceneprint.types import Geometry, Patches
-from sceneprint_client.api import Counts, Localization, Prior, Query
-from tests.whole_engine import Engine
-
-Prepared = list[tuple[Signature, Geometry]]
-Ids = Callable[[Engine], list[str]]
+from sceneprint.types import Patches
+from sceneprint_client.api import Counts, Prior, Query
 
 
-def localized(engine: Engine, upload: Any, **how: Any) -> Localization:
+def localized(engine, upload, **how):
     query = Query.model_validate({"keep": False, **how})
     meta = upload.meta.model_copy(update={"pose": None})
     return localization_of(engine.queries.upload(["hall"], upload.data, meta, query))
 
 
-def judged(there: Localization) -> list[Any]:
+def judged(there):
     """Each pose that is told, with its confidence and evidence."""
     if there.pose is not None:
         return [(there.pose.matrix, there.confidence, there.evidence)]
     return [(one.pose.matrix, one.confidence, one.evidence) for one in there.alternatives]
 
 
-def prior_at(upload: Any, shift: float = 0.0, **more: Any) -> dict[str, Any]:
+def prior_at(upload, shift=0.0, **more):
     T = np.array(upload.pose)
     T[0, 3] += shift
     return {"pose": {"matrix": T.tolist(), "parent_frame": upload.room}, **more}
 
 
-def listed(covariance: Any) -> list[float]:
-    found: list[float] = covariance.ravel().tolist()
-    return found
+def listed(covariance):
+    return covariance.ravel().tolist()
 
 
-def test_frames_are_found_by_where_they_were_taken(full: Engine, uploads: Any, ids: Ids) -> None:
+def test_frames_are_found_by_where_they_were_taken(full, uploads, ids):
     poses = [np.array(one.pose)[:3, 3] for one in uploads]
     with full.store.database.read() as connection:
         row, _, _ = full.view("hall")
 
-        def near(centre: Any, within: float, most: int = 99, room: str = uploads[0].room) -> Any:
+        def near(centre, within, most=99, room=uploads[0].room):
             return placed_frames(
                 connection, row.number, room, row.model_id, centre.tolist(), within, most
             )
@@ -97,9 +91,8 @@ def test_frames_are_found_by_where_they_were_taken(full: Engine, uploads: Any, i
     [(8, 10, ()), (8, 1, ()), (8, 10, (1, 2, 3, 7)), (2, 1, (3, 9))],
 )
 def test_poses_are_scored_on_the_frames_that_pass_alone(
-    full: Engine, prepared: Prepared, signer: Signer, uploads: Any, ids: Ids,
-    asked: int, candidates: int, without: Sequence[int],
-) -> None:  # fmt: skip
+    full, prepared, signer, uploads, ids, asked, candidates, without
+):
     """Neither the frame that asks nor what a filter excludes bears a pose out."""
     names = ids(full)
     others = [i for i in range(len(prepared)) if i != asked and i not in without]
@@ -116,7 +109,6 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
     frames = [QueryFrame(seen, matches)]
     own_p = replace(model_parameters(frames), voted_only=True)
     by_library = localize(frames, poses, rooms, views_of, p=own_p)
-    assert by_library is not None
     assert by_library.verified_by in (None, "map")
 
     how: dict[str, Any] = {"candidates": candidates, "validation": {"ambiguous": 0.0}}
@@ -135,9 +127,7 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
 UNSURE = {"validation": {"ambiguous": 0.0}}
 
 
-def test_frames_of_other_parent_frames_tell_nothing_of_a_pose(
-    full: Engine, uploads: Any, ids: Ids
-) -> None:
+def test_frames_of_other_parent_frames_tell_nothing_of_a_pose(full, uploads, ids):
     """Whatever their coordinates: here those of the room that is asked about."""
     before = localized(full, uploads[8], **UNSURE)
     assert judged(before)
@@ -148,7 +138,7 @@ def test_frames_of_other_parent_frames_tell_nothing_of_a_pose(
     assert judged(after) == judged(before)
 
 
-def test_frames_about_each_pose_are_asked(full: Engine, uploads: Any) -> None:
+def test_frames_about_each_pose_are_asked(full, uploads):
     """A prior where nothing was taken is looked at too, and first."""
     alone = localized(full, uploads[8], candidates=1, **UNSURE)
     prior = prior_at(uploads[8], 50.0)
@@ -157,7 +147,7 @@ def test_frames_about_each_pose_are_asked(full: Engine, uploads: Any) -> None:
     assert judged(alone)
 
 
-def test_the_paper_s_test_asks_no_other_frames(full: Engine, uploads: Any) -> None:
+def test_the_paper_s_test_asks_no_other_frames(full, uploads):
     for mode, told in (("full", True), ("paper", False)):
         there = localized(full, uploads[8], validation={"mode": mode})
         assert (there.status, there.verified_by) == ("found", "matches")
@@ -165,7 +155,7 @@ def test_the_paper_s_test_asks_no_other_frames(full: Engine, uploads: Any) -> No
         assert (there.evidence is not None) is told
 
 
-def test_a_query_says_how_sure_a_pose_must_be(full: Engine, uploads: Any) -> None:
+def test_a_query_says_how_sure_a_pose_must_be(full, uploads):
     sure = localized(full, uploads[8], confidence=0.5)
     assert sure.status == "found"
     asked = full.queries.upload(
@@ -181,11 +171,11 @@ def test_a_query_says_how_sure_a_pose_must_be(full: Engine, uploads: Any) -> Non
             Query(confidence=wrong)
 
 
-def test_candidates_near_a_prior_are_tried_first(full: Engine, uploads: Any, ids: Ids) -> None:
+def test_candidates_near_a_prior_are_tried_first(full, uploads, ids):
     """Those of its parent frame, here the other room: they are rejected before the right one."""
     rooms = dict(zip(ids(full), (one.room for one in uploads), strict=True))
 
-    def tried(prior: dict[str, Any] | None) -> list[str]:
+    def tried(prior):
         query = Query.model_validate({"keep": False, "prior": prior})
         meta = uploads[8].meta.model_copy(update={"pose": None})
         answer = full.queries.upload(["hall"], uploads[8].data, meta, query)
@@ -203,7 +193,7 @@ def test_candidates_near_a_prior_are_tried_first(full: Engine, uploads: Any, ids
     assert set(tried(here)) == {"skipped"}
 
 
-def test_a_prior_is_read_and_changes_no_answer_that_is_sure(full: Engine, uploads: Any) -> None:
+def test_a_prior_is_read_and_changes_no_answer_that_is_sure(full, uploads):
     alone = localized(full, uploads[8])
     for prior in (prior_at(uploads[8], 0.2), prior_at(uploads[8], 3.0)):
         there = localized(full, uploads[8], prior=prior)
@@ -223,16 +213,14 @@ def test_a_prior_is_read_and_changes_no_answer_that_is_sure(full: Engine, upload
         {"covariance": np.eye(6) * 1e-4 + np.full((6, 6), 1.0)},  # mostly of all axes at once
     ],
 )
-def test_priors_of_any_deviation_in_range_are_used(
-    full: Engine, uploads: Any, how: dict[str, Any]
-) -> None:
+def test_priors_of_any_deviation_in_range_are_used(full, uploads, how):
     told = {name: listed(one) if name == "covariance" else one for name, one in how.items()}
     for away in (0.3, 9e8):
         there = localized(full, uploads[8], prior=prior_at(uploads[8], away, **told))
         assert (there.status, there.verified_by) == ("found", "matches")
 
 
-def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> None:
+def test_a_prior_that_cannot_be_used_says_why(full, uploads):
     flat = np.eye(6)
     flat[0, 0] = 0.0
     with pytest.raises(InvalidRequest, match="covariance of the prior is not valid"):
@@ -275,7 +263,7 @@ def test_a_prior_that_cannot_be_used_says_why(full: Engine, uploads: Any) -> Non
         Prior.model_validate({"pose": {"matrix": np.eye(4).tolist()}})
 
 
-def test_a_sequence_places_its_last_frame(full: Engine, uploads: Any) -> None:
+def test_a_sequence_places_its_last_frame(full, uploads):
     """The odometry starts anywhere: only what lies between the frames counts."""
     start = np.eye(4)
     start[:3, 3] = 40.0, -7.0, 1.0
@@ -287,7 +275,6 @@ def test_a_sequence_places_its_last_frame(full: Engine, uploads: Any) -> None:
         sent.append((one.data, meta))
     answer = full.queries.sequence("hall", sent, Query(keep=False))
     assert (answer.status, answer.frames) == ("found", 3)
-    assert answer.location is not None
     assert answer.location.votes == 15  # five of each frame
     there = np.array(answer.location.pose.matrix)
     assert np.linalg.norm(there[:3, 3] - np.array(uploads[8].pose)[:3, 3]) < 0.02
@@ -296,7 +283,7 @@ def test_a_sequence_places_its_last_frame(full: Engine, uploads: Any) -> None:
     assert "earlier" in answer.milliseconds
 
 
-def test_a_sequence_needs_frames_and_odometry(full: Engine, uploads: Any) -> None:
+def test_a_sequence_needs_frames_and_odometry(full, uploads):
     bare = uploads[0].meta.model_copy(update={"pose": None})
     one, other = (uploads[0].data, uploads[0].meta), (uploads[0].data, bare)
     for frames, why in (
@@ -316,8 +303,8 @@ def test_a_sequence_needs_frames_and_odometry(full: Engine, uploads: Any) -> Non
     ],
 )
 def test_what_is_not_found_names_its_likeliest_cause(
-    full: Engine, uploads: Any, make_upload: Any, change: str, cause: str, told: str
-) -> None:
+    full, uploads, make_upload, change, cause, told
+):
     frame = uploads[0].frame
     if change == "scale":
         upload = uploads[0]
@@ -339,15 +326,12 @@ def test_what_is_not_found_names_its_likeliest_cause(
 # What came of a query, by hand
 
 
-def came_of(
-    geometry: Geometry, *statuses: str, estimate: PoseEstimate | None = None, late: bool = False,
-    others: Sequence[Geometry] = (),
-) -> Outcome:  # fmt: skip
+def came_of(geometry, *statuses, estimate=None, late=False, others=()):
     """Of a query with matches of these statuses, compared with these others."""
     matches = []
     for i, status in enumerate(statuses):
         made = PairValidation(
-            status, "strong" if status == "accepted" else None, f"as given {i}",  # type: ignore[arg-type]
+            status, "strong" if status == "accepted" else None, f"as given {i}",
             np.eye(4), 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.0, None, 0,
         )  # fmt: skip
         matches.append(PairMatch(i, 10, 0.5, made))
@@ -361,14 +345,14 @@ def came_of(
     return answer_status(Query(), estimate, tried, matches, counts, geometry, p, posed=True)
 
 
-def supported(*confidences: float) -> PoseEstimate:
+def supported(*confidences):
     """Poses of the map that no match votes for, with these confidences."""
     told = tuple(AlternativePose(np.eye(4), 0, one, None) for one in confidences)
     status: LocalizationStatus = "ambiguous" if told else "not_found"
     return PoseEstimate(status, "the map's say", "hall", None, None, None, None, told)
 
 
-def test_poses_of_the_map_are_told_where_no_match_is_accepted(prepared: Prepared) -> None:
+def test_poses_of_the_map_are_told_where_no_match_is_accepted(prepared):
     seen = prepared[0][1]
     told = came_of(seen, "rejected", estimate=supported(0.5, 0.4), others=[seen])
     assert (told.status, told.reason, told.cause) == ("ambiguous", "the map's say", None)
@@ -385,7 +369,7 @@ def test_poses_of_the_map_are_told_where_no_match_is_accepted(prepared: Prepared
     assert "1 of 2 candidates were validated" in late.reason
 
 
-def test_what_in_view_is_no_help_is_the_cause(prepared: Prepared) -> None:
+def test_what_in_view_is_no_help_is_the_cause(prepared):
     seen, other = prepared[0][1], prepared[1][1]
     few = Patches(*(one[:9] for one in vars(seen.patches).values()))
     told = came_of(replace(seen, patches=few), "rejected", others=[other])

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -12,18 +9,11 @@ from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQ
 from sceneprint.formats.export import points_of
 from sceneprint.geometry.rigid import transform_points
 from sceneprint.geometry.validation.inspection import STEP_COLOURS, patches_at
-from sceneprint.pipeline import Signature
-from sceneprint.types import Geometry
-from sceneprint_client.api import Answer, Query
+from sceneprint_client.api import Query
 from sceneprint_client.surface_encoding import HEADER, POINT
-from tests.whole_engine import Engine
-
-Prepared = list[tuple[Signature, Geometry]]
-Ids = Callable[[Engine], list[str]]
-Rows = np.ndarray[Any, Any]
 
 
-def rows_of(data: bytes) -> tuple[tuple[Any, ...], Rows, Any]:
+def rows_of(data):
     """Header, rows, and their positions in metres."""
     head = HEADER.unpack_from(data)
     rows = np.frombuffer(data, POINT, offset=HEADER.size)
@@ -31,11 +21,11 @@ def rows_of(data: bytes) -> tuple[tuple[Any, ...], Rows, Any]:
 
 
 @pytest.fixture
-def asked(full: Engine, ids: Ids) -> Answer:
+def asked(full, ids):
     return full.query_frame("hall", ids(full)[3], Query(k=2, seed=5))
 
 
-def test_the_points_of_a_frame(full: Engine, prepared: Prepared, ids: Ids) -> None:
+def test_the_points_of_a_frame(full, prepared, ids):
     geometry = prepared[3][1]
     points, normals = points_of(geometry.surface)
     whole = full.points.frame("hall", ids(full)[3])
@@ -53,13 +43,13 @@ def test_the_points_of_a_frame(full: Engine, prepared: Prepared, ids: Ids) -> No
     assert fewer.tag != whole.tag
     with pytest.raises(InvalidRequest, match="no T_base_sensor"):
         full.points.frame("hall", ids(full)[3], "base")
-    pose = np.array(full.get_frame("hall", ids(full)[3]).pose.matrix)  # type: ignore[union-attr]
+    pose = np.array(full.get_frame("hall", ids(full)[3]).pose.matrix)
     _, _, there = rows_of(full.points.frame("hall", ids(full)[3], "parent").make())
     assert there == pytest.approx(transform_points(pose, points.astype(float)), abs=1e-4)
 
 
 @pytest.mark.parametrize("by", ["aligned", "none"])
-def test_residuals_are_those_of_the_overlay(full: Engine, asked: Answer, by: Any) -> None:
+def test_residuals_are_those_of_the_overlay(full, asked, by):
     best = asked.matches[0]
     ply = full.inspection.overlay(asked.query_id, best.frame_id, colour="residual", by=by)
     body = ply.split(b"end_header\n", 1)[1]
@@ -68,7 +58,7 @@ def test_residuals_are_those_of_the_overlay(full: Engine, asked: Answer, by: Any
     told = []
     for side in ("query", "match"):
         head, rows, _ = rows_of(
-            full.points.match(asked.query_id, best.frame_id, "hall", side, by).make()  # type: ignore[arg-type]
+            full.points.match(asked.query_id, best.frame_id, "hall", side, by).make()
         )
         assert head[2] == 7
         assert head[12] == pytest.approx(0.05)
@@ -81,7 +71,7 @@ def test_residuals_are_those_of_the_overlay(full: Engine, asked: Answer, by: Any
         assert inside == pytest.approx(best.validation.overlap, abs=0.05)
 
 
-def test_points_of_a_query_are_those_of_its_side(full: Engine, asked: Answer) -> None:
+def test_points_of_a_query_are_those_of_its_side(full, asked):
     best = asked.matches[0].frame_id
     head, rows, at = rows_of(full.points.query(asked.query_id).make())
     _, compared, there = rows_of(full.points.match(asked.query_id, best).make())
@@ -91,7 +81,7 @@ def test_points_of_a_query_are_those_of_its_side(full: Engine, asked: Answer) ->
     assert head[12] == 0
 
 
-def test_what_cannot_be_drawn(full: Engine, asked: Answer, ids: Ids) -> None:
+def test_what_cannot_be_drawn(full, asked, ids):
     best = asked.matches[0].frame_id
     with pytest.raises(InvalidRequest, match="no rival"):
         full.points.match(asked.query_id, best, by="rival").make()
@@ -107,9 +97,7 @@ def test_what_cannot_be_drawn(full: Engine, asked: Answer, ids: Ids) -> None:
         full.points.match(asked.query_id, best)
 
 
-def test_one_match_is_validated_once(
-    full: Engine, asked: Answer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_match_is_validated_once(full, asked, monkeypatch):
     best, made = asked.matches[0].frame_id, []
     from sceneprint.engine.results import result_views
 
@@ -117,6 +105,6 @@ def test_one_match_is_validated_once(
     monkeypatch.setattr(result_views, "validate", lambda *a, **b: made.append(1) or whole(*a, **b))
     told = full.inspection.match(asked.query_id, best)
     for side in ("query", "match"):
-        full.points.match(asked.query_id, best, side=side).make()  # type: ignore[arg-type]
+        full.points.match(asked.query_id, best, side=side).make()
     assert full.inspection.match(asked.query_id, best) == told
     assert len(made) == 1

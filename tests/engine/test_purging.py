@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -30,13 +29,12 @@ from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.signatures import stored_vector
 from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.surface import NewReconstruction
-from tests.whole_engine import Engine
 
 #: Bytes of a piece that is looked for, and pieces of each thing.
 PIECE, MANY = 24, 40
 
 
-def pieces(data: bytes, others: list[bytes]) -> list[bytes]:
+def pieces(data, others):
     """Parts of some bytes that tell them from others: even over their length."""
     found = []
     for start in np.linspace(0, len(data) - PIECE, 8 * MANY).astype(int).tolist():
@@ -47,13 +45,13 @@ def pieces(data: bytes, others: list[bytes]) -> list[bytes]:
     return found[:: max(len(found) // MANY, 1)]
 
 
-def files(folder: Path) -> Iterator[tuple[str, bytes]]:
+def files(folder):
     for path in sorted(folder.rglob("*")):
         if path.is_file():
             yield str(path.relative_to(folder)), path.read_bytes()
 
 
-def rows(engine: Engine) -> Iterator[tuple[str, bytes]]:
+def rows(engine):
     """All tables of a server's database, as bytes and as text."""
     if engine.store.database.is_sqlite:
         return  # it is one of the files
@@ -65,7 +63,7 @@ def rows(engine: Engine) -> Iterator[tuple[str, bytes]]:
                 yield f"table {table}", row.encode() + raw
 
 
-def places(engine: Engine, folder: Path, wanted: list[bytes]) -> set[str]:
+def places(engine, folder, wanted):
     """Kinds of files, and tables, in which any of some pieces is."""
     found = set()
     for name, data in (*files(folder), *rows(engine)):
@@ -113,7 +111,7 @@ def secret(lived_in, ids, uploads):
     }
 
 
-def asked(engine: Engine, frame_id: str, uploads) -> tuple[str, str, str]:
+def asked(engine, frame_id, uploads):
     """Ids of an answer that was made from a frame, of one that shows it, and of a surface."""
     options = Query(stages="retrieve,diversify,validate", seed=1)
     own = engine.query_frame("hall", frame_id, options)

@@ -22,13 +22,7 @@ from sceneprint.engine.results.query_entry import (
     query_row,
 )
 from sceneprint.engine.results.query_log import QueryLog
-from sceneprint.errors import (
-    FrameError,
-    InvalidRequest,
-    QuotaExceeded,
-    StoreLocked,
-    UnknownQuery,
-)
+from sceneprint.errors import FrameError, InvalidRequest, QuotaExceeded, StoreLocked, UnknownQuery
 from sceneprint.settings import Settings
 from sceneprint.store.answer_files import AnswerObjects, open_answers
 from sceneprint.store.blobs.object_client import open_objects
@@ -66,7 +60,7 @@ def engine(make_engine):
     return made
 
 
-def row(number: int, **more: object) -> NewQuery:
+def row(number, **more):
     """A row of the query of a number; each came a second after the one before."""
     one = NewQuery(
         id=f"{number:032x}", at=time.time() + number, map="hall", maps=None, robot=None,
@@ -77,7 +71,7 @@ def row(number: int, **more: object) -> NewQuery:
     return replace(one, **more)
 
 
-def stored(size: int = 1000, query: Query | None = None) -> StoredAnswer:
+def stored(size=1000, query=None):
     """An answer that takes a little more than `size` bytes."""
     answer = Answer(
         query_id=uuid.uuid4().hex, status="not_found", matches=[], location=None, seed=3,
@@ -88,18 +82,18 @@ def stored(size: int = 1000, query: Query | None = None) -> StoredAnswer:
     return StoredAnswer(answer, query or Query(), "ab" * 32, vector, bytes(size), (7, 3))
 
 
-def log_of(engine, **settings) -> QueryLog:
+def log_of(engine, **settings):
     """A log of the engine's store with other settings."""
     files = open_answers(engine.store.blobs, engine.settings.query_dir)
     return QueryLog(engine.store, files, Settings(**settings))
 
 
-def files_of(engine) -> set[str]:
+def files_of(engine):
     files = open_answers(engine.store.blobs, engine.settings.query_dir)
     return {name for name, _ in files.list()}
 
 
-def log_answer(engine, size: int = 1000, log: QueryLog | None = None, **more: object) -> str:
+def log_answer(engine, size=1000, log=None, **more):
     """Have an answer logged; returns its id."""
     one = stored(size)
     where = engine.query_log if log is None else log
@@ -119,7 +113,7 @@ def numbers(engine, names=None, **wanted):
             return found
 
 
-def count(engine, *conditions) -> int:
+def count(engine, *conditions):
     with engine.store.database.read() as connection:
         asked = select(func.count()).select_from(queries).where(*conditions)
         return connection.execute(asked).scalar_one()

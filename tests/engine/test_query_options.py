@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -25,29 +25,25 @@ from sceneprint.geometry.retrieval.ranking import (
 )
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.index.index_version import SearchHits
-from sceneprint.pipeline import Signature, Signer, retrieve, validate
+from sceneprint.pipeline import retrieve, validate
 from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import frames
-from sceneprint.types import Geometry
-from sceneprint_client.api import Answer, Query
+from sceneprint_client.api import Query
 from sceneprint_client.api.query import ValidationOptions
-from tests.whole_engine import Engine
 
-Prepared = list[tuple[Signature, Geometry]]
-Ids = Callable[[Engine], list[str]]
 VR = ("retrieve", "validate")
 
 
-def ask(engine: Engine, frame_id: str, **how: Any) -> Answer:
+def ask(engine, frame_id, **how):
     return engine.query_frame("hall", frame_id, Query.model_validate({"keep": False, **how}))
 
 
-def told(answer: Answer, *without: str) -> str:
+def told(answer, *without):
     """Its bytes, but for who it is and how long it took."""
     return answer.model_dump_json(exclude={"query_id", "milliseconds", *without})
 
 
-def test_an_answer_without_options_has_none_of_their_fields(full: Engine, ids: Ids) -> None:
+def test_an_answer_without_options_has_none_of_their_fields(full, ids):
     answer = ask(full, ids(full)[3])
     new = ("per_map", "deadline_reached", "explanations", "explained_frame")
     assert [getattr(answer, name) for name in new] == [None] * 4
@@ -60,10 +56,9 @@ def test_an_answer_without_options_has_none_of_their_fields(full: Engine, ids: I
     assert told(same) == told(answer)
 
 
-@pytest.mark.parametrize("candidates", [1, 3, 7])
-def test_so_many_candidates_are_selected_and_tried(full: Engine, ids: Ids, candidates: int) -> None:
+def test_so_many_candidates_are_selected_and_tried(full, ids):
     names = ids(full)
-    for stages in (VR, ("retrieve", "diversify", "validate")):
+    for candidates, stages in product((1, 7), (VR, ("retrieve", "diversify", "validate"))):
         answer = ask(full, names[0], candidates=candidates, k=50, stages=stages)
         assert len(answer.matches) == answer.counts.validated == candidates
         if stages == VR:
@@ -73,9 +68,7 @@ def test_so_many_candidates_are_selected_and_tried(full: Engine, ids: Ids, candi
     assert len(ask(full, names[0], candidates=7, k=2, stages=["retrieve"]).matches) == 2
 
 
-def test_the_scales_of_diversity_are_those_of_the_library(
-    full: Engine, prepared: Prepared, ids: Ids
-) -> None:
+def test_the_scales_of_diversity_are_those_of_the_library(full, prepared, ids):
     names, chosen = ids(full), {}
     vectors = np.stack([one.vector for one, _ in prepared[1:]])
     d = distances(prepared[0][0].vector, vectors, "l2")
@@ -93,7 +86,7 @@ def test_the_scales_of_diversity_are_those_of_the_library(
     assert chosen[1000.0] != chosen[0.01]
 
 
-def test_thresholds_decide_what_is_accepted(full: Engine, ids: Ids) -> None:
+def test_thresholds_decide_what_is_accepted(full, ids):
     name = ids(full)[0]
     before = {one.frame_id: one.validation for one in ask(full, name, k=50).matches}
     accepted = {one for one, v in before.items() if v.status == "accepted"}
@@ -116,7 +109,7 @@ def test_thresholds_decide_what_is_accepted(full: Engine, ids: Ids) -> None:
         assert (one.validation.status == "accepted") is small
 
 
-def test_a_limit_of_the_caller_holds_however_little_the_frames_share() -> None:
+def test_a_limit_of_the_caller_holds_however_little_the_frames_share():
     p = ValidationParameters()
     asked = ValidationOptions(evidence=0.4, plane_overlap=0.3, residual_m=0.05, residual_deg=3.0)
     a = thresholds(asked, p)[0].acceptance
@@ -130,9 +123,7 @@ def test_a_limit_of_the_caller_holds_however_little_the_frames_share() -> None:
     )
 
 
-def test_a_deadline_stops_validation_and_says_so(
-    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_deadline_stops_validation_and_says_so(full, ids, monkeypatch):
     name = ids(full)[0]
     whole = ask(full, name, k=50, deadline_ms=600_000)
     assert whole.deadline_reached is False
@@ -145,7 +136,7 @@ def test_a_deadline_stops_validation_and_says_so(
     }
     allows, asked = Deadline.allows, []
 
-    def thrice(self: Deadline) -> bool:
+    def thrice(self):
         asked.append(allows(self))
         self.reached = len(asked) > 3
         return not self.reached
@@ -160,15 +151,13 @@ def test_a_deadline_stops_validation_and_says_so(
         assert one.validation == full_told[one.frame_id].validation
 
 
-def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(
-    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(full, ids, monkeypatch):
     names, strict = ids(full), {"evidence": 1.0}
     ranked = ask(full, names[0], k=50, stages=["retrieve"]).matches
     how: dict[str, Any] = {"candidates": 3, "stages": VR, "deadline_ms": 600_000}
     allows, asked = Deadline.allows, list[bool]()
 
-    def so_often(self: Deadline) -> bool:
+    def so_often(self):
         asked.append(allows(self))
         self.reached = len(asked) > most
         return not self.reached
@@ -191,9 +180,7 @@ def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(
     )  # fmt: skip
 
 
-def test_no_candidate_is_begun_that_would_likely_end_too_late(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_no_candidate_is_begun_that_would_likely_end_too_late(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     deadline = Deadline(1000, since=99.5)  # ends at 100.5
@@ -211,9 +198,7 @@ def test_no_candidate_is_begun_that_would_likely_end_too_late(
     assert (Deadline(None).allows(), Deadline(None).reached) == (True, None)
 
 
-def test_every_frame_of_the_ranking_is_explained(
-    full: Engine, prepared: Prepared, ids: Ids
-) -> None:
+def test_every_frame_of_the_ranking_is_explained(full, prepared, ids):
     names = ids(full)
     vectors = {name: one.vector for name, (one, _) in zip(names, prepared, strict=True)}
     ranked = [one.frame_id for one in ask(full, names[0], k=50, stages=["retrieve"]).matches]
@@ -261,15 +246,13 @@ def test_every_frame_of_the_ranking_is_explained(
     assert plain[3].reason == "not a candidate: these were the first 3 frames of the ranking"
 
 
-def test_a_frame_is_explained_where_it_was_lost(
-    full: Engine, prepared: Prepared, ids: Ids, signer: Signer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_frame_is_explained_where_it_was_lost(full, prepared, ids, signer, monkeypatch):
     names = ids(full)
     index = {name: i for i, name in enumerate(names)}
     own = retrieve(prepared[0][0], [one for one, _ in prepared[1:]], signer.model)
     rank = {names[1 + i]: place + 1 for place, i in enumerate(own.indices.tolist())}
 
-    def explained(frame_id: str, **how: Any) -> Any:
+    def explained(frame_id, **how):
         answer = ask(full, names[0], explain_frame=frame_id, **how)
         plain = ask(full, names[0], **how)
         assert told(answer, "explained_frame") == told(plain, "explained_frame")
@@ -277,7 +260,7 @@ def test_a_frame_is_explained_where_it_was_lost(
         assert (one.frame_id, one.map, one.state) == (frame_id, "hall", "indexed")
         return one
 
-    def right(one: Any) -> None:
+    def right(one):
         """Its figures are those of the library, whatever the query did."""
         i = index[one.frame_id]
         d = distances(prepared[0][0].vector, prepared[i][0].vector[None], "l2")[0]
@@ -318,16 +301,14 @@ def test_a_frame_is_explained_where_it_was_lost(
     assert (bare.validation, bare.transform, bare.lost_at) == (None, None, "ranking")
 
 
-def test_what_an_approximate_index_missed_is_said(
-    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_an_approximate_index_missed_is_said(full, ids, monkeypatch):
     names = ids(full)
     near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
     real, lost = local_index.search, near[1]
     with full.store.database.read() as connection:
         number = find_frame(connection, find_map(connection, "hall"), lost).number
 
-    def search(*given: Any, dead: frozenset[int], exact: bool, **more: Any) -> SearchHits:
+    def search(*given, dead, exact, **more):
         if exact:
             return real(*given, dead=dead, exact=True, **more)
         return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
@@ -348,7 +329,7 @@ def test_what_an_approximate_index_missed_is_said(
             assert (one.lost_at, one.ranked) == ("ranking", False)
 
 
-def test_a_frame_that_is_not_searched_is_explained(full: Engine, ids: Ids) -> None:
+def test_a_frame_that_is_not_searched_is_explained(full, ids):
     names = ids(full)
     itself = ask(full, names[0], explain_frame=names[0]).explained_frame
     assert (itself.lost_at, itself.rank, itself.passes_filter) == ("query", None, None)
@@ -363,7 +344,7 @@ def test_a_frame_that_is_not_searched_is_explained(full: Engine, ids: Ids) -> No
         ask(full, names[0], explain_frame="nobody")
 
 
-def test_options_as_text_are_those_of_json() -> None:
+def test_options_as_text_are_those_of_json():
     given: dict[str, Any] = {
         "candidates": 7, "diversity": {"sigma": 2.0}, "validation": {"mode": "paper"},
         "deadline_ms": 50, "explain": True, "explain_frame": "f", "keep": False,

@@ -21,7 +21,7 @@ from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState, NewMap
 
 
-def used(engine) -> MapUsage:
+def used(engine):
     """What `hall` says that it holds, and what it does hold."""
     told = engine.get_map("hall")
     with engine.store.database.read() as connection:
@@ -30,7 +30,7 @@ def used(engine) -> MapUsage:
     return MapUsage(told.used_frames, told.used_bytes)
 
 
-def limit(engine, **limits) -> None:
+def limit(engine, **limits):
     edit_map(engine.store, "hall", limits)
 
 
@@ -75,7 +75,7 @@ def test_a_quota_holds_to_the_frame_whoever_sends_at_once(empty, make_engine, up
     limit(empty, quota_frames=7)
     engines, taken, refused = [empty, make_engine()], [], []
 
-    def send(part: int) -> None:
+    def send(part):
         for i, one in enumerate(uploads):
             if i % 4 == part:
                 continue  # each frame is sent three times

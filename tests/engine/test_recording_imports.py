@@ -5,11 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable
 from contextlib import closing
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,44 +15,41 @@ from pydantic import ValidationError
 from sceneprint.decoders.recording_decoder import RecordingDecoder, RecordingIndex
 from sceneprint.engine.ingest import recording_import
 from sceneprint.engine.ingest.archive_import import add_block
-from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.jobs.lifecycle import cancel
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.errors import Busy, InvalidRequest, QuotaExceeded, UnreadableArchive
 from sceneprint.formats.recording.selection import RecordingOptions, recording_sequences
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import files_of
-from sceneprint_client.api import Job, JobState, NewMap
+from sceneprint_client.api import JobState, NewMap
 from sceneprint_client.api.frames import ImportOptions
 from sceneprint_client.frame_files import meta_of
-from tests.whole_engine import Engine
 
 ROOM = 2.5  #: metres from the camera to the wall
 FRAMES = 6
 
 
-def wall(i: int) -> np.ndarray:
+def wall(i):
     """Depth of a wall with steps, in millimetres."""
     rows, columns = np.mgrid[:60, :80]
     samples = 1000 * ROOM + 40 * ((rows // 12 + columns // 16 + i) % 7)
     return samples.astype(np.uint16)
 
 
-def write_drive(ros: SimpleNamespace, folder: Path, container: str = "mcap", **more: Any) -> Path:
+def write_drive(ros, folder, container="mcap", **more):
     """Write a recording with an image every half metre, and return its path."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0, {("base_link", "camera"): ros.camera}, "/tf_static")
         for i in range(FRAMES):
             writer.transforms(i, {("odom", "base_link"): ros.transform(0.5 * i, 0, 0)})
             writer.camera_info(i)
             writer.image(i, wall(i), **more)
 
-    path: Path = ros.write(folder, fill, container)
-    return path
+    return ros.write(folder, fill, container)
 
 
-def begun(engine: Engine, path: Path, **more: Any) -> Job:
+def begun(engine, path, **more):
     options = ImportOptions.model_validate({"as": "recording", "name": path.name, **more})
     with engine.imports.receive("hall", options) as receiver:
         receiver.write(path.read_bytes())
@@ -63,7 +57,7 @@ def begun(engine: Engine, path: Path, **more: Any) -> Job:
     return engine.imports.begin("hall", file, options)[0]
 
 
-def run_import(engine: Engine) -> list[JobState | None]:
+def run_import(engine):
     """Run the slices of the import, and no other job; return the state after each."""
     states = []
     while (work := engine.claim("test")) is not None:
@@ -72,7 +66,7 @@ def run_import(engine: Engine) -> list[JobState | None]:
     return states
 
 
-def second_slice(engine: Engine) -> LongJob:
+def second_slice(engine):
     """Read the recording in the first slice, and return the job for the next one."""
     work = engine.claim("test")
     assert isinstance(work, LongJob)
@@ -83,21 +77,18 @@ def second_slice(engine: Engine) -> LongJob:
 
 
 @pytest.fixture
-def engine(make_engine: Callable[..., Engine]) -> Engine:
+def engine(make_engine):
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="depth"))
     return engine
 
 
 @pytest.mark.parametrize("container", ["mcap", "ros1"])
-def test_frames_are_those_of_an_upload(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path, container: str
-) -> None:
+def test_frames_are_those_of_an_upload(engine, ros, tmp_path, container):
     path = write_drive(ros, tmp_path, container)
     job = begun(engine, path, robot="r1", tags=["seen"])
     assert run_import(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     done = engine.get_job(job.job_id)
-    assert done.result is not None
     assert (done.result["received"], done.result["refused"]) == (FRAMES, 0)
     assert done.result["summary"]["poses"] == FRAMES
     engine.create_map(NewMap(name="sent", model="depth"))
@@ -122,17 +113,13 @@ def test_frames_are_those_of_an_upload(
         assert texts[0] == texts[1]
 
 
-def test_the_outline_is_there_before_the_frames(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_the_outline_is_there_before_the_frames(engine, ros, tmp_path):
     job = begun(engine, write_drive(ros, tmp_path))
     work = engine.claim("test")
     assert isinstance(work, LongJob)
     assert engine.run(work) == JobState.QUEUED
     progress = engine.get_job(job.job_id).progress
-    assert progress is not None
     assert (progress.done, progress.total, progress.phase) == (0, FRAMES, "add")
-    assert progress.recording is not None
     uses = {one.name: (one.count, one.use) for one in progress.recording.topics}
     assert uses == {
         "/camera/depth/image_raw": (FRAMES, "16UC1, used"),
@@ -144,10 +131,8 @@ def test_the_outline_is_there_before_the_frames(
     assert "mounting: at 0.210 -0.050 0.930 m in base_link" in progress.recording.findings
 
 
-def test_topics_are_shown_if_none_can_be_chosen(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path
-) -> None:
-    def fill(writer: Any) -> None:
+def test_topics_are_shown_if_none_can_be_chosen(engine, ros, tmp_path):
+    def fill(writer):
         for name in ("/a", "/b"):
             writer.image(0, wall(0), topic=f"{name}/image_raw")
             writer.camera_info(0, f"{name}/camera_info")
@@ -156,8 +141,6 @@ def test_topics_are_shown_if_none_can_be_chosen(
     job = begun(engine, path)
     assert run_import(engine) == [JobState.QUEUED, JobState.FAILED]
     failed = engine.get_job(job.job_id)
-    assert failed.progress is not None
-    assert failed.progress.recording is not None
     assert failed.error == failed.progress.recording.problem
     assert str(failed.error).endswith(" messages). Select one with `topic`.")
     used = [one.name for one in failed.progress.recording.topics if one.use == "16UC1"]
@@ -165,7 +148,6 @@ def test_topics_are_shown_if_none_can_be_chosen(
     begun(engine, path, topic="/b/image_raw")
     assert run_import(engine)[-1] == JobState.SUCCEEDED
     [frame] = engine.list_frames("hall").items
-    assert frame.name is not None
     assert frame.name.startswith("b/image_raw/")
 
 
@@ -175,10 +157,8 @@ def test_topics_are_shown_if_none_can_be_chosen(
         ({}, "topics of CameraInfo are none. Select one with `camera_info`."),
     ],
 )  # fmt: skip
-def test_a_problem_advises_nothing_that_only_commands_can_do(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path, more: dict[str, str], ends: str
-) -> None:
-    def fill(writer: Any) -> None:
+def test_a_problem_advises_nothing_that_only_commands_can_do(engine, ros, tmp_path, more, ends):
+    def fill(writer):
         writer.image(0, wall(0), topic="/a/image_raw")
 
     job = begun(engine, ros.write(tmp_path, fill, "mcap"), **more)
@@ -186,9 +166,7 @@ def test_a_problem_advises_nothing_that_only_commands_can_do(
     assert str(engine.get_job(job.job_id).error).endswith(ends)
 
 
-def test_an_import_fails_at_once_without_rosbags(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_import_fails_at_once_without_rosbags(engine, ros, tmp_path, monkeypatch):
     job = begun(engine, write_drive(ros, tmp_path))
     monkeypatch.setitem(sys.modules, "rosbags", None)
     assert run_import(engine) == [JobState.FAILED]
@@ -196,15 +174,12 @@ def test_an_import_fails_at_once_without_rosbags(
 
 
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGSTOP])
-def test_only_the_frame_whose_process_fails_is_refused(
-    ros: SimpleNamespace, tmp_path: Path, sent: signal.Signals
-) -> None:
+def test_only_the_frame_whose_process_fails_is_refused(ros, tmp_path, sent):
     path, options = write_drive(ros, tmp_path), ImportOptions.model_validate({"as": "recording"})
     with path.open("rb") as file, closing(RecordingDecoder(file.fileno(), path.name, 3)) as decoder:
         text, index = decoder.outline(options)
         assert RecordingIndex.parse(text).frames == index.frames
         assert index.topic is not None
-        assert decoder._process is not None
         first, second = (decoder.frame(index.topic, one["place"]) for one in index.frames[:2])
         os.kill(decoder._process.pid, sent)
         with pytest.raises(UnreadableArchive):
@@ -212,10 +187,8 @@ def test_only_the_frame_whose_process_fails_is_refused(
         assert decoder.frame(index.topic, index.frames[1]["place"]) == second != first
 
 
-def test_a_slice_is_repeated_if_no_process_can_read_a_frame(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path
-) -> None:
-    def read() -> Upload:
+def test_a_slice_is_repeated_if_no_process_can_read_a_frame(engine, ros, tmp_path):
+    def read():
         raise Busy("No process can be started.")
 
     begun(engine, write_drive(ros, tmp_path))
@@ -226,17 +199,14 @@ def test_a_slice_is_repeated_if_no_process_can_read_a_frame(
 
 
 @pytest.mark.parametrize(("seconds", "looks"), [(1, 1), (8, FRAMES - 1)])
-def test_blocks_of_slow_frames_are_smaller(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    seconds: int, looks: int,
-) -> None:  # fmt: skip
+def test_blocks_of_slow_frames_are_smaller(engine, ros, tmp_path, monkeypatch, seconds, looks):
     begun(engine, write_drive(ros, tmp_path))
     work = second_slice(engine)
     clock = SimpleNamespace(monotonic=iter(range(0, 1000, seconds)).__next__)
     monkeypatch.setattr(recording_import, "time", clock)
     counted = list[bool]()
 
-    def is_over() -> bool:
+    def is_over():
         counted.append(False)
         return False
 
@@ -244,9 +214,7 @@ def test_blocks_of_slow_frames_are_smaller(
     assert len(counted) == looks
 
 
-def test_a_slice_that_is_run_again_adds_no_frame_twice(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_a_slice_that_is_run_again_adds_no_frame_twice(engine, ros, tmp_path):
     begun(engine, write_drive(ros, tmp_path))
     work = second_slice(engine)
     first = engine.jobs.handlers["import-bag"](work, lambda: True)  # its worker dies
@@ -254,20 +222,17 @@ def test_a_slice_that_is_run_again_adds_no_frame_twice(
     assert engine.run(work) == JobState.SUCCEEDED
     assert len(engine.list_frames("hall").items) == FRAMES
     done = engine.get_job(work.job.id).result
-    assert done is not None
     assert (done["received"], done["there"]) == (FRAMES - 1, 1)
 
 
-def test_files_and_their_bytes_go_with_a_cancelled_import(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_files_and_their_bytes_go_with_a_cancelled_import(engine, ros, tmp_path):
     path = write_drive(ros, tmp_path)
     job = begun(engine, path)
     work = engine.claim("test")
     assert isinstance(work, LongJob)
     engine.run(work)
 
-    def stored() -> tuple[list[str], int]:
+    def stored():
         with engine.store.database.read() as connection:
             names = list(files_of(connection, work.job.number))
             return names, find_map(connection, "hall").used_bytes
@@ -277,9 +242,7 @@ def test_files_and_their_bytes_go_with_a_cancelled_import(
     assert stored() == ([], 0)
 
 
-def test_a_recording_counts_against_the_quota_while_it_arrives(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_a_recording_counts_against_the_quota_while_it_arrives(engine, ros, tmp_path):
     path = write_drive(ros, tmp_path)
     engine.create_map(NewMap(name="small", model="depth", quota_bytes=path.stat().st_size - 1))
     options = ImportOptions.model_validate({"as": "recording", "name": path.name})
@@ -290,9 +253,7 @@ def test_a_recording_counts_against_the_quota_while_it_arrives(
         receiver.write(path.read_bytes())
 
 
-def test_damage_is_the_fault_of_the_file(
-    engine: Engine, ros: SimpleNamespace, tmp_path: Path
-) -> None:
+def test_damage_is_the_fault_of_the_file(engine, ros, tmp_path):
     path = write_drive(ros, tmp_path)
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(path.read_bytes()[:-200])
@@ -303,7 +264,7 @@ def test_damage_is_the_fault_of_the_file(
         begun(engine, _written(tmp_path / "notes.txt", b"no recording" * 1000))
 
 
-def _written(path: Path, data: bytes) -> Path:
+def _written(path, data):
     path.write_bytes(data)
     return path
 
@@ -312,6 +273,6 @@ def _written(path: Path, data: bytes) -> Path:
     "more", [{"as": "frames", "topic": "/a"}, {"as": "map", "keyframe_m": 1.0},
              {"as": "recording", "heights": [1.0]}],
 )  # fmt: skip
-def test_options_of_other_imports_are_refused(more: dict[str, Any]) -> None:
+def test_options_of_other_imports_are_refused(more):
     with pytest.raises((ValidationError, InvalidRequest)):
         ImportOptions.model_validate(more)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,21 +12,17 @@ from sqlalchemy import select
 
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
-from sceneprint.geometry.retrieval.ranking import Metric
-from sceneprint.models import Model, save_model
+from sceneprint.models import save_model
 from sceneprint.settings import Settings
 from sceneprint.store.tables import frames, jobs, signatures
-from sceneprint_client.api import Answer, FrameState, JobState, NewMap, Query
-from sceneprint_lab.synth import SynthRoom
+from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from tests.whole_engine import Engine
 
-Make = Callable[..., Engine]
-WorkOff = Callable[[Engine], list[JobState | None]]
 R = Query(stages=("retrieve",), k=50, exact=True)
 
 
 @pytest.fixture(scope="module")
-def short_sighted(small_model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def short_sighted(small_model, tmp_path_factory):
     """A small model that sees nothing beyond 4.5 m."""
     depth = replace(small_model.parameters.depth, maximum_depth=4.5)
     model = replace(
@@ -41,7 +34,7 @@ def short_sighted(small_model: Model, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="module")
-def far_off(make_upload: Callable[..., Any], room_views: Callable[..., SynthRoom]) -> Any:
+def far_off(make_upload, room_views):
     """A view from so far off that the nearest of it is beyond 4.5 m."""
     frame = room_views(99, 0, 1).frames[0]
     depth = np.where(frame.depth > 0, frame.depth * 0.5 + 4.6, 0).astype(np.float32)
@@ -49,7 +42,7 @@ def far_off(make_upload: Callable[..., Any], room_views: Callable[..., SynthRoom
 
 
 @pytest.fixture(scope="module")
-def paper_folder(uploads: Any, work_off: WorkOff, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def paper_folder(uploads, work_off, tmp_path_factory):
     """A data folder whose map `hall` holds all uploads and never had a model but `paper`."""
     folder = tmp_path_factory.mktemp("paper") / "data"
     with Engine(Settings(data_dir=folder)) as engine:
@@ -60,28 +53,27 @@ def paper_folder(uploads: Any, work_off: WorkOff, tmp_path_factory: pytest.TempP
     return folder
 
 
-def ids(engine: Engine, state: FrameState | None = None) -> list[str]:
+def ids(engine, state=None):
     return [frame.frame_id for frame in engine.list_frames("hall", state=state).items]
 
 
-def said(engine: Engine, answer: Answer) -> dict[str, Any]:
+def said(engine, answer):
     """All of an answer but what no two have in common, frames by their places in the map."""
     places = {name: str(i) for i, name in enumerate(ids(engine))}
     told = answer.model_dump_json(exclude={"query_id", "milliseconds", "index_version"})
     for name, place in places.items():
         told = told.replace(name, place)
-    found: dict[str, Any] = json.loads(told)
-    return found
+    return json.loads(told)
 
 
-def models_of(engine: Engine) -> dict[str, int]:
+def models_of(engine):
     """How many signatures each model has."""
     with engine.store.database.read() as connection:
         found = connection.execute(select(signatures.c.model_id)).scalars().all()
     return {model_id: found.count(model_id) for model_id in set(found)}
 
 
-def queued(engine: Engine) -> list[tuple[str, int, str]]:
+def queued(engine):
     with engine.store.database.read() as connection:
         asked = select(jobs.c.kind, jobs.c.priority, jobs.c.model_id).where(
             jobs.c.state == JobState.QUEUED
@@ -90,12 +82,12 @@ def queued(engine: Engine) -> list[tuple[str, int, str]]:
 
 
 def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
-    make_engine: Make, paper_folder: Path, uploads: Any, work_off: WorkOff, tmp_path: Path
-) -> None:
+    make_engine, paper_folder, uploads, work_off, tmp_path
+):
     shutil.copytree(paper_folder, tmp_path / "old")
     engine = make_engine(tmp_path / "old", unindexed_frames=1)
 
-    def ranked(metric: Metric) -> list[tuple[str, int]]:
+    def ranked(metric):
         """What a naive scan of the rows says of the fifth frame."""
         names = {engine.get_frame("hall", name).frame_id for name in ids(engine)}
         with engine.store.database.read() as connection:
@@ -111,7 +103,7 @@ def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
         }
         return sorted(((name, d) for name, d in found.items()), key=lambda one: one[1])
 
-    def answered() -> tuple[Answer, list[tuple[str, int]]]:
+    def answered():
         answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
         return answer, [(match.frame_id, match.distance) for match in answer.matches]
 
@@ -135,15 +127,13 @@ def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
 
 
 def test_after_the_switch_the_map_is_as_if_made_with_that_model(
-    full: Engine, make_engine: Make, paper_folder: Path, uploads: Any, told: Any,
-    work_off: WorkOff, tmp_path: Path,
-) -> None:  # fmt: skip
+    full, make_engine, paper_folder, uploads, told, work_off, tmp_path
+):
     shutil.copytree(paper_folder, tmp_path / "paper")
     fresh = make_engine(tmp_path / "paper")
     before, paper = full.get_map("hall"), fresh.get_map("hall")
     seen = said(full, full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R))
     now = full.reencode("hall", "paper").reencoding
-    assert now is not None
     assert (now.model, now.model_id) == (paper.model, paper.model_id)
     assert (now.done, now.left, now.failed, now.dead) == (0, 12, 0, 0)
     assert queued(full) == [("reencode", -10, paper.model_id)] * 12
@@ -152,10 +142,8 @@ def test_after_the_switch_the_map_is_as_if_made_with_that_model(
         assert {frame.state for frame in frames} == {FrameState.INDEXED}
         assert full.publish_due() == 0
         claimed = full.claim("w")
-        assert claimed is not None
         during = full.get_map("hall")
         assert during.model_copy(update={"reencoding": None}) == before
-        assert during.reencoding is not None
         assert (during.reencoding.done, during.reencoding.left) == (done, 12 - done)
         if done % 4 == 0:
             again = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
@@ -187,21 +175,17 @@ def test_after_the_switch_the_map_is_as_if_made_with_that_model(
     assert full.get_map("hall") == after
 
 
-def test_what_comes_and_goes_meanwhile(
-    full: Engine, uploads: Any, far_off: Any, short_sighted: Path, work_off: WorkOff
-) -> None:
+def test_what_comes_and_goes_meanwhile(full, uploads, far_off, short_sighted, work_off):
     names = ids(full)
     full.reencode("hall", short_sighted)
     full.delete_frame("hall", names[2])
     full.publish_due()
     claimed = full.claim("w")
-    assert claimed is not None
     full.delete_frame("hall", claimed.frame.id)  # while it is signed
     assert full.run(claimed) is None
     added, new = full.add_frame("hall", far_off.data, far_off.meta)
     assert new
     first = full.claim("w")
-    assert first is not None
     assert first.frame.id == added.frame_id  # what robots send goes first
     assert full.run(first) == JobState.SUCCEEDED
     job = full.get_job(added.job_id)
@@ -209,7 +193,6 @@ def test_what_comes_and_goes_meanwhile(
     assert full.get_frame("hall", added.frame_id).job_id == added.job_id
     assert work_off(full) == [JobState.SUCCEEDED] * 10 + [JobState.FAILED]
     now = full.get_map("hall").reencoding
-    assert now is not None
     assert (now.done, now.left, now.failed, now.dead) == (10, 0, 1, 0)
     assert full.get_frame("hall", added.frame_id).state == FrameState.INDEXED
     full.publish_due()
@@ -228,8 +211,8 @@ def test_what_comes_and_goes_meanwhile(
 
 
 def test_a_frame_that_breaks_down_holds_the_switch_up(
-    full: Engine, uploads: Any, short_sighted: Path, due_now: Any, work_off: WorkOff
-) -> None:
+    full, uploads, short_sighted, due_now, work_off
+):
     """Until it is tried again with success, or deleted."""
     before = full.get_map("hall").model_id
     lost = [full.store.blobs.put(uploads[i].data) for i in (3, 5)]
@@ -245,12 +228,10 @@ def test_a_frame_that_breaks_down_holds_the_switch_up(
         full.publish_due()
         told = full.get_map("hall")
         assert (told.model_id, told.frames) == (before, {"indexed": 12})
-        assert told.reencoding is not None
         assert (told.reencoding.done, told.reencoding.left, told.reencoding.dead) == (10, 0, 2)
         assert queued(full) == []  # nobody tries it again unasked
     full.store.blobs.put(uploads[3].data)
     now = full.reencode("hall", short_sighted).reencoding
-    assert now is not None
     assert (now.done, now.left, now.dead) == (10, 2, 0)
     assert work_off(full) == [JobState.SUCCEEDED, JobState.QUEUED]
     full.delete_frame("hall", ids(full)[5])
@@ -260,9 +241,7 @@ def test_a_frame_that_breaks_down_holds_the_switch_up(
     assert told.frames == {"deleted": 1, "indexed": 11}
 
 
-def test_what_is_given_up_leaves_nothing(
-    full: Engine, short_sighted: Path, uploads: Any, work_off: WorkOff, told: Any
-) -> None:
+def test_what_is_given_up_leaves_nothing(full, short_sighted, uploads, work_off, told):
     before, blobs = full.get_map("hall"), set(full.store.blobs.digests())
     full.reencode("hall", short_sighted)
     for _ in range(5):
@@ -286,7 +265,7 @@ def test_what_is_given_up_leaves_nothing(
     assert full.get_map("hall").model.startswith("short-")
 
 
-def test_what_cannot_be_begun(full: Engine, short_sighted: Path) -> None:
+def test_what_cannot_be_begun(full, short_sighted):
     with pytest.raises(UnknownMap):
         full.reencode("nowhere", "paper")
     with pytest.raises(UnreadableModel):

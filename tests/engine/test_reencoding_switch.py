@@ -7,10 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,36 +21,30 @@ from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.search.retrieval import Deadline
 from sceneprint.errors import Busy, ModelMismatch, UselessFrame
 from sceneprint.geometry.retrieval.ranking import distances
-from sceneprint.models import Model, save_model
-from sceneprint.pipeline import Signer, open_signer, prepare
+from sceneprint.models import save_model
+from sceneprint.pipeline import open_signer, prepare
 from sceneprint.store.signatures import StoredSignature, replace_signature
 from sceneprint.store.tables import signatures
-from sceneprint.types import Bytes
 from sceneprint_client.api import FrameState, JobState, Query
-from tests.whole_engine import Engine
 
-Make = Callable[..., Engine]
-WorkOff = Callable[[Engine], list[JobState | None]]
 R = Query(stages=("retrieve",), k=50, exact=True)
 DEPTH = "depth"
 
 
 @pytest.fixture(scope="module")
-def whitened_signer(whitened_model: Model) -> Signer:
+def whitened_signer(whitened_model):
     return open_signer(whitened_model, cached=False)
 
 
 @pytest.fixture(scope="module")
-def small_file(whitened_model: Model, tmp_path_factory: pytest.TempPathFactory) -> str:
+def small_file(whitened_model, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "small.safetensors"
     save_model(whitened_model, path)
     return str(path)
 
 
 @pytest.fixture(scope="module")
-def by_model(
-    uploads: Any, signer: Signer, whitened_signer: Signer
-) -> dict[str, tuple[Signer, Bytes]]:
+def by_model(uploads, signer, whitened_signer):
     """By the label of each model its signer, and its signatures of all uploads."""
     return {
         one.model.label: (one, np.stack([prepare(each.frame, one)[0].vector for each in uploads]))
@@ -61,7 +52,7 @@ def by_model(
     }
 
 
-def switch(engine: Engine, model: str | Path, work_off: WorkOff) -> None:
+def switch(engine, model, work_off):
     """Begin, work off, switch."""
     engine.reencode("hall", model)
     work_off(engine)
@@ -69,17 +60,15 @@ def switch(engine: Engine, model: str | Path, work_off: WorkOff) -> None:
     assert engine.get_map("hall").reencoding is None
 
 
-def useless(*_: object) -> None:
+def useless(*_):
     raise UselessFrame("nothing")
 
 
-def found(answer: Any) -> list[tuple[str, int]]:
+def found(answer):
     return [(match.frame_id, match.distance) for match in answer.matches]
 
 
-def right(
-    names: list[str], by_model: dict[str, tuple[Signer, Bytes]], label: str, asked: int
-) -> list[tuple[str, int]]:
+def right(names, by_model, label, asked):
     """What a query by upload must find in a map of the model."""
     vectors = by_model[label][1]
     apart = distances(vectors[asked].copy(), vectors, "l2")
@@ -88,14 +77,13 @@ def right(
 
 @pytest.mark.thorough
 def test_no_answer_mixes_models_while_a_map_goes_to_and_fro(
-    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
-    by_model: dict[str, tuple[Signer, Bytes]],
-) -> None:  # fmt: skip
+    full, make_engine, uploads, ids, work_off, small_file, by_model
+):
     asking, names = make_engine(full.settings.data_dir), ids(full)
     wanted = {label: [right(names, by_model, label, i) for i in range(12)] for label in by_model}
     over, raised, seen = threading.Event(), [], [[], []]
 
-    def ask(mine: list[str], stored: bool) -> None:
+    def ask(mine, stored):
         try:
             for i in range(10**9):
                 if over.is_set():
@@ -136,14 +124,13 @@ def test_no_answer_mixes_models_while_a_map_goes_to_and_fro(
 
 
 def test_a_query_signed_before_the_switch_is_signed_again(
-    full: Engine, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
-    by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    full, uploads, ids, work_off, small_file, by_model, monkeypatch
+):
     """The map switches between the signing of a query and its search, and behind the search."""
     names, models = ids(full), [small_file, DEPTH, small_file, DEPTH]
 
-    def then_switch(step: Callable[..., Any]) -> Callable[..., Any]:
-        def run(*given: Any, **more: Any) -> Any:
+    def then_switch(step):
+        def run(*given, **more):
             made = step(*given, **more)
             if models:
                 switch(full, models.pop(0), work_off)
@@ -174,8 +161,8 @@ def test_a_query_signed_before_the_switch_is_signed_again(
 
 
 def test_signatures_of_two_models_are_not_compared_whatever_their_length(
-    full: Engine, uploads: Any, whitened_model: Model, signer: Signer
-) -> None:
+    full, uploads, whitened_model, signer
+):
     row = full.row("hall")
     decoders = full.store.decoders
     asked = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R, decoders)
@@ -186,9 +173,8 @@ def test_signatures_of_two_models_are_not_compared_whatever_their_length(
 
 
 def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
-    empty: Engine, uploads: Any, work_off: WorkOff, small_file: str, whitened_model: Model,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    empty, uploads, work_off, small_file, whitened_model, monkeypatch
+):
     for each in uploads[:2]:
         empty.add_frame("hall", each.data, each.meta)
     work_off(empty)
@@ -215,23 +201,21 @@ def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
 
 
 def test_a_frame_indexed_on_the_way_is_signed_with_both(
-    full: Engine, make_upload: Any, uploads: Any, work_off: WorkOff, small_file: str
-) -> None:
+    full, make_upload, uploads, work_off, small_file
+):
     full.delete_frame("hall", full.list_frames("hall").items[0].frame_id)
     full.reencode("hall", small_file)
     full.add_frame("hall", uploads[0].data, uploads[0].meta)
     assert work_off(full) == [JobState.SUCCEEDED] * 13
     told = full.get_map("hall").reencoding
-    assert told is not None
     assert (told.done, told.left) == (12, 0)
     full.publish_due()
     assert full.get_map("hall").reencoding is None
 
 
 def test_the_index_of_the_next_model_is_there_at_the_switch(
-    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
-    by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    full, make_engine, uploads, ids, work_off, small_file, by_model, monkeypatch
+):
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     engine, names = make_engine(full.settings.data_dir, unindexed_frames=5), ids(full)
     assert engine.publish_due() == 1
@@ -253,9 +237,8 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
 
 
 def test_an_index_that_cannot_be_written_does_not_hold_the_switch_up(
-    full: Engine, make_engine: Make, uploads: Any, work_off: WorkOff, small_file: str,
-    tmp_path: Path,
-) -> None:  # fmt: skip
+    full, make_engine, uploads, work_off, small_file, tmp_path
+):
     (tmp_path / "file").write_text("in the way")
     nowhere = tmp_path / "file" / "index"
     engine = make_engine(full.settings.data_dir, unindexed_frames=5, index_dir=nowhere)
@@ -265,15 +248,12 @@ def test_an_index_that_cannot_be_written_does_not_hold_the_switch_up(
 
 
 def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
-    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
-    whitened_signer: Signer, by_model: dict[str, tuple[Signer, Bytes]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    full, make_engine, uploads, ids, work_off, small_file, whitened_signer, by_model, monkeypatch
+):
     """A frame that could not be signed when the index was published, and was before the switch."""
     engine, names = make_engine(full.settings.data_dir, unindexed_frames=5), ids(full)
     engine.reencode("hall", small_file)
     blind = engine.claim("w")
-    assert blind is not None
     with monkeypatch.context() as patch:
         patch.setattr(working, "prepare", useless)
         assert engine.run(blind) == JobState.FAILED
@@ -300,15 +280,13 @@ def test_what_an_index_of_the_next_model_lacks_is_found_after_the_switch(
 
 
 def test_a_rejected_frame_is_gone_for_readers_that_knew_it(
-    full: Engine, make_engine: Make, uploads: Any, ids: Any, work_off: WorkOff, small_file: str,
-    by_model: dict[str, tuple[Signer, Bytes]], monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    full, make_engine, uploads, ids, work_off, small_file, by_model, monkeypatch
+):
     """One that slept while the map went to another model, which rejected a frame, and back."""
     sleeper, names = make_engine(full.settings.data_dir), ids(full)
     assert sleeper.query_frame("hall", names[0], R).counts.map == 11
     full.reencode("hall", small_file)
     blind = full.claim("w")
-    assert blind is not None
 
     with monkeypatch.context() as patch:
         patch.setattr(working, "prepare", useless)
@@ -365,38 +343,27 @@ while True:
 @pytest.mark.parametrize(
     ("module", "step", "call", "when", "switched"),
     [
-        pytest.param(
-            "sceneprint.engine.jobs.signature_job",
-            "replace_signature",
-            5,
-            "after",
-            False,
-            marks=pytest.mark.thorough,
-        ),
-        pytest.param(
-            "sceneprint.engine.upkeep.index_upkeep",
-            "publish",
-            1,
-            "after",
-            False,
-            marks=pytest.mark.thorough,
-        ),
+        ("sceneprint.engine.jobs.signature_job", "replace_signature", 5, "after", False),
+        ("sceneprint.engine.upkeep.index_upkeep", "publish", 1, "after", False),
         ("sceneprint.store.reencoding_rows", "switch_model", 1, "after", False),  # not committed
-        pytest.param(
-            "sceneprint.store.signatures",
-            "remove_signature",
-            4,
-            "after",
-            True,
-            marks=pytest.mark.thorough,
-        ),
+        ("sceneprint.store.signatures", "remove_signature", 4, "after", True),
     ],
 )
 def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
-    full: Engine, make_engine: Make, uploads: Any, ids: Any, due_now: Any, work_off: WorkOff,
-    small_file: str, by_model: dict[str, tuple[Signer, Bytes]],
-    module: str, step: str, call: int, when: str, switched: bool,
-) -> None:  # fmt: skip
+    full,
+    make_engine,
+    uploads,
+    ids,
+    due_now,
+    work_off,
+    small_file,
+    by_model,
+    module,
+    step,
+    call,
+    when,
+    switched,
+):
     names, folder = ids(full), str(full.settings.data_dir)
     full.reencode("hall", small_file)
     arguments = [folder, module, step, str(call), when]
@@ -406,7 +373,6 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
         late = threading.Timer(90, worker.kill)
         late.start()
         try:
-            assert worker.stdout is not None
             assert worker.stdout.readline() == f"{step}\n"
         finally:
             late.cancel()
@@ -435,15 +401,15 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
 
 
 def test_a_frame_is_signed_again_by_a_model_that_the_map_goes_back_to(
-    full: Engine, ids: Any, work_off: WorkOff, small_file: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    full, ids, work_off, small_file, monkeypatch
+):
     """What the first model made of it is there still, as removing it takes a while."""
     name = ids(full)[3]
     with monkeypatch.context() as patch:
         patch.setattr(map_lifecycle, "_tidy", lambda *_, **__: False)
         original, first = working.prepare, full.get_map("hall").model
 
-        def refuse(frame: Any, signer: Any) -> Any:
+        def refuse(frame, signer):
             if frame.name == name and signer.model.label != first:
                 raise UselessFrame("nothing")
             return original(frame, signer)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import pytest
 from sqlalchemy import select, update
 
@@ -14,26 +10,22 @@ from sceneprint.engine.upkeep.repair import MOST, PAUSE_S, PRIORITY, resign_fram
 from sceneprint.errors import DamagedBlob
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import find_map
-from sceneprint.store.tables import MapRow, frames, jobs, signatures
+from sceneprint.store.tables import frames, jobs, signatures
 from sceneprint_client.api import FrameState, JobState, Query
-from tests.whole_engine import Engine
-
-Ids = Callable[[Engine], list[str]]
-WorkOff = Callable[[Engine], list[JobState | None]]
 
 
-def row_of(engine: Engine) -> MapRow:
+def row_of(engine):
     with engine.store.database.read() as connection:
         return find_map(connection, "hall")
 
 
-def number_of(engine: Engine, frame_id: str) -> int:
+def number_of(engine, frame_id):
     with engine.store.database.read() as connection:
         found = connection.execute(select(frames.c.number).where(frames.c.id == frame_id))
         return int(found.scalar_one())
 
 
-def column(engine: Engine, frame_id: str, name: str) -> Any:
+def column(engine, frame_id, name):
     asked = select(signatures.c[name]).where(
         signatures.c.frame_number == number_of(engine, frame_id)
     )
@@ -41,24 +33,24 @@ def column(engine: Engine, frame_id: str, name: str) -> Any:
         return connection.execute(asked).scalar_one()
 
 
-def artifact(engine: Engine, frame_id: str) -> Path:
+def artifact(engine, frame_id):
     return engine.store.blobs.path(column(engine, frame_id, "geometry"))
 
 
-def waiting(engine: Engine) -> list[Any]:
+def waiting(engine):
     asked = select(jobs).where(jobs.c.state == JobState.QUEUED)
     with engine.store.database.read() as connection:
         return list(connection.execute(asked).all())
 
 
-def damage(path: Path) -> bytes:
+def damage(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 3] ^= 8
     path.write_bytes(data)
     return bytes(data)
 
 
-def damage_signature(engine: Engine, frame_id: str) -> bytes:
+def damage_signature(engine, frame_id):
     """Change a byte of the vector, and return the sound one."""
     sound: bytes = column(engine, frame_id, "vector")
     data = bytearray(sound)
@@ -69,14 +61,12 @@ def damage_signature(engine: Engine, frame_id: str) -> bytes:
     return sound
 
 
-def statuses(answer: Any) -> dict[str, tuple[str, str | None]]:
+def statuses(answer):
     return {m.frame_id: (m.validation.status, m.validation.reason) for m in answer.matches}
 
 
 @pytest.mark.parametrize("how", ["changed", "missing"])
-def test_a_damaged_artifact_is_skipped_and_soon_made_again(
-    full: Engine, uploads: Any, ids: Ids, work_off: WorkOff, how: str
-) -> None:
+def test_a_damaged_artifact_is_skipped_and_soon_made_again(full, uploads, ids, work_off, how):
     asked = uploads[1]
     before = full.queries.upload(["hall"], asked.data, asked.meta, Query())
     hurt = before.matches[0].frame_id
@@ -113,9 +103,7 @@ def test_a_damaged_artifact_is_skipped_and_soon_made_again(
     assert waiting(full) == []
 
 
-def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(
-    full: Engine, ids: Ids, work_off: WorkOff
-) -> None:
+def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(full, ids, work_off):
     hurt = ids(full)[3]
     before = full.query_frame("hall", hurt, Query())
     damage(artifact(full, hurt))
@@ -131,8 +119,8 @@ def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(
 
 
 def test_a_damaged_signature_is_never_compared_and_soon_made_again(
-    full: Engine, make_engine: Callable[..., Engine], uploads: Any, ids: Ids, work_off: WorkOff
-) -> None:
+    full, make_engine, uploads, ids, work_off
+):
     hurt, ask = ids(full)[3], Query(stages=("retrieve",), k=50)
     others = full.query_frame("hall", hurt, ask)
     sound = damage_signature(full, hurt)
@@ -156,8 +144,8 @@ def test_a_damaged_signature_is_never_compared_and_soon_made_again(
 
 
 def test_who_passes_a_damaged_signature_over_has_it_made_again(
-    full: Engine, make_engine: Callable[..., Engine], uploads: Any, ids: Ids, work_off: WorkOff
-) -> None:
+    full, make_engine, uploads, ids, work_off
+):
     hurt, ask = ids(full)[3], Query(stages=("retrieve",), k=50)
     damage_signature(full, hurt)
     answer = full.queries.upload(["hall"], uploads[3].data, uploads[3].meta, ask)
@@ -178,7 +166,7 @@ def test_who_passes_a_damaged_signature_over_has_it_made_again(
     assert len(answer.matches) == answer.counts.map == 12
 
 
-def test_a_frame_with_nothing_sound_left_says_so(full: Engine, ids: Ids) -> None:
+def test_a_frame_with_nothing_sound_left_says_so(full, ids):
     hurt = ids(full)[3]
     damage(artifact(full, hurt))
     with full.store.database.read() as connection:
@@ -188,16 +176,14 @@ def test_a_frame_with_nothing_sound_left_says_so(full: Engine, ids: Ids) -> None
         full.query_frame("hall", hurt, Query())
 
 
-def test_what_cannot_be_healed_is_not_tried_for_ever(
-    full: Engine, uploads: Any, ids: Ids, work_off: WorkOff, due_now: Callable[..., None]
-) -> None:
+def test_what_cannot_be_healed_is_not_tried_for_ever(full, uploads, ids, work_off, due_now):
     hurt = ids(full)[1]
     artifact(full, hurt).unlink()
     with full.store.database.read() as connection:
         blob = connection.execute(select(frames.c.blob).where(frames.c.id == hurt)).scalar_one()
     full.store.blobs.path(blob).unlink()
 
-    def ask() -> Any:
+    def ask():
         return full.queries.upload(["hall"], uploads[1].data, uploads[1].meta, Query())
 
     assert statuses(ask())[hurt][0] == "skipped"
@@ -214,9 +200,7 @@ def test_what_cannot_be_healed_is_not_tried_for_ever(
     assert len(waiting(full)) == 1
 
 
-def test_an_upload_that_comes_again_heals_all_that_was_lost(
-    full: Engine, uploads: Any, ids: Ids, work_off: WorkOff
-) -> None:
+def test_an_upload_that_comes_again_heals_all_that_was_lost(full, uploads, ids, work_off):
     hurt, each = ids(full)[2], uploads[2]
     path = artifact(full, hurt)
     sound = path.read_bytes()
@@ -231,9 +215,7 @@ def test_an_upload_that_comes_again_heals_all_that_was_lost(
     assert path.read_bytes() == sound
 
 
-def test_an_upload_that_comes_again_otherwise_packed_takes_the_place(
-    full: Engine, uploads: Any, ids: Ids
-) -> None:
+def test_an_upload_that_comes_again_otherwise_packed_takes_the_place(full, uploads, ids):
     """Other bytes of the same content: the frame refers to them, and nothing to the damaged."""
     import io
 
@@ -257,7 +239,7 @@ def test_an_upload_that_comes_again_otherwise_packed_takes_the_place(
         blob = now
 
 
-def test_at_most_so_many_a_query_and_none_that_is_not_indexed(full: Engine, ids: Ids) -> None:
+def test_at_most_so_many_a_query_and_none_that_is_not_indexed(full, ids):
     row, numbers = row_of(full), [number_of(full, one) for one in ids(full)]
     full.delete_frame("hall", ids(full)[0])
     with full.store.database.write() as connection:
@@ -269,9 +251,7 @@ def test_at_most_so_many_a_query_and_none_that_is_not_indexed(full: Engine, ids:
     assert resign_frames(full.store, row, list(range(10**6, 10**6 + 100)), row.model_id) == 0
 
 
-def test_a_store_that_cannot_be_written_costs_no_answer(
-    full: Engine, uploads: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_store_that_cannot_be_written_costs_no_answer(full, uploads, caplog):
     frame = full.list_frames("hall").items[0].frame_id
     damage(artifact(full, frame))
     with full.store.database.write() as connection:
@@ -282,9 +262,7 @@ def test_a_store_that_cannot_be_written_costs_no_answer(
     assert "repair failed" in caplog.text
 
 
-def test_frames_that_cannot_be_healed_keep_no_other_from_it(
-    full: Engine, ids: Ids, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_that_cannot_be_healed_keep_no_other_from_it(full, ids, monkeypatch):
     monkeypatch.setattr(repair, "MOST", 2)
     monkeypatch.setattr(repair, "PAUSE_S", 0.0)
     names = ids(full)

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
 from contextlib import closing
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import select, update
@@ -18,32 +15,31 @@ from sceneprint.settings import Settings
 from sceneprint.store.scrub_rows import PASS_S, SLICE_S, ScrubRow, read_scrub
 from sceneprint.store.tables import frames, scrubs, signatures
 from sceneprint_client.api import JobState
-from tests.whole_engine import Engine
 from worker.loop import Trace, Worker
 
 
 @pytest.fixture(autouse=True)
-def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+def _patient(monkeypatch):
     """Slices end by what they read, however slow the machine is."""
     monkeypatch.setattr("sceneprint.maintenance.scrub.TURN_S", 60.0)
 
 
-def _scrub(engine: Engine, rate: float = 1.0) -> Scrub:
+def _scrub(engine, rate=1.0):
     settings = engine.settings.model_copy(update={"blob_check_mb_per_s": rate})
     return Scrub(settings, engine.store)
 
 
-def _row(engine: Engine) -> ScrubRow | None:
+def _row(engine):
     with engine.store.database.read() as connection:
         return read_scrub(connection)
 
 
-def _due(engine: Engine) -> None:
+def _due(engine):
     with engine.store.database.write() as connection:
         connection.execute(update(scrubs).values(next_at=0.0))
 
 
-def _blobs(engine: Engine) -> tuple[list[Path], list[Path], list[str]]:
+def _blobs(engine):
     """Uploads, artifacts and ids of the frames, in their order."""
     with engine.store.database.read() as connection:
         rows = connection.execute(
@@ -55,35 +51,32 @@ def _blobs(engine: Engine) -> tuple[list[Path], list[Path], list[str]]:
     return [place(r[0]) for r in rows], [place(r[1]) for r in rows], [r[2] for r in rows]
 
 
-def _flip(path: Path) -> None:
+def _flip(path):
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
 
 
-def test_all_bytes_are_read_once_a_day(full: Engine) -> None:
+def test_all_bytes_are_read_once_a_day(full):
     uploads, artifacts, _ = _blobs(full)
     before = time.time()
     row = _scrub(full).run(now=True)
-    assert row is not None
     assert (row.blobs, row.damaged) == (len(uploads) + len(artifacts), 0)
     assert row.bytes == sum(one.stat().st_size for one in (*uploads, *artifacts))
     stored = _row(full)
-    assert stored is not None
     assert (stored.position, stored.blobs, stored.bytes) == (0, row.blobs, row.bytes)
     assert stored.finished_at is not None
     assert before <= stored.began_at <= stored.finished_at <= time.time()
     assert stored.next_at == stored.began_at + PASS_S
     assert _scrub(full).run(now=True) is None  # nobody else begins another
     told = full.statistics.collect().scrub
-    assert told is not None
     assert (told.blobs, told.bytes, told.damaged) == (row.blobs, row.bytes, 0)
 
 
 @pytest.mark.parametrize("reason", ["time", "ring"])
 def test_a_slice_ends_after_a_few_frames_where_its_time_is_over_or_a_frame_waits(
-    full: Engine, monkeypatch: pytest.MonkeyPatch, reason: str
-) -> None:
+    full, monkeypatch, reason
+):
     uploads, _, _ = _blobs(full)
     monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
     if reason == "time":
@@ -91,16 +84,13 @@ def test_a_slice_ends_after_a_few_frames_where_its_time_is_over_or_a_frame_waits
     seen = []
     for _ in range(4):
         row = _scrub(full).run(lambda: reason == "time", now=True)
-        assert row is not None
         seen.append(row.blobs)
         _due(full)
     assert seen == [10, 20, 2 * len(uploads), 2 * len(uploads)]
     assert len(uploads) == 12
 
 
-def test_damage_is_told_and_what_can_be_made_again_is(
-    full: Engine, work_off: Callable[[Engine], Any]
-) -> None:
+def test_damage_is_told_and_what_can_be_made_again_is(full, work_off):
     uploads, artifacts, ids = _blobs(full)
     sound = artifacts[1].read_bytes()
     _flip(artifacts[1])
@@ -117,7 +107,6 @@ def test_damage_is_told_and_what_can_be_made_again_is(
         )
         connection.execute(update(frames).where(frames.c.id == ids[5]).values(pose_x=7.0))
     row = _scrub(full).run(now=True)
-    assert row is not None
     assert row.damaged == 5
     wanted = full.events.wanted("hall", ["frame.damaged"])
     found = full.events.page(wanted).items
@@ -130,13 +119,10 @@ def test_damage_is_told_and_what_can_be_made_again_is(
     assert artifacts[2].exists()
     _due(full)
     again = _scrub(full).run(now=True)
-    assert again is not None
     assert again.damaged == 2  # the upload, until it is sent again, and the position
 
 
-def test_a_slice_is_as_large_as_the_rate_and_goes_on_where_the_last_one_ended(
-    full: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slice_is_as_large_as_the_rate_and_goes_on_where_the_last_one_ended(full, monkeypatch):
     uploads, artifacts, _ = _blobs(full)
     monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
     sizes = [a.stat().st_size + b.stat().st_size for a, b in zip(uploads, artifacts, strict=True)]
@@ -144,26 +130,24 @@ def test_a_slice_is_as_large_as_the_rate_and_goes_on_where_the_last_one_ended(
     seen = []
     for _ in range(4):
         row = _scrub(full, rate).run(now=True)
-        assert row is not None
         seen.append((row.blobs, row.bytes))
         stored = _row(full)
-        assert stored is not None
         if stored.finished_at is None:
             assert stored.next_at == pytest.approx(time.time() + SLICE_S, abs=30)
         _due(full)
     assert seen == [
         (10, sum(sizes[:5])), (20, sum(sizes[:10])), (24, sum(sizes)), (24, sum(sizes)),
     ]  # fmt: skip
-    assert _row(full).finished_at is not None  # type: ignore[union-attr]
+    assert _row(full).finished_at is not None
 
 
-def test_two_workers_do_not_read_the_same_slice(full: Engine) -> None:
+def test_two_workers_do_not_read_the_same_slice(full):
     first, second = _scrub(full, 1e-6), _scrub(full, 1e-6)
     assert first.run(now=True) is not None
     assert second.run(now=True) is None
 
 
-def test_none_is_read_where_it_is_switched_off(full: Engine) -> None:
+def test_none_is_read_where_it_is_switched_off(full):
     assert _scrub(full, 0.0).run(now=True) is None
     assert _row(full) is None
     assert Settings.model_fields["blob_check_mb_per_s"].default == 1.0
@@ -173,12 +157,12 @@ def test_none_is_read_where_it_is_switched_off(full: Engine) -> None:
     ("next_at", "due"), [(99.0, True), (100.0, True), (160.0, False), (100.0 + PASS_S, False),
                          (101.0 + PASS_S, True)],
 )  # fmt: skip
-def test_a_clock_that_was_set_back_does_not_stop_it(next_at: float, due: bool) -> None:
+def test_a_clock_that_was_set_back_does_not_stop_it(next_at, due):
     assert ScrubRow(1, 0, next_at, 0.0, None, 0, 0, 0).is_due(100.0) is due
 
 
 @pytest.fixture
-def stop() -> Iterator[StopSignal]:
+def stop():
     """One whose handlers are gone afterwards."""
     numbers = (signal.SIGTERM, signal.SIGINT)
     before = [signal.getsignal(one) for one in numbers]
@@ -188,9 +172,7 @@ def stop() -> Iterator[StopSignal]:
         signal.signal(number, handler)
 
 
-def test_a_worker_scrubs_only_until_it_is_rung_for(
-    full: Engine, stop: StopSignal, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_scrubs_only_until_it_is_rung_for(full, stop, monkeypatch):
     monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
     with full.bell.listen() as listener, closing(Trace()) as trace:
         worker = Worker(full.context, listener, trace, stop)
@@ -201,6 +183,5 @@ def test_a_worker_scrubs_only_until_it_is_rung_for(
                 full.bell.ring()
             worker.turn()
             row = _row(full)
-            assert row is not None
             assert row.blobs == blobs
             _due(full)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,20 +11,16 @@ from sceneprint.engine.products.session_differences import POINTS
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint_client.api import JobState
-from sceneprint_client.api.sessions import GONE, NEW, Difference, NewDifference
-from sceneprint_client.surface_encoding import SurfacePoints, decode_points
-from tests.whole_engine import Engine
+from sceneprint_client.api.sessions import GONE, NEW, NewDifference
+from sceneprint_client.surface_encoding import decode_points
 
-WorkOff = Callable[[Engine], list[JobState | None]]
 #: Of the box's front, before the cameras; and the pixels that it fills there.
 BOX_M = 0.8
 BOX = (slice(120, 360), slice(160, 480))
 
 
 @pytest.fixture
-def compared(
-    empty: Engine, uploads: Any, make_upload: Callable[..., Any], work_off: WorkOff
-) -> Any:
+def compared(empty, uploads, make_upload, work_off):
     """Map `hall`: three frames of a room in session a, and in session b with something before the
     camera; one frame of another room in session c. Returns the engine and the box's pose."""
     for one in uploads[:3]:
@@ -44,23 +38,22 @@ def compared(
     return empty, [one.pose for one in uploads[:3]]
 
 
-def difference(engine: Engine, work_off: WorkOff, before: str, after: str) -> Difference:
+def difference(engine, work_off, before, after):
     begun = engine.differences.begin("hall", NewDifference(before=before, after=after))
     assert begun.state is JobState.QUEUED
     assert work_off(engine)[-1] is JobState.SUCCEEDED
     return engine.differences.get("hall", begun.job_id)
 
 
-def points_of(engine: Engine, told: Difference) -> SurfacePoints:
+def points_of(engine, told):
     file = engine.differences.file("hall", told.job_id, POINTS)
     return decode_points(engine.store.blobs.get(file.blob))
 
 
-def test_what_came_is_new_and_what_went_is_gone(compared: Any, work_off: WorkOff) -> None:
+def test_what_came_is_new_and_what_went_is_gone(compared, work_off):
     engine, poses = compared
     told = difference(engine, work_off, "a", "b")
     result = told.result
-    assert result is not None
     assert (result.frames_before, result.frames_after, result.skipped) == (3, 3, 0)
     assert result.cell_m == 0.05
     assert result.new > 80
@@ -76,15 +69,14 @@ def test_what_came_is_new_and_what_went_is_gone(compared: Any, work_off: WorkOff
     depths = np.stack([transform_points(inverse(T), new)[:, 2] for T in poses])
     assert (np.abs(depths - BOX_M).min(axis=0) < 0.05).mean() > 0.95
     back = difference(engine, work_off, "b", "a")
-    assert back.result is not None
     assert (back.result.gone, back.result.new) == (result.new, result.gone)
     gone = points_of(engine, back)
     np.testing.assert_array_equal(gone.points[gone.patches == GONE], new)
 
 
 def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
-    compared: Any, work_off: WorkOff, each_slice_lost_once: Callable[..., int]
-) -> None:
+    compared, work_off, each_slice_lost_once
+):
     engine, _ = compared
     whole = difference(engine, work_off, "a", "b")
     begun = engine.differences.begin("hall", NewDifference(before="a", after="b"))
@@ -107,7 +99,7 @@ def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
     assert not engine.store.blobs.holds(files[0].blob)
 
 
-def test_sessions_that_cannot_be_compared_are_refused(compared: Any) -> None:
+def test_sessions_that_cannot_be_compared_are_refused(compared):
     engine, _ = compared
     for asked, why in (
         ({"before": "a", "after": "z"}, "'z' of map 'hall' has no indexed frame with a pose"),

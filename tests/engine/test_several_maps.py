@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,13 @@ import pytest
 
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
-from sceneprint_client.api import Answer, NamedFrame, NewMap, Query, SeveralQuery
-from tests.whole_engine import Engine
+from sceneprint_client.api import NamedFrame, NewMap, Query, SeveralQuery
 
-Ids = Callable[[Engine], list[str]]
 MAPS = ["hall", "lab"]
 
 
 @pytest.fixture
-def two(full: Engine, uploads: Any, work_off: Any) -> Engine:
+def two(full, uploads, work_off):
     """`hall` with all twelve frames, and `lab` with two of each room."""
     full.create_map(NewMap(name="lab", model="depth"))
     for i in (1, 4, 7, 10):
@@ -27,16 +24,16 @@ def two(full: Engine, uploads: Any, work_off: Any) -> Engine:
     return full
 
 
-def names_of(engine: Engine, name: str) -> list[str]:
+def names_of(engine, name):
     return [frame.frame_id for frame in engine.list_frames(name).items]
 
 
-def ask(engine: Engine, maps: list[str], upload: Any, **how: Any) -> Answer:
+def ask(engine, maps, upload, **how):
     query = Query.model_validate({"keep": False, **how})
     return engine.queries.upload(maps, upload.data, upload.meta, query)
 
 
-def test_the_ranking_is_that_of_both_maps_together(two: Engine, uploads: Any) -> None:
+def test_the_ranking_is_that_of_both_maps_together(two, uploads):
     how: dict[str, Any] = {"stages": ["retrieve"], "k": 50}
     alone = {name: ask(two, [name], uploads[1], **how) for name in MAPS}
     both = ask(two, MAPS, uploads[1], **how)
@@ -59,7 +56,7 @@ def test_the_ranking_is_that_of_both_maps_together(two: Engine, uploads: Any) ->
     assert (only.counts.passed, only.per_map["hall"].counts.passed) == (4, 0)
 
 
-def test_a_pose_is_of_one_map(two: Engine, uploads: Any) -> None:
+def test_a_pose_is_of_one_map(two, uploads):
     both = ask(two, MAPS, uploads[8], k=50, candidates=50, stages=["retrieve", "validate"])
     accepted = [one for one in both.matches if one.validation.status == "accepted"]
     counts = {name: sum(one.map == name for one in accepted) for name in MAPS}
@@ -77,7 +74,7 @@ def test_a_pose_is_of_one_map(two: Engine, uploads: Any) -> None:
     assert diverse.matches[0].rank == 1
 
 
-def test_a_stored_frame_does_not_find_itself_and_finds_others(two: Engine, ids: Ids) -> None:
+def test_a_stored_frame_does_not_find_itself_and_finds_others(two, ids):
     own = ids(two)[4]
     query = Query(stages=("retrieve",), k=50, keep=False)
     both = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), query)
@@ -96,7 +93,7 @@ def test_a_stored_frame_does_not_find_itself_and_finds_others(two: Engine, ids: 
         two.queries.stored(["lab"], NamedFrame(map="lab", frame_id=own), query)
 
 
-def test_two_maps_may_call_their_frames_alike(full: Engine, uploads: Any, work_off: Any) -> None:
+def test_two_maps_may_call_their_frames_alike(full, uploads, work_off):
     maps = ["attic", "cellar"]
     for name, places in zip(maps, ((0, 1), (1, 2)), strict=True):
         full.create_map(NewMap(name=name, model="depth"))
@@ -105,7 +102,7 @@ def test_two_maps_may_call_their_frames_alike(full: Engine, uploads: Any, work_o
             full.uploads.add(name, upload)
     work_off(full)
 
-    def asked(of: list[str], **how: Any) -> Answer:
+    def asked(of, **how):
         return full.queries.stored(of, NamedFrame(map="attic", frame_id="b"), Query(**how))
 
     several = asked(maps)
@@ -124,7 +121,7 @@ def test_two_maps_may_call_their_frames_alike(full: Engine, uploads: Any, work_o
     assert asked(["cellar"]).location.pose.child_frame == "query.optical"
     assert asked(["attic"]).location.pose.child_frame == "b.optical"
 
-    def explained(frame_id: str) -> Any:
+    def explained(frame_id):
         return asked(maps, explain_frame=frame_id, keep=False).explained_frame
 
     told = explained("b")  # not the query itself: there is another
@@ -137,7 +134,7 @@ def test_two_maps_may_call_their_frames_alike(full: Engine, uploads: Any, work_o
     assert (explained("a").map, explained("a").lost_at) == ("attic", "state")
 
 
-def test_maps_of_two_models_are_not_asked_as_one(two: Engine, uploads: Any, ids: Ids) -> None:
+def test_maps_of_two_models_are_not_asked_as_one(two, uploads, ids):
     two.create_map(NewMap(name="big", model="paper"))
     with pytest.raises(InvalidRequest, match=r"hall has depth-.*big has paper-") as caught:
         ask(two, ["hall", "big"], uploads[0])
@@ -149,8 +146,8 @@ def test_maps_of_two_models_are_not_asked_as_one(two: Engine, uploads: Any, ids:
         ask(two, ["hall", "attic"], uploads[0])
 
 
-def test_maps_are_chosen_by_who_asks(two: Engine) -> None:
-    def of(maps: Any, *may: str) -> list[str]:
+def test_maps_are_chosen_by_who_asks(two):
+    def of(maps, *may):
         return two.queries.maps_of(SeveralQuery.model_validate({"maps": maps}), may.__contains__)
 
     assert of("*", "lab", "hall") == ["hall", "lab"]
@@ -158,7 +155,7 @@ def test_maps_are_chosen_by_who_asks(two: Engine) -> None:
     assert of("lab, hall,lab", "lab", "hall") == ["lab", "hall"]
     for maps, may in ((["hall", "lab"], ["hall"]), (["hall", "attic"], ["hall", "attic"])):
         with pytest.raises(UnknownMap) as caught:
-            two.queries.upload(of(maps, *may), b"", None, Query())  # type: ignore[arg-type]
+            two.queries.upload(of(maps, *may), b"", None, Query())
         assert str(caught.value).startswith(f"There is no map {maps[1]!r}.")
     with pytest.raises(UnknownMap, match="no map to search"):
         of("*")

@@ -5,10 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,38 +14,34 @@ import pytest
 from pydantic import ValidationError
 from sqlalchemy import select
 
-from benchmarks.s3 import ObjectServer
 from sceneprint.atomic_files import folder_turn
 from sceneprint.engine.search import index_place, local_index
-from sceneprint.engine.search.index_place import IN_USE_S, IndexPlace
+from sceneprint.engine.search.index_place import IN_USE_S
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
 from sceneprint.index.index_manifest import manifests
 from sceneprint.index.index_version import IndexVersion, clear, newest, publish
 from sceneprint.settings import Settings
-from sceneprint.store.blobs.object_client import Objects, open_objects
+from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map
 from sceneprint.store.postgres.session_locks import index_turn
-from sceneprint.store.tables import MapRow, frames, signatures
-from sceneprint_client.api import Answer, NewMap, Query
-from tests.whole_engine import Engine
+from sceneprint.store.tables import frames, signatures
+from sceneprint_client.api import NewMap, Query
 
-Make = Callable[..., Engine]
-WorkOff = Callable[[Engine], list[Any]]
 ALL = Query(stages=("retrieve",), k=50)
 
 
 @pytest.fixture(autouse=True)
-def _always_look(monkeypatch: pytest.MonkeyPatch) -> None:
+def _always_look(monkeypatch):
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
     monkeypatch.setattr(index_place, "LOOK_S", 0.0)
     monkeypatch.setattr(index_upkeep, "ELSEWHERE_S", 0.0)
 
 
 @pytest.fixture
-def place(store_url: str, request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def place(store_url, request, tmp_path):
     """URL of what is shared: a bucket beside a server, a folder beside SQLite."""
     if store_url.startswith("sqlite"):
         return f"file://{tmp_path}/shared"
@@ -55,11 +49,11 @@ def place(store_url: str, request: pytest.FixtureRequest, tmp_path: Path) -> str
 
 
 @pytest.fixture
-def host(make_engine: Make, store_url: str, place: str, tmp_path: Path) -> Callable[..., Engine]:
+def host(make_engine, store_url, place, tmp_path):
     """Another host of the fleet, with a folder of its own."""
     (tmp_path / "common" / "blobs").mkdir(parents=True)
 
-    def make(name: str, **more: object) -> Engine:
+    def make(name, **more):
         given = {
             "database_url": store_url, "blob_url": f"file://{tmp_path}/common",
             "index_url": place, "unindexed_frames": 2, "undo_window_s": 0,
@@ -70,10 +64,10 @@ def host(make_engine: Make, store_url: str, place: str, tmp_path: Path) -> Calla
 
 
 @pytest.fixture
-def fill(uploads: Any, work_off: WorkOff) -> Callable[..., list[str]]:
+def fill(uploads, work_off):
     """Index uploads in a map; returns their ids."""
 
-    def add(engine: Engine, which: range, name: str = "hall") -> list[str]:
+    def add(engine, which, name="hall"):
         added = [engine.add_frame(name, uploads[i].data, uploads[i].meta)[0] for i in which]
         assert work_off(engine) == ["succeeded"] * len(which)
         return [one.frame_id for one in added]
@@ -82,7 +76,7 @@ def fill(uploads: Any, work_off: WorkOff) -> Callable[..., list[str]]:
 
 
 @pytest.fixture
-def built(host: Callable[..., Engine], fill: Callable[..., list[str]]) -> Engine:
+def built(host, fill):
     """A host that has built and shared an index of four frames."""
     engine = host("one")
     engine.create_map(NewMap(name="hall", model="depth"))
@@ -91,38 +85,36 @@ def built(host: Callable[..., Engine], fill: Callable[..., list[str]]) -> Engine
     return engine
 
 
-def shared(engine: Engine) -> IndexPlace:
+def shared(engine):
     return engine.indexes
 
 
-def row_of(engine: Engine, name: str = "hall") -> MapRow:
+def row_of(engine, name="hall"):
     with engine.store.database.read() as connection:
         return find_map(connection, name)
 
 
-def folder_of(engine: Engine, name: str = "hall") -> Path:
+def folder_of(engine, name="hall"):
     return index_folder(engine.settings.indexes, row_of(engine, name))
 
 
-def numbers(engine: Engine) -> list[int]:
+def numbers(engine):
     return [number for number, _ in manifests(folder_of(engine))]
 
 
-def ask(engine: Engine, uploads: Any, which: int = 1, name: str = "hall") -> Answer:
+def ask(engine, uploads, which=1, name="hall"):
     return engine.queries.upload([name], uploads[which].data, uploads[which].meta, ALL)
 
 
-def found(answer: Answer) -> list[tuple[str, int]]:
+def found(answer):
     return [(match.frame_id, match.distance) for match in answer.matches]
 
 
-def keys(objects: Objects) -> list[str]:
+def keys(objects):
     return sorted(one.key.rpartition("/")[2] for one in objects.list("index/"))
 
 
-def test_one_host_builds_and_others_fetch_what_they_serve(
-    built: Engine, host: Callable[..., Engine], fill: Any, uploads: Any, place: str
-) -> None:
+def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, uploads, place):
     other, objects = host("two"), open_objects(place)
     assert other.publish_due() == 0  # it is built, and nobody has asked this host for the map
     assert numbers(other) == []
@@ -146,9 +138,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(
     assert ask(built, uploads).counts.map == 8
 
 
-def test_a_host_goes_on_from_what_another_built(
-    built: Engine, host: Callable[..., Engine], fill: Any
-) -> None:
+def test_a_host_goes_on_from_what_another_built(built, host, fill):
     """The one that builds next fetches what it has not, and reads the rest from the database."""
     other = host("two")
     fill(built, range(4, 8))
@@ -156,17 +146,14 @@ def test_a_host_goes_on_from_what_another_built(
     assert other.publish_due() == 1
     assert numbers(other) == [2, 1]
     head = shared(built).head(row_of(built))
-    assert head is not None
     assert (head.number, head.frames) == (2, 8)
 
 
 @pytest.fixture
-def append(place: str) -> Callable[..., IndexVersion]:
+def append(place):
     """Publish and share signatures that no frame has, as the next version of map "hall"."""
 
-    def run(
-        engine: Engine, n: int, drop: frozenset[int] = frozenset(), **more: Any
-    ) -> IndexVersion:
+    def run(engine, n, drop=frozenset(), **more):
         row, folder = row_of(engine), folder_of(engine)
         previous = newest(folder, row.model_id, 448)
         first = 0 if previous is None else int(previous.keys[-1]) + 1
@@ -184,9 +171,8 @@ def append(place: str) -> Callable[..., IndexVersion]:
 
 
 def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
-    built: Engine, append: Any, place: str, host: Callable[..., Engine],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    built, append, place, host, monkeypatch
+):
     """Of a merge: files first, and the manifest last; the next builder goes on from what is put."""
     built.create_map(NewMap(name="other", model="depth"))
     row, objects, other = row_of(built), open_objects(place), host("two")
@@ -196,8 +182,8 @@ def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
     before, store = shared(built).head(row), shared(built)._store
     for kind in (".keys", ".faiss", ".json"):
 
-        def dying(put: Callable[..., Any], kind: str = kind) -> Callable[..., Any]:
-            def run(key: str, *arguments: Any, **more: Any) -> Any:
+        def dying(put, kind=kind):
+            def run(key, *arguments, **more):
                 if key.endswith(kind):
                     raise UnusableStore("gone")
                 return put(key, *arguments, **more)
@@ -223,9 +209,8 @@ def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
 
 
 def test_files_of_a_version_stay_while_somebody_may_fetch_it(
-    built: Engine, append: Any, place: str, host: Callable[..., Engine],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    built, append, place, host, monkeypatch
+):
     """Also old ones, that the next version has merged."""
     built.create_map(NewMap(name="other", model="depth"))
     row, objects, other = row_of(built), open_objects(place), host("two")
@@ -244,7 +229,7 @@ def test_files_of_a_version_stay_while_somebody_may_fetch_it(
     # all is an hour old but this and the newest, which have just come
     listed, new = objects.list, (f"{third.number:010d}.json", fresh)
 
-    def aged(prefix: str) -> list[Any]:
+    def aged(prefix):
         return [
             one if one.key.endswith(new) else replace(one, changed_at=one.changed_at - 3600)
             for one in listed(prefix)
@@ -256,16 +241,13 @@ def test_files_of_a_version_stay_while_somebody_may_fetch_it(
     assert left >= files[1] | files[2] | {f"{n.number:010d}.json" for n in (second, third)}
     assert fresh in left
     assert f"{first.number:010d}.json" not in left
-    assert head is not None
     for name, size in head.files:  # who began before goes on
         shared(other)._get(objects, folder_of(built), name, size)
     shared(built).prune(row, clean=True)
     assert set(keys(objects)) == files[2] | {f"{third.number:010d}.json"}
 
 
-def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
-    host: Callable[..., Engine], append: Any
-) -> None:
+def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(host, append):
     """The version is another each time, and the segment the same."""
     one, service = host("one"), host("two", purge_deadline_s=1)
     one.create_map(NewMap(name="hall", model="depth"))
@@ -285,7 +267,7 @@ def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(
     assert numbers(service) == [4]
 
 
-def test_while_one_host_builds_no_other_does(host: Callable[..., Engine], fill: Any) -> None:
+def test_while_one_host_builds_no_other_does(host, fill):
     engine = host("one")
     if engine.store.database.is_sqlite:
         pytest.skip("the builders of one machine have the lock of a folder")
@@ -303,7 +285,7 @@ def test_while_one_host_builds_no_other_does(host: Callable[..., Engine], fill: 
     assert engine.publish_due() == 1
 
 
-def test_who_lost_the_turn_publishes_nothing(built: Engine) -> None:
+def test_who_lost_the_turn_publishes_nothing(built):
     database = built.store.database
     if database.is_sqlite:
         pytest.skip("it is of one machine")
@@ -320,11 +302,10 @@ def test_who_lost_the_turn_publishes_nothing(built: Engine) -> None:
             mine()
 
 
-def test_a_number_is_given_once(built: Engine) -> None:
+def test_a_number_is_given_once(built):
     """Two that publish the same number: the second finds out, and what is there stays."""
     row = row_of(built)
     head = shared(built).head(row)
-    assert head is not None
     assert shared(built).share(row, head)  # a try whose answer was lost
     assert not shared(built).share(row, head.model_copy(update={"anchor": "another"}))
     assert shared(built).head(row) == head
@@ -332,8 +313,8 @@ def test_a_number_is_given_once(built: Engine) -> None:
 
 @pytest.mark.sqlite_only("a folder is put back with its database")
 def test_a_restored_database_is_not_given_what_came_after(
-    make_engine: Make, tmp_path: Path, fill: Any, uploads: Any, put_back: Any
-) -> None:
+    make_engine, tmp_path, fill, uploads, put_back
+):
     """Put back to two frames, the database gives the numbers of the next three out again."""
     given: dict[str, Any] = {"index_url": f"file://{tmp_path}/shared", "unindexed_frames": 2}
     data, kept = tmp_path / "data", tmp_path / "kept"
@@ -361,7 +342,7 @@ def test_a_restored_database_is_not_given_what_came_after(
     assert answer.counts.map == 5
 
 
-def signature(engine: Engine, frame_id: str) -> bytes:
+def signature(engine, frame_id):
     with engine.store.database.read() as connection:
         return bytes(
             connection.execute(
@@ -370,9 +351,7 @@ def signature(engine: Engine, frame_id: str) -> bytes:
         )
 
 
-def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
-    built: Engine, host: Callable[..., Engine], uploads: Any, ids: Any, place: str, tmp_path: Path
-) -> None:
+def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, ids, place, tmp_path):
     """In the store, on the host that publishes, on one with workers, and on one without."""
     other, service = host("two"), host("three", purge_deadline_s=1)
     for engine in (other, service):
@@ -381,7 +360,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
         assert numbers(engine) == [1]
     objects, secret = open_objects(place), signature(built, ids(built)[0])
 
-    def held() -> set[str]:
+    def held():
         stored = (objects.get(one.key) for one in objects.list("index/"))
         files = {name: tmp_path.glob(f"{name}/index/*/*.*") for name in ("one", "two", "three")}
         return {
@@ -403,9 +382,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(
     assert ask(other, uploads).index_version == 2
 
 
-def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(
-    built: Engine, host: Callable[..., Engine], uploads: Any, ids: Any
-) -> None:
+def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, host, uploads, ids):
     service = host("two", purge_deadline_s=1)
     ask(service, uploads)
     shared(service).finish()
@@ -419,9 +396,7 @@ def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(
     assert ask(service, uploads).counts.map == 3
 
 
-def test_a_number_of_an_index_that_was_emptied_is_not_used_again(
-    built: Engine, ids: Any, fill: Any, place: str
-) -> None:
+def test_a_number_of_an_index_that_was_emptied_is_not_used_again(built, ids, fill, place):
     for name in ids(built):
         built.delete_frame("hall", name)
     built.purging.now()
@@ -433,9 +408,7 @@ def test_a_number_of_an_index_that_was_emptied_is_not_used_again(
     assert numbers(built) == [2]
 
 
-def test_nothing_is_shared_of_maps_that_are_gone(
-    built: Engine, fill: Any, place: str, host: Callable[..., Engine], uploads: Any
-) -> None:
+def test_nothing_is_shared_of_maps_that_are_gone(built, fill, place, host, uploads):
     service = host("two", purge_deadline_s=1)
     built.create_map(NewMap(name="other", model="depth"))
     fill(built, range(4, 8), "other")
@@ -454,9 +427,7 @@ def test_nothing_is_shared_of_maps_that_are_gone(
     assert not folder.exists()
 
 
-def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(
-    built: Engine, host: Callable[..., Engine], uploads: Any, place: str
-) -> None:
+def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(built, host, uploads, place):
     objects, other = open_objects(place), host("two")
     (key,) = [one.key for one in objects.list("index/") if one.key.endswith(".faiss")]
     data = bytearray(objects.get(key))
@@ -471,9 +442,7 @@ def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(
     assert ask(other, uploads).index_version == 2
 
 
-def test_a_file_that_is_damaged_here_is_fetched_again(
-    built: Engine, host: Callable[..., Engine]
-) -> None:
+def test_a_file_that_is_damaged_here_is_fetched_again(built, host):
     (path,) = folder_of(built).glob("*.faiss")
     sound = path.read_bytes()
     path.write_bytes(b"x" + sound[1:])
@@ -484,9 +453,8 @@ def test_a_file_that_is_damaged_here_is_fetched_again(
 
 
 def test_queries_go_on_without_the_store_and_workers_try_again(
-    make_engine: Make, postgres_url: str, bucket: str, object_server: ObjectServer, fill: Any,
-    uploads: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: Any,
-) -> None:  # fmt: skip
+    make_engine, postgres_url, bucket, object_server, fill, uploads, tmp_path, monkeypatch, caplog
+):
     (tmp_path / "common" / "blobs").mkdir(parents=True)
     given: dict[str, Any] = {
         "database_url": postgres_url, "blob_url": f"file://{tmp_path}/common",
@@ -509,9 +477,7 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
 
 
 @pytest.mark.parametrize(("idle_s", "left"), [(IN_USE_S + 60, False), (IN_USE_S - 60, True)])
-def test_room_is_made_of_indexes_that_nobody_uses(
-    built: Engine, host: Callable[..., Engine], fill: Any, uploads: Any, idle_s: float, left: bool
-) -> None:
+def test_room_is_made_of_indexes_that_nobody_uses(built, host, fill, uploads, idle_s, left):
     built.create_map(NewMap(name="other", model="depth"))
     fill(built, range(4), "other")
     assert built.publish_due() == 1
@@ -529,18 +495,14 @@ def test_room_is_made_of_indexes_that_nobody_uses(
         assert ask(node, uploads, name=name).counts.map == 4
 
 
-def test_another_database_is_refused(
-    built: Engine, make_engine: Make, place: str, tmp_path: Path
-) -> None:
+def test_another_database_is_refused(built, make_engine, place, tmp_path):
     stranger = make_engine(tmp_path / "stranger", index_url=place)
     stranger.create_map(NewMap(name="hall", model="depth"))
     with pytest.raises(UnusableStore, match="another database"):
         shared(stranger).head(row_of(stranger))
 
 
-def test_a_folder_where_somebody_builds_is_left_alone(
-    built: Engine, host: Callable[..., Engine]
-) -> None:
+def test_a_folder_where_somebody_builds_is_left_alone(built, host):
     other = host("two")
     with folder_turn(folder_of(other)) as mine:
         assert mine
@@ -548,6 +510,6 @@ def test_a_folder_where_somebody_builds_is_left_alone(
     assert shared(other).sync(row_of(other)) is not None
 
 
-def test_memory_is_shared_with_nobody() -> None:
+def test_memory_is_shared_with_nobody():
     with pytest.raises(ValidationError, match="only in one process"):
         Settings(index_url="memory:///")

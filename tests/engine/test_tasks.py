@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 from sqlalchemy import select, update
 
 from sceneprint.engine.jobs import tasks
 from sceneprint.engine.jobs.lifecycle import list_jobs
-from sceneprint.engine.jobs.tasks import Handler, IsOver, LongJob, SliceResult
+from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
 from sceneprint.process import work_of
 from sceneprint.store.events import number_events
 from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
-from sceneprint_client.api import Job, JobState, NewMap
-from tests.whole_engine import Engine
+from sceneprint_client.api import JobState, NewMap
 
 
 @pytest.fixture
-def engine(make_engine: Callable[..., Engine]) -> Engine:
+def engine(make_engine):
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="depth"))
     return engine
 
 
-def count_to(engine: Engine, most: int) -> Handler:
+def count_to(engine, most):
     """A handler that finds one number a slice, and keeps a file of each."""
 
-    def handle(task: LongJob, _: IsOver) -> SliceResult:
+    def handle(task, _):
         done = task.progress.get("done", 0)
         blob = engine.store.blobs.put(f"part {done}".encode())
         return SliceResult(
@@ -46,7 +42,7 @@ def count_to(engine: Engine, most: int) -> Handler:
     return handle
 
 
-def items(engine: Engine, job: Job) -> list[int]:
+def items(engine, job):
     with engine.store.database.read() as connection:
         number = find_job(connection, job.job_id).number
         return [item["n"] for item in items_of(connection, number)]
@@ -62,7 +58,6 @@ def test_each_slice_is_kept_and_the_last_one_ends_the_job(engine, work_off):
     assert engine.run(claimed) == JobState.QUEUED
     between = engine.get_job(job.job_id)
     assert (between.state, between.attempts, between.result) == (JobState.QUEUED, 1, None)
-    assert between.progress is not None
     assert (between.progress.done, between.progress.total) == (1, 3)
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     ended = engine.get_job(job.job_id)
@@ -90,7 +85,7 @@ def test_a_slice_of_a_worker_that_fell_silent_counts_once(engine, work_off):
 def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work_off):
     able = False
 
-    def handle(task: LongJob, is_over: IsOver) -> SliceResult:
+    def handle(task, is_over):
         if task.progress and not able:
             raise InvalidRequest("the second step is impossible")
         return count_to(engine, 3)(task, is_over)
@@ -111,7 +106,7 @@ def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work
 
 
 def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
-    def handle(_task: LongJob, _: IsOver) -> SliceResult:
+    def handle(_task, _):
         raise RuntimeError("no luck")
 
     engine.handle("count", handle)
@@ -155,10 +150,7 @@ def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
     assert [one.job_id for one in list_jobs(engine.store, kind="count").items] == [other.job_id]
 
 
-def test_frames_that_wait_are_signed_between_two_slices(
-    engine: Engine, uploads: Any, work_off: Callable[[Engine], list[JobState]],
-    due_now: Callable[[Engine], None],
-) -> None:  # fmt: skip
+def test_frames_that_wait_are_signed_between_two_slices(engine, uploads, work_off, due_now):
     engine.handle("count", count_to(engine, 3))
     engine.begin_task("count", "hall", {})
     first = engine.claim("w")
@@ -173,7 +165,7 @@ def test_frames_that_wait_are_signed_between_two_slices(
     assert work_off(engine) == [JobState.SUCCEEDED, JobState.QUEUED, JobState.SUCCEEDED]
 
 
-def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) -> None:
+def test_tries_before_a_slice_that_came_through_count_no_more(engine):
     engine.handle("count", count_to(engine, 30))
     job, _ = engine.begin_task("count", "hall", {})
     for _ in range(12):  # a machine that is restarted within every other slice
@@ -186,10 +178,8 @@ def test_tries_before_a_slice_that_came_through_count_no_more(engine: Engine) ->
     assert items(engine, job) == list(range(12))
 
 
-def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
-    engine: Engine,
-) -> None:
-    def handle(task: LongJob, is_over: IsOver) -> SliceResult:
+def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(engine):
+    def handle(task, is_over):
         with engine.store.database.write() as connection:
             remove_job(connection, find_job(connection, task.job.id))
         return count_to(engine, 2)(task, is_over)
@@ -204,12 +194,10 @@ def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(
     assert list(engine.store.blobs.digests()) == []  # nor is anything left
 
 
-def test_a_file_that_a_deletion_swept_is_made_again(
-    engine: Engine, work_off: Callable[[Engine], list[JobState]]
-) -> None:
+def test_a_file_that_a_deletion_swept_is_made_again(engine, work_off):
     swept: list[str] = []
 
-    def handle(task: LongJob, is_over: IsOver) -> SliceResult:
+    def handle(task, is_over):
         outcome = count_to(engine, 1)(task, is_over)
         if not swept:  # another job that had made the same is removed at this moment
             swept.append(outcome.files[0].blob)
@@ -223,9 +211,7 @@ def test_a_file_that_a_deletion_swept_is_made_again(
     assert engine.store.blobs.get(swept[0]) == b"part 0"
 
 
-def test_a_file_that_another_takes_the_place_of_is_removed(
-    engine: Engine, work_off: Callable[[Engine], list[JobState]]
-) -> None:
+def test_a_file_that_another_takes_the_place_of_is_removed(engine, work_off):
     engine.handle("count", count_to(engine, 3))
     engine.begin_task("count", "hall", {})
     work_off(engine)
@@ -233,12 +219,10 @@ def test_a_file_that_another_takes_the_place_of_is_removed(
     assert engine.store.blobs.get(blob) == b"part 2"
 
 
-def test_a_slice_ends_when_another_tenant_waits(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slice_ends_when_another_tenant_waits(engine, monkeypatch):
     monkeypatch.setattr(tasks, "SLICE_S", 1e6)
 
-    def handle(_: LongJob, is_over: IsOver) -> SliceResult:
+    def handle(_, is_over):
         with work_of("other"):
             engine.begin_task("count", "hall", {})
         while not is_over():
@@ -253,5 +237,4 @@ def test_a_slice_ends_when_another_tenant_waits(
     assert held is not None
     assert engine.run(held) == JobState.QUEUED
     following = engine.claim("w")
-    assert following is not None
     assert (following.job.kind, following.job.tenant) == ("count", "other")

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,21 +16,19 @@ from sceneprint.index.index_manifest import manifests, read_manifest
 from sceneprint.index.part_files import verify
 from sceneprint.store.tables import models
 from sceneprint_client.api import JobState, NewMap, Query
-from tests.whole_engine import Engine
 
-Make = Callable[..., Engine]
 ALL = Query(stages=("retrieve",), k=50)
 
 
-def fill(engine: Engine, uploads: Any, work_off: Any, which: range) -> list[str]:
+def fill(engine, uploads, work_off, which):
     added = [engine.add_frame("hall", uploads[i].data, uploads[i].meta)[0] for i in which]
     assert work_off(engine) == [JobState.SUCCEEDED] * len(which)
     return [one.frame_id for one in added]
 
 
 def test_an_index_of_a_history_that_was_undone_is_not_believed(
-    make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path, put_back: Any
-) -> None:
+    make_engine, uploads, work_off, tmp_path, put_back
+):
     """Put back to two frames, the database gives the numbers of the next three out again."""
     data, kept = tmp_path / "data", tmp_path / "kept"
     engine = make_engine(data, unindexed_frames=2)
@@ -62,8 +57,8 @@ def test_an_index_of_a_history_that_was_undone_is_not_believed(
 
 
 def test_an_index_that_cannot_be_written_costs_no_frame(
-    make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path, caplog: Any
-) -> None:
+    make_engine, uploads, work_off, tmp_path, caplog
+):
     (tmp_path / "file").write_text("in the way")
     engine = make_engine(index_dir=tmp_path / "file" / "index", unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="depth"))
@@ -77,8 +72,8 @@ def test_an_index_that_cannot_be_written_costs_no_frame(
 
 
 def test_indexes_of_deleted_maps_are_removed_and_nothing_else(
-    make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path
-) -> None:
+    make_engine, uploads, work_off, tmp_path
+):
     engine = make_engine(unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="depth"))
     fill(engine, uploads, work_off, range(3))
@@ -96,16 +91,14 @@ def test_indexes_of_deleted_maps_are_removed_and_nothing_else(
     assert [one.name for one in engine.settings.indexes.glob("[!.]*")] == ["notes"]
 
 
-def test_what_was_not_asked_for_long_is_not_held(
-    make_engine: Make, uploads: Any, work_off: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_not_asked_for_long_is_not_held(make_engine, uploads, work_off, monkeypatch):
     engine = make_engine()
     for name in ("hall", "other"):
         engine.create_map(NewMap(name=name, model="depth"))
         engine.add_frame(name, uploads[0].data, uploads[0].meta)
     work_off(engine)
 
-    def held() -> list[str]:
+    def held():
         for name in ("hall", "other", "hall"):
             answer = engine.queries.upload([name], uploads[0].data, uploads[0].meta, ALL)
             assert answer.matches[0].distance == 0
@@ -116,9 +109,7 @@ def test_what_was_not_asked_for_long_is_not_held(
     assert held() == ["hall"]
 
 
-def test_a_model_that_cannot_be_read_costs_its_maps_alone(
-    make_engine: Make, uploads: Any, work_off: Any, caplog: Any
-) -> None:
+def test_a_model_that_cannot_be_read_costs_its_maps_alone(make_engine, uploads, work_off, caplog):
     engine = make_engine()
     for name, model in (("hall", "depth"), ("old", "paper")):
         engine.create_map(NewMap(name=name, model=model))
@@ -135,9 +126,7 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(
         fresh.queries.upload(["old"], uploads[0].data, uploads[0].meta, ALL)
 
 
-def test_an_index_is_published_by_what_it_lacks_however_large(
-    data: Path, make_engine: Make, uploads: Any, work_off: Any
-) -> None:
+def test_an_index_is_published_by_what_it_lacks_however_large(data, make_engine, uploads, work_off):
     """Twelve frames, and deletions one after the other: each second one is published."""
     engine = make_engine(data, unindexed_frames=1)
     assert engine.publish_due() == 1
@@ -152,14 +141,12 @@ def test_an_index_is_published_by_what_it_lacks_however_large(
     assert (answer.counts.map, answer.index_version) == (8, 3)
 
 
-def test_a_worker_reads_a_file_of_an_index_once(
-    make_engine: Make, uploads: Any, work_off: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_reads_a_file_of_an_index_once(make_engine, uploads, work_off, monkeypatch):
     """To read a large index for each of many small publications would cost more than to write."""
     engine, read = make_engine(unindexed_frames=1), list[str]()
     engine.create_map(NewMap(name="hall", model="depth"))
 
-    def noted(folder: Path, name: str, size: int) -> Iterator[None]:
+    def noted(folder, name, size):
         read.append(name)
         return verify(folder, name, size)
 
@@ -179,9 +166,7 @@ def test_a_worker_reads_a_file_of_an_index_once(
     assert number == 3
 
 
-def test_purging_removes_what_a_publication_had_only_marked(
-    make_engine: Make, uploads: Any, work_off: Any
-) -> None:
+def test_purging_removes_what_a_publication_had_only_marked(make_engine, uploads, work_off):
     engine = make_engine(unindexed_frames=1, undo_window_s=0)
     engine.create_map(NewMap(name="hall", model="depth"))
     names = fill(engine, uploads, work_off, range(12))
@@ -204,9 +189,7 @@ def test_purging_removes_what_a_publication_had_only_marked(
     assert (answer.counts.map, answer.index_version) == (10, 3)
 
 
-def test_purging_writes_an_index_again_whose_keys_are_damaged(
-    make_engine: Make, uploads: Any, work_off: Any
-) -> None:
+def test_purging_writes_an_index_again_whose_keys_are_damaged(make_engine, uploads, work_off):
     """Nobody knows any more whether it holds the frame."""
     engine = make_engine(unindexed_frames=1, undo_window_s=0)
     engine.create_map(NewMap(name="hall", model="depth"))
@@ -225,9 +208,7 @@ def test_purging_writes_an_index_again_whose_keys_are_damaged(
     assert number == 2
 
 
-def test_maps_of_whole_fisher_vectors_have_no_index(
-    make_engine: Make, uploads: Any, work_off: Any, tmp_path: Path
-) -> None:
+def test_maps_of_whole_fisher_vectors_have_no_index(make_engine, uploads, work_off, tmp_path):
     engine = make_engine(unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="paper"))
     names = fill(engine, uploads, work_off, range(3))
@@ -239,9 +220,7 @@ def test_maps_of_whole_fisher_vectors_have_no_index(
     assert (answer.matches[0].frame_id, answer.index_version) == (names[1], 0)
 
 
-def test_a_model_of_another_version_keeps_its_index(
-    make_engine: Make, uploads: Any, work_off: Any
-) -> None:
+def test_a_model_of_another_version_keeps_its_index(make_engine, uploads, work_off):
     """Who made it looks after it."""
     engine = make_engine(unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="depth"))
