@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
 from benchmarks.postgres import Server
-from sceneprint.store import Store, open_store
-from sceneprint.types import DepthFrame
+from sceneprint.store import open_store
 from sceneprint_client.api import FrameMeta
 
 
@@ -22,7 +19,7 @@ class Small(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def small(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Small]:
+def small(room_frames, small_image):
     """Frames with different content, from different offsets."""
     found = []
     for number in range(12):
@@ -32,7 +29,7 @@ def small(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) 
 
 
 @pytest.fixture
-def server_store(postgres_url: str, tmp_path: Path) -> Iterator[Store]:
+def server_store(postgres_url, tmp_path):
     """A store on PostgreSQL."""
     opened = open_store(postgres_url, tmp_path / "blobs")
     yield opened
@@ -40,7 +37,7 @@ def server_store(postgres_url: str, tmp_path: Path) -> Iterator[Store]:
 
 
 @pytest.fixture
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Server, Server]]:
+def pair(tmp_path_factory):
     """A primary and an asynchronous standby."""
     folder = tmp_path_factory.mktemp("pair")
     primary = Server(folder / "primary")

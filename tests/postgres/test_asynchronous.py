@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from benchmarks.postgres import Server
 from sceneprint.errors import StoreAway, UnknownFrame
 from sceneprint.settings import Settings
-from sceneprint.store import Database
 from sceneprint.store.events import EventFilter, EventRow
 from sceneprint_client.api import JobState, NewMap, Query
 from service.event_stream import Feed
@@ -23,14 +18,14 @@ ASKED = Query(k=5, candidates=5, keep=False)
 
 
 @pytest.fixture
-def engine(pair: tuple[Server, Server], tmp_path: Path) -> Iterator[Engine]:
+def engine(pair, tmp_path):
     hosts = "&".join(f"host=127.0.0.1:{server.port}" for server in pair)
     url = f"postgresql://postgres@/fleet?{hosts}&target_session_attrs=read-write"
     with Engine(Settings.model_validate({"database_url": url, "data_dir": tmp_path})) as opened:
         yield opened
 
 
-def index(engine: Engine, frame: Any) -> str:
+def index(engine, frame):
     added, _ = engine.add_frame("hall", *frame)
     work = engine.claim("w")
     assert work is not None
@@ -38,13 +33,13 @@ def index(engine: Engine, frame: Any) -> str:
     return added.frame_id
 
 
-def found(engine: Engine, frame: Any) -> list[str]:
+def found(engine, frame):
     answer = engine.queries.upload(["hall"], *frame, ASKED)
     return sorted(match.frame_id for match in answer.matches)
 
 
 @pytest.fixture
-def told(engine: Engine) -> Iterator[list[EventRow]]:
+def told(engine):
     """What a stream of events tells, from the first on."""
     found: list[EventRow] = []
     ended = threading.Event()
@@ -55,8 +50,8 @@ def told(engine: Engine) -> Iterator[list[EventRow]]:
     thread.join()
 
 
-def _follow(database: Database, found: list[EventRow], ended: threading.Event) -> None:
-    async def follow() -> None:
+def _follow(database, found, ended):
+    async def follow():
         feed = Feed(database, most=1, retained=1000)
         feed.join()
         reading = asyncio.ensure_future(_gather(feed, found))
@@ -69,15 +64,14 @@ def _follow(database: Database, found: list[EventRow], ended: threading.Event) -
     asyncio.run(follow())
 
 
-async def _gather(feed: Feed, found: list[EventRow]) -> None:
+async def _gather(feed, found):
     async for events, _ in feed.batches(EventFilter(), 0, lambda: True):
         found += events
 
 
 def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
-    engine: Engine, pair: tuple[Server, Server], small: list[Any], until: Callable[..., Any],
-    told: list[EventRow],
-) -> None:  # fmt: skip
+    engine, pair, small, until, told
+):
     primary, standby = pair
     engine.create_map(NewMap(name="hall", model="depth"))
     kept = [index(engine, frame) for frame in small[:2]]

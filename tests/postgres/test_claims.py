@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pytest
-from sqlalchemy import Connection, text, update
+from sqlalchemy import text, update
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import LostLease
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.maps import add_map, store_model
-from sceneprint.store.tables import JobRow, jobs
+from sceneprint.store.tables import jobs
 from sceneprint_client.api import JobState
 
 BLOCKED = text(
@@ -25,7 +24,7 @@ BLOCKED = text(
 
 
 @pytest.fixture
-def store(server_store: Store) -> Store:
+def store(server_store):
     """With three jobs of no frame that wait."""
     with server_store.database.write() as connection:
         store_model(connection, "ab" * 32, "toy", b"the file of a model")
@@ -35,40 +34,40 @@ def store(server_store: Store) -> Store:
     return server_store
 
 
-def claim(store: Store, worker: str = "w", lease_s: float = 60.0) -> JobRow | None:
+def claim(store, worker="w", lease_s=60.0):
     with store.database.write(turn=False) as connection:
         return queue.claim(connection, worker, lease_s)
 
 
-def claimed(store: Store, worker: str = "w", lease_s: float = 60.0) -> JobRow:
+def claimed(store, worker="w", lease_s=60.0):
     held = claim(store, worker, lease_s)
     assert held is not None
     return held
 
 
-def now_is(store: Store, job: JobRow) -> JobRow:
+def now_is(store, job):
     with store.database.read() as connection:
         return queue.find_job(connection, job.id)
 
 
-def turned(store: Store, job: JobRow, **values: object) -> None:
+def turned(store, job, **values):
     with store.database.write() as connection:
         connection.execute(update(jobs).where(jobs.c.number == job.number).values(**values))
 
 
 @contextmanager
-def uncommitted(store: Store) -> Iterator[tuple[Connection, Callable[[], None]]]:
+def uncommitted(store):
     """A transaction without a turn, and what commits it."""
     with ExitStack() as held:
         connection = held.enter_context(store.database.write(turn=False))
         yield connection, held.pop_all().close
 
 
-def beside(store: Store, until: Callable[..., Any], what: Callable[[], Any]) -> Callable[[], Any]:
+def beside(store, until, what):
     """Begin something that has to wait for a lock; what waits for its end, and returns it."""
     found: list[Any] = []
 
-    def run() -> None:
+    def run():
         try:
             found.append(what())
         except Exception as error:
@@ -77,14 +76,14 @@ def beside(store: Store, until: Callable[..., Any], what: Callable[[], Any]) -> 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
 
-    def waits() -> bool:
+    def waits():
         assert found == [], found
         with store.database.read() as connection:
             return bool(connection.execute(BLOCKED).scalar_one() == 1)
 
     until(waits)
 
-    def end() -> Any:
+    def end():
         thread.join(PATIENCE_S)
         (one,) = found
         return one
@@ -92,7 +91,7 @@ def beside(store: Store, until: Callable[..., Any], what: Callable[[], Any]) -> 
     return end
 
 
-def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(store: Store) -> None:
+def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(store):
     with store.database.write(), uncommitted(store) as (connection, commit):
         first = queue.claim(connection, "a", 60.0)
         second, third = claimed(store, "b"), claimed(store, "c")
@@ -103,11 +102,10 @@ def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(stor
     assert [now_is(store, held).worker for held in (first, second, third)] == ["a", "b", "c"]
 
 
-def test_what_fell_silent_is_locked_only_by_who_takes_it(store: Store) -> None:
+def test_what_fell_silent_is_locked_only_by_who_takes_it(store):
     silent = claimed(store, "dead", -1.0)
     with store.database.write(turn=False) as connection:
         held = queue.claim(connection, "a", 60.0)
-        assert held is not None
         assert held.number == 2  # what was not tried yet goes first
         with store.database.write(turn=False) as other:
             other.execute(text("SET LOCAL lock_timeout = 1"))
@@ -118,11 +116,11 @@ def test_what_fell_silent_is_locked_only_by_who_takes_it(store: Store) -> None:
 
 
 @pytest.mark.parametrize("first", ["claim", "cancel"])
-def test_a_claim_beside_a_cancellation(store: Store, until: Any, first: str) -> None:
+def test_a_claim_beside_a_cancellation(store, until, first):
     with store.database.read() as connection:
         job = queue.find_job(connection, _id_of(connection, 1))
 
-    def cancel() -> None:
+    def cancel():
         with store.database.write() as connection:
             queue.cancel(connection, job)
 
@@ -142,20 +140,18 @@ def test_a_claim_beside_a_cancellation(store: Store, until: Any, first: str) -> 
     assert now_is(store, job).state == JobState.CANCELLED
 
 
-def _id_of(connection: Connection, number: int) -> str:
+def _id_of(connection, number):
     asked = text("SELECT id FROM jobs WHERE number = :number")
     return str(connection.execute(asked, {"number": number}).scalar_one())
 
 
 @pytest.mark.parametrize("what", ["finish", "check_held", "renew"])
-def test_an_end_that_comes_late_and_a_claim_take_effect_once(
-    store: Store, until: Any, what: str
-) -> None:
+def test_an_end_that_comes_late_and_a_claim_take_effect_once(store, until, what):
     """The lease is over, and both find the job: the second waits, and finds that it lost it."""
     late = claimed(store, "late", -1.0)
     claimed(store, "b"), claimed(store, "c")
 
-    def end(connection: Connection) -> None:
+    def end(connection):
         if what == "finish":
             queue.finish(connection, late, JobState.SUCCEEDED)
         elif what == "renew":
@@ -168,7 +164,7 @@ def test_an_end_that_comes_late_and_a_claim_take_effect_once(
         assert claim(store, "next") is None
     turned(store, late, state=JobState.RUNNING, leased_until=0.0)
 
-    def ends() -> None:
+    def ends():
         with store.database.write() as connection:
             end(connection)
 
@@ -182,13 +178,11 @@ def test_an_end_that_comes_late_and_a_claim_take_effect_once(
     assert now_is(store, late) == held
 
 
-def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
-    store: Store, until: Any
-) -> None:
+def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(store, until):
     dead = claimed(store, "dead", -1.0)
     claimed(store, "b"), claimed(store, "c")
 
-    def tell() -> JobRow | None:
+    def tell():
         with store.database.write() as connection:
             return queue.fail_dead_worker(
                 connection, dead.id, dead.token, "died", "trace", counts=False
@@ -203,11 +197,11 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(
     assert now_is(store, dead) == held  # which is not queued again under its worker
 
 
-def test_a_renewal_beside_the_burial_of_its_job(store: Store, until: Any) -> None:
+def test_a_renewal_beside_the_burial_of_its_job(store, until):
     held = claimed(store, "w", -1.0)
     turned(store, held, attempts=queue.MAXIMUM_ATTEMPTS)
 
-    def bury() -> list[JobRow]:
+    def bury():
         with store.database.write() as connection:
             return queue.dead_letter(connection)
 
@@ -219,7 +213,7 @@ def test_a_renewal_beside_the_burial_of_its_job(store: Store, until: Any) -> Non
     assert now_is(store, held).state == JobState.RUNNING
 
 
-def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store: Store) -> None:
+def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store):
     held = claimed(store, "first")
     turned(store, held, worker="second")  # the same token: the standby lacked the first claim
     with pytest.raises(LostLease), store.database.write() as connection:
@@ -227,9 +221,7 @@ def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store: Store
 
 
 @pytest.mark.parametrize("hours", [-5, 5])
-def test_the_clock_of_a_host_decides_nothing(
-    store: Store, monkeypatch: pytest.MonkeyPatch, hours: int
-) -> None:
+def test_the_clock_of_a_host_decides_nothing(store, monkeypatch, hours):
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() + 3600 * hours)
     held = claimed(store, "w", 60.0)

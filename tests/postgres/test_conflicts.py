@@ -3,45 +3,38 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from typing import Any
 
 import pytest
-from sqlalchemy import Connection
 
-from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import StoreLocked
-from sceneprint.store import Store, open_database
+from sceneprint.store import open_database
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.tables import MapRow
 
 MODEL = "ab" * 32
 
 
 @pytest.fixture
-def rows(server_store: Store) -> list[MapRow]:
+def rows(server_store):
     with server_store.database.write() as connection:
         store_model(connection, MODEL, "toy", b"a model")
         return [add_map(connection, name, None, MODEL) for name in ("a", "b")]
 
 
-def test_a_deadlock_of_two_costs_none_of_those_written_with_them(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_a_deadlock_of_two_costs_none_of_those_written_with_them(server_store, rows):
     """Two robots use the same two keys in another order, in groups of two maps."""
     database = server_store.database
     first, second = (IdempotentRequest("robot", key, "0" * 64) for key in ("1", "2"))
     both, tries = threading.Barrier(2), list[str]()
 
-    def keep(request: IdempotentRequest, meet: bool = False) -> Callable[[Connection], str]:
-        def work(connection: Connection) -> str:
+    def keep(request, meet=False):
+        def work(connection):
             is_first = request.key not in tries
             tries.append(request.key)
             request.store(connection, {})
@@ -51,11 +44,11 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(
 
         return work
 
-    def innocent(connection: Connection) -> str:
+    def innocent(connection):
         record_event(connection, "a", None, None)
         return "done"
 
-    def run(group: Grouping, work: Callable[[Connection], str]) -> str:
+    def run(group, work):
         try:
             return group.run(work)
         except StoreLocked:
@@ -81,9 +74,7 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(
 
 
 @pytest.mark.parametrize("level", ["repeatable read", "serializable"])
-def test_who_waited_for_its_turn_sees_what_was_committed_meanwhile(
-    postgres: Server, level: str
-) -> None:
+def test_who_waited_for_its_turn_sees_what_was_committed_meanwhile(postgres, level):
     """Whatever the database's own level is: a remover would not see the frame that needs a blob."""
     url = postgres.create(f"level_{level.partition(' ')[0]}")
     postgres.execute(
@@ -104,12 +95,12 @@ def test_who_waited_for_its_turn_sees_what_was_committed_meanwhile(
 
 
 def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
-    server_store: Store, rows: list[MapRow], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    server_store, rows, monkeypatch
+):
     database = server_store.database
     database.guard_schema()
 
-    def sign(row: MapRow) -> bool:
+    def sign(row):
         with database.write(map_number=row.number, single=True) as connection:
             return bool(connection.exec_driver_sql("SELECT 1").scalar_one())
 
@@ -118,7 +109,7 @@ def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
     both, look = threading.Barrier(2), postgres.KnownSchema.read
 
-    def look_together(self: Any, connection: Any) -> None:
+    def look_together(self, connection):
         both.wait(PATIENCE_S)  # both have sent the schema of before
         look(self, connection)
 
@@ -127,7 +118,7 @@ def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
         assert list(pool.map(sign, rows)) == [True, True]
 
 
-def test_a_prepared_statement_that_is_gone_is_told(server_store: Store) -> None:
+def test_a_prepared_statement_that_is_gone_is_told(server_store):
     """As behind a pooler that gives one connection to several clients."""
     with (
         pytest.raises(StoreLocked, match="A prepared statement no longer exists"),

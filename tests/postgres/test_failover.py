@@ -10,14 +10,11 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
-from fastapi import FastAPI
 
 from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
@@ -38,7 +35,7 @@ class Fleet:
         default_factory=lambda: httpx.Client(timeout=PATIENCE_S, trust_env=False)
     )
 
-    def log(self, message: str) -> list[dict[str, Any]]:
+    def log(self, message):
         text = self.errors.read_text()
         try:
             lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
@@ -46,12 +43,12 @@ class Fleet:
             raise AssertionError(f"not JSON in the log: {text[-3000:]}") from error
         return [line for line in lines if line["message"] == message]
 
-    def ask(self, method: str, path: str, **given: Any) -> httpx.Response:
+    def ask(self, method, path, **given):
         return self.client.request(method, self.url + path, **given)
 
 
 @pytest.fixture
-def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -> Iterator[Fleet]:
+def fleet(tmp_path_factory, until):
     """`sceneprint serve`, started before its database is there."""
     folder = tmp_path_factory.mktemp("fleet")
     primary = Server(folder / "primary")
@@ -74,7 +71,6 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -
     try:
         until(lambda: made.log("waiting for the database"))
         primary.start()
-        assert process.stdout is not None
         told = re.match(r"sceneprint: serving (\S+)", process.stdout.readline())
         assert told is not None, errors.read_text()
         made.url = told[1]
@@ -91,9 +87,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, until: Callable[..., Any]) -
 
 
 @pytest.mark.thorough
-def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
-    fleet: Fleet, small: list[Any], until: Callable[..., Any]
-) -> None:
+def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(fleet, small, until):
     assert fleet.ask("POST", "/v1/maps", json={"name": "hall", "model": "depth"}).is_success
     kept = []
     views = [
@@ -101,13 +95,13 @@ def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
         for one in small
     ]
 
-    def upload(view: Any) -> httpx.Response:
+    def upload(view):
         answer = fleet.ask("POST", "/v1/maps/hall/frames", files=view)
         if answer.status_code == 202:
             kept.append(answer.json()["frame_id"])
         return answer
 
-    def query(view: Any) -> httpx.Response:
+    def query(view):
         return fleet.ask("POST", "/v1/maps/hall/queries", files=view)
 
     for view in views[:3]:
@@ -143,15 +137,13 @@ def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(
     assert fleet.process.poll() is None
 
 
-async def _states_told(app: FastAPI) -> dict[str, int]:
+async def _states_told(app):
     """Frames by state, as the application tells them once it has begun."""
     async with app.router.lifespan_context(app):
         return dict(app.state.service.statistics.collect().frames)
 
 
-def test_a_database_that_goes_while_a_service_starts_is_waited_for(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, until: Callable[..., Any]
-) -> None:
+def test_a_database_that_goes_while_a_service_starts_is_waited_for(tmp_path, caplog, until):
     """Gone between the first look of the process at its store, and that of the application."""
     server = Server(tmp_path / "primary")
     server.start()
@@ -160,7 +152,7 @@ def test_a_database_that_goes_while_a_service_starts_is_waited_for(
     url = f"postgresql+psycopg://postgres@127.0.0.1:{server.port}/fleet"
     settings = Settings(database_url=url, data_dir=tmp_path / "data")
 
-    def return_once_waited_for() -> None:
+    def return_once_waited_for():
         until(lambda: "waiting for the database" in caplog.messages)
         server.start()
 

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import threading
 from collections import defaultdict
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from pathlib import Path
 from random import Random
-from typing import Any
 
 import pytest
-from sqlalchemy import Connection, insert, select, text
+from sqlalchemy import insert, select, text
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.admin.operations import next_events
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import IdempotencyConflict, StoreLocked
-from sceneprint.store import Store, open_store
+from sceneprint.store import open_store
 from sceneprint.store.events import (
     EventFilter,
     EventRow,
@@ -33,7 +30,7 @@ from sceneprint.store.events import (
 from sceneprint.store.keys import IdempotentRequest, Overtaken
 from sceneprint.store.maps import add_map, next_revision, store_model
 from sceneprint.store.postgres.connection import EVENTS, LOCKS
-from sceneprint.store.tables import MapRow, event_values, events, pending_events
+from sceneprint.store.tables import event_values, events, pending_events
 
 MODEL = "ab" * 32
 MAPS, WRITERS, EACH = 8, 12, 40
@@ -44,28 +41,28 @@ _WAITING = text(
 
 
 @pytest.fixture
-def rows(server_store: Store) -> list[MapRow]:
+def rows(server_store):
     """Some maps."""
     with server_store.database.write() as connection:
         store_model(connection, MODEL, "toy", b"a model")
         return [add_map(connection, f"map-{i}", None, MODEL) for i in range(MAPS)]
 
 
-def waiting(store: Store) -> int:
+def waiting(store):
     with store.database.read() as connection:
         return int(connection.execute(_WAITING).scalar_one())
 
 
-def told(store: Store) -> list[EventRow]:
+def told(store):
     """All events that a reader finds."""
     return next_events(store.database, EventFilter(), 0, 10_000).events
 
 
-def others_write(database_url: str, of: int | None, folder: Path) -> Callable[[], bool]:
+def others_write(database_url, of, folder):
     """A writer of another process, begun; tells whether it is done."""
     done = threading.Event()
 
-    def write() -> None:
+    def write():
         other = open_store(database_url, folder)
         try:
             with other.database.write(map_number=of) as connection:
@@ -82,9 +79,8 @@ def others_write(database_url: str, of: int | None, folder: Path) -> Callable[[]
     ("held", "wanted", "waits"), [(0, 1, False), (0, 0, True), (0, None, True), (None, 0, True)]
 )
 def test_writers_of_different_maps_do_not_wait_for_each_other(
-    server_store: Store, rows: list[MapRow], postgres_url: str, tmp_path: Path,
-    until: Callable[[Callable[[], Any]], Any], held: int | None, wanted: int | None, waits: bool,
-) -> None:  # fmt: skip
+    server_store, rows, postgres_url, tmp_path, until, held, wanted, waits
+):
     numbers = {None: None, **{i: row.number for i, row in enumerate(rows)}}
     with server_store.database.write(map_number=numbers[held]):
         done = others_write(postgres_url, numbers[wanted], tmp_path / "other")
@@ -93,14 +89,12 @@ def test_writers_of_different_maps_do_not_wait_for_each_other(
     until(done)
 
 
-def test_readers_miss_no_event_and_see_those_of_a_map_in_its_order(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_readers_miss_no_event_and_see_those_of_a_map_in_its_order(server_store, rows):
     """Writers commit in any order, some of all maps among them, while others read on."""
     database, written = server_store.database, defaultdict[str, list[int]](list)
     over, found = threading.Event(), [list[EventRow](), list[EventRow]()]
 
-    def write(seed: int) -> None:
+    def write(seed):
         chance = Random(seed)
         for _ in range(EACH):
             row = chance.choice(rows)
@@ -113,7 +107,7 @@ def test_readers_miss_no_event_and_see_those_of_a_map_in_its_order(
             with guard:
                 written[row.name].append(revision)
 
-    def read(into: list[EventRow]) -> None:
+    def read(into):
         place, last = 0, False
         while not last:
             last = over.is_set()
@@ -139,9 +133,7 @@ def test_readers_miss_no_event_and_see_those_of_a_map_in_its_order(
     assert found[0] == found[1]
 
 
-def test_numbers_of_the_version_before_follow_those_that_are_pending(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_numbers_of_the_version_before_follow_those_that_are_pending(server_store, rows):
     """It knows nothing of them, and holds the turn alone when it tells something."""
     database, (row, *_) = server_store.database, rows
     with database.write(map_number=row.number) as connection:
@@ -156,9 +148,7 @@ def test_numbers_of_the_version_before_follow_those_that_are_pending(
         assert connection.execute(select(pending_events)).all() == []
 
 
-def test_an_event_of_a_transaction_that_failed_is_never_told(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_an_event_of_a_transaction_that_failed_is_never_told(server_store, rows):
     database = server_store.database
     with suppress(KeyError), database.write(map_number=rows[0].number) as connection:
         record_event(connection, "lost", rows[0].name)
@@ -169,8 +159,8 @@ def test_an_event_of_a_transaction_that_failed_is_never_told(
 
 
 def test_what_cannot_be_numbered_now_comes_later_and_marks_no_state(
-    server_store: Store, rows: list[MapRow], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    server_store, rows, monkeypatch
+):
     database, name = server_store.database, rows[0].name
     monkeypatch.setattr("sceneprint.store.events.NUMBERING_S", 0.05)
     with database.write(map_number=rows[0].number) as connection:
@@ -183,7 +173,7 @@ def test_what_cannot_be_numbered_now_comes_later_and_marks_no_state(
     assert [one.kind for one in told(server_store)][MAPS:] == ["late"]
 
 
-def test_an_anchor_marks_what_was_pending(server_store: Store, rows: list[MapRow]) -> None:
+def test_an_anchor_marks_what_was_pending(server_store, rows):
     database, (row, *_) = server_store.database, rows
     with database.write(map_number=row.number) as connection:
         record_event(connection, "frame.indexed", row.name, "a")
@@ -194,20 +184,18 @@ def test_an_anchor_marks_what_was_pending(server_store: Store, rows: list[MapRow
         assert anchor_of_now(database, rows[1].name) != anchor
 
 
-def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(server_store, rows):
     """Neither saw the other when it looked; the second finds out when it is stored."""
     database = server_store.database
     first, second = (IdempotentRequest("robot", "key", mark * 64) for mark in "ab")
     looked, stored, tries = threading.Event(), threading.Event(), list[int]()
 
-    def keep_first(connection: Connection) -> None:
+    def keep_first(connection):
         assert looked.wait(PATIENCE_S)
         assert first.stored_result(connection) is None
         first.store(connection, {"of": "first"})
 
-    def keep_second(connection: Connection) -> None:
+    def keep_second(connection):
         tries.append(1)
         assert second.stored_result(connection) is None
         looked.set()
@@ -215,7 +203,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
         record_event(connection, "second", rows[1].name)
         second.store(connection, {"of": "second"})
 
-    def run_first() -> None:
+    def run_first():
         Grouping(database, rows[0].number).run(keep_first)
         stored.set()
 
@@ -233,9 +221,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(
         assert first.stored_result(connection) == {"of": "first"}
 
 
-def test_nothing_is_pending_where_nobody_reads_once_somebody_numbers(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_nothing_is_pending_where_nobody_reads_once_somebody_numbers(server_store, rows):
     for row in rows:
         with server_store.database.write(map_number=row.number) as connection:
             record_event(connection, "x", row.name)

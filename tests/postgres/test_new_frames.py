@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from typing import Any
@@ -17,21 +16,13 @@ from sceneprint.engine.ingest import write_groups
 from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.errors import StoreLocked
 from sceneprint.process import of_request, work_of
-from sceneprint.store import Database, Store, open_database
+from sceneprint.store import open_database
 from sceneprint.store.database import MAP_WRITERS
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.postgres.connection import MapsInUse, take_turn
-from sceneprint.store.tables import (
-    MapRow,
-    frame_tags,
-    frames,
-    idempotency,
-    jobs,
-    maps,
-    pending_events,
-)
+from sceneprint.store.tables import frame_tags, frames, idempotency, jobs, maps, pending_events
 
 MODEL = "ab" * 32
 VALUES: dict[str, Any] = {
@@ -39,35 +30,34 @@ VALUES: dict[str, Any] = {
     "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": [],
     "pose_parent": None, "pose": None, "name": None, "sequence": None,
 }  # fmt: skip
-Until = Callable[[Callable[[], Any]], Any]
 
 
 @pytest.fixture
-def rows(server_store: Store) -> list[MapRow]:
+def rows(server_store):
     with server_store.database.write() as connection:
         store_model(connection, MODEL, "toy", b"a model")
         return [add_map(connection, name, None, MODEL) for name in ("a", "b", "c")]
 
 
-def new(row: MapRow, content: int, **given: Any) -> NewFrame:
+def new(row, content, **given):
     known = {name: given.pop(name) for name in list(given) if name in VALUES}
     return NewFrame(row, {**VALUES, **known, "content_id": f"{content:064x}"}, **given)
 
 
-def receive(database: Database, *given: NewFrame, wait_s: float = 10.0) -> list[bool]:
+def receive(database, *given, wait_s=10.0):
     """Whether each was taken."""
     with database.write_maps({one.row.number for one in given}, wait_s) as connection:
         ids = receive_frames(connection, given)
     return [one.frame_id in ids for one in given]
 
 
-def counted(database: Database) -> list[tuple[str, int, int]]:
+def counted(database):
     with database.read() as connection:
         asked = select(maps.c.name, maps.c.used_frames, maps.c.used_bytes).order_by(maps.c.name)
         return [tuple(row) for row in connection.execute(asked)]
 
 
-def content_of(database: Database) -> list[tuple[int, str, str]]:
+def content_of(database):
     """Map, content and job of each frame in the order of their numbers."""
     with database.read() as connection:
         asked = (
@@ -78,9 +68,7 @@ def content_of(database: Database) -> list[tuple[int, str, str]]:
         return [tuple(row) for row in connection.execute(asked)]
 
 
-def test_frames_of_several_maps_are_taken_in_their_order(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_frames_of_several_maps_are_taken_in_their_order(server_store, rows):
     database, (a, b, c) = server_store.database, rows
     given = [new(c, 5), new(a, 9), new(b, 9, bytes=77), new(a, 1), new(c, 4)]
     assert receive(database, *given) == [True] * 5
@@ -95,9 +83,7 @@ def test_frames_of_several_maps_are_taken_in_their_order(
         ]
 
 
-def test_each_has_its_own_columns_tags_and_priority(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_each_has_its_own_columns_tags_and_priority(server_store, rows):
     pose = [[1.0, 0.0, 0.0, 2.5], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.5], [0, 0, 0, 1.0]]
     plain = new(rows[0], 1)
     full = new(
@@ -120,7 +106,7 @@ def test_each_has_its_own_columns_tags_and_priority(
     assert sorted(map(tuple, tags)) == [(other["number"], "dark"), (other["number"], "wet")]
 
 
-def test_a_cloud_has_no_intrinsics(server_store: Store, rows: list[MapRow]) -> None:
+def test_a_cloud_has_no_intrinsics(server_store, rows):
     """They are null as JSON has it: the column takes no other."""
     given = [new(rows[0], 1), new(rows[0], 2, intrinsics=None)]
     assert receive(server_store.database, *given) == [True, True]
@@ -131,9 +117,7 @@ def test_a_cloud_has_no_intrinsics(server_store: Store, rows: list[MapRow]) -> N
         ]  # fmt: skip
 
 
-def test_what_is_there_or_comes_twice_is_taken_once(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_what_is_there_or_comes_twice_is_taken_once(server_store, rows):
     database, (a, b, _) = server_store.database, rows
     assert receive(database, new(a, 1)) == [True]
     given = [new(a, 2), new(a, 1), new(b, 1), new(a, 2), new(a, 3)]
@@ -150,8 +134,8 @@ def test_what_is_there_or_comes_twice_is_taken_once(
     ],
 )  # fmt: skip
 def test_a_map_without_room_for_all_takes_none_and_others_take_theirs(
-    server_store: Store, rows: list[MapRow], change: dict[str, Any], taken: bool
-) -> None:
+    server_store, rows, change, taken
+):
     database, (a, b, _) = server_store.database, rows
     with database.write() as connection:
         connection.execute(update(maps).where(maps.c.number == a.number).values(**change))
@@ -161,14 +145,12 @@ def test_a_map_without_room_for_all_takes_none_and_others_take_theirs(
     }  # fmt: skip
 
 
-def test_what_was_done_under_its_key_is_not_done_again(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_what_was_done_under_its_key_is_not_done_again(server_store, rows):
     """And the answers of the others are remembered."""
     database, (a, b, _) = server_store.database, rows
     requests = [IdempotentRequest("robot", key, "0" * 64) for key in ("old", "new")]
 
-    def kept(request: IdempotentRequest) -> dict[str, Any]:
+    def kept(request):
         return request.columns({"frames": request.key})
 
     assert receive(database, new(a, 1, kept=kept(requests[0]))) == [True]
@@ -184,7 +166,7 @@ def test_what_was_done_under_its_key_is_not_done_again(
     assert counted(database) == [("a", 2, 6), ("b", 1, 3), ("c", 0, 0)]
 
 
-def test_each_is_of_the_request_that_it_came_with(server_store: Store, rows: list[MapRow]) -> None:
+def test_each_is_of_the_request_that_it_came_with(server_store, rows):
     given = list[NewFrame]()
     for name in ("one", "two"):
         with of_request(name):
@@ -197,16 +179,14 @@ def test_each_is_of_the_request_that_it_came_with(server_store: Store, rows: lis
 
 
 @contextmanager
-def in_use(database: Database, row: MapRow) -> Iterator[Any]:
+def in_use(database, row):
     """The map's turn, of another process."""
     with database._writers.begin() as other:
         take_turn(other, 10.0, None, row.number)
         yield other
 
 
-def test_a_map_that_is_in_use_is_waited_for_shortly(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_a_map_that_is_in_use_is_waited_for_shortly(server_store, rows):
     database, (a, b, _) = server_store.database, rows
     with in_use(database, b):
         with pytest.raises(MapsInUse):
@@ -216,9 +196,7 @@ def test_a_map_that_is_in_use_is_waited_for_shortly(
     assert receive(database, new(b, 1), wait_s=0.05) == [True]
 
 
-def test_maps_are_locked_in_one_order(
-    server_store: Store, rows: list[MapRow], until: Until
-) -> None:
+def test_maps_are_locked_in_one_order(server_store, rows, until):
     """Who waits for a map has none that comes after it: nobody waits for one who waits for him."""
     database = server_store.database
     with database.write() as connection:
@@ -236,9 +214,7 @@ def test_maps_are_locked_in_one_order(
     assert {name: n for name, n, _ in counted(database) if n} == {"a": 1, last.name: 1}
 
 
-def test_a_turn_that_does_not_come_is_no_map_in_use(
-    server_store: Store, rows: list[MapRow], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_turn_that_does_not_come_is_no_map_in_use(server_store, rows, monkeypatch):
     database = server_store.database
     monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
     with database._writers.begin() as other:
@@ -248,11 +224,11 @@ def test_a_turn_that_does_not_come_is_no_map_in_use(
     assert database._held
 
 
-def together(group: NewFrames, given: list[NewFrame], until: Until) -> list[Any]:
+def together(group, given, until):
     """What came of frames that all waited for one statement."""
     found: list[Any] = [None] * len(given)
 
-    def run(i: int) -> None:
+    def run(i):
         try:
             found[i] = group.receive(given[i])
         except Exception as error:
@@ -270,12 +246,10 @@ def together(group: NewFrames, given: list[NewFrame], until: Until) -> list[Any]
     return found
 
 
-def test_frames_of_many_threads_are_one_transaction(
-    server_store: Store, rows: list[MapRow], until: Until, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_of_many_threads_are_one_transaction(server_store, rows, until, monkeypatch):
     database, sizes = server_store.database, list[int]()
 
-    def noted(connection: Any, given: list[NewFrame]) -> set[str]:
+    def noted(connection, given):
         sizes.append(len(given))
         return receive_frames(connection, given)
 
@@ -291,17 +265,13 @@ def test_frames_of_many_threads_are_one_transaction(
         }
 
 
-def test_one_that_cannot_be_written_sends_all_on_alone(
-    server_store: Store, rows: list[MapRow], until: Until
-) -> None:
+def test_one_that_cannot_be_written_sends_all_on_alone(server_store, rows, until):
     given = [new(rows[0], 1), new(rows[1], 2, sequence=2**80), new(rows[2], 3)]
     assert together(NewFrames(server_store.database), given, until) == [False] * 3
     assert [one[1] for one in counted(server_store.database)] == [0, 0, 0]
 
 
-def test_a_map_in_use_sends_all_on_alone(
-    server_store: Store, rows: list[MapRow], until: Until, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_in_use_sends_all_on_alone(server_store, rows, until, monkeypatch):
     monkeypatch.setattr(write_groups, "MAPS_WAIT_S", 0.05)
     given = [new(rows[0], 1), new(rows[1], 2)]
     with in_use(server_store.database, rows[1]):
@@ -309,9 +279,7 @@ def test_a_map_in_use_sends_all_on_alone(
     assert found == [False, False]
 
 
-def test_a_store_that_cannot_be_used_is_told_to_all(
-    server_store: Store, rows: list[MapRow], until: Until, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_cannot_be_used_is_told_to_all(server_store, rows, until, monkeypatch):
     monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
     given = [new(rows[0], 1), new(rows[1], 2)]
     with server_store.database._writers.begin() as other:
@@ -320,19 +288,17 @@ def test_a_store_that_cannot_be_used_is_told_to_all(
     assert [type(one) for one in found] == [StoreLocked, StoreLocked]
 
 
-def test_others_do_not_wait_for_the_maps_of_who_leads(
-    server_store: Store, rows: list[MapRow], until: Until
-) -> None:
+def test_others_do_not_wait_for_the_maps_of_who_leads(server_store, rows, until):
     """A tenant whose own maps are all in use comes first in the group of all."""
     database, group = server_store.database, NewFrames(server_store.database)
     with database.write() as connection:
         busy = [add_map(connection, f"busy-{i}", None, MODEL) for i in range(MAP_WRITERS)]
 
-    def write(row: MapRow) -> None:
+    def write(row):
         with work_of("its tenant"), database.write(map_number=row.number):
             pass
 
-    def lead() -> bool:
+    def lead():
         with work_of("its tenant"):
             return group.receive(new(rows[0], 1))
 
@@ -349,9 +315,7 @@ def test_others_do_not_wait_for_the_maps_of_who_leads(
             one.result(PATIENCE_S)
 
 
-def test_a_statement_that_was_prepared_in_vain_is_prepared_again(
-    server_store: Store, rows: list[MapRow]
-) -> None:
+def test_a_statement_that_was_prepared_in_vain_is_prepared_again(server_store, rows):
     """The driver takes a statement for prepared that an error before it kept from being so."""
     database, (a, b, _) = server_store.database, rows
     for content in range(5):  # it prepares what comes for the sixth time

@@ -8,11 +8,10 @@ import shutil
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
@@ -27,10 +26,9 @@ from tests.whole_engine import Engine
 SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "deployment" / "recover.sh"
 #: Of the server's command line, which the copy in its folder does not have.
 OPTIONS_TOLD = f"-c max_connections={OPTIONS['max_connections']} -c unix_socket_directories="
-Until = Callable[[Callable[[], Any]], Any]
 
 
-def recover(*arguments: object, options: str = "") -> subprocess.CompletedProcess[str]:
+def recover(*arguments, options=""):
     """Run the script as who runs PostgreSQL."""
     path = f"{binaries()}:{os.environ['PATH']}"
     command = [*nobody_prefix(), "env", f"PATH={path}", f"PGOPTS={options}", "bash", str(SCRIPT)]
@@ -41,7 +39,7 @@ def recover(*arguments: object, options: str = "") -> subprocess.CompletedProces
 
 
 @pytest.fixture
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory):
     """A folder in which PostgreSQL's user may write."""
     place = tmp_path_factory.mktemp("drill")
     for folder in (place, *place.parents[:2]):
@@ -53,7 +51,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def archiving(page: Path, archive: Path) -> dict[str, str]:
+def archiving(page, archive):
     """The settings of a page's section, for another folder."""
     section = page.read_text().partition("### Point-in-time recovery")[2]
     told = re.findall(r"^(archive_\w+) = '?(.*?)'?$", section, re.MULTILINE)
@@ -61,7 +59,7 @@ def archiving(page: Path, archive: Path) -> dict[str, str]:
 
 
 @pytest.fixture
-def primary(place: Path) -> Iterator[Server]:
+def primary(place):
     options = archiving(SCRIPT.parents[1] / "deployment.md", place / "archive")
     assert sorted(options) == ["archive_command", "archive_mode", "archive_timeout"]
     server = Server(place / "primary", durable=True, options=options)
@@ -70,12 +68,12 @@ def primary(place: Path) -> Iterator[Server]:
     server.kill()
 
 
-def settings_of(url: str, data: Path) -> Settings:
+def settings_of(url, data):
     given = {"database_url": url, "data_dir": data, "undo_window_s": 0, "unindexed_frames": 1}
     return Settings.model_validate(given)
 
 
-def add(engine: Engine, frame: Any, name: str = "hall") -> str:
+def add(engine, frame, name="hall"):
     added, _ = engine.add_frame(name, *frame)
     work = engine.claim("w")
     assert work is not None
@@ -83,12 +81,12 @@ def add(engine: Engine, frame: Any, name: str = "hall") -> str:
     return added.frame_id
 
 
-def found(engine: Engine, frame: Any, name: str = "hall") -> list[str]:
+def found(engine, frame, name="hall"):
     asked = Query(k=9, candidates=9, keep=False, stages=["retrieve"])
     return [one.frame_id for one in engine.queries.upload([name], *frame, asked).matches]
 
 
-def kinds(url: str, data: Path) -> Counter[str]:
+def kinds(url, data):
     """What fsck finds, notes as well."""
     return Counter(one.kind for one in fsck(settings_of(url, data)))
 
@@ -102,7 +100,7 @@ class Drill(NamedTuple):
     late: list[str]
 
 
-def mistake(primary: Server, place: Path, data: Path, small: list[Any], until: Until) -> Drill:
+def mistake(primary, place, data, small, until):
     """A map is deleted and begun again, and another goes on: published indexes know all that."""
     with Engine(settings_of(primary.create("fleet"), data)) as engine:
         for name in ("hall", "yard"):
@@ -129,7 +127,7 @@ def mistake(primary: Server, place: Path, data: Path, small: list[Any], until: U
 
 
 @contextmanager
-def recovered(place: Path, data: Path, moment: str) -> Iterator[Server]:
+def recovered(place, data, moment):
     """A server that the script made."""
     new = Server(data.with_suffix(".unused"))  # of which the port is taken, and nothing else
     done = recover(
@@ -147,9 +145,7 @@ def recovered(place: Path, data: Path, moment: str) -> Iterator[Server]:
 
 
 @pytest.mark.thorough
-def test_a_map_that_was_deleted_by_mistake_is_brought_back(
-    primary: Server, place: Path, tmp_path: Path, small: list[Any], until: Until
-) -> None:
+def test_a_map_that_was_deleted_by_mistake_is_brought_back(primary, place, tmp_path, small, until):
     data, versions = tmp_path / "data", tmp_path / "versions"
     drill = mistake(primary, place, data, small, until)
     with recovered(place, place / "recovered", drill.moment) as server:
@@ -182,7 +178,7 @@ def test_a_map_that_was_deleted_by_mistake_is_brought_back(
         ]
 
 
-def _check_recovered(settings: Settings, small: list[Any], drill: Drill) -> None:
+def _check_recovered(settings, small, drill):
     with Engine(settings) as engine:
         assert engine.store.database.history == "00000002"
         assert engine.get_map("hall").frames == {"indexed": 3}
@@ -208,7 +204,7 @@ def _check_recovered(settings: Settings, small: list[Any], drill: Drill) -> None
         (3, "2026' OR", "are refused"), (4, "", "usage"),
     ],
 )  # fmt: skip
-def test_what_it_is_given_is_checked_first(place: Path, at: int, value: str, said: str) -> None:
+def test_what_it_is_given_is_checked_first(place, at, value, said):
     (place / "base").mkdir()
     (place / "base" / "PG_VERSION").write_text("18")
     given: list[object] = [place / "base", place / "archive", place / "data", "2026-11-28 12:00+00"]
@@ -221,7 +217,7 @@ def test_what_it_is_given_is_checked_first(place: Path, at: int, value: str, sai
 
 
 @pytest.mark.parametrize("link", ["pg_wal", "pg_tblspc/16400"])
-def test_a_backup_whose_files_are_elsewhere_is_not_written_to(place: Path, link: str) -> None:
+def test_a_backup_whose_files_are_elsewhere_is_not_written_to(place, link):
     (place / "base" / "pg_tblspc").mkdir(parents=True)
     (place / "base" / "PG_VERSION").write_text("18")
     (place / "base" / link).symlink_to(place)
@@ -232,11 +228,11 @@ def test_a_backup_whose_files_are_elsewhere_is_not_written_to(place: Path, link:
     assert not (place / "data").exists()
 
 
-def test_the_archive_takes_a_file_again_and_never_another_of_its_name(place: Path) -> None:
+def test_the_archive_takes_a_file_again_and_never_another_of_its_name(place):
     archive = place / "archive"
     command = archiving(SCRIPT.parents[1] / "deployment.md", archive)["archive_command"]
 
-    def take(content: str) -> int:
+    def take(content):
         (place / "wal").write_text(content)
         told = command.replace("%p", str(place / "wal")).replace("%f", "0001")
         return subprocess.run(["sh", "-c", told], capture_output=True, check=False).returncode

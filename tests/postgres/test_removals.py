@@ -7,22 +7,18 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import select, text, update
 
 from benchmarks.postgres import Server
-from benchmarks.s3 import ObjectServer
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs, collect_doomed_blobs
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
 from sceneprint.settings import Settings
-from sceneprint.store import Store, open_store
+from sceneprint.store import open_store
 from sceneprint.store.blobs.folder import LONGEST_S, FolderBlobs
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.deletion import doom, remove_map
@@ -33,7 +29,6 @@ from sceneprint.store.tables import doomed, signatures
 from sceneprint_client.api import JobState, NewMap
 from tests.whole_engine import Engine
 
-Until = Callable[[Callable[[], Any]], Any]
 OTHER = hashlib.sha256(b"of another frame").hexdigest()
 WAITING = text(
     "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted "
@@ -70,7 +65,7 @@ garbage_collection.collect_blobs(store, blobs)
 class HeldDeletes:
     """A port of an object server that holds requests to delete, until they are let through."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port):
         self._to, self._is_dropped = port, False
         self.arrived, self._passes = threading.Event(), threading.Event()
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -79,16 +74,16 @@ class HeldDeletes:
         self._threads = [threading.Thread(target=self._accept, daemon=True)]
         self._threads[0].start()
 
-    def release(self) -> None:
+    def release(self):
         """Let them through, and those that come."""
         self._passes.set()
 
-    def drop(self) -> None:
+    def drop(self):
         """Break their connections, and those of who comes."""
         self._is_dropped = True
         self._passes.set()
 
-    def close(self) -> None:
+    def close(self):
         """End it."""
         self.drop()
         for one in (self._listener, *self._open):
@@ -98,7 +93,7 @@ class HeldDeletes:
             thread.join(PATIENCE_S)
         self._listener.close()
 
-    def _accept(self) -> None:
+    def _accept(self):
         with suppress(OSError):
             while True:
                 near, _ = self._listener.accept()
@@ -107,14 +102,14 @@ class HeldDeletes:
                 self._threads.append(thread)
                 thread.start()
 
-    def _hand_on(self, near: socket.socket) -> None:
+    def _hand_on(self, near):
         with near, socket.create_connection(("127.0.0.1", self._to)) as far:
             back = threading.Thread(target=self._pump, args=(far, near), daemon=True)
             back.start()
             self._pump(near, far, holds=True)
             back.join()
 
-    def _pump(self, source: socket.socket, to: socket.socket, *, holds: bool = False) -> None:
+    def _pump(self, source, to, *, holds=False):
         with suppress(OSError):
             while data := source.recv(1 << 16):
                 method, _, rest = data.partition(b"\r\n")[0].partition(b" ")
@@ -132,19 +127,19 @@ class HeldDeletes:
 class Background(threading.Thread):
     """A call in a thread, of which is known what came of it."""
 
-    def __init__(self, do: Callable[[], Any]) -> None:
+    def __init__(self, do):
         super().__init__(daemon=True)
         self._do, self._found, self._error = do, None, None
         self.start()
 
-    def run(self) -> None:
+    def run(self):
         """Call it."""
         try:
             self._found = self._do()
         except BaseException as error:
             self._error = error
 
-    def result(self) -> Any:
+    def result(self):
         """What it returned."""
         self.join(PATIENCE_S)
         assert not self.is_alive()
@@ -154,14 +149,14 @@ class Background(threading.Thread):
 
 
 @pytest.fixture
-def held(object_server: ObjectServer) -> Iterator[HeldDeletes]:
+def held(object_server):
     proxy = HeldDeletes(object_server.port)
     yield proxy
     proxy.close()
 
 
 @pytest.fixture
-def engine(postgres_url: str, bucket: str, tmp_path: Path) -> Iterator[Engine]:
+def engine(postgres_url, bucket, tmp_path):
     """A service of the fleet; it has its own way to the object store."""
     given = {"database_url": postgres_url, "blob_url": bucket, "data_dir": tmp_path}
     with Engine(Settings.model_validate(given)) as opened:
@@ -170,10 +165,7 @@ def engine(postgres_url: str, bucket: str, tmp_path: Path) -> Iterator[Engine]:
 
 
 @pytest.fixture
-def remover(
-    engine: Engine, postgres_url: str, bucket: str, held: HeldDeletes,
-    monkeypatch: pytest.MonkeyPatch,
-) -> Iterator[Store]:  # fmt: skip
+def remover(engine, postgres_url, bucket, held, monkeypatch):
     """The store in another process: its requests to delete are held."""
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{held.port}")
     for name, seconds in (("TRIED_S", 0.1), ("SMALL_S", 90)):
@@ -185,11 +177,11 @@ def remover(
 
 
 @pytest.fixture
-def removal(remover: Store, held: HeldDeletes) -> Iterator[Callable[..., Background]]:
+def removal(remover, held):
     """Begin to remove blobs, and come back when the request to delete them is held."""
     begun = list[Background]()
 
-    def begin(*blobs: str) -> Background:
+    def begin(*blobs):
         begun.append(Background(lambda: collect_blobs(remover, blobs)))
         assert held.arrived.wait(PATIENCE_S)
         return begun[-1]
@@ -200,41 +192,39 @@ def removal(remover: Store, held: HeldDeletes) -> Iterator[Callable[..., Backgro
         one.join(PATIENCE_S)
 
 
-def waiting(engine: Engine) -> int:
+def waiting(engine):
     with engine.store.database.read() as connection:
         return int(connection.execute(WAITING).scalar_one())
 
 
-def doomed_in(engine: Engine) -> list[str]:
+def doomed_in(engine):
     with engine.store.database.read() as connection:
         return list(connection.execute(select(doomed.c.blob).order_by(doomed.c.blob)).scalars())
 
 
-def end_sessions(engine: Engine, which: str) -> None:
+def end_sessions(engine, which):
     """Cut the one process off that has an advisory lock of that kind."""
     with engine.store.database.read() as connection:
         ended = connection.execute(text(f"{SESSIONS} AND {which}")).scalar_one()
     assert ended == 1
 
 
-def grow_old(engine: Engine) -> None:
+def grow_old(engine):
     """Let the time pass after which no removal of before goes on."""
     with engine.store.database.write() as connection:
         connection.execute(update(doomed).values(at=doomed.c.at - LONGEST_S))
 
 
-def alone(engine: Engine, small: Any) -> Any:
+def alone(engine, small):
     return engine.add_frame("hall", *small[0])
 
 
-def in_a_group(engine: Engine, small: Any) -> Any:
+def in_a_group(engine, small):
     found, _ = engine.uploads.add_all("hall", [Upload(*one) for one in small[:2]])
     return found
 
 
-def test_an_upload_does_not_wait_for_a_removal(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background]
-) -> None:
+def test_an_upload_does_not_wait_for_a_removal(engine, small, held, removal):
     digest = engine.store.blobs.put(b"of another frame")
     removing = removal(digest)
     for add in (alone, in_a_group):
@@ -251,10 +241,8 @@ def test_an_upload_does_not_wait_for_a_removal(
 
 @pytest.mark.parametrize(("add", "turn_s"), [(alone, 0.001), (in_a_group, 60.0)])
 def test_the_same_content_is_there_after_its_removal(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    until: Until, add: Callable[[Engine, Any], Any], turn_s: float,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    engine, small, held, removal, until, add, turn_s, monkeypatch
+):
     """Who has committed its frame has no turn, and waits for longer."""
     monkeypatch.setattr("sceneprint.store.blobs.object_store.TURN_S", turn_s)
     digest = engine.store.blobs.put(small[0].png)
@@ -270,9 +258,7 @@ def test_the_same_content_is_there_after_its_removal(
     assert engine.run(work) == JobState.SUCCEEDED
 
 
-def test_an_artifact_is_there_after_its_removal(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background], until: Until
-) -> None:
+def test_an_artifact_is_there_after_its_removal(engine, small, held, removal, until):
     engine.create_map(NewMap(name="yard"))
     for name in ("hall", "yard"):
         engine.add_frame(name, *small[0])
@@ -296,10 +282,7 @@ def test_an_artifact_is_there_after_its_removal(
     assert engine.store.blobs.get(artifact) == data
 
 
-def test_a_removal_that_takes_too_long_stores_nothing(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+def test_a_removal_that_takes_too_long_stores_nothing(engine, small, held, removal, monkeypatch):
     monkeypatch.setattr("sceneprint.store.blobs.object_store.TURN_S", 0.1)
     monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
     digest = engine.store.blobs.put(small[0].png)
@@ -314,9 +297,8 @@ def test_a_removal_that_takes_too_long_stores_nothing(
 
 
 def test_an_upload_that_waited_in_vain_has_its_blob_when_it_is_sent_again(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    engine, small, held, removal, monkeypatch
+):
     monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
     once = IdempotentRequest("robot", "a key", "a" * 64)
     digest = engine.store.blobs.put(small[0].png)
@@ -333,10 +315,7 @@ def test_an_upload_that_waited_in_vain_has_its_blob_when_it_is_sent_again(
     assert engine.store.blobs.get(digest) == small[0].png
 
 
-def test_a_second_upload_waits_for_a_removal_too(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    until: Until, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+def test_a_second_upload_waits_for_a_removal_too(engine, small, held, removal, until, monkeypatch):
     """The first one may die before it has put its blob once more."""
     monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
     digest = engine.store.blobs.put(small[0].png)
@@ -355,9 +334,8 @@ def test_a_second_upload_waits_for_a_removal_too(
 
 
 def test_what_is_on_its_way_out_stays_doomed_for_all(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background],
-    until: Until, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    engine, small, held, removal, until, monkeypatch
+):
     """Also where another removal finds that something refers to it by now."""
     monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
     digest = engine.store.blobs.put(small[0].png)
@@ -374,9 +352,8 @@ def test_what_is_on_its_way_out_stays_doomed_for_all(
 
 @pytest.mark.parametrize("dies", ["before", "after"])
 def test_what_a_killed_remover_leaves(
-    engine: Engine, small: Any, held: HeldDeletes, postgres_url: str, bucket: str, dies: str,
-    remover: Store, until: Until, monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    engine, small, held, postgres_url, bucket, dies, remover, until, monkeypatch
+):
     digest = engine.store.blobs.put(small[0].png)
     engine.store.blobs.put(b"of another frame")
     if dies == "after":
@@ -405,9 +382,7 @@ def test_what_a_killed_remover_leaves(
     assert engine.store.blobs.get(digest) == small[0].png
 
 
-def test_a_server_that_fell_tells_of_the_removal_that_was_under_way(
-    tmp_path: Path, bucket: str
-) -> None:
+def test_a_server_that_fell_tells_of_the_removal_that_was_under_way(tmp_path, bucket):
     server = Server(tmp_path / "server")
     server.start()
     try:
@@ -431,7 +406,7 @@ def test_a_server_that_fell_tells_of_the_removal_that_was_under_way(
         server.kill()
 
 
-def test_what_is_removed_one_by_one_ends_in_time(tmp_path: Path) -> None:
+def test_what_is_removed_one_by_one_ends_in_time(tmp_path):
     objects = open_objects(f"file://{tmp_path}")
     for key in ("a", "c"):
         objects.put(key, b"x")
@@ -441,21 +416,7 @@ def test_what_is_removed_one_by_one_ends_in_time(tmp_path: Path) -> None:
     assert [one.key for one in objects.list("")] == []
 
 
-def test_a_snapshot_defers_a_removal(engine: Engine) -> None:
-    digest = engine.store.blobs.put(b"of another frame")
-    with engine.store.blobs.block_removals():
-        collect_blobs(engine.store, [digest])
-        assert engine.store.blobs.holds(digest)
-        assert doomed_in(engine) == [digest]
-    assert collect_doomed_blobs(engine.store) == 1
-    assert not engine.store.blobs.holds(digest)
-    assert doomed_in(engine) == []
-
-
-def test_blobs_stay_doomed_where_the_object_store_is_away(
-    engine: Engine, held: HeldDeletes, removal: Callable[..., Background],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+def test_blobs_stay_doomed_where_the_object_store_is_away(engine, held, removal, monkeypatch):
     digest = engine.store.blobs.put(b"of another frame")
     removing = removal(digest)
     held.drop()
@@ -471,9 +432,7 @@ def test_blobs_stay_doomed_where_the_object_store_is_away(
     assert doomed_in(engine) == []
 
 
-def test_another_removal_does_not_hide_that_of_who_was_cut_off(
-    engine: Engine, small: Any, held: HeldDeletes, removal: Callable[..., Background]
-) -> None:
+def test_another_removal_does_not_hide_that_of_who_was_cut_off(engine, small, held, removal):
     """What it had asked for is carried out later, and not after an upload that is acknowledged."""
     digest, other = (engine.store.blobs.put(one) for one in (small[0].png, b"of another frame"))
     removing = removal(digest)
@@ -491,9 +450,8 @@ def test_another_removal_does_not_hide_that_of_who_was_cut_off(
 
 
 def test_a_request_without_an_answer_may_be_carried_out_later(
-    engine: Engine, small: Any, held: HeldDeletes, postgres_url: str, bucket: str,
-    monkeypatch: pytest.MonkeyPatch, until: Until,
-) -> None:  # fmt: skip
+    engine, small, held, postgres_url, bucket, monkeypatch, until
+):
     monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{held.port}")
     monkeypatch.setattr("sceneprint.store.blobs.object_client.SMALL_S", 1)
     digest = engine.store.blobs.put(small[0].png)
@@ -510,15 +468,15 @@ def test_a_request_without_an_answer_may_be_carried_out_later(
 
 
 def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
-    small: Any, postgres_url: str, tmp_path: Path, until: Until, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    small, postgres_url, tmp_path, until, monkeypatch
+):
     """Its disk may stall for longer than the server waits for it."""
     given = Settings.model_validate({"database_url": postgres_url, "data_dir": tmp_path})
     given.blobs.mkdir()
     arrived, passes = threading.Event(), threading.Event()
     remove = FolderBlobs.remove
 
-    def stall(self: FolderBlobs, *digests: str) -> None:
+    def stall(self, *digests):
         arrived.set()
         passes.wait()
         remove(self, *digests)
@@ -540,9 +498,7 @@ def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
         assert engine.store.blobs.get(digest) == small[0].png
 
 
-def test_what_is_doomed_again_meanwhile_is_not_settled(
-    engine: Engine, held: HeldDeletes, removal: Callable[..., Background]
-) -> None:
+def test_what_is_doomed_again_meanwhile_is_not_settled(engine, held, removal):
     """It may have been put again, and its frame deleted, by who died before it removed it."""
     first, second = (engine.store.blobs.put(one) for one in (b"of another frame", b"of a third"))
     removing = removal(first, second)
@@ -553,10 +509,7 @@ def test_what_is_doomed_again_meanwhile_is_not_settled(
     assert doomed_in(engine) == [first]
 
 
-def test_one_removal_waits_for_another(
-    engine: Engine, held: HeldDeletes, removal: Callable[..., Background], until: Until,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+def test_one_removal_waits_for_another(engine, held, removal, until, monkeypatch):
     blobs = [engine.store.blobs.put(one) for one in (b"a", b"b", b"c")]
     removing = removal(blobs[0])
     with monkeypatch.context() as patch:

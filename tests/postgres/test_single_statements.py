@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Connection, Table, insert, select, update
+from sqlalchemy import insert, select, update
 
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.events import record_event
 from sceneprint.store.maps import add_frame, add_map, map_of_number, store_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.parent_joins import ParentJoin, join_parent
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame, index_frame
 from sceneprint.store.tables import (
-    JobRow,
-    MapRow,
     frame_row,
     frame_tags,
     frames,
@@ -48,7 +45,7 @@ VALUES: dict[str, Any] = {
 
 
 @pytest.fixture
-def pair(server_store: Store) -> list[MapRow]:
+def pair(server_store):
     """Two maps that are alike: one for each way."""
     with server_store.database.write() as connection:
         for model in (MODEL, OTHER):
@@ -56,7 +53,7 @@ def pair(server_store: Store) -> list[MapRow]:
         return [add_map(connection, name, None, MODEL) for name in ("single", "parts")]
 
 
-def received(store: Store, row: MapRow, *, at_once: bool) -> None:
+def received(store, row, *, at_once):
     with store.database.write(map_number=row.number) as connection:
         if at_once:
             assert len(receive_frames(connection, [NewFrame(row, VALUES, 3)])) == 1
@@ -66,17 +63,14 @@ def received(store: Store, row: MapRow, *, at_once: bool) -> None:
         record_event(connection, "frame.received", row.name, frame.id, job.id)
 
 
-def claimed(store: Store, row: MapRow) -> JobRow:
+def claimed(store, row):
     with store.database.write() as connection:
         held = queue.claim(connection, "worker", 60.0)
-    assert held is not None
     assert held.map_number == row.number
     return held
 
 
-def indexed(
-    store: Store, row: MapRow, job: JobRow, made: StoredSignature = MADE, *, at_once: bool
-) -> bool:
+def indexed(store, row, job, made=MADE, *, at_once):
     with store.database.write(map_number=row.number) as connection:
         asked = select(frames).where(frames.c.number == job.frame_number)
         frame = frame_row(connection.execute(asked).mappings().one())
@@ -88,7 +82,7 @@ def indexed(
         return True
 
 
-def rows(store: Store, row: MapRow) -> dict[str, list[dict[str, Any]]]:
+def rows(store, row):
     """All that a map has, but for what is chance."""
     with store.database.read() as connection:
         own = list(
@@ -108,12 +102,12 @@ def rows(store: Store, row: MapRow) -> dict[str, list[dict[str, Any]]]:
                 for name, of in which.items()}  # fmt: skip
 
 
-def _told(connection: Connection, table: Table, of: Any) -> list[dict[str, Any]]:
+def _told(connection, table, of):
     found = connection.execute(select(table).where(of).order_by(*table.primary_key)).mappings()
     return [{name: one[name] for name in one if name not in CHANCE} for one in found]
 
 
-def test_a_frame_is_received_as_by_its_parts(server_store: Store, pair: list[MapRow]) -> None:
+def test_a_frame_is_received_as_by_its_parts(server_store, pair):
     for row, at_once in zip(pair, (True, False), strict=True):
         received(server_store, row, at_once=at_once)
     single, parts = (rows(server_store, row) for row in pair)
@@ -124,9 +118,7 @@ def test_a_frame_is_received_as_by_its_parts(server_store: Store, pair: list[Map
     assert (single["maps"][0]["used_frames"], single["maps"][0]["used_bytes"]) == (1, 70)
 
 
-def test_a_frame_of_a_joined_parent_frame_is_indexed_in_the_root(
-    server_store: Store, pair: list[MapRow]
-) -> None:
+def test_a_frame_of_a_joined_parent_frame_is_indexed_in_the_root(server_store, pair):
     row, T = pair[0], np.diag([-1.0, -1.0, 1.0, 1.0])  # half a turn about z
     received(server_store, row, at_once=True)
     job = claimed(server_store, row)
@@ -143,43 +135,8 @@ def test_a_frame_of_a_joined_parent_frame_is_indexed_in_the_root(
     assert (stored["pose"], stored["sent_pose"]) == ((T @ np.array(POSE)).tolist(), POSE)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"quota_frames": 0}, {"quota_bytes": 69}, {"name": "renamed"},
-        pytest.param(None, id="the content is there"),
-    ],
-)  # fmt: skip
-def test_a_frame_that_has_no_place_leaves_nothing(
-    server_store: Store, pair: list[MapRow], change: dict[str, Any] | None
-) -> None:
-    row = pair[0]
-    if change is None:
-        received(server_store, row, at_once=True)
-    else:
-        with server_store.database.write() as connection:
-            connection.execute(update(maps).where(maps.c.number == row.number).values(**change))
-    before = rows(server_store, row)
-    with server_store.database.write(map_number=row.number) as connection:
-        assert receive_frames(connection, [NewFrame(row, VALUES)]) == set()
-    assert rows(server_store, row) == before
-
-
-def test_a_quota_that_a_frame_fills_has_room_for_it(
-    server_store: Store, pair: list[MapRow]
-) -> None:
-    row = pair[0]
-    full = update(maps).where(maps.c.number == row.number).values(quota_frames=1, quota_bytes=70)
-    with server_store.database.write() as connection:
-        connection.execute(full)
-    received(server_store, row, at_once=True)
-    assert rows(server_store, row)["maps"][0]["used_bytes"] == 70
-
-
 @pytest.mark.parametrize("fused", [False, True])
-def test_a_frame_is_indexed_as_by_its_parts(
-    server_store: Store, pair: list[MapRow], fused: bool
-) -> None:
+def test_a_frame_is_indexed_as_by_its_parts(server_store, pair, fused):
     """Also one that is signed anew, whose surface has to be fused anew."""
     held = []
     for row in pair:
@@ -206,27 +163,25 @@ def test_a_frame_is_indexed_as_by_its_parts(
     assert [one["kind"] for one in single["pending_events"]] == ["frame.received", "frame.indexed"]
 
 
-def _lost(connection: Connection, job: JobRow) -> None:
+def _lost(connection, job):
     connection.execute(update(jobs).where(jobs.c.number == job.number).values(token=job.token + 1))
 
 
-def _cancelled(connection: Connection, job: JobRow) -> None:
+def _cancelled(connection, job):
     connection.execute(update(jobs).where(jobs.c.number == job.number).values(state="cancelled"))
 
 
-def _switching(connection: Connection, job: JobRow) -> None:
+def _switching(connection, job):
     of = maps.c.number == job.map_number
     connection.execute(update(maps).where(of).values(next_model_id=OTHER))
 
 
-def _switched(connection: Connection, job: JobRow) -> None:
+def _switched(connection, job):
     connection.execute(update(maps).where(maps.c.number == job.map_number).values(model_id=OTHER))
 
 
 @pytest.mark.parametrize("happened", [_lost, _cancelled, _switching, _switched])
-def test_a_job_that_is_lost_or_of_another_model_indexes_nothing(
-    server_store: Store, pair: list[MapRow], happened: Callable[[Connection, JobRow], None]
-) -> None:
+def test_a_job_that_is_lost_or_of_another_model_indexes_nothing(server_store, pair, happened):
     row = pair[0]
     received(server_store, row, at_once=True)
     job = claimed(server_store, row)
@@ -237,7 +192,7 @@ def test_a_job_that_is_lost_or_of_another_model_indexes_nothing(
     assert rows(server_store, row) == before
 
 
-def test_revisions_of_a_map_follow_each_other(server_store: Store, pair: list[MapRow]) -> None:
+def test_revisions_of_a_map_follow_each_other(server_store, pair):
     row = pair[0]
     with server_store.database.write(map_number=row.number) as connection:
         for i in range(3):

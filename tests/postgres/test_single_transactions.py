@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,27 +17,16 @@ from sceneprint.engine.jobs import signature_job
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import IdempotencyConflict, LostLease, NewerSchema, StoreLocked
 from sceneprint.settings import Settings
-from sceneprint.store import Database, Store, open_database, queue
+from sceneprint.store import open_database, queue
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, find_map, frame_of, store_model
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.signatures import StoredSignature, index_claimed_frame
-from sceneprint.store.tables import (
-    FrameRow,
-    JobRow,
-    MapRow,
-    frames,
-    idempotency,
-    jobs,
-    maps,
-    pending_events,
-    signatures,
-)
+from sceneprint.store.tables import frames, idempotency, jobs, maps, pending_events, signatures
 from sceneprint_client.api import JobState, NewMap
 from tests.whole_engine import Engine
 
-Until = Callable[[Callable[[], Any]], Any]
 MODEL = "ab" * 32
 #: What is known of a frame beside its content.
 KNOWN: dict[str, Any] = {
@@ -57,7 +44,7 @@ WAITING = text(str(LOCKS_HELD).replace("AND granted", "AND NOT granted"))
 class TripCounter:
     """A server's port that counts round trips: how often one asks after the other has answered."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port):
         self._to, self._asks, self.trips = port, False, 0
         self._lock = threading.Lock()
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -65,7 +52,7 @@ class TripCounter:
         self._open: list[socket.socket] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def _accept(self) -> None:
+    def _accept(self):
         with suppress(OSError):
             while True:
                 near, _ = self._listener.accept()
@@ -74,7 +61,7 @@ class TripCounter:
                 for pair in ((near, far, True), (far, near, False)):
                     threading.Thread(target=self._pump, args=pair, daemon=True).start()
 
-    def _pump(self, source: socket.socket, to: socket.socket, asks: bool) -> None:
+    def _pump(self, source, to, asks):
         with suppress(OSError):
             while data := source.recv(1 << 16):
                 with self._lock:
@@ -83,20 +70,20 @@ class TripCounter:
                 to.sendall(data)
             to.shutdown(socket.SHUT_WR)
 
-    def close(self) -> None:
+    def close(self):
         for one in (self._listener, *self._open):
             one.close()
 
 
 @pytest.fixture
-def row(server_store: Store) -> MapRow:
+def row(server_store):
     with server_store.database.write() as connection:
         store_model(connection, MODEL, "toy", b"a model")
         return add_map(connection, "hall", None, MODEL)
 
 
 @pytest.fixture
-def counted(server_store: Store, row: MapRow) -> Iterator[tuple[Database, TripCounter]]:
+def counted(server_store, row):
     """The same database by way of one who counts."""
     url = server_store.database._engine.url
     assert url.port is not None
@@ -107,51 +94,48 @@ def counted(server_store: Store, row: MapRow) -> Iterator[tuple[Database, TripCo
     counter.close()
 
 
-def upload(database: Database, row: MapRow, number: int) -> None:
+def upload(database, row, number):
     with database.write(map_number=row.number, single=True) as connection:
         values = {**KNOWN, "content_id": f"{number:064x}"}
         assert receive_frames(connection, [NewFrame(row, values)])
 
 
-def claimed(database: Database) -> tuple[JobRow, FrameRow]:
+def claimed(database):
     with database.write(turn=False) as connection:
         job = queue.claim(connection, "worker", 60.0)
-        assert job is not None
         return job, frame_of(connection, job.frame)
 
 
-def sign(database: Database, job: JobRow, frame: FrameRow) -> None:
+def sign(database, job, frame):
     made = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
     with database.write(map_number=frame.map_number, single=True) as connection:
         assert index_claimed_frame(connection, job, frame, "hall", made)
 
 
-def edit(database: Database, row: MapRow, note: str, *, single: bool = True) -> None:
+def edit(database, row, note, *, single=True):
     with database.write(map_number=row.number, single=single) as connection:
         connection.execute(update(maps).where(maps.c.number == row.number).values(name=note))
 
 
-def named(store: Store) -> str:
+def named(store):
     with store.database.read() as connection:
         return str(connection.execute(select(maps.c.name)).scalar_one())
 
 
-def locks(store: Store, which: Any = LOCKS_HELD) -> int:
+def locks(store, which=LOCKS_HELD):
     with store.database.read() as connection:
         return int(connection.execute(which).scalar_one())
 
 
 @contextmanager
-def held(store: Store, row: MapRow | None) -> Iterator[Any]:
+def held(store, row):
     """The map's turn, of another process; None: that of all maps."""
     with store.database._writers.begin() as other:
         postgres.take_turn(other, 10.0, None, None if row is None else row.number)
         yield other
 
 
-def test_an_upload_and_a_signature_take_one_round_trip_each(
-    counted: tuple[Database, TripCounter], row: MapRow
-) -> None:
+def test_an_upload_and_a_signature_take_one_round_trip_each(counted, row):
     database, counter = counted
     for number in range(8):  # what is asked often is prepared, which has its own messages
         upload(database, row, number)
@@ -171,9 +155,7 @@ def test_an_upload_and_a_signature_take_one_round_trip_each(
         assert [tuple(one) for one in connection.execute(counts)] == [("indexed", 9)]
 
 
-def test_it_is_committed_with_its_answer_and_keeps_no_turn(
-    server_store: Store, row: MapRow
-) -> None:
+def test_it_is_committed_with_its_answer_and_keeps_no_turn(server_store, row):
     database = server_store.database
     asked = text(str(LOCKS_HELD).replace("count(*)", "mode") + " AND pid = pg_backend_pid()")
     with database.write(map_number=row.number, single=True) as connection:
@@ -185,7 +167,7 @@ def test_it_is_committed_with_its_answer_and_keeps_no_turn(
         assert named(server_store) == "at once"
 
 
-def test_nothing_cuts_its_commit_off(server_store: Store, row: MapRow) -> None:
+def test_nothing_cuts_its_commit_off(server_store, row):
     """A commit may wait for a standby for longer than any statement may take."""
     asked = text("SELECT current_setting('statement_timeout'), current_setting('lock_timeout')")
     with server_store.database.write(map_number=row.number, single=True) as connection:
@@ -194,12 +176,10 @@ def test_nothing_cuts_its_commit_off(server_store: Store, row: MapRow) -> None:
         assert connection.exec_driver_sql("SHOW statement_timeout").scalar_one() == "1min"
 
 
-def test_it_sees_what_was_committed_while_its_turn_was_waited_for(
-    server_store: Store, row: MapRow, until: Until
-) -> None:
+def test_it_sees_what_was_committed_while_its_turn_was_waited_for(server_store, row, until):
     found = list[str]()
 
-    def late() -> None:
+    def late():
         with server_store.database.write(map_number=row.number, single=True) as connection:
             found.append(connection.execute(select(maps.c.name)).scalar_one())
 
@@ -212,12 +192,10 @@ def test_it_sees_what_was_committed_while_its_turn_was_waited_for(
     assert found == ["renamed"]
 
 
-def test_who_waited_for_a_migration_writes_nothing(
-    server_store: Store, row: MapRow, until: Until
-) -> None:
+def test_who_waited_for_a_migration_writes_nothing(server_store, row, until):
     raised = list[Exception]()
 
-    def late() -> None:
+    def late():
         try:
             edit(server_store.database, row, "late")
         except NewerSchema as error:
@@ -234,9 +212,7 @@ def test_who_waited_for_a_migration_writes_nothing(
     assert [str(one).partition("schema ")[2][:4] for one in raised] == ["9999"]
 
 
-def test_a_schema_that_went_on_and_may_be_written_to_is_noted(
-    server_store: Store, row: MapRow
-) -> None:
+def test_a_schema_that_went_on_and_may_be_written_to_is_noted(server_store, row):
     database = server_store.database
     edit(database, row, "before")
     with database.write() as connection:
@@ -251,9 +227,7 @@ def test_a_schema_that_went_on_and_may_be_written_to_is_noted(
     assert named(server_store) == "later"
 
 
-def test_a_turn_that_does_not_come_in_time_is_said(
-    server_store: Store, row: MapRow, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_turn_that_does_not_come_in_time_is_said(server_store, row, monkeypatch):
     monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
     with held(server_store, row), pytest.raises(StoreLocked):
         edit(server_store.database, row, "late")
@@ -264,7 +238,7 @@ def test_a_turn_that_does_not_come_in_time_is_said(
     assert not server_store.database._held
 
 
-def test_a_warning_of_before_is_not_one_of_its_commit(server_store: Store, row: MapRow) -> None:
+def test_a_warning_of_before_is_not_one_of_its_commit(server_store, row):
     """One of its commit says that it is not on the standby."""
     with server_store.database.read() as connection:
         warned = connection.execute(text("SELECT pg_cancel_backend(2147483647)")).scalar()
@@ -273,7 +247,7 @@ def test_a_warning_of_before_is_not_one_of_its_commit(server_store: Store, row: 
     assert named(server_store) == "after"
 
 
-def test_what_fails_leaves_nothing(server_store: Store, row: MapRow) -> None:
+def test_what_fails_leaves_nothing(server_store, row):
     database = server_store.database
     with (
         pytest.raises(Exception, match="division by zero"),
@@ -288,7 +262,7 @@ def test_what_fails_leaves_nothing(server_store: Store, row: MapRow) -> None:
     assert named(server_store) == "after"
 
 
-def test_it_has_one_statement(server_store: Store, row: MapRow) -> None:
+def test_it_has_one_statement(server_store, row):
     rows = [{"at": 0.0, "kind": "late", "map": "hall", "data": {}}] * 2
     database, many = server_store.database, insert(pending_events)
     with (
@@ -304,9 +278,7 @@ def test_it_has_one_statement(server_store: Store, row: MapRow) -> None:
         assert connection.execute(select(func.count()).select_from(pending_events)).scalar() == 1
 
 
-def test_a_connection_that_was_ended_a_moment_ago_is_not_used(
-    server_store: Store, row: MapRow
-) -> None:
+def test_a_connection_that_was_ended_a_moment_ago_is_not_used(server_store, row):
     database = server_store.database
     with database.read() as connection:
         mine = connection.exec_driver_sql("SELECT pg_backend_pid()").scalar_one()
@@ -319,7 +291,7 @@ def test_a_connection_that_was_ended_a_moment_ago_is_not_used(
 
 
 @pytest.fixture
-def engine(postgres_url: str, tmp_path: Path) -> Iterator[Engine]:
+def engine(postgres_url, tmp_path):
     (tmp_path / "blobs").mkdir()
     given = {"database_url": postgres_url, "data_dir": tmp_path}
     with Engine(Settings.model_validate(given)) as opened:
@@ -327,13 +299,11 @@ def engine(postgres_url: str, tmp_path: Path) -> Iterator[Engine]:
         yield opened
 
 
-def removed_before(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch, then: Callable[[], None]
-) -> None:
+def removed_before(engine, monkeypatch, then):
     """Have a deletion remove an upload just before its commit, and something done after that."""
     once = NewFrames.receive
 
-    def run(group: NewFrames, frame: NewFrame) -> bool:
+    def run(group, frame):
         monkeypatch.undo()
         collect_blobs(engine.store, list(engine.store.blobs.digests()))
         found = once(group, frame)
@@ -345,27 +315,23 @@ def removed_before(
 
 
 def test_an_upload_that_a_deletion_removed_before_its_commit_is_put_again(
-    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    engine, small, monkeypatch
+):
     removed_before(engine, monkeypatch, lambda: None)
     added, new = engine.add_frame("hall", *small[0])
     assert new
     work = engine.claim("w")
-    assert work is not None
     assert work.job.id == added.job_id
     assert engine.run(work) == JobState.SUCCEEDED
     assert engine.get_map("hall").frames == {"indexed": 1}
 
 
-def test_a_worker_that_missed_an_upload_tries_again(
-    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_worker_that_missed_an_upload_tries_again(engine, small, monkeypatch):
     """It had come between the commit and the upload's being put again."""
     missed = list[str]()
 
-    def work_in_between() -> None:
+    def work_in_between():
         work = engine.claim("w")
-        assert work is not None
         assert engine.run(work) == JobState.QUEUED
         missed.append(work.job.id)
 
@@ -380,14 +346,12 @@ def test_a_worker_that_missed_an_upload_tries_again(
     assert engine.get_map("hall").frames == {"indexed": 1}
 
 
-def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(
-    engine: Engine, small: Any, until: Until, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(engine, small, until, monkeypatch):
     """Those for the same map wait behind it, and nobody with them."""
     engine.create_map(NewMap(name="other"))
     tried, receive = list[str](), NewFrames.receive
 
-    def noted(group: NewFrames, frame: NewFrame) -> bool:
+    def noted(group, frame):
         tried.append(frame.row.name)
         return receive(group, frame)
 
@@ -396,7 +360,7 @@ def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(
         row = find_map(connection, "hall")
     done = list[bool]()
 
-    def late(number: int) -> None:
+    def late(number):
         done.append(engine.add_frame("hall", *small[number])[1])
 
     first, second = (threading.Thread(target=late, args=(i,)) for i in (0, 1))
@@ -413,7 +377,7 @@ def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(
     assert engine.get_map("hall").frames == {"received": 2}
 
 
-def test_a_frame_has_the_id_that_it_is_put_under(engine: Engine, small: Any) -> None:
+def test_a_frame_has_the_id_that_it_is_put_under(engine, small):
     mine, other, no = (
         Upload(*small[i], frame_id=frame_id) for i, frame_id in enumerate(("mine", "other", None))
     )
@@ -425,15 +389,15 @@ def test_a_frame_has_the_id_that_it_is_put_under(engine: Engine, small: Any) -> 
 
 
 def test_an_artifact_that_a_deletion_removed_before_its_commit_is_put_again(
-    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    engine, small, monkeypatch
+):
     engine.add_frame("hall", *small[0])
     work = engine.claim("w")
     assert work is not None
     (upload,) = engine.store.blobs.digests()
     index = signature_job.index_claimed_frame
 
-    def late(*given: Any, **how: Any) -> bool:
+    def late(*given, **how):
         monkeypatch.undo()
         collect_blobs(engine.store, [one for one in engine.store.blobs.digests() if one != upload])
         assert list(engine.store.blobs.digests()) == [upload]
@@ -446,15 +410,15 @@ def test_an_artifact_that_a_deletion_removed_before_its_commit_is_put_again(
     assert engine.store.geometries.read(artifact).patches
 
 
-def once_of(what: str) -> IdempotentRequest:
+def once_of(what):
     return IdempotentRequest("robot", "a key", what * 64)
 
 
-def add(engine: Engine, frame: Any, once: IdempotentRequest, map_name: str = "hall") -> Any:
+def add(engine, frame, once, map_name="hall"):
     return engine.uploads.add(map_name, Upload(*frame), once)
 
 
-def test_what_a_request_came_to_is_remembered_with_its_frame(engine: Engine, small: Any) -> None:
+def test_what_a_request_came_to_is_remembered_with_its_frame(engine, small):
     said = list[str]()
     event.listen(
         engine.store.database._engine, "before_cursor_execute",
@@ -477,14 +441,12 @@ def test_what_a_request_came_to_is_remembered_with_its_frame(engine: Engine, sma
     assert engine.get_map("hall").frames == {"received": 2}
 
 
-def test_a_request_whose_key_is_used_meanwhile_takes_nothing(
-    engine: Engine, small: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_request_whose_key_is_used_meanwhile_takes_nothing(engine, small, monkeypatch):
     """By another request, for another map, whose turn is another."""
     engine.create_map(NewMap(name="other"))
     run = NewFrames.receive
 
-    def overtaken(group: NewFrames, frame: NewFrame) -> bool:
+    def overtaken(group, frame):
         monkeypatch.undo()
         add(engine, small[1], once_of("b"), "other")
         return run(group, frame)
@@ -498,8 +460,8 @@ def test_a_request_whose_key_is_used_meanwhile_takes_nothing(
     assert len(list(engine.store.blobs.digests())) == 1
 
 
-def test_what_has_a_fence_is_taken_behind_it(engine: Engine, small: Any) -> None:
-    def lost(_: Any) -> None:
+def test_what_has_a_fence_is_taken_behind_it(engine, small):
+    def lost(_):
         raise LostLease("another worker has it")
 
     with pytest.raises(LostLease):

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import psycopg
 import pytest
 from sqlalchemy import text
 
-from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import StoreAway
-from sceneprint.store import Store
 from sceneprint.store.events import EventFilter, list_events, record_event
 
 WAITING = "FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
 
 
-def waits_for_standby(server: Server) -> bool:
+def waits_for_standby(server):
     """Return whether a commit waits for a standby; its wait is ended."""
     url = server.url("postgres").replace("+psycopg", "")
 
-    def commit() -> None:
+    def commit():
         with psycopg.connect(url, autocommit=True) as connection:
             connection.execute("CREATE TEMP TABLE probe ()")
 
@@ -37,7 +33,7 @@ def waits_for_standby(server: Server) -> bool:
 
 
 @pytest.fixture
-def forsaken(postgres: Server, until: Callable[..., Any]) -> Iterator[Server]:
+def forsaken(postgres, until):
     """A server whose standby is away."""
     for statement in ("ALTER SYSTEM SET synchronous_standby_names = 'nobody'",
                       "SELECT pg_reload_conf()"):  # fmt: skip
@@ -48,12 +44,10 @@ def forsaken(postgres: Server, until: Callable[..., Any]) -> Iterator[Server]:
     postgres.execute("SELECT pg_reload_conf()")
 
 
-def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
-    server_store: Store, forsaken: Server, until: Callable[..., Any]
-) -> None:
+def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(server_store, forsaken, until):
     database, raised = server_store.database, []
 
-    def write() -> None:
+    def write():
         try:
             with database.write() as connection:
                 limit = connection.execute(text("SHOW statement_timeout")).scalar_one()
@@ -73,7 +67,7 @@ def test_a_commit_whose_wait_is_ended_by_hand_is_not_acknowledged(
     assert "An operator ended the wait for a standby" in str(raised[0])
 
 
-def test_other_warnings_are_no_doubt(server_store: Store) -> None:
+def test_other_warnings_are_no_doubt(server_store):
     with server_store.database.write() as connection:
         connection.execute(text("DO $$ BEGIN RAISE WARNING 'of something else'; END $$"))
         record_event(connection, "map.created", "hall")

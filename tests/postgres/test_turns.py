@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 from sqlalchemy import func, insert, select, text
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import NewerSchema, StoreLocked
-from sceneprint.store import Store
+from sceneprint.errors import NewerSchema
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.tables import events
 
@@ -22,22 +19,20 @@ _WAITING = text(
 )
 
 
-def waiting(store: Store) -> int:
+def waiting(store):
     with store.database.read() as connection:
         return int(connection.execute(_WAITING).scalar_one())
 
 
-def write(store: Store) -> None:
+def write(store):
     with store.database.write() as connection:
         connection.execute(insert(events).values(at=0.0, kind="late", data={}))
 
 
-def test_who_waited_for_a_migration_finds_its_schema_and_writes_nothing(
-    server_store: Store, until: Callable[[Callable[[], Any]], Any]
-) -> None:
+def test_who_waited_for_a_migration_finds_its_schema_and_writes_nothing(server_store, until):
     raised = list[Exception]()
 
-    def late() -> None:
+    def late():
         try:
             write(server_store)
         except NewerSchema as error:
@@ -60,9 +55,7 @@ def test_who_waited_for_a_migration_finds_its_schema_and_writes_nothing(
 @pytest.mark.parametrize(
     ("wait_s", "after"), [(0.1, ("10s", "0")), (10.0, ("10s", "0")), (60.0, ("0", "0"))]
 )
-def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(
-    server_store: Store, wait_s: float, after: tuple[str, str]
-) -> None:
+def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(server_store, wait_s, after):
     limits = "SELECT current_setting('lock_timeout'), current_setting('statement_timeout')"
     engine = server_store.database._writers
     with engine.begin() as connection:
@@ -70,17 +63,3 @@ def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(
         assert tuple(connection.exec_driver_sql(limits).one()) == after
     with engine.begin() as connection:
         assert tuple(connection.exec_driver_sql(limits).one()) == ("10s", "1min")
-
-
-def test_a_turn_that_does_not_come_in_time_is_said_and_given_up(server_store: Store) -> None:
-    database = server_store.database
-    with database._writers.begin() as other:
-        postgres.take_turn(other, 10.0)
-        database._held = True  # somebody has waited in vain before: two seconds are enough
-        with pytest.raises(StoreLocked):
-            write(server_store)
-        assert waiting(server_store) == 0
-    write(server_store)
-    with database.read() as connection:
-        late_ones = select(func.count()).where(events.c.kind == "late")
-        assert connection.execute(late_ones).scalar_one() == 1

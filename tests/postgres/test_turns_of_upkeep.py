@@ -6,10 +6,7 @@ import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import event, text
@@ -31,7 +28,7 @@ _ONE = "pg_advisory_xact_lock_shared("
 
 
 @pytest.fixture
-def engine(postgres_url: str, tmp_path: Path) -> Iterator[Engine]:
+def engine(postgres_url, tmp_path):
     (tmp_path / "blobs").mkdir()  # its database is there: it is made by nobody
     values = {"database_url": postgres_url, "data_dir": tmp_path, "decoders": 0}
     with Engine(Settings.model_validate(values)) as opened:
@@ -40,11 +37,11 @@ def engine(postgres_url: str, tmp_path: Path) -> Iterator[Engine]:
 
 
 @contextmanager
-def turns(engine: Engine) -> Iterator[Counter[str]]:
+def turns(engine):
     """Counts how often the turn of all maps, and that of one, is taken."""
     found: Counter[str] = Counter()
 
-    def note(_connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
+    def note(_connection, _cursor, statement, *_):
         found["all"] += _ALL.search(statement) is not None
         found["one"] += _ONE in statement
 
@@ -56,13 +53,11 @@ def turns(engine: Engine) -> Iterator[Counter[str]]:
         event.remove(of, "before_cursor_execute", note)
 
 
-def test_writers_of_two_maps_may_doom_the_same_blobs(
-    engine: Engine, postgres_url: str, tmp_path: Path, until: Callable[..., Any]
-) -> None:
+def test_writers_of_two_maps_may_doom_the_same_blobs(engine, postgres_url, tmp_path, until):
     blobs = [f"{number:064x}" for number in range(3)]
     done = threading.Event()
 
-    def doom_elsewhere() -> None:
+    def doom_elsewhere():
         with (
             closing(open_store(postgres_url, tmp_path / "blobs")) as other,
             other.database.write(map_number=8) as connection,
@@ -79,13 +74,13 @@ def test_writers_of_two_maps_may_doom_the_same_blobs(
         assert doomed_blobs(connection, 9) == blobs
 
 
-def waiting(engine: Engine) -> bool:
+def waiting(engine):
     """Whether a transaction waits for the end of another."""
     with engine.store.database.read() as connection:
         return bool(connection.execute(_WAITING).scalar_one())
 
 
-def test_retention_takes_the_turn_of_its_map(engine: Engine, small: Any) -> None:
+def test_retention_takes_the_turn_of_its_map(engine, small):
     for frame in small[:3]:
         engine.add_frame("hall", *frame)
     with turns(engine) as taken:
@@ -96,7 +91,7 @@ def test_retention_takes_the_turn_of_its_map(engine: Engine, small: Any) -> None
     assert [one.kind for one in told].count("frame.deleted") == 3
 
 
-def test_a_slice_takes_the_turn_of_its_map(engine: Engine) -> None:
+def test_a_slice_takes_the_turn_of_its_map(engine):
     engine.handle("count", lambda _task, _is_over: SliceResult(True, {}, event="counted"))
     engine.begin_task("count", "hall", {})
     work = engine.claim("w")

@@ -5,15 +5,12 @@ from __future__ import annotations
 import os
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 from sqlalchemy import text
 
-from benchmarks.postgres import Server
-from sceneprint.store import Store, wakeup
-from sceneprint.store.database import Database, reach_database
+from sceneprint.store import wakeup
+from sceneprint.store.database import reach_database
 from sceneprint.store.wakeup import Notices, process_name
 
 #: Seconds after which nothing rings any more, on the slowest machine.
@@ -25,21 +22,19 @@ END = text(
 
 
 @pytest.fixture
-def ours(server_store: Store) -> Iterator[Notices]:
+def ours(server_store):
     opened = Notices(server_store.database)
     yield opened
     opened.close()
 
 
-def end(database: Database, what: str) -> int:
+def end(database, what):
     """End the connections whose last statement was like that; how many there were."""
     with database.read() as connection:
         return len(connection.execute(END, {"what": what}).all())
 
 
-def test_who_waits_is_woken_by_another_process_and_by_nothing_else(
-    ours: Notices, postgres: Server, postgres_url: str
-) -> None:
+def test_who_waits_is_woken_by_another_process_and_by_nothing_else(ours, postgres, postgres_url):
     told, tell = os.pipe()
     with ours.listen() as listener:
         assert listener.wait(FOREVER)  # what was rung before it connected
@@ -55,9 +50,7 @@ def test_who_waits_is_woken_by_another_process_and_by_nothing_else(
     os.close(tell)
 
 
-def test_a_crowd_of_rings_is_one_connection_and_few_notices(
-    ours: Notices, server_store: Store
-) -> None:
+def test_a_crowd_of_rings_is_one_connection_and_few_notices(ours, server_store):
     with ours.listen() as first, ours.listen() as second:
         for listener in (first, second):
             assert listener.wait(FOREVER)
@@ -74,21 +67,19 @@ def test_a_crowd_of_rings_is_one_connection_and_few_notices(
             assert connection.execute(text(asked)).scalar_one() == 1
 
 
-def test_every_process_that_listens_is_known_by_its_name(ours: Notices) -> None:
+def test_every_process_that_listens_is_known_by_its_name(ours):
     assert ours.listeners() == []
     with ours.listen(), ours.listen():
         assert ours.listeners() == [process_name()] * 2
     assert len(f"{wakeup.LISTENS}{'h' * 44}:4194304") == 63  # of which the server keeps all
 
 
-def test_the_name_of_a_host_is_cut_at_its_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_name_of_a_host_is_cut_at_its_beginning(monkeypatch):
     monkeypatch.setattr("socket.gethostname", lambda: "a" * 20 + "b" * 44)
     assert process_name() == f"{'b' * 44}:{os.getpid()}"
 
 
-def test_connections_that_are_lost_are_made_anew(
-    ours: Notices, server_store: Store, until: Callable[..., Any]
-) -> None:
+def test_connections_that_are_lost_are_made_anew(ours, server_store, until):
     with ours.listen() as listener:
         assert listener.wait(FOREVER)
         ours.ring()
@@ -100,9 +91,7 @@ def test_connections_that_are_lost_are_made_anew(
         assert until(lambda: listener.wait(0.1))
 
 
-def test_where_the_server_is_away_nobody_is_harmed(
-    postgres: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_the_server_is_away_nobody_is_harmed(postgres, monkeypatch):
     monkeypatch.setattr(wakeup, "AGAIN_S", 0.05)
     away = Notices(reach_database("postgresql://nobody@127.0.0.1:1/none"))
     with away.listen() as listener:
@@ -115,7 +104,7 @@ def test_where_the_server_is_away_nobody_is_harmed(
     assert away._ringer is None
 
 
-def test_a_server_that_never_answers_holds_up_no_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_never_answers_holds_up_no_end(monkeypatch):
     monkeypatch.setattr(wakeup, "CLOSING_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
@@ -123,7 +112,6 @@ def test_a_server_that_never_answers_holds_up_no_end(monkeypatch: pytest.MonkeyP
         mute.ring()
         asked, _ = silent.accept()
         ringer = mute._ringer
-        assert ringer is not None
         mute.close()
         assert ringer.is_alive()
         asked.close()

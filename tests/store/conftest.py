@@ -6,19 +6,16 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
-from sqlalchemy import Connection, event, update
+from sqlalchemy import event, update
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.store import Store, open_database, open_store, queue
+from sceneprint.store import open_database, open_store, queue
 from sceneprint.store.maps import add_frame, add_map, store_model
-from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs
-from sceneprint_client.api import JobState
+from sceneprint.store.tables import jobs
 
 MODEL = "ab" * 32
 
@@ -55,7 +52,7 @@ for line in sys.stdin:
 
 
 @pytest.fixture(scope="session")
-def race() -> Iterator[Callable[..., list[Any]]]:
+def race():
     """A function that runs `work(i)` of a script in several processes at once with ARGS."""
     nursery = subprocess.Popen(
         [sys.executable, "-c", NURSERY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -64,18 +61,17 @@ def race() -> Iterator[Callable[..., list[Any]]]:
     assert nursery.stdout is not None
     to, of = nursery.stdin, nursery.stdout
 
-    def run(code: str, count: int, *args: object) -> list[Any]:
+    def run(code, count, *args):
         print(json.dumps([code, count, [str(one) for one in args]]), file=to, flush=True)
         answer = of.readline()
         assert answer, "the processes did not end well: see their traceback above"
-        found: list[Any] = json.loads(answer)
-        return found
+        return json.loads(answer)
 
     yield run
     nursery.communicate(timeout=PATIENCE_S)
 
 
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+def pytest_generate_tests(metafunc):
     """Run a database test on both databases, or only on SQLite if it concerns SQLite."""
     if "url" in metafunc.fixturenames:
         marked = metafunc.definition.get_closest_marker("sqlite_only") is not None
@@ -85,7 +81,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 @pytest.fixture(scope="session")
-def empty_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def empty_file(tmp_path_factory):
     """An empty SQLite file with the current schema, since copying is faster than creating."""
     path = tmp_path_factory.mktemp("empty") / "truth.db"
     open_database(f"sqlite:///{path}").close()
@@ -94,7 +90,7 @@ def empty_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def url(request, tmp_path):
     """URL of a new database; on a server it already has the schema."""
     if request.param == "postgresql":
         (
@@ -105,7 +101,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def store(url: str, empty_file: Path, tmp_path: Path) -> Iterator[Store]:
+def store(url, empty_file, tmp_path):
     if url.startswith("sqlite"):
         (tmp_path / "blobs").mkdir()
         shutil.copyfile(empty_file, tmp_path / "truth.db")
@@ -115,7 +111,7 @@ def store(url: str, empty_file: Path, tmp_path: Path) -> Iterator[Store]:
 
 
 @pytest.fixture
-def hall(store: Store) -> MapRow:
+def hall(store):
     """An empty map."""
     with store.database.write() as connection:
         store_model(connection, MODEL, "toy", b"the file of a model")
@@ -123,13 +119,10 @@ def hall(store: Store) -> MapRow:
 
 
 @pytest.fixture
-def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
+def received(store, hall):
     """A function that inserts a frame with default fields."""
 
-    def add(
-        content: str, row: MapRow = hall, frame_id: str | None = None,
-        within: Connection | None = None, **given: object,
-    ) -> FrameRow:  # fmt: skip
+    def add(content, row=hall, frame_id=None, within=None, **given):
         values: dict[str, Any] = {
             "content_id": content, "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1},
             "depth_scale": 1000.0, "depth_along_ray": False, "robot": None, "session": None,
@@ -145,10 +138,10 @@ def received(store: Store, hall: MapRow) -> Callable[..., FrameRow]:
 
 
 @pytest.fixture
-def queued(store: Store, received: Callable[..., FrameRow]) -> Callable[..., JobRow]:
+def queued(store, received):
     """A function that queues a job for a new frame."""
 
-    def add(name: str, priority: int = 0) -> JobRow:
+    def add(name, priority=0):
         frame = received(name)
         with store.database.write() as connection:
             return queue.enqueue(connection, "sign", frame.number, priority)
@@ -157,10 +150,10 @@ def queued(store: Store, received: Callable[..., FrameRow]) -> Callable[..., Job
 
 
 @pytest.fixture
-def turned(store: Store) -> Callable[..., None]:
+def turned(store):
     """A function that sets columns of a job, such as an expired lease."""
 
-    def write(job: JobRow, **values: object) -> None:
+    def write(job, **values):
         with store.database.write() as connection:
             connection.execute(update(jobs).where(jobs.c.number == job.number).values(**values))
 
@@ -170,45 +163,45 @@ def turned(store: Store) -> Callable[..., None]:
 class Hand:
     """A worker's access to the queue."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store):
         self.database = store.database
 
-    def take(self, worker: str = "w", lease_s: float = 60.0) -> JobRow | None:
+    def take(self, worker="w", lease_s=60.0):
         with self.database.write() as connection:
             return queue.claim(connection, worker, lease_s)
 
-    def taken(self, worker: str = "w", lease_s: float = 60.0) -> JobRow:
+    def taken(self, worker="w", lease_s=60.0):
         held = self.take(worker, lease_s)
         assert held is not None
         return held
 
-    def row(self, job: JobRow) -> JobRow:
+    def row(self, job):
         with self.database.read() as connection:
             return queue.find_job(connection, job.id)
 
-    def fail(self, held: JobRow, error: str = "broke", trace: str = "Trace") -> JobState:
+    def fail(self, held, error="broke", trace="Trace"):
         with self.database.write() as connection:
             return queue.fail(connection, held, error, trace)
 
-    def due(self) -> bool:
+    def due(self):
         with self.database.read() as connection:
             return queue.has_due(connection)
 
 
 @pytest.fixture
-def hand(store: Store) -> Hand:
+def hand(store):
     return Hand(store)
 
 
 @pytest.fixture(scope="session")
-def plans() -> Callable[[Connection], AbstractContextManager[list[str]]]:
+def plans():
     """A context that returns SQLite's query plans of all statements of a connection."""
 
     @contextmanager
-    def looked_at(connection: Connection) -> Iterator[list[str]]:
+    def looked_at(connection):
         told: list[str] = []
 
-        def explain(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
+        def explain(_, cursor, statement, parameters, *__):
             cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
             told.extend(row[3] for row in cursor.fetchall())
 
@@ -220,7 +213,7 @@ def plans() -> Callable[[Connection], AbstractContextManager[list[str]]]:
 
 
 @pytest.fixture(scope="session")
-def opens() -> str:
+def opens():
     """Code for `race` that opens the database of a URL and returns its schema version."""
     return """
 from sceneprint.store import open_database

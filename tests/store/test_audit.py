@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import insert, select
 
 from sceneprint.engine.admin import operations
 from sceneprint.engine.admin.operations import Audit
 from sceneprint.errors import InvalidRequest, UnknownMap
 from sceneprint.process import Actor, acting_as, name_request, set_actor, work_of
-from sceneprint.store import Store
 from sceneprint.store.audit_log import (
     AuditFilter,
-    AuditRow,
     list_lines,
     record_change,
     record_refusal,
@@ -28,12 +24,12 @@ from sceneprint.store.tables import audit, events, pending_events, tenants
 DAY_S = 86_400.0
 
 
-def lines_of(store: Store, **wanted: Any) -> list[AuditRow]:
+def lines_of(store, **wanted):
     with store.database.read() as connection:
         return list_lines(connection, AuditFilter(**wanted), 1000, after=0)
 
 
-def add_lines(store: Store, *lines: dict[str, Any]) -> None:
+def add_lines(store, *lines):
     usual = {
         "at": 1.0, "actor": "robot", "tenant": "robot", "action": "map.edited", "map": None,
         "data": {},
@@ -42,12 +38,12 @@ def add_lines(store: Store, *lines: dict[str, Any]) -> None:
         connection.execute(insert(audit), [usual | one for one in lines])
 
 
-def fail_after_event(connection: Connection) -> None:
+def fail_after_event(connection):
     record_event(connection, "map.deleted", "hall")
     find_map(connection, "none")
 
 
-def test_an_event_of_an_actor_has_a_line_in_its_transaction(store: Store) -> None:
+def test_an_event_of_an_actor_has_a_line_in_its_transaction(store):
     set_actor(Actor("robot-7", "192.0.2.7"))
     name_request("r1")
     try:
@@ -70,7 +66,7 @@ def test_an_event_of_an_actor_has_a_line_in_its_transaction(store: Store) -> Non
         assert connection.execute(select(events.c.data)).scalars().all() == [{"fields": ["title"]}]
 
 
-def test_a_line_names_what_was_changed(store: Store) -> None:
+def test_a_line_names_what_was_changed(store):
     with acting_as("boss"), store.database.write(map_number=1) as connection:
         record_event(connection, "frame.edited", "hall", "f1", "j1", fields=["tags"])
         record_event(connection, "key.created", name="screen")
@@ -84,7 +80,7 @@ def test_a_line_names_what_was_changed(store: Store) -> None:
     ]
 
 
-def test_what_a_worker_carries_out_has_no_line(store: Store) -> None:
+def test_what_a_worker_carries_out_has_no_line(store):
     with store.database.write() as connection:
         record_event(connection, "frame.indexed", "hall", "f1")
         record_change(connection, "job.removed", "hall", "j1")
@@ -94,7 +90,7 @@ def test_what_a_worker_carries_out_has_no_line(store: Store) -> None:
     assert both == [[("frame.indexed",)], []]
 
 
-def test_texts_of_a_refused_request_are_cut(store: Store) -> None:
+def test_texts_of_a_refused_request_are_cut(store):
     robot = Actor("robot", "2001:db8::1")
     with store.database.write() as connection:
         record_refusal(
@@ -105,7 +101,7 @@ def test_texts_of_a_refused_request_are_cut(store: Store) -> None:
     assert (line.action, line.address, line.data) == ("refused", "2001:db8::1", {"status": 403})
 
 
-def test_lines_are_found_by_actor_map_action_and_time(store: Store) -> None:
+def test_lines_are_found_by_actor_map_action_and_time(store):
     add_lines(
         store, {"actor": "boss", "action": "key.created"}, {"map": "hall"},
         {"at": 5.0, "action": "keys"},
@@ -117,9 +113,7 @@ def test_lines_are_found_by_actor_map_action_and_time(store: Store) -> None:
         assert [one.number for one in lines_of(store, **wanted)] == numbers
 
 
-def test_pages_go_from_the_newest_to_the_oldest(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pages_go_from_the_newest_to_the_oldest(store, monkeypatch):
     add_lines(store, *[{"at": float(i), "actor": ""} for i in range(5)])
     log = Audit(store, days=2.0)
     first = log.page(AuditFilter(), limit=3)
@@ -132,7 +126,7 @@ def test_pages_go_from_the_newest_to_the_oldest(
     assert [one.number for one in log.lines(AuditFilter())] == [1, 2, 3, 4, 5]
 
 
-def test_old_lines_are_removed(store: Store) -> None:
+def test_old_lines_are_removed(store):
     add_lines(store, *[{"at": DAY_S * day} for day in (1, 2, 9, 3)])
     log = Audit(store, days=2.0)
     assert log.tidy(now=DAY_S * 4.5) == 2  # the last stays behind a younger one
@@ -143,7 +137,7 @@ def test_old_lines_are_removed(store: Store) -> None:
     assert [one.number for one in lines_of(store)] == [5]  # a number is never given again
 
 
-def test_the_newest_lines_of_each_tenant_are_kept(store: Store) -> None:
+def test_the_newest_lines_of_each_tenant_are_kept(store):
     """However much one changes, the lines of the others stay."""
     with store.database.write() as connection:
         connection.execute(

@@ -62,17 +62,17 @@ class Kept:
     write: Callable[[str, bytes], object]
 
 
-def files(folder: Path) -> list[str]:
+def files(folder):
     return sorted(str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file())
 
 
 @pytest.fixture
-def blobs(tmp_path: Path) -> FolderBlobs:
+def blobs(tmp_path):
     return FolderBlobs(tmp_path / "blobs")
 
 
 @pytest.fixture(params=["folder", "s3", "memory", "file"])
-def kept(request: pytest.FixtureRequest, tmp_path: Path) -> Kept:
+def kept(request, tmp_path):
     """A new place for blobs, of each kind there is."""
     if request.param == "folder":
         return Kept(
@@ -89,8 +89,8 @@ def kept(request: pytest.FixtureRequest, tmp_path: Path) -> Kept:
     )
 
 
-def test_a_blob_lies_under_the_hash_of_its_content(kept: Kept) -> None:
-    assert kept.blobs.put(b"depth") == DIGEST
+def test_a_blob_lies_under_the_hash_of_its_content(kept):
+    assert kept.blobs.put(b"depth") == kept.blobs.put(b"depth") == DIGEST
     assert kept.files() == [KEY]
     assert kept.blobs.get(DIGEST) == b"depth"
     assert (kept.blobs.size(DIGEST), kept.blobs.size("0" * 64)) == (5, None)
@@ -101,14 +101,8 @@ def test_a_blob_lies_under_the_hash_of_its_content(kept: Kept) -> None:
     assert sorted(kept.blobs.digests()) == sorted([DIGEST, empty])
 
 
-def test_the_same_bytes_put_twice_are_one(kept: Kept) -> None:
-    assert kept.blobs.put(b"depth") == kept.blobs.put(b"depth") == DIGEST
-    assert kept.files() == [KEY]
-    assert kept.blobs.get(DIGEST) == b"depth"
-
-
 @pytest.mark.parametrize("byte", [0, 4])
-def test_one_flipped_bit_is_noticed(kept: Kept, tmp_path: Path, byte: int) -> None:
+def test_one_flipped_bit_is_noticed(kept, tmp_path, byte):
     kept.blobs.put(b"depth")
     assert kept.blobs.condition(DIGEST) == "sound"
     data = bytearray(b"depth")
@@ -129,14 +123,14 @@ def test_one_flipped_bit_is_noticed(kept: Kept, tmp_path: Path, byte: int) -> No
 
 
 @pytest.mark.parametrize("left", [b"", b"depths", b"dEpth"])
-def test_putting_the_bytes_again_mends_a_damaged_blob(kept: Kept, left: bytes) -> None:
+def test_putting_the_bytes_again_mends_a_damaged_blob(kept, left):
     kept.blobs.put(b"depth")
     kept.write(KEY, left)
     assert kept.blobs.put(b"depth") == DIGEST
     assert kept.blobs.get(DIGEST) == b"depth"
 
 
-def test_a_missing_blob_is_said(kept: Kept) -> None:
+def test_a_missing_blob_is_said(kept):
     with pytest.raises(DamagedBlob, match=r"(does not exist|No such file).*upload it again"):
         kept.blobs.get(DIGEST)
     with pytest.raises(FileNotFoundError):
@@ -155,7 +149,7 @@ def test_a_missing_blob_is_said(kept: Kept) -> None:
     ["", "../x", "../../etc/passwd", "/etc/passwd", DIGEST[:-1], DIGEST + "0", DIGEST + "\n",
      DIGEST.upper(), "/" * 64, "." * 64, DIGEST[:62] + "/x", "\0" * 64, "\u0660" * 64],
 )  # fmt: skip
-def test_nothing_but_a_digest_becomes_a_path(blobs: FolderBlobs, given: str) -> None:
+def test_nothing_but_a_digest_becomes_a_path(blobs, given):
     others = ObjectBlobs(open_objects("memory:///"), FileLocks(Path("/none")), lambda: "me")
     for each in (blobs, others):
         for call in (each.get, each.open, each.holds, each.size, each.remove):
@@ -164,7 +158,7 @@ def test_nothing_but_a_digest_becomes_a_path(blobs: FolderBlobs, given: str) -> 
         assert each.condition(given) == "missing"
 
 
-def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept: Kept) -> None:
+def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept):
     parts = [bytes([number]) * 3_000_000 for number in range(7)]  # more than a store takes at once
     whole = b"".join(parts)
     with kept.blobs.incoming() as blob:
@@ -186,7 +180,7 @@ def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept: Kept) -> None:
         assert file.read(1) == b""
 
 
-def test_what_others_leave_there_is_no_blob(kept: Kept) -> None:
+def test_what_others_leave_there_is_no_blob(kept):
     kept.blobs.put(b"depth")
     kept.write(f"blobs/{DIGEST[:2]}/.0123456789ab.part", b"half")
     kept.write("blobs/readme", DIGEST.encode())
@@ -199,7 +193,7 @@ def test_what_others_leave_there_is_no_blob(kept: Kept) -> None:
     }  # fmt: skip
 
 
-def test_who_needs_blobs_keeps_others_from_removing_them(kept: Kept) -> None:
+def test_who_needs_blobs_keeps_others_from_removing_them(kept):
     with kept.blobs.block_removals(), kept.blobs.block_removals(), kept.blobs.removing() as allowed:
         assert not allowed
     with kept.blobs.removing() as allowed, kept.blobs.removing() as also:
@@ -208,7 +202,7 @@ def test_who_needs_blobs_keeps_others_from_removing_them(kept: Kept) -> None:
         assert allowed
 
 
-def test_what_others_leave_in_the_folder_is_not_listed(blobs: FolderBlobs, tmp_path: Path) -> None:
+def test_what_others_leave_in_the_folder_is_not_listed(blobs, tmp_path):
     blobs.put(b"depth")
     (tmp_path / "blobs" / DIGEST[:2] / ".0123456789ab.part").write_bytes(b"half")
     (tmp_path / "blobs" / "lost+found").mkdir()
@@ -216,7 +210,7 @@ def test_what_others_leave_in_the_folder_is_not_listed(blobs: FolderBlobs, tmp_p
     assert list(blobs.digests()) == [DIGEST]
 
 
-def test_a_full_disk_leaves_nothing_and_hurts_nothing(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_nothing_and_hurts_nothing(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", NARROW, str(tmp_path / "blobs")],
         capture_output=True, text=True, check=False,
@@ -231,7 +225,7 @@ def test_a_full_disk_leaves_nothing_and_hurts_nothing(tmp_path: Path) -> None:
     assert files(tmp_path) == [f"blobs/{kept[:2]}/{kept}"]
 
 
-def test_a_file_where_a_folder_should_be_is_said(tmp_path: Path) -> None:
+def test_a_file_where_a_folder_should_be_is_said(tmp_path):
     place = tmp_path / "blobs" / DIGEST[:2]
     blobs = FolderBlobs(tmp_path / "blobs")
     place.write_bytes(b"")  # a file where the folder should be
@@ -241,16 +235,16 @@ def test_a_file_where_a_folder_should_be_is_said(tmp_path: Path) -> None:
         FolderBlobs(place / "below")
 
 
-def test_a_blob_may_be_put_and_removed_at_once(blobs: FolderBlobs, tmp_path: Path) -> None:
+def test_a_blob_may_be_put_and_removed_at_once(blobs, tmp_path):
     """What removes is the sweep; an upload of the same content must not stumble over it."""
     raised: list[BaseException] = []
     over = threading.Event()
 
-    def sweep() -> None:
+    def sweep():
         while not over.is_set():
             blobs.remove(DIGEST)
 
-    def put() -> None:
+    def put():
         try:
             for _ in range(150):
                 blobs.put(b"depth")
@@ -278,14 +272,8 @@ def test_a_blob_may_be_put_and_removed_at_once(blobs: FolderBlobs, tmp_path: Pat
         (errno.EIO, UnusableStore, "Check the folder and its permissions."),
     ],
 )
-def test_what_to_do_depends_on_what_failed(
-    blobs: FolderBlobs,
-    monkeypatch: pytest.MonkeyPatch,
-    number: int,
-    kind: type[UnusableStore],
-    advice: str,
-) -> None:
-    def fail(_: int) -> None:
+def test_what_to_do_depends_on_what_failed(blobs, monkeypatch, number, kind, advice):
+    def fail(_):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "fsync", fail)
@@ -296,9 +284,7 @@ def test_what_to_do_depends_on_what_failed(
     assert not blobs.holds(DIGEST)
 
 
-def test_what_is_there_already_is_made_durable_too(
-    blobs: FolderBlobs, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_there_already_is_made_durable_too(blobs, monkeypatch):
     """Who put it first may have been killed between the name and its fsync."""
     blobs.put(b"depth")
     synced: list[int] = []

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
 from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Connection, update
+from sqlalchemy import update
 
-from sceneprint.store import Store
 from sceneprint.store.frame_queries import (
     CapturePosition,
     count_run,
@@ -24,16 +21,14 @@ from sceneprint.store.frame_queries import (
 )
 from sceneprint.store.frames import write_frame
 from sceneprint.store.maps import add_map
-from sceneprint.store.tables import FrameRow, MapRow, frames
+from sceneprint.store.tables import FrameRow, frames
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.listing import FrameListing, Run
 
-Received = Callable[..., FrameRow]
-Plans = Callable[[Connection], AbstractContextManager[list[str]]]
 START = datetime(2026, 11, 16, 9, 30, tzinfo=UTC)
 
 
-def drawn(rng: np.random.Generator) -> dict[str, Any]:
+def drawn(rng):
     """Metadata of a frame; times and names are few, so that bounds and equals are met."""
     pose = np.eye(4)
     pose[:3, 3] = rng.integers(-2, 3, 3)
@@ -50,7 +45,7 @@ def drawn(rng: np.random.Generator) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def taken(one: FrameRow) -> tuple[Any, ...]:
+def taken(one):
     """The order in which frames were taken, by its sentence."""
     return (
         one.captured_at is None, one.captured_at or 0.0, one.sequence is None, one.sequence or 0,
@@ -59,7 +54,7 @@ def taken(one: FrameRow) -> tuple[Any, ...]:
 
 
 @pytest.fixture
-def mixed(store: Store, hall: MapRow, received: Received) -> list[FrameRow]:
+def mixed(store, hall, received):
     """Frames of a map in all states, some edited since; another map has frames as well."""
     rng = np.random.default_rng(4)
     with store.database.write() as connection:
@@ -87,7 +82,7 @@ def mixed(store: Store, hall: MapRow, received: Received) -> list[FrameRow]:
     return sorted(found, key=lambda row: row.number)
 
 
-def passes(one: FrameRow, w: FrameListing) -> bool:
+def passes(one, w):
     """By the sentences of `FrameListing`, condition by condition."""
     at = None if one.captured_at is None else datetime.fromtimestamp(one.captured_at, UTC)
     came = datetime.fromtimestamp(one.received_at, UTC)
@@ -111,7 +106,7 @@ def passes(one: FrameRow, w: FrameListing) -> bool:
     )
 
 
-def some_listing(rng: np.random.Generator) -> FrameListing:
+def some_listing(rng):
     a, b, c, d = (START + timedelta(seconds=int(n)) for n in rng.integers(0, 30, 4))
     every: dict[str, Any] = {
         "state": rng.choice(["indexed", "rejected", "deleted"]),
@@ -130,13 +125,11 @@ def some_listing(rng: np.random.Generator) -> FrameListing:
     return FrameListing.model_validate({**given, "order": rng.choice(orders)})
 
 
-def position(one: FrameRow) -> CapturePosition:
+def position(one):
     return CapturePosition(one.number, one.captured_at, one.sequence)
 
 
-def test_every_list_is_that_of_plain_python(
-    store: Store, hall: MapRow, mixed: list[FrameRow]
-) -> None:
+def test_every_list_is_that_of_plain_python(store, hall, mixed):
     rng, sizes = np.random.default_rng(9), Counter[bool]()
     sessions = [FrameListing(session=name, order="taken") for name in (["s1"], ["s2"])]
     with store.database.read() as connection:
@@ -159,9 +152,7 @@ def test_every_list_is_that_of_plain_python(
     assert min(sizes.values()) > 13  # neither all empty nor all full
 
 
-def test_sessions_are_those_of_plain_python(
-    store: Store, hall: MapRow, mixed: list[FrameRow]
-) -> None:
+def test_sessions_are_those_of_plain_python(store, hall, mixed):
     expected: dict[tuple[str, str], list[FrameRow]] = {}
     for one in mixed:
         if one.state != "deleted":
@@ -183,9 +174,7 @@ def test_sessions_are_those_of_plain_python(
         assert run.parents == Counter(o.pose_parent for o in own if o.pose_parent is not None)
 
 
-def test_poses_of_a_run_are_those_of_plain_python(
-    store: Store, hall: MapRow, mixed: list[FrameRow]
-) -> None:
+def test_poses_of_a_run_are_those_of_plain_python(store, hall, mixed):
     since = START + timedelta(seconds=5)
     for run in (
         Run(session="s1", parent_frame="p1"),
@@ -230,13 +219,11 @@ def test_poses_of_a_run_are_those_of_plain_python(
         assert found == [(one.id, one.sequence, one.pose) for one in placed]
 
 
-def test_poses_are_stamped_by_time_or_else_by_place(
-    store: Store, hall: MapRow, received: Received
-) -> None:
+def test_poses_are_stamped_by_time_or_else_by_place(store, hall, received):
     posed = {"session": "s", "pose_parent": "p", "pose": np.eye(4).tolist()}
     run = Run(session="s", parent_frame="p")
 
-    def stamps(clock: str = "taken") -> str | None:
+    def stamps(clock="taken"):
         with store.database.read() as connection:
             asked = run.model_copy(update={"clock": clock})
             return stamps_of_run(connection, hall.number, asked)
@@ -252,7 +239,7 @@ def test_poses_are_stamped_by_time_or_else_by_place(
     assert stamps("sequence") == "sequence"
 
 
-def test_poses_are_taken_evenly(store: Store, hall: MapRow, received: Received) -> None:
+def test_poses_are_taken_evenly(store, hall, received):
     """At the multiples of 10 / (most - 1), rounded up, of the eleven times."""
     rows = [
         received(
@@ -277,9 +264,7 @@ def test_poses_are_taken_evenly(store: Store, hall: MapRow, received: Received) 
 SEARCHED = "USING COVERING INDEX ix_frames_searched"
 
 
-def test_each_list_takes_the_index_that_is_meant_for_it(
-    store: Store, hall: MapRow, plans: Plans
-) -> None:
+def test_each_list_takes_the_index_that_is_meant_for_it(store, hall, plans):
     ways: list[tuple[dict[str, Any], str]] = [
         ({}, "INDEX ix_frames_map_number_number"),
         ({"order": "desc"}, "INDEX ix_frames_map_number_number"),
@@ -307,9 +292,7 @@ def test_each_list_takes_the_index_that_is_meant_for_it(
         assert not any(step.startswith("SCAN") for step in told), (wanted, told)
 
 
-def test_sessions_are_counted_without_reading_a_row(
-    store: Store, hall: MapRow, plans: Plans
-) -> None:
+def test_sessions_are_counted_without_reading_a_row(store, hall, plans):
     with store.database.read() as connection, plans(connection) as told:
         list_runs(connection, hall.number, ("a", "b"), 9)
         count_run(connection, hall.number, Run(session="s"))

@@ -10,20 +10,17 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 
 from sceneprint.errors import NewerSchema, UnusableStore
-from sceneprint.store import Store, open_database
+from sceneprint.store import open_database
 from sceneprint.store.database import known_revisions, migration_config, revision_of
 from sceneprint.store.maps import find_map
-from sceneprint.store.tables import MapRow
 
 TABLES = [
     "audit", "doomed", "events", "former_maps",
@@ -54,7 +51,7 @@ for what in (lambda: open_store("sqlite://", folder / "blobs"),
 """
 
 
-def described(path: Path) -> set[tuple[str, ...]]:
+def described(path):
     """What SQLite itself says of tables and indexes, in words: the order of constraints is free."""
     with closing(sqlite3.connect(path)) as connection:
         rows = connection.execute(
@@ -72,7 +69,7 @@ def described(path: Path) -> set[tuple[str, ...]]:
 
 
 @pytest.mark.sqlite_only("what its file says of itself")
-def test_a_changed_table_needs_a_migration(store: Store, tmp_path: Path) -> None:
+def test_a_changed_table_needs_a_migration(store, tmp_path):
     found = described(tmp_path / "truth.db")
     assert sorted(name for kind, name, *_ in found if kind == "table") \
         == sorted([*TABLES, "sqlite_sequence"])  # fmt: skip
@@ -80,7 +77,7 @@ def test_a_changed_table_needs_a_migration(store: Store, tmp_path: Path) -> None
     assert (known_revisions()[0], digest) == SCHEMA
 
 
-def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> None:
+def test_opening_again_changes_nothing(url, store, hall):
     again = open_database(url)
     with again.read() as connection:
         assert find_map(connection, "hall") == hall
@@ -88,9 +85,7 @@ def test_opening_again_changes_nothing(url: str, store: Store, hall: MapRow) -> 
 
 
 @pytest.mark.sqlite_only("a file")
-def test_four_processes_may_migrate_one_empty_database_at_once(
-    url: str, tmp_path: Path, race: Callable[..., list[Any]], opens: str
-) -> None:
+def test_four_processes_may_migrate_one_empty_database_at_once(url, tmp_path, race, opens):
     assert race(opens, 4, url) == [[known_revisions()[0]]] * 4
     with closing(sqlite3.connect(tmp_path / "truth.db")) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
@@ -100,10 +95,10 @@ def test_four_processes_may_migrate_one_empty_database_at_once(
     )
 
 
-def test_threads_may_migrate_databases_of_their_own_at_once(tmp_path: Path) -> None:
+def test_threads_may_migrate_databases_of_their_own_at_once(tmp_path):
     start, raised = threading.Barrier(6), []
 
-    def open_one(i: int) -> None:
+    def open_one(i):
         start.wait()
         try:
             open_database(f"sqlite:///{tmp_path / f'{i}.db'}").close()
@@ -122,7 +117,7 @@ def test_threads_may_migrate_databases_of_their_own_at_once(tmp_path: Path) -> N
 
 
 @pytest.mark.sqlite_only("a file")
-def test_a_database_of_a_later_version_is_left_as_it_is(url: str, tmp_path: Path) -> None:
+def test_a_database_of_a_later_version_is_left_as_it_is(url, tmp_path):
     open_database(url).close()
     path = tmp_path / "truth.db"
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
@@ -136,7 +131,7 @@ def test_a_database_of_a_later_version_is_left_as_it_is(url: str, tmp_path: Path
 
 
 @pytest.mark.sqlite_only("a file")
-def test_a_file_that_is_no_database_is_left_as_it_is(url: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_database_is_left_as_it_is(url, tmp_path):
     path = tmp_path / "truth.db"
     path.write_bytes(b"my notes about the warehouse\n" * 400)
     with pytest.raises(UnusableStore, match=r"not a database\. Restore the data folder"):
@@ -153,14 +148,14 @@ def test_a_file_that_is_no_database_is_left_as_it_is(url: str, tmp_path: Path) -
         ("postgresql+nodriver://reader:hunter2@host/db", "SCENEPRINT_DATABASE_URL"),
     ],
 )
-def test_what_cannot_be_opened_says_so_without_the_password(given: str, said: str) -> None:
+def test_what_cannot_be_opened_says_so_without_the_password(given, said):
     with pytest.raises(UnusableStore, match=said) as caught:
         open_database(given)
     assert "hunter2" not in str(caught.value)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody who may not write")
-def test_a_folder_that_may_not_be_written_says_so() -> None:
+def test_a_folder_that_may_not_be_written_says_so():
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         (folder / "other").mkdir()
@@ -181,7 +176,7 @@ def test_a_folder_that_may_not_be_written_says_so() -> None:
 
 
 @pytest.mark.sqlite_only("a file")
-def test_a_damaged_page_is_said(url: str, store: Store, tmp_path: Path) -> None:
+def test_a_damaged_page_is_said(url, store, tmp_path):
     store.database.close()
     path = tmp_path / "truth.db"
     data = bytearray(path.read_bytes())
@@ -191,7 +186,7 @@ def test_a_damaged_page_is_said(url: str, store: Store, tmp_path: Path) -> None:
         open_database(url)
 
 
-def test_the_revisions_are_those_that_alembic_sees(store: Store) -> None:
+def test_the_revisions_are_those_that_alembic_sees(store):
     scripts = ScriptDirectory.from_config(migration_config())
     every = {one.revision for one in scripts.walk_revisions()}
     assert known_revisions() == (scripts.get_current_head(), every)
@@ -200,7 +195,7 @@ def test_the_revisions_are_those_that_alembic_sees(store: Store) -> None:
         assert revision_of(connection) == context.get_current_revision() == known_revisions()[0]
 
 
-def test_a_store_that_is_there_is_opened_without_alembic(url: str, store: Store) -> None:
+def test_a_store_that_is_there_is_opened_without_alembic(url, store):
     """It takes longer to load than the rest of the store, in each process anew."""
     code = (
         "import sys; from sceneprint.store import open_database; "
@@ -210,7 +205,7 @@ def test_a_store_that_is_there_is_opened_without_alembic(url: str, store: Store)
     assert done.stdout == "False\n"
 
 
-def test_a_connection_that_is_in_use_is_closed_when_it_comes_back(tmp_path: Path) -> None:
+def test_a_connection_that_is_in_use_is_closed_when_it_comes_back(tmp_path):
     database = open_database(f"sqlite:///{tmp_path / 'a.db'}")
     with database.read() as connection:
         used = connection.connection.driver_connection
@@ -238,18 +233,18 @@ except UnusableStore as error:
 """
 
 
-def narrow() -> None:
+def narrow():
     """For a child about to begin: its files stay small, as on a disk that is full."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096 * PAGES, 4096 * PAGES))
 
 
-def schema(path: Path) -> set[tuple[str, ...]]:
+def schema(path):
     with closing(sqlite3.connect(path)) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         return set(connection.execute("SELECT name, sql FROM sqlite_master").fetchall())
 
 
-def test_a_schema_that_finds_no_room_changes_nothing(tmp_path: Path) -> None:
+def test_a_schema_that_finds_no_room_changes_nothing(tmp_path):
     path = tmp_path / "truth.db"
     url = f"sqlite:///{path}"
     found = schema(path)

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from sqlalchemy import insert, select, update
 
-from sceneprint.store import Store
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.events import EventFilter, list_events, newest_seen, removal_floor
 from sceneprint.store.maps import add_map, find_map, store_model
@@ -57,11 +56,11 @@ def work(i):
 
 
 @pytest.fixture
-def empty(store: Store) -> Store:
+def empty(store):
     return store
 
 
-def fill(store: Store, count: int) -> None:
+def fill(store, count):
     with store.database.write() as connection:
         store_model(connection, "m" * 64, "small", b"")
         for name in ("hall", "shop"):
@@ -135,10 +134,10 @@ def test_every_kind_that_is_told_is_declared():
     assert all(re.fullmatch(r"[a-z_]+\.[a-z_]+", kind) and len(kind) <= 32 for kind in KINDS)
 
 
-def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -> None:
+def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
     """Nor is it told of one that is already deleted it was made, and of which there is no other."""
 
-    def told(since: float | None, *names: str) -> list[tuple[str, str | None]]:
+    def told(since, *names):
         wanted = EventFilter(frozenset(names), since=since)
         with store.database.read() as connection:
             found = [(one.kind, one.map) for one in list_events(connection, wanted)]
@@ -150,18 +149,18 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store: Store) -
         assert found or lost == 0
         return found
 
-    def at(seconds: float) -> None:
+    def at(seconds):
         """When what has happened since the last time was."""
         with store.database.write() as connection:
             new = events.c.at > 10_000
             connection.execute(update(events).where(new).values(at=seconds))
 
-    def begin(*names: str) -> None:
+    def begin(*names):
         with store.database.write() as connection:
             for name in names:
                 add_map(connection, name, None, "m" * 64)
 
-    def end(*names: str) -> None:
+    def end(*names):
         with store.database.write() as connection:
             for name in names:
                 remove_map(connection, find_map(connection, name))

@@ -2,35 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Any
-
 import pytest
-from sqlalchemy import Connection, update
+from sqlalchemy import update
 
-from sceneprint.store import Store
 from sceneprint.store.frame_queries import QueryOrigin, passing_frames
 from sceneprint.store.frames import delete_frame, set_state
 from sceneprint.store.maps import add_map
-from sceneprint.store.tables import FrameRow, MapRow, frames
+from sceneprint.store.tables import frames
 from sceneprint_client.api import Filter, FrameState
 
-Received = Callable[..., FrameRow]
-Plans = Callable[[Connection], AbstractContextManager[list[str]]]
 NOBODY = QueryOrigin(None, None, None)
 
 
-def found(store: Store, row: MapRow, taken: QueryOrigin = NOBODY, **wanted: Any) -> list[int]:
+def found(store, row, taken=NOBODY, **wanted):
     with store.database.read() as connection:
         return sorted(passing_frames(connection, row.number, Filter(**wanted), taken).tolist())
 
 
 @pytest.fixture
-def indexed(store: Store, received: Received) -> Callable[..., FrameRow]:
+def indexed(store, received):
     """Insert a frame as queries find it."""
 
-    def add(content: str, **given: Any) -> FrameRow:
+    def add(content, **given):
         frame = received(content, **given)
         with store.database.write() as connection:
             connection.execute(
@@ -41,9 +34,7 @@ def indexed(store: Store, received: Received) -> Callable[..., FrameRow]:
     return add
 
 
-def test_only_indexed_frames_of_the_map_pass(
-    store: Store, hall: MapRow, indexed: Received, received: Received
-) -> None:
+def test_only_indexed_frames_of_the_map_pass(store, hall, indexed, received):
     kept = [indexed(f"kept {i}", tags=["a"], robot="r1") for i in range(12)]
     with store.database.write() as connection:
         attic = add_map(connection, "attic", None, hall.model_id)
@@ -65,7 +56,7 @@ def test_only_indexed_frames_of_the_map_pass(
     assert (nobody.dtype, nobody.shape) == ("int64", (0,))
 
 
-def test_own_session_is_that_of_the_robot(store: Store, hall: MapRow, indexed: Received) -> None:
+def test_own_session_is_that_of_the_robot(store, hall, indexed):
     """Named: by robot, session and time of a frame; the query is r1 in s at 100, 10 s away."""
     made = {
         given: indexed(str(given), robot=given[0], session=given[1], captured_at=given[2]).number
@@ -102,9 +93,7 @@ BOX = {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}
         {"exclude_frames": ["a"]},
     ],
 )
-def test_no_filter_reads_other_maps(
-    store: Store, hall: MapRow, plans: Plans, wanted: dict[str, Any]
-) -> None:
+def test_no_filter_reads_other_maps(store, hall, plans, wanted):
     with store.database.read() as connection, plans(connection) as told:
         passing_frames(
             connection, hall.number, Filter.model_validate(wanted), QueryOrigin("r1", "s", 1.0)

@@ -3,32 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 
 import pytest
 from sqlalchemy import select, update
 from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import Conflict, UnknownFrame, UnknownKey, UnknownMap
-from sceneprint.store import Store, frame_queries, queue
+from sceneprint.store import frame_queries, queue
 from sceneprint.store import frames as stored
 from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import signatures as signed
 from sceneprint.store.deletion import remove_map
-from sceneprint.store.tables import FrameRow, MapRow, events, keys, signatures
+from sceneprint.store.tables import events, keys, signatures
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.listing import FrameListing
 
-Received = Callable[..., FrameRow]
-Indexed = Callable[[FrameRow], int]
-
 
 @pytest.fixture
-def indexed(store: Store, hall: MapRow) -> Indexed:
+def indexed(store, hall):
     """Give a frame a signature of three bytes that tell its number."""
 
-    def index(frame: FrameRow) -> int:
+    def index(frame):
         made = signed.StoredSignature(
             hall.model_id, bytes([frame.number, 2, 3]), f"{frame.number:064d}", [4], [12]
         )
@@ -38,20 +34,18 @@ def indexed(store: Store, hall: MapRow) -> Indexed:
     return index
 
 
-def delete(store: Store, row: MapRow, frame: FrameRow) -> list[str]:
+def delete(store, row, frame):
     with store.database.write() as connection:
         now = stored_maps.find_frame(connection, row, frame.id)
         return stored.delete_frame(connection, row, now)
 
 
-def changes(
-    store: Store, row: MapRow, since: int, limit: int = 256
-) -> list[list[signed.SignatureChange]]:
+def changes(store, row, since, limit=256):
     with store.database.read() as connection:
         return list(signed.changes_since(connection, row, since, limit))
 
 
-def test_a_row_comes_back_as_it_was_given(store: Store, hall: MapRow, received: Received) -> None:
+def test_a_row_comes_back_as_it_was_given(store, hall, received):
     pose = [[0.1 + 0.2, -0.0, 1 / 3, 5e-324], [0.0, 1.0, 0.0, 1e22], [0.0, 0.0, 1.0, 0.0],
             [0.0, 0.0, 0.0, 1.0]]  # fmt: skip
     frame = received(
@@ -72,9 +66,7 @@ def test_a_row_comes_back_as_it_was_given(store: Store, hall: MapRow, received: 
     assert (frame.captured_at, frame.session) == (1763731200.123456, "s\u00e9ance")
 
 
-def test_an_id_is_in_a_map_once_and_given_up_by_what_is_deleted(
-    store: Store, hall: MapRow, received: Received
-) -> None:
+def test_an_id_is_in_a_map_once_and_given_up_by_what_is_deleted(store, hall, received):
     first = received("a", frame_id="gate.1")
     with pytest.raises(IntegrityError):
         received("b", frame_id="gate.1")
@@ -94,9 +86,7 @@ def test_an_id_is_in_a_map_once_and_given_up_by_what_is_deleted(
     assert again.number > second.number > first.number
 
 
-def test_changes_come_in_order_whatever_the_block(
-    store: Store, hall: MapRow, received: Received, indexed: Indexed
-) -> None:
+def test_changes_come_in_order_whatever_the_block(store, hall, received, indexed):
     frames = [received(str(i)) for i in range(5)]
     revisions = [indexed(frames[i]) for i in (3, 0, 4, 1)]
     assert revisions == [1, 2, 3, 4]  # frame 2 is never signed
@@ -126,8 +116,8 @@ def test_changes_come_in_order_whatever_the_block(
 
 
 def test_a_damaged_signature_is_noticed_and_deleting_its_frame_helps(
-    store: Store, hall: MapRow, received: Received, indexed: Indexed
-) -> None:
+    store, hall, received, indexed
+):
     good, bad = received("a"), received("b")
     indexed(good)
     indexed(bad)
@@ -146,9 +136,7 @@ def test_a_damaged_signature_is_noticed_and_deleting_its_frame_helps(
     ]  # fmt: skip
 
 
-def test_a_deleted_frame_leaves_a_row_and_nothing_else(
-    store: Store, hall: MapRow, received: Received, indexed: Indexed
-) -> None:
+def test_a_deleted_frame_leaves_a_row_and_nothing_else(store, hall, received, indexed):
     frame, other = received("a", blob="11" * 32), received("b", blob="11" * 32)
     indexed(frame)
     artifact = f"{frame.number:064d}"
@@ -181,31 +169,7 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(
     assert received("a").number > other.number
 
 
-def test_pages_follow_the_order_of_arrival(
-    store: Store, hall: MapRow, received: Received, indexed: Indexed
-) -> None:
-    frames = [received(str(i)) for i in range(5)]
-    indexed(frames[3])
-    done = FrameListing(state=FrameState.INDEXED)
-    with store.database.read() as connection:
-        first = frame_queries.list_frames(connection, hall.number, None, 2, FrameListing())
-        rest = frame_queries.list_frames(
-            connection,
-            hall.number,
-            frame_queries.CapturePosition(first[-1].number, None, None),
-            9,
-            FrameListing(),
-        )
-        found = frame_queries.list_frames(connection, hall.number, None, 9, done)
-        assert stored.count_states(connection, hall.number) == {"indexed": 1, "received": 4}
-        assert stored.count_states(connection) == {"indexed": 1, "received": 4}
-    assert [frame.number for frame in first + rest] == [frame.number for frame in frames]
-    assert [frame.number for frame in found] == [frames[3].number]
-
-
-def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
-    store: Store, hall: MapRow, received: Received, indexed: Indexed
-) -> None:
+def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(store, hall, received, indexed):
     with store.database.write() as connection:
         other = stored_maps.add_map(connection, "other", "Other", hall.model_id)
     mine, theirs = received("a", blob="11" * 32), received("a", other, blob="11" * 32)
@@ -238,7 +202,7 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(
     assert again.number > other.number
 
 
-def test_a_key_is_shown_once_and_kept_as_a_hash(store: Store) -> None:
+def test_a_key_is_shown_once_and_kept_as_a_hash(store):
     with store.database.write() as connection:
         assert stored_keys.list_keys(connection) == []
         secret = stored_keys.create_key(connection, "fleet", {"*": "admin"})

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import pytest
 
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.overlap import sample_points
-from sceneprint.pipeline import Signer, prepare
+from sceneprint.pipeline import prepare
 from sceneprint.store import GeometryCache
 from sceneprint.store.blobs.folder import FolderBlobs
-from sceneprint.types import DepthFrame
 
 
 @pytest.fixture(scope="module")
-def artifacts(small_signer: Signer, room_frames: tuple[DepthFrame, ...]) -> list[bytes]:
+def artifacts(small_signer, room_frames):
     return [write_geometry(prepare(frame, small_signer)[1]) for frame in room_frames[:4]]
 
 
 @pytest.fixture
-def blobs(tmp_path: Path) -> FolderBlobs:
+def blobs(tmp_path):
     return FolderBlobs(tmp_path / "blobs", make=True)
 
 
@@ -71,9 +69,7 @@ def test_a_deleted_frame_leaves_nothing(blobs, artifacts):
     assert cache.bytes_held == 0
 
 
-def test_what_was_read_long_ago_goes_however_often_it_is_used(
-    blobs, artifacts, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_read_long_ago_goes_however_often_it_is_used(blobs, artifacts, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     cache, digests = GeometryCache(blobs, 1 << 30), [blobs.put(one) for one in artifacts[:2]]
@@ -96,7 +92,7 @@ def test_the_estimate_covers_the_arrays(blobs, artifacts):
     assert least < _size_of_one(blobs, digest) < 2 * least
 
 
-def _size_of_one(blobs: FolderBlobs, digest: str) -> int:
+def _size_of_one(blobs, digest):
     cache = GeometryCache(blobs, 1 << 30)
     cache.read(digest)
     return cache.bytes_held

@@ -7,9 +7,7 @@ import os
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 from sqlalchemy import create_engine, text
@@ -49,7 +47,7 @@ for line in sys.stdin:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
+def folder(tmp_path):
     """A database with one row, closed, and read-only for who has no special rights."""
     folder = tmp_path / "data"
     folder.mkdir()
@@ -60,12 +58,12 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     folder.chmod(0o755)
 
 
-def insert(connection: sqlite3.Connection) -> None:
+def insert(connection):
     connection.execute("INSERT INTO events (at, kind, data) VALUES (0, 'x', '{}')")
     connection.commit()
 
 
-def add(folder: Path) -> None:
+def add(folder):
     with closing(sqlite3.connect(folder / "a.db")) as connection:
         insert(connection)
 
@@ -73,32 +71,29 @@ def add(folder: Path) -> None:
 class Reader:
     """The process that may only read."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.process = subprocess.Popen(
             [sys.executable, "-c", READER, str(folder)], text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=os.environ | {"READER": READER},
         )  # fmt: skip
 
-    def ask(self, what: str = "read") -> str:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
+    def ask(self, what="read"):
         self.process.stdin.write(f"{what}\n")
         self.process.stdin.flush()
         return self.process.stdout.readline().strip()
 
 
 @pytest.fixture
-def reader(folder: Path) -> Iterator[Reader]:
+def reader(folder):
     """Started when a test asks it first; what it says is that of one process."""
     made = Reader(folder)
     yield made
     with made.process:
-        assert made.process.stdin is not None
         made.process.stdin.close()
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="another user must write what this one may only read")
-def test_who_may_only_read_sees_what_others_write(folder: Path, reader: Reader) -> None:
+def test_who_may_only_read_sees_what_others_write(folder, reader):
     assert reader.ask() == "1 ['a.db']"
     assert reader.ask("write").startswith("ReadOnlyStore: ")
     writer = sqlite3.connect(folder / "a.db")
@@ -111,7 +106,7 @@ def test_who_may_only_read_sees_what_others_write(folder: Path, reader: Reader) 
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="another user must write what this one may only read")
-def test_a_log_that_was_left_is_read_or_refused(folder: Path, reader: Reader) -> None:
+def test_a_log_that_was_left_is_read_or_refused(folder, reader):
     """As after the power was lost, with and without the index of the log."""
     with closing(sqlite3.connect(folder / "a.db")) as writer:
         insert(writer)
@@ -127,14 +122,14 @@ def test_a_log_that_was_left_is_read_or_refused(folder: Path, reader: Reader) ->
     assert reader.ask() == "1 ['a.db', 'a.db-wal']"  # all that the file itself holds
 
 
-def test_a_file_that_changes_while_it_is_read_is_not_believed(folder: Path) -> None:
+def test_a_file_that_changes_while_it_is_read_is_not_believed(folder):
     """It is read without locks, as unchanging; somebody writes it after all."""
     folder.chmod(0o755)
     sealed = ReadOnlyFile(folder / "a.db")
     engine = create_engine(f"sqlite:///{folder}/a.db", creator=sealed.connect)
     database = Database(engine, sealed)
 
-    def total(meanwhile: Callable[[], None]) -> int:
+    def total(meanwhile):
         with database.read() as connection:
             meanwhile()
             return int(connection.execute(text("SELECT sum(number) FROM events")).scalar_one())
@@ -147,7 +142,7 @@ def test_a_file_that_changes_while_it_is_read_is_not_believed(folder: Path) -> N
     database.close()
 
 
-def without_rights() -> None:
+def without_rights():
     """For a child about to begin: permissions hold for root as well."""
     ctypes.CDLL(None).prctl(24, 1, 0, 0, 0)
 
@@ -166,7 +161,7 @@ except SceneprintError as error:
 """
 
 
-def test_a_later_schema_on_a_read_only_folder_is_left_alone(folder: Path) -> None:
+def test_a_later_schema_on_a_read_only_folder_is_left_alone(folder):
     folder.chmod(0o755)
     with closing(sqlite3.connect(folder / "a.db")) as connection:
         connection.execute("UPDATE alembic_version SET version_num = '9999'")
@@ -184,7 +179,7 @@ def test_a_later_schema_on_a_read_only_folder_is_left_alone(folder: Path) -> Non
     assert [path.name for path in folder.iterdir()] == ["a.db"]
 
 
-def test_a_folder_that_may_be_written_is_opened_for_writing(folder: Path) -> None:
+def test_a_folder_that_may_be_written_is_opened_for_writing(folder):
     folder.chmod(0o755)
     store = open_store(f"sqlite:///{folder}/a.db", folder / "blobs")
     store.database.require_writable()
@@ -233,7 +228,7 @@ except ReadOnlyStore as error:
 """
 
 
-def test_a_disk_that_turns_read_only_is_said(tmp_path: Path) -> None:
+def test_a_disk_that_turns_read_only_is_said(tmp_path):
     if subprocess.run(["unshare", "-rm", "true"], capture_output=True).returncode != 0:
         pytest.skip("no namespace of mounts can be made here")
     done = subprocess.run(

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 
 from sceneprint.errors import LostLease
-from sceneprint.store import Store, queue
-from sceneprint.store.tables import JobRow, jobs
+from sceneprint.store import queue
+from sceneprint.store.tables import jobs
 from sceneprint_client.api import JobState
-
-Queued = Callable[..., JobRow]
-Turned = Callable[..., None]
 
 
 @pytest.mark.parametrize("state", [JobState.SUCCEEDED, JobState.FAILED])
-def test_what_is_finished_stays_so(
-    store: Store, hand: Any, queued: Queued, state: JobState
-) -> None:
+def test_what_is_finished_stays_so(store, hand, queued, state):
     job = queued("a")
     held = hand.taken()
     before = time.time()
@@ -37,8 +30,8 @@ def test_what_is_finished_stays_so(
 
 
 def test_a_job_that_breaks_waits_longer_each_time_and_is_dead_after_three(
-    store: Store, hand: Any, queued: Queued, turned: Turned
-) -> None:
+    store, hand, queued, turned
+):
     job = queued("a")
     for attempt, wait in ((1, 2.0), (2, 8.0)):
         held = hand.taken()
@@ -61,9 +54,7 @@ def test_a_job_that_breaks_waits_longer_each_time_and_is_dead_after_three(
     assert hand.take() is None
 
 
-def test_success_forgets_the_errors_of_earlier_tries(
-    store: Store, hand: Any, queued: Queued, turned: Turned
-) -> None:
+def test_success_forgets_the_errors_of_earlier_tries(store, hand, queued, turned):
     job = queued("a")
     hand.fail(hand.taken())
     turned(job, run_after=0.0)
@@ -77,9 +68,7 @@ def test_success_forgets_the_errors_of_earlier_tries(
     )  # fmt: skip
 
 
-def test_a_job_whose_workers_all_fell_silent_is_buried(
-    store: Store, hand: Any, queued: Queued, turned: Turned
-) -> None:
+def test_a_job_whose_workers_all_fell_silent_is_buried(store, hand, queued, turned):
     silent = queued("a")
     for attempt in range(1, 11):
         held = hand.taken()
@@ -104,7 +93,7 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(
         queue.finish(connection, held, JobState.SUCCEEDED)
 
 
-def test_what_was_tried_goes_behind_what_was_not(hand: Any, queued: Queued, turned: Turned) -> None:
+def test_what_was_tried_goes_behind_what_was_not(hand, queued, turned):
     """A machine that dies again and again does not use up the tries of the oldest job."""
     first, second = queued("a"), queued("b")
     assert hand.taken().number == first.number
@@ -114,7 +103,7 @@ def test_what_was_tried_goes_behind_what_was_not(hand: Any, queued: Queued, turn
     assert hand.taken().number == first.number
 
 
-def test_silence_is_not_counted_as_breaking_down(hand: Any, queued: Queued, turned: Turned) -> None:
+def test_silence_is_not_counted_as_breaking_down(hand, queued, turned):
     """A machine restarted eight times must not cost a frame that then breaks down once."""
     job = queued("a")
     for _ in range(8):
@@ -126,9 +115,7 @@ def test_silence_is_not_counted_as_breaking_down(hand: Any, queued: Queued, turn
     assert hand.fail(hand.taken()) == JobState.DEAD  # the tenth try is the last, whatever ended it
 
 
-def test_cancelling_takes_a_job_from_whoever_has_it(
-    store: Store, hand: Any, queued: Queued
-) -> None:
+def test_cancelling_takes_a_job_from_whoever_has_it(store, hand, queued):
     running, waiting, over, other = (queued(name) for name in "abcd")
     held = hand.taken()
     with store.database.write() as connection:
@@ -149,7 +136,7 @@ def test_cancelling_takes_a_job_from_whoever_has_it(
     assert hand.row(other) == other
 
 
-def test_what_is_given_back_was_never_tried(store: Store, hand: Any, queued: Queued) -> None:
+def test_what_is_given_back_was_never_tried(store, hand, queued):
     job = queued("a")
     for token in (1, 2, 3, 4, 5):  # as often as workers are stopped
         held = hand.taken()

@@ -6,21 +6,19 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.errors import UnknownKey
-from sceneprint.store import Store, keys
+from sceneprint.store import keys
 from sceneprint.store.tables import keys as table
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+def clock(monkeypatch):
     """The time that keys go by; to be moved by hand."""
     now = [1_000_000.0]
     monkeypatch.setattr(keys.time, "time", lambda: now[0])
     return now
 
 
-def test_a_secret_ends_with_its_overlap_and_the_next_goes_on(
-    store: Store, clock: list[float]
-) -> None:
+def test_a_secret_ends_with_its_overlap_and_the_next_goes_on(store, clock):
     with store.database.write() as connection:
         first = keys.create_key(connection, "robot", {"hall": "write"}, 1_000_900.0)
         second = keys.rotate_key(connection, "robot", 100)
@@ -41,17 +39,17 @@ def test_a_secret_ends_with_its_overlap_and_the_next_goes_on(
         assert [keys.find_key(connection, one) for one in (third, fourth)] == [None, None]
 
 
-def test_a_use_is_written_once_an_hour(store: Store, clock: list[float]) -> None:
+def test_a_use_is_written_once_an_hour(store, clock):
     uses = keys.KeyUses()
 
-    def used() -> list[float | None]:
+    def used():
         with store.database.read() as connection:
             return list(connection.execute(select(table.c.last_used_at)).scalars())
 
     with store.database.write() as connection:
         secret = keys.create_key(connection, "robot", {"*": "read"})
 
-    def use() -> None:
+    def use():
         with store.database.read() as connection:
             found = keys.find_key(connection, secret)
         assert found is not None

@@ -8,8 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -48,24 +46,20 @@ open_objects(sys.argv[1]).put_file("large", Slow())
      "s3://bucket/../pw", "s3://bucket/%2e%2e/pw", "s3://bucket/a\0pw", "file://", "file:///",
      "file://host/pw", "memory://pw"],
 )  # fmt: skip
-def test_what_names_no_store_is_refused_and_not_repeated(given: str) -> None:
+def test_what_names_no_store_is_refused_and_not_repeated(given):
     with pytest.raises(UnusableStore, match="SCENEPRINT_BLOB_URL") as caught:
         open_objects(given)
     assert "pw" not in str(caught.value)
 
 
-def test_a_store_without_tls_is_asked_only_where_that_is_allowed(
-    bucket: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_without_tls_is_asked_only_where_that_is_allowed(bucket, monkeypatch):
     monkeypatch.delenv("AWS_ALLOW_HTTP")
     with pytest.raises(UnusableStore, match="AWS_ALLOW_HTTP=true"):
         open_objects(bucket)
 
 
 @pytest.mark.parametrize("kind", ["s3", "memory", "file"])
-def test_keys_are_put_listed_and_removed(
-    kind: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_keys_are_put_listed_and_removed(kind, request, tmp_path):
     url = {"memory": "memory:///", "file": f"file://{tmp_path}/some%20where"}.get(kind)
     objects = open_objects(url or f"{request.getfixturevalue('bucket')}/pre/fix")
     assert check_objects(objects) > 0
@@ -93,7 +87,7 @@ def test_keys_are_put_listed_and_removed(
     assert objects.head("a/1") is None
 
 
-def test_a_bucket_that_is_not_there_is_no_missing_blob(bucket: str) -> None:
+def test_a_bucket_that_is_not_there_is_no_missing_blob(bucket):
     objects = open_objects(f"{bucket}-none/x")
     for call in (
         lambda: objects.get("a"),
@@ -104,11 +98,10 @@ def test_a_bucket_that_is_not_there_is_no_missing_blob(bucket: str) -> None:
             call()
 
 
-def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket: str) -> None:
+def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket):
     with subprocess.Popen(
         [sys.executable, "-c", HALF_WAY, bucket], stdout=subprocess.PIPE, text=True
     ) as child:
-        assert child.stdout is not None
         assert child.stdout.readline() == "half way\n"
         child.send_signal(signal.SIGKILL)
     objects = open_objects(bucket)
@@ -117,7 +110,7 @@ def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket: str) -> None:
 
 
 @pytest.fixture
-def brittle(monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectServer]:
+def brittle(monkeypatch):
     """A server of this test alone, and little patience with it."""
     monkeypatch.setattr(object_client, "TRIED_S", 1)
     monkeypatch.setattr(object_client, "SMALL_S", 1)
@@ -128,14 +121,12 @@ def brittle(monkeypatch: pytest.MonkeyPatch) -> Iterator[ObjectServer]:
         yield server
 
 
-def test_a_server_that_falls_acknowledges_nothing(
-    brittle: ObjectServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_falls_acknowledges_nothing(brittle, monkeypatch):
     monkeypatch.setattr(object_client, "TRIED_S", 0.2)
     objects = open_objects(brittle.bucket("fragile"))
 
     class Fatal(io.BytesIO):
-        def read(self, size: int | None = -1, /) -> bytes:
+        def read(self, size=-1, /):
             if self.tell() >= 3 * PART:
                 brittle.kill()
             return super().read(size)
@@ -156,9 +147,7 @@ def test_a_server_that_falls_acknowledges_nothing(
     assert [one.key for one in objects.list("")] == ["a"]
 
 
-def test_a_server_that_never_answers_is_given_up(
-    monkeypatch: pytest.MonkeyPatch, bucket: str
-) -> None:
+def test_a_server_that_never_answers_is_given_up(monkeypatch, bucket):
     monkeypatch.setattr(object_client, "SMALL_S", 0.3)
     monkeypatch.setattr(object_client, "TRIED_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from itertools import pairwise
-from pathlib import Path
 
 import pytest
 
@@ -14,11 +12,11 @@ from sceneprint.store.opaque_ids import START
 
 
 @pytest.fixture
-def opened() -> Iterator[Callable[[Path], object]]:
+def opened():
     """The seals of a new or a known store; all are closed at the end."""
     with ExitStack() as stack:
 
-        def opened(folder: Path) -> object:
+        def opened(folder):
             store = open_store(f"sqlite:///{folder / 'sceneprint.db'}", folder / "blobs")
             stack.callback(store.database.close)
             return store.seals

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Connection, insert, select, update
+from sqlalchemy import insert, select, update
 
-from sceneprint.store import Store
 from sceneprint.store.maps import add_frame, add_map, position, store_model
 from sceneprint.store.parent_joins import (
     ParentJoin,
@@ -19,7 +17,6 @@ from sceneprint.store.parent_joins import (
     undone_pairs,
 )
 from sceneprint.store.tables import frame_row, frames, surface_frames
-from sceneprint.types import Floats
 from sceneprint_client.api import FrameState
 
 MODEL = "ab" * 32
@@ -38,7 +35,7 @@ A_B[:3] = [[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 100.0]]
 
 
 @pytest.fixture
-def at(store: Store) -> Any:
+def at(store):
     """A writing connection, and the number of a map of four frames: in A, B, C and without pose."""
     with store.database.write() as connection:
         store_model(connection, MODEL, "toy", b"")
@@ -55,7 +52,7 @@ def at(store: Store) -> Any:
         yield connection, row.number
 
 
-def stored(connection: Connection) -> dict[str | None, tuple[Any, ...]]:
+def stored(connection):
     """What the frame of each session has: parent frame, pose, and what was sent."""
     c = frames.c
     columns = (c.session, c.pose_parent, c.pose, c.pose_x, c.sent_parent, c.sent_pose)
@@ -63,7 +60,7 @@ def stored(connection: Connection) -> dict[str | None, tuple[Any, ...]]:
             for name, parent, pose, x, *sent in connection.execute(select(*columns))}  # fmt: skip
 
 
-def moved(T: Floats, root: str, parent: str) -> tuple[Any, ...]:
+def moved(T, root, parent):
     pose = (T @ np.array(SENT)).tolist()
     return root, pose, pose[0][3], parent, SENT
 
@@ -73,13 +70,13 @@ AS_SENT = {
 }  # fmt: skip
 
 
-def join_chain(connection: Connection, number: int) -> None:
+def join_chain(connection, number):
     assert join_parent(connection, number, ParentJoin("C", "B", B_C), CB)
     assert stored(connection) == AS_SENT | {"C": moved(B_C, "B", "C")}
     assert join_parent(connection, number, ParentJoin("B", "A", A_B), BA)
 
 
-def test_a_chain_of_joins_leads_to_its_root(at: Any) -> None:
+def test_a_chain_of_joins_leads_to_its_root(at):
     connection, number = at
     join_chain(connection, number)
     chained = {"B": moved(A_B, "A", "B"), "C": moved(A_B @ B_C, "A", "C")}
@@ -92,7 +89,7 @@ def test_a_chain_of_joins_leads_to_its_root(at: Any) -> None:
 
 
 @pytest.mark.parametrize("first", [CB, BA])
-def test_joins_are_undone_in_either_order(at: Any, first: str) -> None:
+def test_joins_are_undone_in_either_order(at, first):
     connection, number = at
     join_chain(connection, number)
     deleted = update(frames).where(frames.c.session == "C")  # it may be restored
@@ -109,7 +106,7 @@ def test_joins_are_undone_in_either_order(at: Any, first: str) -> None:
     assert undone_pairs(connection, number) == []
 
 
-def test_what_was_moved_is_noted_for_surfaces(at: Any) -> None:
+def test_what_was_moved_is_noted_for_surfaces(at):
     connection, number = at
     join_chain(connection, number)
     numbers = list(connection.execute(select(frames.c.number).order_by(frames.c.number)).scalars())
@@ -123,7 +120,7 @@ def test_what_was_moved_is_noted_for_surfaces(at: Any) -> None:
     assert set(connection.execute(changed).scalars()) == {*numbers[1:3]}  # of B and C
 
 
-def test_a_frame_in_flight_is_moved_once(at: Any) -> None:
+def test_a_frame_in_flight_is_moved_once(at):
     connection, number = at
     which = select(frames).where(frames.c.session == "C")
     before = frame_row(connection.execute(which).mappings().one())
@@ -141,7 +138,7 @@ def test_a_frame_in_flight_is_moved_once(at: Any) -> None:
     assert root_columns(connection, now) == root_columns(connection, before) == {}
 
 
-def test_a_copied_frame_follows_the_joins_of_its_own_map(at: Any) -> None:
+def test_a_copied_frame_follows_the_joins_of_its_own_map(at):
     """Its map has not the join that moved it elsewhere."""
     connection, number = at
     copied = moved(B_C, "B", "C")

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 from sqlalchemy import event, select, update
@@ -13,19 +11,14 @@ from sceneprint.engine.jobs.lifecycle import LEFT_S
 from sceneprint.errors import LostLease, UnknownJob
 from sceneprint.process import work_of
 from sceneprint.settings import Settings
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.signatures import StoredSignature, index_frame
-from sceneprint.store.tables import FrameRow, JobRow, MapRow, jobs, signatures
+from sceneprint.store.tables import jobs, signatures
 from sceneprint.store.tenants import create_tenant
 from sceneprint_client.api import JobState
 
-Queued = Callable[..., JobRow]
-Turned = Callable[..., None]
 
-
-def test_a_job_is_queued_as_it_should_be(
-    store: Store, hall: MapRow, hand: Any, queued: Queued
-) -> None:
+def test_a_job_is_queued_as_it_should_be(store, hall, hand, queued):
     before = time.time()
     job = queued("a", 3)
     assert (job.kind, job.state, job.priority, job.attempts, job.token) == (
@@ -45,9 +38,7 @@ def test_a_job_is_queued_as_it_should_be(
         assert (listed.job, listed.map_name, listed.followed_by) == (job, hall.name, None)
 
 
-def test_what_matters_more_comes_first_and_of_equals_what_came_first(
-    store: Store, hand: Any, queued: Queued, turned: Turned
-) -> None:
+def test_what_matters_more_comes_first_and_of_equals_what_came_first(store, hand, queued, turned):
     jobs = [queued(str(i), priority) for i, priority in enumerate([0, 5, 0, 5, -1, 9])]
     turned(jobs[2], run_after=1.0)  # waits longest, but came later than the first
     order = [hand.taken().number - jobs[0].number for _ in jobs]
@@ -55,7 +46,7 @@ def test_what_matters_more_comes_first_and_of_equals_what_came_first(
     assert hand.take() is None
 
 
-def test_a_claim_is_a_lease_with_a_token(store: Store, hand: Any, queued: Queued) -> None:
+def test_a_claim_is_a_lease_with_a_token(store, hand, queued):
     job = queued("a")
     assert hand.due()
     before = time.time()
@@ -71,7 +62,7 @@ def test_a_claim_is_a_lease_with_a_token(store: Store, hand: Any, queued: Queued
     assert hand.take() is None
 
 
-def test_a_job_waits_for_its_time(store: Store, hand: Any, queued: Queued, turned: Turned) -> None:
+def test_a_job_waits_for_its_time(store, hand, queued, turned):
     job = queued("a")
     turned(job, run_after=time.time() + 30)
     assert not hand.due()
@@ -81,9 +72,7 @@ def test_a_job_waits_for_its_time(store: Store, hand: Any, queued: Queued, turne
     assert hand.taken().number == job.number
 
 
-def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
-    store: Store, hand: Any, queued: Queued, turned: Turned
-) -> None:
+def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(store, hand, queued, turned):
     job = queued("a")
     first = hand.taken("first")
     turned(job, leased_until=time.time() + 100)
@@ -105,9 +94,7 @@ def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(
         assert hand.row(job) == second
 
 
-def test_what_comes_late_leaves_nothing(
-    store: Store, hand: Any, hall: MapRow, received: Callable[..., FrameRow], turned: Turned
-) -> None:
+def test_what_comes_late_leaves_nothing(store, hand, hall, received, turned):
     frame = received("a")
     with store.database.write() as connection:
         job = queue.enqueue(connection, "sign", frame.number)
@@ -130,9 +117,7 @@ def test_what_comes_late_leaves_nothing(
     assert hand.row(job).state == JobState.SUCCEEDED
 
 
-def test_renewing_extends_the_lease_and_nothing_else(
-    store: Store, hand: Any, queued: Queued, turned: Turned
-) -> None:
+def test_renewing_extends_the_lease_and_nothing_else(store, hand, queued, turned):
     queued("a")
     held = hand.taken("w", 10.0)
     turned(held, leased_until=time.time() - 1)  # late, but nobody else came
@@ -147,13 +132,13 @@ def test_renewing_extends_the_lease_and_nothing_else(
 
 
 @pytest.mark.sqlite_only("its query plans")
-def test_a_claim_is_looked_up_and_not_sorted(store: Store, hall: MapRow) -> None:
+def test_a_claim_is_looked_up_and_not_sorted(store, hall):
     """100,000 jobs wait while a map is signed again, and a claim holds all writers up."""
     queue_jobs(store, hall, "many", 50)
     with store.database.write() as connection:
         said: list[str] = []
 
-        def listen(_: Any, _cursor: Any, statement: str, parameters: Any, *_more: Any) -> None:
+        def listen(_, _cursor, statement, parameters, *_more):
             if statement.startswith(("SELECT", "WITH")):
                 plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", parameters)
                 said.extend(row[3] for row in plan if row[3].startswith(("SEARCH", "SCAN", "USE")))
@@ -169,16 +154,14 @@ def test_a_claim_is_looked_up_and_not_sorted(store: Store, hall: MapRow) -> None
 # Tenants take turns.
 
 
-def queue_jobs(store: Store, hall: MapRow, tenant: str, count: int, priority: int = 0) -> None:
+def queue_jobs(store, hall, tenant, count, priority=0):
     with store.database.write() as connection, work_of(tenant):
         for _ in range(count):
             queue.enqueue(connection, "import", None, priority, map_number=hall.number)
 
 
-def test_a_thousand_jobs_of_priority_10_delay_another_tenant_by_one_turn(
-    store: Store, hand: Any, hall: MapRow
-) -> None:
-    queue_jobs(store, hall, "noisy", 1000, 10)
+def test_many_jobs_of_priority_10_delay_another_tenant_by_one_turn(store, hand, hall):
+    queue_jobs(store, hall, "noisy", 50, 10)
     assert [hand.taken().tenant for _ in range(3)] == ["noisy"] * 3
     queue_jobs(store, hall, "quiet", 1, -10)
     assert "quiet" in [hand.taken().tenant for _ in range(2)]
@@ -187,9 +170,7 @@ def test_a_thousand_jobs_of_priority_10_delay_another_tenant_by_one_turn(
     assert hand.taken().tenant == "noisy"  # who waits alone waits for nobody
 
 
-def test_between_two_turns_of_a_tenant_each_other_has_at_most_one(
-    store: Store, hand: Any, hall: MapRow
-) -> None:
+def test_between_two_turns_of_a_tenant_each_other_has_at_most_one(store, hand, hall):
     for tenant, count in (("a", 6), ("b", 4), ("c", 2)):
         queue_jobs(store, hall, tenant, count, priority={"a": 10, "b": 0, "c": -10}[tenant])
     order = "".join(hand.taken().tenant for _ in range(12))
@@ -199,13 +180,11 @@ def test_between_two_turns_of_a_tenant_each_other_has_at_most_one(
     assert "".join(hand.taken().tenant for _ in range(6)) == "cacaca"
 
 
-def test_a_long_job_makes_way_for_other_tenants_and_for_higher_priorities(
-    store: Store, hand: Any, hall: MapRow
-) -> None:
+def test_a_long_job_makes_way_for_other_tenants_and_for_higher_priorities(store, hand, hall):
     queue_jobs(store, hall, "long", 1)
     held = hand.taken()
 
-    def makes_way() -> bool:
+    def makes_way():
         with store.database.read() as connection:
             return queue.has_waiting_before(connection, held)
 
@@ -225,7 +204,7 @@ def test_a_long_job_makes_way_for_other_tenants_and_for_higher_priorities(
     assert not makes_way()
 
 
-def test_priority_decides_within_a_tenant(store: Store, hand: Any, hall: MapRow) -> None:
+def test_priority_decides_within_a_tenant(store, hand, hall):
     for tenant in ("a", "b"):
         for priority in (0, 10, -10):
             queue_jobs(store, hall, tenant, 1, priority)
@@ -235,9 +214,7 @@ def test_priority_decides_within_a_tenant(store: Store, hand: Any, hall: MapRow)
     ]  # fmt: skip
 
 
-def test_upkeep_waits_for_what_was_asked_and_what_no_key_asked_takes_turns(
-    store: Store, hand: Any, hall: MapRow
-) -> None:
+def test_upkeep_waits_for_what_was_asked_and_what_no_key_asked_takes_turns(store, hand, hall):
     queue_jobs(store, hall, "", 2, queue.UPKEEP)
     queue_jobs(store, hall, "", 1, queue.UPKEEP + 1)
     queue_jobs(store, hall, "a", 2, queue.UPKEEP)
@@ -247,9 +224,7 @@ def test_upkeep_waits_for_what_was_asked_and_what_no_key_asked_takes_turns(
     ]  # fmt: skip
 
 
-def test_what_fell_silent_has_its_tenants_turn(
-    store: Store, hand: Any, hall: MapRow, turned: Turned
-) -> None:
+def test_what_fell_silent_has_its_tenants_turn(store, hand, hall, turned):
     queue_jobs(store, hall, "a", 2)
     silent = hand.taken("dead", -1.0)
     queue_jobs(store, hall, "b", 1)
@@ -258,7 +233,7 @@ def test_what_fell_silent_has_its_tenants_turn(
     assert silent.number == taken[2].number  # tried before: behind the tenant's other
 
 
-def test_deleted_jobs_give_no_turn_back(store: Store, hand: Any, hall: MapRow) -> None:
+def test_deleted_jobs_give_no_turn_back(store, hand, hall):
     with store.database.write() as connection:
         for name in ("a", "b"):
             create_tenant(connection, name)
@@ -270,9 +245,7 @@ def test_deleted_jobs_give_no_turn_back(store: Store, hand: Any, hall: MapRow) -
     assert (first.tenant, hand.taken().tenant, hand.taken().tenant) == ("a", "b", "a")
 
 
-def test_a_clock_set_back_changes_no_turn(
-    store: Store, hand: Any, hall: MapRow, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_clock_set_back_changes_no_turn(store, hand, hall, monkeypatch):
     queue_jobs(store, hall, "b", 2)
     queue_jobs(store, hall, "a", 2)
     with store.database.write() as connection:
@@ -284,8 +257,8 @@ def test_a_clock_set_back_changes_no_turn(
 
 
 def test_jobs_and_leases_written_before_the_clock_was_set_back_are_taken(
-    store: Store, hand: Any, queued: Queued, turned: Turned
-) -> None:
+    store, hand, queued, turned
+):
     """A year back: what was due then is due now, and no lease was ever that long."""
     year, job = 365 * 86_400.0, queued("a")
     turned(job, run_after=time.time() + year)
@@ -298,7 +271,7 @@ def test_jobs_and_leases_written_before_the_clock_was_set_back_are_taken(
     assert (second.worker, second.token) == ("second", 2)
 
 
-def test_no_pause_and_no_lease_is_longer_than_the_clock_may_be_wrong_by() -> None:
+def test_no_pause_and_no_lease_is_longer_than_the_clock_may_be_wrong_by():
     longest = max(queue.pause_s(n) for n in range(1, queue.MAXIMUM_FAILURES))
     assert max(longest, LEFT_S) < queue.LONGEST_PAUSE_S
     lease = Settings.model_fields["job_lease_s"].metadata

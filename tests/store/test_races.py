@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import Any
 
-from sceneprint.store import Store, queue
+from sceneprint.store import queue
 from sceneprint.store.maps import find_map, next_revision
-from sceneprint.store.tables import JobRow, MapRow
 from sceneprint_client.api import JobState
-
-Queued = Callable[..., JobRow]
 
 WORKS = """
 from sceneprint_client.api import JobState
@@ -32,11 +27,11 @@ def work(i):
 """
 
 
-def test_threads_at_one_queue_get_each_job_once(store: Store, hall: MapRow, queued: Queued) -> None:
+def test_threads_at_one_queue_get_each_job_once(store, hall, queued):
     wanted = [queued(str(i)).number for i in range(30)]
     start, done, raised = threading.Barrier(8), [], []
 
-    def work(name: str) -> None:
+    def work(name):
         try:
             start.wait()
             while True:
@@ -63,9 +58,7 @@ def test_threads_at_one_queue_get_each_job_once(store: Store, hall: MapRow, queu
         assert find_map(connection, "hall").revision == 30
 
 
-def test_processes_at_one_queue_get_each_job_once(
-    url: str, store: Store, hall: MapRow, queued: Queued, race: Callable[..., list[Any]]
-) -> None:
+def test_processes_at_one_queue_get_each_job_once(url, store, hall, queued, race):
     wanted = [queued(str(i)).number for i in range(30)]
     found = race(WORKS, 3, url, hall.number)
     assert all(isinstance(each, list) for each in found), found  # else what was raised
@@ -75,14 +68,12 @@ def test_processes_at_one_queue_get_each_job_once(
         assert find_map(connection, "hall").revision == 30
 
 
-def test_threads_that_outlive_their_leases_take_effect_once(
-    store: Store, hall: MapRow, queued: Queued, turned: Callable[..., None]
-) -> None:
+def test_threads_that_outlive_their_leases_take_effect_once(store, hall, queued, turned):
     """Every lease is over at once, so that each job is in several hands: one of them counts."""
     jobs = [queued(str(i)) for i in range(12)]
     start, effects, lost, raised = threading.Barrier(4), [], [], []
 
-    def work(name: str) -> None:
+    def work(name):
         try:
             start.wait()
             while True:

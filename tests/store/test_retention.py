@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-
 import pytest
-from sqlalchemy import Connection
 
-from sceneprint.store import Store, events
+from sceneprint.store import events
 from sceneprint.store.deletion import remove_map
 from sceneprint.store.events import (
     EventFilter,
@@ -24,12 +21,12 @@ from sceneprint.store.maps import add_map, find_map, store_model
 
 
 @pytest.fixture
-def empty(store: Store) -> Store:
+def empty(store):
     return store
 
 
 @pytest.fixture
-def filled(empty: Store) -> Store:
+def filled(empty):
     """Two maps, made by the events 1 and 2; then hall, shop and none in turn, 3 to 62."""
     with empty.database.write() as connection:
         store_model(connection, "m" * 64, "small", b"")
@@ -40,11 +37,11 @@ def filled(empty: Store) -> Store:
     return empty
 
 
-def numbers_of(connection: Connection, name: str | None) -> list[int]:
+def numbers_of(connection, name):
     return [one.number for one in list_events(connection, EventFilter()) if one.map == name]
 
 
-def expected(connection: Connection, kept: int, anchors: Collection[int]) -> set[int]:
+def expected(connection, kept, anchors):
     """Of each map all but the newest, the one before these, and the anchors."""
     gone: set[int] = set()
     for name, more in (("hall", 1), ("shop", 1), (None, 0)):

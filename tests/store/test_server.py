@@ -6,34 +6,21 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
-from typing import Any
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import insert, select, text
 
-from benchmarks.postgres import Server
 from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
-from sceneprint.store import Database, Store, database, open_database, open_store
+from sceneprint.store import database, open_database, open_store
 from sceneprint.store.database import database_exists, known_revisions, reach_database
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import create_key, list_keys
-from sceneprint.store.maps import (
-    add_frame,
-    add_map,
-    find_map,
-    frames_of,
-    list_maps,
-    store_model,
-)
+from sceneprint.store.maps import add_frame, add_map, find_map, frames_of, list_maps, store_model
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.tables import MapRow, events, maps, metadata
-
-Race = Callable[..., list[Any]]
+from sceneprint.store.tables import events, maps, metadata
 
 SQLITE = """
 import sys
@@ -47,21 +34,21 @@ print([name for name in ("psycopg", "obstore") if name in sys.modules])
 
 
 @pytest.fixture
-def empty_url(postgres: Server) -> Iterator[str]:
+def empty_url(postgres):
     """A database without any table."""
     yield postgres.create("bare")
     postgres.drop("bare")
 
 
 @pytest.fixture
-def served(postgres_url: str) -> Iterator[Database]:
+def served(postgres_url):
     opened = open_database(postgres_url)
     yield opened
     opened.close()
 
 
 @pytest.fixture
-def keeper(postgres_url: str) -> Iterator[Callable[[], None]]:
+def keeper(postgres_url):
     """Who has the turn, as another process would: over connections of its own. Ends it."""
     other = reach_database(postgres_url)
     with ExitStack() as held:
@@ -70,9 +57,7 @@ def keeper(postgres_url: str) -> Iterator[Callable[[], None]]:
     other.close()
 
 
-def test_two_processes_may_open_an_empty_database_at_once(
-    empty_url: str, race: Race, opens: str
-) -> None:
+def test_two_processes_may_open_an_empty_database_at_once(empty_url, race, opens):
     assert not database_exists(empty_url)
     assert race(opens, 2, empty_url) == [[known_revisions()[0]]] * 2
     assert database_exists(empty_url)
@@ -94,7 +79,7 @@ def test_two_processes_may_open_an_empty_database_at_once(
     made.close()
 
 
-def test_events_are_numbered_beyond_32_bits(served: Database) -> None:
+def test_events_are_numbered_beyond_32_bits(served):
     with served.write() as connection:
         connection.execute(text("SELECT setval('events_number_seq', 3000000000)"))
         record_event(connection, "key.created")
@@ -102,8 +87,8 @@ def test_events_are_numbered_beyond_32_bits(served: Database) -> None:
 
 
 def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(
-    postgres_url: str, empty_url: str, tmp_path: Path
-) -> None:
+    postgres_url, empty_url, tmp_path
+):
     new = open_store(empty_url, tmp_path / "new" / "blobs")
     new.blobs.put(b"upload")
     new.database.close()
@@ -115,9 +100,7 @@ def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(
     assert not (tmp_path / "old").exists()
 
 
-def test_a_turn_that_another_process_keeps_is_said(
-    served: Database, keeper: Callable[[], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_turn_that_another_process_keeps_is_said(served, keeper, monkeypatch):
     monkeypatch.setattr(database, "BUSY_S", 0.2)
     monkeypatch.setattr(postgres, "HELD_S", 0.2)
     for _ in range(2):  # the second, who comes after one that waited in vain, waits less
@@ -136,9 +119,7 @@ def test_a_turn_that_another_process_keeps_is_said(
         assert connection.execute(select(events.c.kind)).scalars().all() == ["x"]
 
 
-def test_a_migration_waits_for_its_turn_longer_than_a_writer(
-    served: Database, keeper: Callable[[], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_migration_waits_for_its_turn_longer_than_a_writer(served, keeper, monkeypatch):
     monkeypatch.setattr(database, "BUSY_S", 0.05)
     with pytest.raises(StoreLocked), served.write():
         pytest.fail("it is not our turn")
@@ -152,7 +133,7 @@ def test_a_migration_waits_for_its_turn_longer_than_a_writer(
         assert connection.execute(text("SHOW lock_timeout")).scalar() == "10s"
 
 
-def test_a_reader_sees_one_state_and_writes_nothing(served: Database) -> None:
+def test_a_reader_sees_one_state_and_writes_nothing(served):
     with ExitStack() as stack:
         held = [stack.enter_context(served.read()) for _ in range(3)]
         for connection in held:
@@ -178,9 +159,7 @@ def test_a_reader_sees_one_state_and_writes_nothing(served: Database) -> None:
 @pytest.mark.parametrize(
     ("set_to", "found"), [("off", "on"), ("local", "local"), ("remote_apply", "remote_apply")]
 )
-def test_a_commit_is_never_acknowledged_before_it_is_on_disk(
-    postgres: Server, postgres_url: str, set_to: str, found: str
-) -> None:
+def test_a_commit_is_never_acknowledged_before_it_is_on_disk(postgres, postgres_url, set_to, found):
     name = postgres_url.rpartition("/")[2]
     postgres.execute(f"ALTER DATABASE {name} SET synchronous_commit = {set_to}")
     opened = open_database(postgres_url)
@@ -189,9 +168,7 @@ def test_a_commit_is_never_acknowledged_before_it_is_on_disk(
     opened.close()
 
 
-def test_more_readers_than_connections_are_told_so(
-    postgres_url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_more_readers_than_connections_are_told_so(postgres_url, monkeypatch):
     for name, value in (("IDLE_CONNECTIONS", 1), ("MOST", 2), ("BUSY_S", 0.1)):
         monkeypatch.setattr(postgres, name, value)
     few = reach_database(postgres_url)
@@ -202,7 +179,7 @@ def test_more_readers_than_connections_are_told_so(
     few.close()
 
 
-def test_a_connection_of_its_own_commits_each_statement(served: Database) -> None:
+def test_a_connection_of_its_own_commits_each_statement(served):
     own = served.driver_connection()
     own.execute("INSERT INTO events (at, kind, data) VALUES (1, 'own', '{}')")
     with served.read() as connection:
@@ -212,7 +189,7 @@ def test_a_connection_of_its_own_commits_each_statement(served: Database) -> Non
     assert own.closed
 
 
-def test_texts_are_in_the_order_of_their_code_points(store: Store) -> None:
+def test_texts_are_in_the_order_of_their_code_points(store):
     names = ["b", "B", "a", "_", "-", "ä", "Z", "z", "é", "10", "9", "\U0001f600", "\uffee"]
     with store.database.write() as connection:
         for name in names:
@@ -223,7 +200,7 @@ def test_texts_are_in_the_order_of_their_code_points(store: Store) -> None:
         assert [key.name for key in list_keys(connection, after, 3)] == sorted(names)[5:8]
 
 
-def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store: Store) -> None:
+def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store):
     with store.database.write() as connection:
         store_model(connection, "m", "n" * 200, b"x")
         add_map(connection, "hall", None, "m")
@@ -232,16 +209,14 @@ def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store: Store) -
         assert found.all() == []
 
 
-def test_more_numbers_are_asked_for_than_one_statement_takes(
-    store: Store, hall: MapRow, received: Callable[..., Any]
-) -> None:
+def test_more_numbers_are_asked_for_than_one_statement_takes(store, hall, received):
     made = [received(name).number for name in "abc"]
     with store.database.read() as connection:
         found = frames_of(connection, range(70_000))
     assert sorted(found) == made
 
 
-def test_numbers_may_have_64_bits(store: Store, hall: MapRow) -> None:
+def test_numbers_may_have_64_bits(store, hall):
     values = {
         "blob": "b", "bytes": 2**40, "intrinsics": {}, "depth_scale": 1.0, "tags": [],
         "depth_along_ray": False, "pose": None,
@@ -257,7 +232,7 @@ def test_numbers_may_have_64_bits(store: Store, hall: MapRow) -> None:
         assert find_map(connection, "far").revision == 2**41
 
 
-def test_a_process_on_sqlite_loads_no_driver_of_others(tmp_path: Path) -> None:
+def test_a_process_on_sqlite_loads_no_driver_of_others(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", SQLITE, f"sqlite:///{tmp_path / 'a.db'}", str(tmp_path / "blobs")],
         capture_output=True, text=True, check=False,
@@ -265,7 +240,7 @@ def test_a_process_on_sqlite_loads_no_driver_of_others(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
-def test_what_was_stored_is_json(store: Store, hall: MapRow) -> None:
+def test_what_was_stored_is_json(store, hall):
     """Not of PostgreSQL's other kind, which sorts keys and knows no escaped NUL."""
     data = {"b": 1, "a": ["\0", "\ud800", 1e300, None]}
     with store.database.write() as connection:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
-from sqlalchemy import Connection, select, text
+from sqlalchemy import select, text
 from sqlalchemy.exc import DBAPIError
 
-from benchmarks.postgres import Server
 from sceneprint import errors
-from sceneprint.store import Database, open_database
+from sceneprint.store import open_database
 from sceneprint.store.database import database_exists, reach_database
 from sceneprint.store.read_only import inspect_database
 from sceneprint.store.tables import maps
 
 
 @pytest.fixture
-def served(postgres_url: str) -> Iterator[Database]:
+def served(postgres_url):
     opened = open_database(postgres_url)
     yield opened
     opened.close()
@@ -43,10 +40,8 @@ def served(postgres_url: str) -> Iterator[Database]:
         ("XX001", errors.UnusableStore, "Restore a bundle"),
     ],
 )
-def test_a_fault_is_of_its_kind_and_leaves_nothing(
-    served: Database, state: str, kind: type[Exception], said: str
-) -> None:
-    def go_wrong(connection: Connection) -> None:
+def test_a_fault_is_of_its_kind_and_leaves_nothing(served, state, kind, said):
+    def go_wrong(connection):
         connection.execute(text("INSERT INTO models VALUES ('m', 'toy', 'x', 1.0)"))
         raised = f"DO $$ BEGIN RAISE EXCEPTION 'so it is' USING ERRCODE = '{state}'; END $$"
         connection.exec_driver_sql(raised)
@@ -59,14 +54,14 @@ def test_a_fault_is_of_its_kind_and_leaves_nothing(
         assert connection.execute(text("SELECT count(*) FROM models")).scalar() == 0
 
 
-def test_a_mistake_of_ours_stays_one(served: Database) -> None:
+def test_a_mistake_of_ours_stays_one(served):
     for wrong in ("SELECT nothing", "SELEC", "SELECT 1/0", "SELECT 'x'::int"):
         with pytest.raises(DBAPIError), served.read() as connection:
             connection.exec_driver_sql(wrong)
 
 
-def test_a_statement_without_end_is_ended(served: Database) -> None:
-    def sleep(connection: Connection) -> None:
+def test_a_statement_without_end_is_ended(served):
+    def sleep(connection):
         connection.exec_driver_sql("SET LOCAL statement_timeout = 50")
         connection.exec_driver_sql("SELECT pg_sleep(600)")
 
@@ -76,8 +71,8 @@ def test_a_statement_without_end_is_ended(served: Database) -> None:
         assert connection.execute(select(maps)).all() == []
 
 
-def test_connections_that_were_ended_are_made_anew(served: Database, postgres: Server) -> None:
-    def fall(connection: Connection) -> None:
+def test_connections_that_were_ended_are_made_anew(served, postgres):
+    def fall(connection):
         mine = connection.execute(text("SELECT pg_backend_pid()")).scalar_one()
         postgres.execute(f"SELECT pg_terminate_backend({mine}, 60000)")
         connection.execute(select(maps))
@@ -114,8 +109,8 @@ def test_connections_that_were_ended_are_made_anew(served: Database, postgres: S
     ],
 )  # fmt: skip
 def test_what_cannot_be_reached_is_said_without_the_password(
-    postgres: Server, given: str, kind: type[Exception], said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    postgres, given, kind, said, monkeypatch
+):
     monkeypatch.setenv("PGHOST", "/nowhere")
     port = postgres.url().rpartition(":")[2].partition("/")[0]
     for use in (open_database, database_exists, _looked_at):
@@ -128,14 +123,12 @@ def test_what_cannot_be_reached_is_said_without_the_password(
         assert isinstance(caught.value, kind)
 
 
-def _looked_at(url: str) -> None:
+def _looked_at(url):
     with inspect_database(url):
         pass
 
 
-def test_a_table_that_is_changed_elsewhere_costs_one_try(
-    served: Database, postgres: Server, postgres_url: str
-) -> None:
+def test_a_table_that_is_changed_elsewhere_costs_one_try(served, postgres, postgres_url):
     """Connections have prepared for it what they asked of it again and again."""
     name, asked = postgres_url.rpartition("/")[2], text("SELECT a FROM changing")
     postgres.execute("CREATE TABLE changing (a int)", name)
@@ -152,7 +145,7 @@ def test_a_table_that_is_changed_elsewhere_costs_one_try(
         assert [one.execute(asked).all(), other.execute(asked).all()] == [[], []]
 
 
-def test_a_database_of_another_encoding_is_refused(postgres: Server) -> None:
+def test_a_database_of_another_encoding_is_refused(postgres):
     postgres.execute(
         "CREATE DATABASE ascii ENCODING 'SQL_ASCII' LC_COLLATE 'C' LC_CTYPE 'C' TEMPLATE template0"
     )
@@ -161,7 +154,7 @@ def test_a_database_of_another_encoding_is_refused(postgres: Server) -> None:
     postgres.drop("ascii")
 
 
-def test_a_server_that_is_not_there_is_not_asked_before_it_must() -> None:
+def test_a_server_that_is_not_there_is_not_asked_before_it_must():
     far = reach_database("postgresql://u:hunter2@127.0.0.1:1/x?host=a:1&host=b:2")
     assert far.shown == "postgresql://u@127.0.0.1:1/x"
     assert "hunter2" not in repr(far.shown)

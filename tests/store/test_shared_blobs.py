@@ -5,18 +5,14 @@ from __future__ import annotations
 import errno
 import subprocess
 import sys
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import text
 
-from benchmarks.postgres import Server
 from sceneprint.errors import StoreLocked, UnusableStore
-from sceneprint.store import Store, open_blobs, open_database, open_store
+from sceneprint.store import open_blobs, open_database, open_store
 from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import ObjectBlobs
@@ -33,12 +29,12 @@ with open_store(sys.argv[1], sys.argv[2]).blobs.block_removals():
 """
 
 
-def objects_of(store: Store) -> ObjectBlobs:
+def objects_of(store):
     assert isinstance(store.blobs, ObjectBlobs)
     return store.blobs
 
 
-def lose_lock(store: Store, until: Callable[..., Any]) -> None:
+def lose_lock(store, until):
     """Close the connection that removes, and wait until the server has released its lock."""
     objects_of(store)._locks.close()
     locks = text(
@@ -49,7 +45,7 @@ def lose_lock(store: Store, until: Callable[..., Any]) -> None:
         until(lambda: connection.execute(locks, {"blobs": BLOBS}).scalar_one() == 0)
 
 
-def test_a_new_database_gets_its_folder_beside_blobs_elsewhere(tmp_path: Path) -> None:
+def test_a_new_database_gets_its_folder_beside_blobs_elsewhere(tmp_path):
     data, blobs = tmp_path / "data" / "node", tmp_path / "mount" / "blobs"
     store = open_store(f"sqlite:///{data / 'a.db'}", blobs)
     digest = store.blobs.put(b"depth")
@@ -58,7 +54,7 @@ def test_a_new_database_gets_its_folder_beside_blobs_elsewhere(tmp_path: Path) -
     assert [*blobs.rglob(digest)] != []
 
 
-def test_a_prefix_belongs_to_one_database(store_url: str, bucket: str, tmp_path: Path) -> None:
+def test_a_prefix_belongs_to_one_database(store_url, bucket, tmp_path):
     first = open_store(store_url, f"{bucket}/mine")
     digest = first.blobs.put(b"depth")
     first.close()
@@ -75,7 +71,7 @@ def test_a_prefix_belongs_to_one_database(store_url: str, bucket: str, tmp_path:
         open_store(store_url, f"{bucket}/mine")
 
 
-def test_a_folder_of_a_fleet_belongs_to_one_database(postgres: Server, tmp_path: Path) -> None:
+def test_a_folder_of_a_fleet_belongs_to_one_database(postgres, tmp_path):
     """Hosts mount it, and another database would remove what it does not refer to."""
     first, second = (postgres.create(f"on_a_folder_{i}") for i in range(2))
     with closing(open_store(first, tmp_path)) as store:
@@ -89,7 +85,7 @@ def test_a_folder_of_a_fleet_belongs_to_one_database(postgres: Server, tmp_path:
         assert not (tmp_path / MARK).exists()
 
 
-def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:
+def test_who_only_looks_marks_nothing(store_url, bucket):
     database = open_database(store_url)
     blobs = open_blobs(bucket, database, claim=False)
     assert list(open_objects(bucket).list("")) == []
@@ -100,8 +96,8 @@ def test_who_only_looks_marks_nothing(store_url: str, bucket: str) -> None:
 
 
 def test_a_store_that_is_away_is_opened_and_claimed_later(
-    tmp_path: Path, bucket: str, monkeypatch: pytest.MonkeyPatch, object_server: Any
-) -> None:
+    tmp_path, bucket, monkeypatch, object_server
+):
     monkeypatch.setattr("sceneprint.store.blobs.object_client.TRIED_S", 0.1)
     monkeypatch.setattr("sceneprint.store.blobs.object_client.AWAY_S", 0.0)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
@@ -124,14 +120,11 @@ def test_a_store_that_is_away_is_opened_and_claimed_later(
     store.close()
 
 
-def test_all_processes_share_one_lock(
-    store_url: str, bucket: str, until: Callable[..., Any]
-) -> None:
+def test_all_processes_share_one_lock(store_url, bucket, until):
     store = open_store(store_url, bucket)
     with subprocess.Popen(
         [sys.executable, "-c", HOLDS, store_url, bucket], stdout=subprocess.PIPE, text=True
     ) as other:
-        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with store.blobs.removing() as allowed:
             assert not allowed
@@ -139,7 +132,7 @@ def test_all_processes_share_one_lock(
             pass
         other.kill()
 
-    def removes() -> bool:
+    def removes():
         with store.blobs.removing() as allowed:
             return allowed
 
@@ -149,9 +142,7 @@ def test_all_processes_share_one_lock(
     store.close()
 
 
-def test_what_was_put_is_held_without_asking_until_something_is_removed(
-    postgres_url: str, bucket: str
-) -> None:
+def test_what_was_put_is_held_without_asking_until_something_is_removed(postgres_url, bucket):
     mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
     objects = open_objects(bucket)
     digest = mine.blobs.put(b"depth")
@@ -172,9 +163,7 @@ def test_what_was_put_is_held_without_asking_until_something_is_removed(
     theirs.close()
 
 
-def test_a_remover_that_dies_is_not_forgotten(
-    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any]
-) -> None:
+def test_a_remover_that_dies_is_not_forgotten(postgres_url, bucket, monkeypatch, until):
     mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
     removing = theirs.blobs.removing()
     assert removing.__enter__()
@@ -197,8 +186,8 @@ def test_a_remover_that_dies_is_not_forgotten(
 
 
 def test_who_lost_its_lock_does_not_end_the_removal_of_another(
-    postgres_url: str, bucket: str, monkeypatch: pytest.MonkeyPatch, until: Callable[..., Any]
-) -> None:
+    postgres_url, bucket, monkeypatch, until
+):
     monkeypatch.setattr(LONGEST, 0.0)
     mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
     removing = mine.blobs.removing()
@@ -213,12 +202,10 @@ def test_who_lost_its_lock_does_not_end_the_removal_of_another(
     theirs.close()
 
 
-def test_a_folder_without_locks_holds_what_it_has(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_without_locks_holds_what_it_has(tmp_path, monkeypatch):
     """Nothing is removed there, so there is nothing to wait for."""
 
-    def refuse(*_: object) -> None:
+    def refuse(*_):
         raise OSError(errno.ENOLCK, "no locks available")
 
     monkeypatch.setattr("fcntl.flock", refuse)
@@ -230,7 +217,7 @@ def test_a_folder_without_locks_holds_what_it_has(
     store.close()
 
 
-def test_a_folder_waits_for_who_removes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_waits_for_who_removes(tmp_path, monkeypatch):
     store = open_store(f"sqlite:///{tmp_path / 'a.db'}", tmp_path / "blobs")
     digest = store.blobs.put(b"depth")
     with ThreadPoolExecutor(1) as pool, store.blobs.removing() as allowed:
@@ -246,7 +233,7 @@ def test_a_folder_waits_for_who_removes(tmp_path: Path, monkeypatch: pytest.Monk
     store.close()
 
 
-def test_a_lock_that_was_lost_is_said(postgres_url: str, bucket: str) -> None:
+def test_a_lock_that_was_lost_is_said(postgres_url, bucket):
     store = open_store(postgres_url, bucket)
     kept = store.blobs.block_removals()
     kept.__enter__()

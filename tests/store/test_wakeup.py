@@ -6,7 +6,6 @@ import fcntl
 import os
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -18,16 +17,16 @@ from sceneprint.store.wakeup import Wakeup
 FOREVER = 60.0
 
 
-def fifos(folder: Path) -> list[Path]:
+def fifos(folder):
     return list((folder / "bells").iterdir())
 
 
 @pytest.fixture
-def ours(tmp_path: Path) -> Wakeup:
+def ours(tmp_path):
     return Wakeup(tmp_path / "bells")
 
 
-def test_all_who_wait_are_woken(ours: Wakeup) -> None:
+def test_all_who_wait_are_woken(ours):
     with ours.listen() as first, ours.listen() as second:
         rung: list[bool] = []
         threads = [
@@ -42,7 +41,7 @@ def test_all_who_wait_are_woken(ours: Wakeup) -> None:
         assert rung == [True, True]
 
 
-def test_what_is_rung_before_the_wait_ends_it_once(ours: Wakeup) -> None:
+def test_what_is_rung_before_the_wait_ends_it_once(ours):
     ours.ring()  # nobody has ever listened
     with ours.listen() as listener:
         assert not listener.wait(0)
@@ -53,7 +52,7 @@ def test_what_is_rung_before_the_wait_ends_it_once(ours: Wakeup) -> None:
         assert not listener.wait(0)
 
 
-def test_another_descriptor_ends_the_wait_too(ours: Wakeup) -> None:
+def test_another_descriptor_ends_the_wait_too(ours):
     told, tell = os.pipe()
     with ours.listen() as listener:
         os.write(tell, b"!")
@@ -62,7 +61,7 @@ def test_another_descriptor_ends_the_wait_too(ours: Wakeup) -> None:
     os.close(tell)
 
 
-def test_who_listens_no_more_leaves_nothing(ours: Wakeup, tmp_path: Path) -> None:
+def test_who_listens_no_more_leaves_nothing(ours, tmp_path):
     with ours.listen():
         (fifo,) = fifos(tmp_path)
         assert fifo.is_fifo()
@@ -70,7 +69,7 @@ def test_who_listens_no_more_leaves_nothing(ours: Wakeup, tmp_path: Path) -> Non
     assert fifos(tmp_path) == []
 
 
-def test_what_the_dead_left_is_removed_when_it_is_old(ours: Wakeup, tmp_path: Path) -> None:
+def test_what_the_dead_left_is_removed_when_it_is_old(ours, tmp_path):
     with ours.listen() as listener:
         (own,) = fifos(tmp_path)
         old, new, file = (tmp_path / "bells" / name for name in ("old", "new", "file"))
@@ -86,9 +85,7 @@ def test_what_the_dead_left_is_removed_when_it_is_old(ours: Wakeup, tmp_path: Pa
         assert listener.wait(FOREVER)
 
 
-def test_a_listener_shows_that_it_lives_and_mends_its_fifo(
-    ours: Wakeup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_listener_shows_that_it_lives_and_mends_its_fifo(ours, tmp_path, monkeypatch):
     monkeypatch.setattr(wakeup, "ALIVE_S", 0.0)
     with ours.listen() as listener:
         (own,) = fifos(tmp_path)
@@ -102,7 +99,7 @@ def test_a_listener_shows_that_it_lives_and_mends_its_fifo(
         assert listener.wait(FOREVER)
 
 
-def test_where_there_can_be_no_bell_nobody_is_harmed(tmp_path: Path) -> None:
+def test_where_there_can_be_no_bell_nobody_is_harmed(tmp_path):
     (tmp_path / "bells").write_bytes(b"a file")
     ours = Wakeup(tmp_path / "bells")
     with ours.listen() as listener:

@@ -4,29 +4,25 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import pytest
-from sqlalchemy import Connection, event, func, select
+from sqlalchemy import event, func, select
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.write_groups import MOST_TOGETHER, Grouping, _Group, _Waiting
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.process import of_request, request_id
-from sceneprint.store import Database, Store
 from sceneprint.store.events import record_event
 from sceneprint.store.tables import events
 
 
 @pytest.fixture
-def database(store: Store) -> Database:
+def database(store):
     return store.database
 
 
-def together(
-    database: Database, works: list[Callable[[Connection], Any]], *, one_by_one: bool = False
-) -> tuple[list[Any], int]:
+def together(database, works, *, one_by_one=False):
     """What came of works that all waited for one writer, and how often was committed.
 
     With `one_by_one`, they come in their order, and the first of them writes for all.
@@ -35,7 +31,7 @@ def together(
     event.listen(database._engine, "commit", lambda _: commits.__setitem__(0, commits[0] + 1))
     found: list[Any] = [None] * len(works)
 
-    def run(i: int) -> None:
+    def run(i):
         try:
             found[i] = group.run(works[i])
         except BaseException as error:
@@ -53,38 +49,38 @@ def together(
     return found, commits[0] - 1
 
 
-def until_waiting(group: _Group[Any], count: int) -> None:
+def until_waiting(group, count):
     end = time.monotonic() + PATIENCE_S
     while len(group._waiting) < count:
         assert time.monotonic() < end
         time.sleep(0.001)
 
 
-def count(database: Database, kind: str) -> int:
+def count(database, kind):
     with database.read() as connection:
         asked = select(func.count()).where(events.c.kind == kind)
         return int(connection.execute(asked).scalar_one())
 
 
-def noting(kind: str, result: object) -> Callable[[Connection], Any]:
-    def work(connection: Connection) -> object:
+def noting(kind, result):
+    def work(connection):
         record_event(connection, kind, None, None)
         return result
 
     return work
 
 
-def test_who_waits_together_is_committed_together(database: Database) -> None:
+def test_who_waits_together_is_committed_together(database):
     found, commits = together(database, [noting("a", i) for i in range(MOST_TOGETHER + 3)])
     assert found == list(range(MOST_TOGETHER + 3))
     assert count(database, "a") == MOST_TOGETHER + 3
     assert commits == 2  # at most MOST in one
 
 
-def test_each_is_of_its_own_request_whoever_writes_it(database: Database) -> None:
+def test_each_is_of_its_own_request_whoever_writes_it(database):
     group, seen = Grouping(database), dict[int, str | None]()
 
-    def run(i: int) -> None:
+    def run(i):
         with of_request(f"request {i}"):
             seen[i] = group.run(lambda _: request_id())
 
@@ -99,8 +95,8 @@ def test_each_is_of_its_own_request_whoever_writes_it(database: Database) -> Non
 
 
 @pytest.mark.parametrize("kind", [FrameConflict, LostLease])
-def test_a_refusal_costs_no_other(database: Database, kind: type[Exception]) -> None:
-    def refuse(_: Connection) -> None:
+def test_a_refusal_costs_no_other(database, kind):
+    def refuse(_):
         raise kind("no")
 
     found, commits = together(database, [noting("a", 0), refuse, noting("a", 2)])
@@ -108,10 +104,8 @@ def test_a_refusal_costs_no_other(database: Database, kind: type[Exception]) -> 
     assert (count(database, "a"), commits) == (2, 1)
 
 
-def test_what_breaks_a_transaction_leaves_no_trace_and_the_others_their_own(
-    database: Database,
-) -> None:
-    def break_down(connection: Connection) -> None:
+def test_what_breaks_a_transaction_leaves_no_trace_and_the_others_their_own(database):
+    def break_down(connection):
         record_event(connection, "broken", None, None)
         raise ValueError("a mistake")
 
@@ -121,8 +115,8 @@ def test_what_breaks_a_transaction_leaves_no_trace_and_the_others_their_own(
     assert (count(database, "a"), count(database, "broken")) == (2, 0)
 
 
-def test_a_full_disk_is_told_to_all(database: Database) -> None:
-    def full(connection: Connection) -> None:
+def test_a_full_disk_is_told_to_all(database):
+    def full(connection):
         record_event(connection, "full", None, None)
         raise StoreFull("no room")
 
@@ -131,10 +125,10 @@ def test_a_full_disk_is_told_to_all(database: Database) -> None:
     assert (count(database, "a"), count(database, "full")) == (0, 0)
 
 
-def test_ctrl_c_ends_its_own_writer_alone(database: Database) -> None:
+def test_ctrl_c_ends_its_own_writer_alone(database):
     group, tries = Grouping(database), [0]
 
-    def stop(_: Connection) -> None:
+    def stop(_):
         tries[0] += 1
         raise KeyboardInterrupt
 
@@ -144,11 +138,11 @@ def test_ctrl_c_ends_its_own_writer_alone(database: Database) -> None:
     assert (tries, count(database, "a")) == ([1], 1)
 
 
-def test_ctrl_c_in_a_second_try_forgets_nobody(database: Database) -> None:
+def test_ctrl_c_in_a_second_try_forgets_nobody(database):
     """It ends the thread that writes for all: those that it has not written go on themselves."""
     errors = [ValueError, KeyboardInterrupt]
 
-    def stop(_: Connection) -> None:
+    def stop(_):
         if errors:
             raise errors.pop(0)
 
@@ -159,14 +153,12 @@ def test_ctrl_c_in_a_second_try_forgets_nobody(database: Database) -> None:
     assert (errors, count(database, "a")) == ([], 3)
 
 
-def test_ctrl_c_of_one_that_waits_is_its_own(
-    database: Database, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_of_one_that_waits_is_its_own(database, monkeypatch):
     """Also where it was to lead next."""
     group, found = Grouping(database), list[Any]()
     interrupted = _Waiting(noting("a", 2))
 
-    def wait() -> None:
+    def wait():
         group._hand_over()  # before it notices
         raise KeyboardInterrupt
 
@@ -180,13 +172,11 @@ def test_ctrl_c_of_one_that_waits_is_its_own(
     assert (found, count(database, "a"), group._led, group._waiting) == ([3], 1, False, [])
 
 
-def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(monkeypatch):
     entered, taken_by_now, leave = (threading.Event() for _ in range(3))
 
     class Interrupted(_Group[str]):
-        def _write_together(self, batch: list[_Waiting[str]]) -> None:
+        def _write_together(self, batch):
             entered.set()
             assert taken_by_now.wait(PATIENCE_S)
             self._take(batch)
@@ -195,15 +185,15 @@ def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(
             raise KeyboardInterrupt
 
     class Leaving(_Waiting[str]):
-        def __init__(self, work: str) -> None:
+        def __init__(self, work):
             super().__init__(work)
             monkeypatch.setattr(self.ready, "wait", self.leave)
 
-        def leave(self) -> None:
+        def leave(self):
             assert leave.wait(PATIENCE_S)
             raise KeyboardInterrupt
 
-    def run(name: str) -> None:
+    def run(name):
         with pytest.raises(KeyboardInterrupt):
             group._await(name)
 
