@@ -5,38 +5,28 @@ from __future__ import annotations
 import hashlib
 import shutil
 import sqlite3
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle.backup import take_backup
 from sceneprint.settings import Settings
-from sceneprint.types import DepthFrame
-from sceneprint_client.api import (
-    Answer,
-    FrameMeta,
-    GivenPose,
-    JobState,
-    NewMap,
-    Query,
-)
+from sceneprint_client.api import FrameMeta, GivenPose, JobState, NewMap, Query
 from tests.whole_engine import Engine
 
 SIGNED = 4
 
 
-def settings_of(folder: Path) -> Settings:
+def settings_of(folder):
     """Return settings of a data folder, independent of the environment; deletions are immediate."""
     return Settings(data_dir=folder, database_url=None, index_dir=None, undo_window_s=0)
 
 
 @pytest.fixture(scope="session")
-def settings() -> Callable[[Path], Settings]:
+def settings():
     return settings_of
 
 
@@ -49,11 +39,10 @@ class Upload:
 
 
 @pytest.fixture(scope="session")
-def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Upload]:
+def uploads(room_frames, small_image):
     """24 small frames with poses, from four offsets of each of six views."""
     found = []
     for frame in room_frames:
-        assert frame.pose is not None
         for place in range(4):
             data, camera = small_image(frame, *divmod(place, 2))
             pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
@@ -62,7 +51,7 @@ def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]
 
 
 @pytest.fixture(scope="session")
-def master(uploads: list[Upload], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def master(uploads, tmp_path_factory):
     """A read-only data folder with signed, deleted and waiting frames, a key and an orphan."""
     folder = tmp_path_factory.mktemp("master") / "data"
     with Engine(settings_of(folder)) as engine:
@@ -79,13 +68,13 @@ def master(uploads: list[Upload], tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.fixture
-def data(master: Path, tmp_path: Path) -> Path:
+def data(master, tmp_path):
     """A writable copy of `master`."""
     return Path(shutil.copytree(master, tmp_path / "data"))
 
 
 @pytest.fixture(scope="session")
-def place(master: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+def place(master, tmp_path_factory):
     """A read-only folder with a bundle of `master`."""
     folder = str(tmp_path_factory.mktemp("place") / "bundles")
     take_backup(settings_of(master), folder)
@@ -93,10 +82,10 @@ def place(master: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="session")
-def content() -> Callable[[Path], dict[str, str]]:
+def content():
     """A function that returns the SQL dump and the hashes of the blobs of a data folder."""
 
-    def of(folder: Path) -> dict[str, str]:
+    def of(folder):
         with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
             sql = "\n".join(sorted(database.iterdump()))
         blobs = [path for path in (folder / "blobs").rglob("*") if path.is_file()]
@@ -109,10 +98,10 @@ def content() -> Callable[[Path], dict[str, str]]:
 
 
 @pytest.fixture(scope="session")
-def rows() -> Callable[..., list[tuple[Any, ...]]]:
+def rows():
     """A function that queries a data folder's database."""
 
-    def ask(folder: Path, asked: str) -> list[tuple[Any, ...]]:
+    def ask(folder, asked):
         with closing(sqlite3.connect(folder / "sceneprint.db", timeout=PATIENCE_S)) as database:
             found = database.execute(asked).fetchall()
             database.commit()
@@ -122,10 +111,10 @@ def rows() -> Callable[..., list[tuple[Any, ...]]]:
 
 
 @pytest.fixture(scope="session")
-def answers() -> Callable[[Path, list[Upload]], list[Answer]]:
+def answers():
     """A function that returns the answers of the map `hall`, without parts that always differ."""
 
-    def of(folder: Path, asked: list[Upload]) -> list[Answer]:
+    def of(folder, asked):
         free = {"query_id": "", "milliseconds": {}}
         with Engine(settings_of(folder)) as engine:
             return [
@@ -139,13 +128,11 @@ def answers() -> Callable[[Path, list[Upload]], list[Answer]]:
 
 
 @pytest.fixture
-def sceneprint(
-    run_command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., Any]:
+def sceneprint(run_command, monkeypatch):
     """A function that runs a command in this process and checks its exit code."""
     monkeypatch.delenv("SCENEPRINT_DATABASE_URL", raising=False)
 
-    def run(*arguments: object, expect: int = 0) -> Any:
+    def run(*arguments, expect=0):
         said = run_command(*arguments, expect=expect)
         if expect == 2:
             assert said.stdout == ""

@@ -16,11 +16,9 @@ import tempfile
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import pytest
 from pydantic import SecretStr
@@ -44,19 +42,19 @@ from tests.whole_engine import Engine
 file_only = pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 
 
-def names_in(folder: Path) -> list[str]:
+def names_in(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def parts_in(folder: Path) -> dict[str, bytes]:
+def parts_in(folder):
     return {one.name: one.read_bytes() for one in folder.glob("parts/??/*")}
 
 
-def lines_of(data: bytes) -> list[Any]:
+def lines_of(data):
     return [json.loads(line) for line in zlib.decompress(data).split(b"\n")]
 
 
-def blobs_of(folder: str | Path) -> dict[str, int]:
+def blobs_of(folder):
     there = BundlePlace.open(str(folder))
     return {digest: size for digest, size, _ in listed_blobs(there, there.read())}
 
@@ -262,7 +260,6 @@ def test_the_commands(master, tmp_path, sceneprint, monkeypatch):
     found = re.fullmatch(
         rf"place: bundle (\S+), {held}, (\S+) MB of it new, in \S+ s\n", said.stdout
     )
-    assert found is not None
     assert float(found[2]) > 0
     assert said.stderr == ""
     assert ", 0.0 MB of it new," in sceneprint("snapshot", "--data", master, "--to", "place").stdout
@@ -326,7 +323,7 @@ def test_damaged_blobs_are_left_out_and_named(
 def test_what_cannot_be_taken(data, tmp_path, sceneprint, monkeypatch):
     folder = tmp_path / "place"
 
-    def refused(text: str, data: Path = data, to: object = folder) -> None:
+    def refused(text, data=data, to=folder):
         assert text in sceneprint("snapshot", "--data", data, "--to", to, expect=2).stderr
         assert not (folder / "bundles").exists() or names_in(folder / "bundles") == []
 
@@ -381,7 +378,7 @@ def test_a_row_that_is_none_is_named(data, tmp_path, settings):
 def test_a_place_is_one_stores_and_one_writers(master, data, tmp_path, settings):
     folder, inner = str(tmp_path / "place"), list[Exception]()
 
-    def come(_done: int, _total: int) -> None:
+    def come(_done, _total):
         try:
             take_backup(settings(data), folder)
         except BundleError as error:
@@ -430,7 +427,7 @@ def test_a_read_only_folder_can_be_taken(master):
 
 
 def test_interrupted_it_leaves_no_bundle(master, tmp_path, settings):
-    def stop(done: int, total: int) -> None:
+    def stop(done, total):
         if done > total // 2:
             raise KeyboardInterrupt
 
@@ -455,7 +452,7 @@ def test_progress_goes_from_nothing_to_all(kind, master, place, tmp_path, settin
 
 
 @pytest.fixture
-def longest_file() -> Iterator[Callable[[int], None]]:
+def longest_file():
     """Let no file of this process grow beyond a limit, as on a disk that becomes full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -485,7 +482,7 @@ def test_it_is_one_state(postgres_url, tmp_path):
     """What is committed while it is written is not in it, whatever table is next."""
     database, late = open_database(postgres_url), open_database(postgres_url)
 
-    def key(name: str) -> dict[str, object]:
+    def key(name):
         return {"id": name, "name": name, "digest": name, "grants": {}, "created_at": 0.0}
 
     fleet = Settings(
@@ -501,7 +498,7 @@ def test_it_is_one_state(postgres_url, tmp_path):
                 record_event(connection, "frame.received", "hall", frame)
         done: list[int] = []
 
-        def go_on(count: int, _total: int) -> None:
+        def go_on(count, _total):
             if not done:
                 with late.write() as connection:
                     connection.execute(insert(keys), [key("late")])
@@ -518,10 +515,10 @@ def test_it_is_one_state(postgres_url, tmp_path):
     ]  # fmt: skip
 
 
-def test_an_iterator_that_is_given_up_waits_for_no_thread() -> None:
+def test_an_iterator_that_is_given_up_waits_for_no_thread():
     go, finished = threading.Event(), list[int]()
 
-    def work(item: int) -> int:
+    def work(item):
         if item:
             go.wait(PATIENCE_S)
             finished.append(item)
@@ -529,6 +526,6 @@ def test_an_iterator_that_is_given_up_waits_for_no_thread() -> None:
 
     found = in_order(work, range(100))
     assert next(found) == 0
-    found.close()  # type: ignore[attr-defined]
+    found.close()
     assert finished == []
     go.set()

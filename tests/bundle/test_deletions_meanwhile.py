@@ -19,7 +19,7 @@ def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
         before = set(engine.store.blobs.digests())
         frames = [one.frame_id for one in engine.list_frames("hall").items]
 
-        def delete(_done: int, _total: int) -> None:
+        def delete(_done, _total):
             while frames:
                 engine.delete_frame("hall", frames.pop())
 
@@ -53,7 +53,7 @@ def test_a_sweep_under_way_is_waited_for(data, tmp_path, settings):
     with Engine(settings(data)) as engine:
         (frame, *_) = [one.frame_id for one in engine.list_frames("hall").items]
 
-        def take() -> None:
+        def take():
             taken.append(take_backup(settings(data), str(tmp_path / "place")))
 
         thread = threading.Thread(target=take)

@@ -52,8 +52,6 @@ def test_killed_at_any_moment(kind, master, place, tmp_path, content, settings):
         [sys.executable, "-c", NURSERY, kind, source, str(tmp_path)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
     ) as nursery:  # fmt: skip
-        assert nursery.stdin is not None
-        assert nursery.stdout is not None
         for life in range(KILLS):
             nursery.stdin.write("born\n")
             assert int(nursery.stdout.readline()) > 0

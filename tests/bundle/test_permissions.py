@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 
@@ -18,13 +16,13 @@ from tests.whole_engine import Engine
 
 
 @pytest.fixture
-def no_umask() -> Iterator[None]:
+def no_umask():
     before = os.umask(0)
     yield
     os.umask(before)
 
 
-def public_paths(folder: Path) -> set[str]:
+def public_paths(folder):
     """What in a folder anybody but its owner may read, write or enter; its own name is `.`."""
     found = set[str]()
     for one in (folder, *folder.rglob("*")):

@@ -38,11 +38,11 @@ file_only = pytest.mark.sqlite_only("looks at the database as a file of the data
 own_servers = pytest.mark.sqlite_only("these have servers of their own")
 
 
-def fleet_of(folder: Path, url: str, **other: object) -> Settings:
+def fleet_of(folder, url, **other):
     return Settings(data_dir=folder, database_url=SecretStr(url), index_dir=None, **other)
 
 
-def answers_of(settings: Settings, asked: list) -> list:
+def answers_of(settings, asked):
     """What the map `hall` answers, but for what no two answers share."""
     free = {"query_id": "", "milliseconds": {}}
     with Engine(settings) as engine:
@@ -50,19 +50,19 @@ def answers_of(settings: Settings, asked: list) -> list:
         return [one.model_copy(update=free) for one in found]
 
 
-def ask(url: str, asked: str) -> list[tuple]:
+def ask(url, asked):
     with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
         return connection.execute(asked).fetchall()
 
 
-def rows_in(url: str) -> int:
+def rows_in(url):
     """Rows that are not there of themselves."""
     own = ("secrets", "samples", "schema_range", "scrubs")
     names = [one.name for one in metadata.sorted_tables if one.name not in own]
     return sum(ask(url, f"SELECT count(*) FROM {name}")[0][0] for name in names)
 
 
-def changed(folder: Path, *statements: str) -> None:
+def changed(folder, *statements):
     """Change a data folder's database past all that would refuse it."""
     with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
         for one in statements:
@@ -104,21 +104,18 @@ def test_what_is_restored_is_what_was_there(
     [((), None, True), (("--keys", "revoke"), None, False), ((), "y", True), ((), "", False)],
 )
 def test_keys_of_a_bundle_are_listed_and_kept_or_revoked(
-    place, tmp_path, settings, options, typed, kept
+    place, tmp_path, settings, sceneprint, monkeypatch, options, typed, kept
 ):
     new = tmp_path / "new"
-    command = [sys.executable, "-m", "sceneprint", "restore", place, "--data", str(new), *options]
     terminal, stdin = pty.openpty()
-    with os.fdopen(terminal, "wb", buffering=0) as keyboard, os.fdopen(stdin, "rb") as read:
+    with os.fdopen(terminal, "wb", buffering=0) as keyboard, os.fdopen(stdin) as read:
         if typed is not None:
             keyboard.write(f"{typed}\n".encode())
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL if typed is None else read, capture_output=True,
-            text=True, timeout=PATIENCE_S,
-        )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
-    assert ("Keep these keys?" in done.stdout) == (typed is not None)
-    assert ": robot." in done.stdout.splitlines()[-1]
+            monkeypatch.setattr(sys, "stdin", read)
+        said = sceneprint("restore", place, "--data", new, *options)
+    assert said.stderr == ""
+    assert ("Keep these keys?" in said.stdout) == (typed is not None)
+    assert ": robot." in said.stdout.splitlines()[-1]
     with Engine(settings(new)) as engine:
         assert [key.name for key in list_keys(engine.store).items] == ["robot"] * kept
     with closing(sqlite3.connect(new / "sceneprint.db")) as database:
@@ -176,7 +173,7 @@ def test_an_empty_folder_is_filled_and_stays_the_same_one(place, tmp_path, conte
 def test_somebody_else_is_faster(place, tmp_path, name):
     folder = tmp_path / "new"
 
-    def come(done: int, total: int) -> None:
+    def come(done, total):
         if done > total // 2:
             (folder / name).write_bytes(b"somebody else's")
 
@@ -220,7 +217,7 @@ def test_a_restore_killed_between_two_names_goes_on(place, tmp_path, content):
 def test_two_at_once(place, tmp_path):
     inner: list[Exception] = []
 
-    def come(_done: int, _total: int) -> None:
+    def come(_done, _total):
         try:
             restore_to_folder(place, tmp_path / "new")
         except BundleError as error:

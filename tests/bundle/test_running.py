@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -31,11 +30,11 @@ class Robot(threading.Thread):
     deleting: dict[str, float] = field(default_factory=dict)
     failed: list[Exception] = field(default_factory=list)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         super().__init__(daemon=True)
         self.over = threading.Event()
 
-    def run(self) -> None:
+    def run(self):
         import httpx
 
         try:
@@ -45,7 +44,7 @@ class Robot(threading.Thread):
         except Exception as error:
             self.failed.append(error)
 
-    def round(self, client) -> None:
+    def round(self, client):
         for each in self.uploads:
             if self.over.is_set():
                 return
@@ -64,7 +63,7 @@ class Robot(threading.Thread):
 
 
 @contextmanager
-def at_work(url: str, uploads: list) -> Iterator[list[Robot]]:
+def at_work(url, uploads):
     robots = [Robot(url, uploads[i::2]) for i in range(2)]
     for robot in robots:
         robot.start()

@@ -24,7 +24,6 @@ from sceneprint.geometry.retrieval.ranking import (
     pairwise_distances,
 )
 from sceneprint.geometry.validation.validation import ValidationParameters
-from sceneprint.index.index_version import SearchHits
 from sceneprint.pipeline import retrieve, validate
 from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import frames

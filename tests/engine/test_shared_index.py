@@ -21,7 +21,7 @@ from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
 from sceneprint.index.index_manifest import manifests
-from sceneprint.index.index_version import IndexVersion, clear, newest, publish
+from sceneprint.index.index_version import clear, newest, publish
 from sceneprint.settings import Settings
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.events import anchor_of_now

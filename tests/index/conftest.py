@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
-from sceneprint.index.index_version import IndexVersion, publish
-from sceneprint.index.part_files import Keys
-from sceneprint.types import Bytes
-
-Walk = Callable[..., Bytes]
-Publish = Callable[..., IndexVersion]
+from sceneprint.index.index_version import publish
 
 
 @pytest.fixture(scope="session")
-def walk() -> Walk:
+def walk():
     """A function that returns signatures (n, length) of a camera on smooth walks, without clusters.
 
     Sixteen slow sinusoids of random periods are the position of the camera. A fixed nonlinear map
     of low rank converts them to bytes, each with its own noise.
     """
 
-    def make(n: int, length: int = 256, seed: int = 0, walks: int = 1) -> Bytes:
+    def make(n, length=256, seed=0, walks=1):
         place = np.random.default_rng(99)
         mix, fold = place.normal(size=(16, 48)), place.normal(size=(48, length))
         rng = np.random.default_rng(seed)
@@ -36,25 +27,24 @@ def walk() -> Walk:
             parts.append(np.abs(np.tanh(np.sin(angles) @ mix / 2) @ fold) * 9)
         smooth = np.concatenate(parts)
         noisy = smooth + rng.normal(size=smooth.shape) * 4 + 12
-        found: Bytes = np.clip(noisy, 0, 255).astype(np.uint8)
-        return found
+        return np.clip(noisy, 0, 255).astype(np.uint8)
 
     return make
 
 
 @pytest.fixture
-def published(tmp_path: Path) -> Publish:
+def published(tmp_path):
     """A function that publishes keys and signatures as the next version of a folder."""
 
     def run(
-        keys: Keys,
-        signatures: Bytes,
-        previous: IndexVersion | None = None,
-        folder: Path = tmp_path / "map",
-        revision: int = 0,
-        drop: frozenset[int] = frozenset(),
-        **more: Any,
-    ) -> IndexVersion:
+        keys,
+        signatures,
+        previous=None,
+        folder=tmp_path / "map",
+        revision=0,
+        drop=frozenset(),
+        **more,
+    ):
         version = publish(
             folder,
             model_id="model",
@@ -71,10 +61,10 @@ def published(tmp_path: Path) -> Publish:
 
 
 @pytest.fixture(scope="session")
-def nearest() -> Callable[..., tuple[list[int], list[int]]]:
+def nearest():
     """A function that returns the nearest keys and distances by sorting all sums."""
 
-    def find(query: Bytes, frames: dict[int, Bytes], size: int) -> tuple[list[int], list[int]]:
+    def find(query, frames, size):
         asked = query.astype(np.int64)
         found = sorted(
             (int(((x.astype(np.int64) - asked) ** 2).sum()), k) for k, x in frames.items()

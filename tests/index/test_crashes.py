@@ -7,8 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +20,6 @@ from sceneprint.index.index_version import (
     search,
     signatures_of,
 )
-from sceneprint.types import Bytes
 
 LENGTH, STEP = 512, 25
 
@@ -58,18 +55,18 @@ for line in sys.stdin:
 """
 
 
-def deadline(process: subprocess.Popen[str], seconds: float = 120) -> threading.Timer:
+def deadline(process, seconds=120):
     """Kill a process that has not done in that time, so that nobody waits for it any more."""
     timer = threading.Timer(seconds, process.kill)
     timer.start()
     return timer
 
 
-def signatures_at(keys: np.ndarray) -> Bytes:
+def signatures_at(keys):
     return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
 
 
-def is_whole(version: IndexVersion) -> bool:
+def is_whole(version):
     """Whether a version holds the first `revision` frames, and nothing else."""
     n = version.revision
     np.testing.assert_array_equal(version.keys, np.arange(n))
@@ -80,14 +77,12 @@ def is_whole(version: IndexVersion) -> bool:
     return True
 
 
-def test_a_builder_killed_at_any_moment(tmp_path: Path) -> None:
+def test_a_builder_killed_at_any_moment(tmp_path):
     delays, revision, unfinished = random.Random(4), 0, 0
     with subprocess.Popen(
         [sys.executable, "-c", NURSERY, str(tmp_path)],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1,
     ) as nursery:  # fmt: skip
-        assert nursery.stdin is not None
-        assert nursery.stdout is not None
         timer = deadline(nursery)
         for _ in range(12):
             nursery.stdin.write("born\n")
@@ -101,7 +96,6 @@ def test_a_builder_killed_at_any_moment(tmp_path: Path) -> None:
             nursery.stdin.write("die\n")
             assert nursery.stdout.readline() == "dead\n"
             found = newest(tmp_path, "model", LENGTH)
-            assert found is not None
             assert found.revision > revision
             assert is_whole(found)
             revision = found.revision
@@ -119,9 +113,7 @@ def test_a_builder_killed_at_any_moment(tmp_path: Path) -> None:
     assert not list(tmp_path.glob(".*.part"))
 
 
-def test_readers_go_on_while_versions_pass(
-    walk: Callable[..., Bytes], published: Callable[..., IndexVersion], tmp_path: Path
-) -> None:
+def test_readers_go_on_while_versions_pass(walk, published, tmp_path):
     """Threads search an old version while its files are removed, others follow the newest."""
     folder, signatures = tmp_path / "map", walk(1200, LENGTH)
     first = published(np.arange(300), signatures[:300], revision=300)
@@ -131,7 +123,7 @@ def test_readers_go_on_while_versions_pass(
     expected = [search(q, first, tail, 20, metric="l2") for q in queries]
     counts = [0, 0]
 
-    def search_old() -> None:
+    def search_old():
         while not done.is_set():
             for query, right in zip(queries, expected, strict=True):
                 hits = search(query, first, tail, 20, metric="l2")
@@ -139,7 +131,7 @@ def test_readers_go_on_while_versions_pass(
                     errors.append("an old version has changed")
             counts[0] += 1
 
-    def follow() -> None:
+    def follow():
         known: IndexVersion | None = None
         while not done.is_set():
             found = newest(folder, "model", LENGTH, known=known)
@@ -153,8 +145,8 @@ def test_readers_go_on_while_versions_pass(
                 errors.append(f"version {known.number} has {len(known)} of {n}")
             counts[1] += 1
 
-    def guarded(work: Callable[[], None]) -> Callable[[], None]:
-        def run() -> None:
+    def guarded(work):
+        def run():
             try:
                 work()
             except Exception as error:  # what a thread raises would be lost

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,27 +10,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.index.index_version import (
-    IndexVersion,
-    SearchHits,
     Tail,
     publish,
     search,
     signatures_of,
 )
-from sceneprint.types import Bytes
 
-Walk = Callable[..., Bytes]
-Publish = Callable[..., IndexVersion]
-Nearest = Callable[..., tuple[list[int], list[int]]]
 LENGTH = 256
 search_l2 = partial(search, metric="l2")
 
 
-def answer(hits: SearchHits) -> tuple[list[int], list[int]]:
+def answer(hits):
     return hits.keys.tolist(), hits.distances.tolist()
 
 
-def frames_of(keys: np.ndarray, signatures: Bytes) -> dict[int, Bytes]:
+def frames_of(keys, signatures):
     return dict(zip(keys.tolist(), signatures, strict=True))
 
 
@@ -44,7 +36,7 @@ def frames_of(keys: np.ndarray, signatures: Bytes) -> dict[int, Bytes]:
     dead=st.sets(st.integers(0, 12)),
     metric=st.sampled_from(["l1", "l2"]),
 )
-def test_a_tail_alone(n: int, size: int, seed: int, dead: set[int], metric: Any) -> None:
+def test_a_tail_alone(n, size, seed, dead, metric):
     rng = np.random.default_rng(seed)
     keys, signatures = rng.permutation(n).astype(np.int64), rng.integers(0, 4, (n, 3), np.uint8)
     query = rng.integers(0, 4, 3, np.uint8)
@@ -67,9 +59,8 @@ def test_a_tail_alone(n: int, size: int, seed: int, dead: set[int], metric: Any)
     share=st.sampled_from([0.3, 0.8, 1.0]),
 )
 def test_of_equal_frames_the_smaller_keys_are_found(
-    tmp_path_factory: pytest.TempPathFactory, nearest: Nearest,
-    kinds: int, n: int, length: int, seed: int, share: float,
-) -> None:  # fmt: skip
+    tmp_path_factory, nearest, kinds, n, length, seed, share
+):
     """Duplicates by the dozen, so that the cut lies among equal distances."""
     rng = np.random.default_rng(seed)
     signatures = rng.integers(0, 256, (kinds, length), np.uint8)[rng.integers(0, kinds, n)]
@@ -87,7 +78,7 @@ def test_of_equal_frames_the_smaller_keys_are_found(
         assert answer(hits) == nearest(query, frames, size)
 
 
-def test_distances_that_floats_cannot_hold_are_exact(published: Publish, nearest: Nearest) -> None:
+def test_distances_that_floats_cannot_hold_are_exact(published, nearest):
     """Above 2^24 FAISS rounds: neighbours that differ by one would be equal."""
     signatures = np.full((40, 512), 255, np.uint8)
     for i in range(40):
@@ -100,7 +91,7 @@ def test_distances_that_floats_cannot_hold_are_exact(published: Publish, nearest
         assert answer(hits) == nearest(query, frames_of(keys, signatures), size)
 
 
-def test_an_empty_map(published: Publish, walk: Walk) -> None:
+def test_an_empty_map(published, walk):
     query = walk(1)[0]
     for version in (None, published(np.arange(0), walk(0), published(np.arange(3), walk(3)),
                                        drop=frozenset({0, 1, 2}))):  # fmt: skip
@@ -109,7 +100,7 @@ def test_an_empty_map(published: Publish, walk: Walk) -> None:
         assert (hits.exact, hits.compared) == (True, 0)
 
 
-def test_signatures_of_hits(published: Publish, walk: Walk) -> None:
+def test_signatures_of_hits(published, walk):
     signatures = walk(60)
     version = published(
         np.arange(20, 50), signatures[20:50], published(np.arange(20), signatures[:20])
@@ -126,7 +117,7 @@ def test_signatures_of_hits(published: Publish, walk: Walk) -> None:
             signatures_of(np.array([3, 50, 51]), where, tail)
 
 
-def test_mistakes_are_refused(published: Publish, walk: Walk) -> None:
+def test_mistakes_are_refused(published, walk):
     signatures = walk(10)
     version, empty = published(np.arange(10), signatures), Tail.empty(LENGTH)
     query = signatures[0]

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,34 +28,31 @@ from sceneprint.index.segment import (
 )
 from sceneprint.types import Bytes
 
-Walk = Callable[..., Bytes]
-Publish = Callable[..., IndexVersion]
-Nearest = Callable[..., tuple[list[int], list[int]]]
 LENGTH = 24
 NONE = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
 
 
-def bits(n: int, seed: int) -> Bytes:
+def bits(n, seed):
     """Signatures of 0 and 1 alone, so that many distances are equal."""
     return np.random.default_rng(seed).integers(0, 2, (n, LENGTH), np.uint8)
 
 
-def sizes(version: IndexVersion) -> list[int]:
+def sizes(version):
     return [len(one) for one in version.segments]
 
 
-def names(version: IndexVersion) -> set[str]:
+def names(version):
     return {name for name, _ in version.manifest.files}
 
 
-def written(before: IndexVersion | None, after: IndexVersion) -> int:
+def written(before, after):
     """Bytes of the files that a version has and the one before has not."""
     known = set() if before is None else names(before)
     return sum(size for name, size in after.manifest.files if name not in known)
 
 
 @given(st.lists(st.integers(1, 100_000), min_size=1, max_size=40))
-def test_each_segment_is_thrice_as_large_as_the_next(given_sizes: list[int]) -> None:
+def test_each_segment_is_thrice_as_large_as_the_next(given_sizes):
     groups = merge_plan(given_sizes)
     assert sorted(at for group in groups for at in group) == list(range(len(given_sizes)))
     totals = [sum(given_sizes[at] for at in group) for group in groups]
@@ -67,7 +61,7 @@ def test_each_segment_is_thrice_as_large_as_the_next(given_sizes: list[int]) -> 
     assert all(b >= RATIO * a for a, b in zip(totals[first:], totals[first + 1 :], strict=False))
 
 
-def test_merges_by_hand() -> None:
+def test_merges_by_hand():
     assert merge_plan([100, 10]) == [[1], [0]]
     assert merge_plan([99, 33]) == [[1], [0]]
     assert merge_plan([98, 33]) == [[1, 0]]
@@ -76,7 +70,7 @@ def test_merges_by_hand() -> None:
 
 
 @pytest.mark.parametrize("step", [1, 16])
-def test_all_writing_together_is_in_n_log_n(walk: Walk, published: Publish, step: int) -> None:
+def test_all_writing_together_is_in_n_log_n(walk, published, step):
     """From nothing to n in equal steps: each frame is written once, and at each merge again."""
     n, length = 128 * step, 64
     signatures, made, total, most = walk(n, length), None, 0, 0
@@ -93,7 +87,7 @@ def test_all_writing_together_is_in_n_log_n(walk: Walk, published: Publish, step
     assert most == 4
 
 
-def test_an_append_of_a_sixteenth_writes_a_sixteenth(walk: Walk, published: Publish) -> None:
+def test_an_append_of_a_sixteenth_writes_a_sixteenth(walk, published):
     signatures = walk(3400, 64)
     first = published(np.arange(3200), signatures[:3200])
     second = published(np.arange(3200, 3400), signatures[3200:], first, drop=frozenset([7, 9]))
@@ -104,13 +98,12 @@ def test_an_append_of_a_sixteenth_writes_a_sixteenth(walk: Walk, published: Publ
     assert second.segments[0].vectors.shape == (3200, 64)
 
 
-def test_what_is_open_stays_open(walk: Walk, published: Publish, tmp_path: Path) -> None:
+def test_what_is_open_stays_open(walk, published, tmp_path):
     """A reader that follows maps only what is new."""
     signatures = walk(130)
     first = published(np.arange(100), signatures[:100])
     second = published(np.arange(100, 110), signatures[100:110], first)
     found = newest(tmp_path / "map", "model", 256, known=first)
-    assert found is not None
     assert [one is first.segments[0] for one in found.segments] == [True, False]
     assert second.segments[0] is first.segments[0]
     third = published(*([part[:0] for part in (np.arange(0), signatures)]), second,
@@ -122,9 +115,7 @@ def test_what_is_open_stays_open(walk: Walk, published: Publish, tmp_path: Path)
 
 @settings(max_examples=80)
 @given(data=st.data(), flat=st.sampled_from([0, 1 << 30]), seed=st.integers(0, 999))
-def test_any_history_is_searched_as_one_map(
-    tmp_path_factory: pytest.TempPathFactory, nearest: Nearest, data: Any, flat: int, seed: int
-) -> None:
+def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, flat, seed):
     """New, signed anew, deleted and indexed again, in any order, against a dict of all frames."""
     folder, rng = tmp_path_factory.mktemp("map"), np.random.default_rng(seed)
     frames: dict[int, Bytes] = {}
@@ -139,7 +130,6 @@ def test_any_history_is_searched_as_one_map(
             folder, model_id="model", revision=step, blocks=[(keys, own)], previous=made,
             drop=frozenset(drop), clean=clean, flat_bytes=flat,
         )  # fmt: skip
-        assert made is not None
         frames |= dict(zip(keys.tolist(), own, strict=True))
         frames = {key: row for key, row in frames.items() if key not in drop}
         assert not (clean and made.manifest.worn_keys)
@@ -177,7 +167,7 @@ def test_any_history_is_searched_as_one_map(
         )
 
 
-def test_a_segment_of_which_too_much_is_gone_is_written_again(published: Publish) -> None:
+def test_a_segment_of_which_too_much_is_gone_is_written_again(published):
     rows = bits(500, 2)
     made = published(np.arange(400), rows[:400])
     made = published(np.arange(400, 440), rows[400:440], made)
@@ -191,9 +181,7 @@ def test_a_segment_of_which_too_much_is_gone_is_written_again(published: Publish
     assert [len(one.keys) for one in made.segments] == [299]
 
 
-def test_cleaning_writes_only_segments_that_something_is_gone_of(
-    walk: Walk, published: Publish, tmp_path: Path
-) -> None:
+def test_cleaning_writes_only_segments_that_something_is_gone_of(walk, published, tmp_path):
     signatures = walk(207, LENGTH)
     made = published(np.arange(150), signatures[:150])
     for start, end in ((150, 190), (190, 203), (203, 207)):
@@ -213,9 +201,7 @@ def test_cleaning_writes_only_segments_that_something_is_gone_of(
     assert clean.manifest.worn_keys == ()
 
 
-def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(
-    walk: Walk, published: Publish, tmp_path: Path
-) -> None:
+def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(walk, published, tmp_path):
     length = 64
     signatures = walk(3000, length, walks=20)
     flat = 2500 * length
@@ -232,7 +218,6 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(
         assert one.record.file("faiss") == before.record.file("faiss")
         assert one.record.recall.frames == len(one)
     opened = newest(tmp_path / "map", "model", length)
-    assert opened is not None
     each = [one.sketches.probes for one in opened.segments if one.sketches is not None]
     recall = opened.manifest.recall
     assert recall.probes == sum(each)
@@ -247,7 +232,7 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(
     assert less.manifest.recall.probes == 0
 
 
-def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_path: Path) -> None:
+def test_segments_find_as_much_as_one_file(walk, published, tmp_path):
     """Recall of the ten nearest, of frames of the map and of queries from elsewhere."""
     length, n = 64, 5916
     signatures = walk(n, length, walks=40)
@@ -256,7 +241,6 @@ def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_p
     for start, end in ((0, 4000), (4000, 5300), (5300, 5730), (5730, 5870), (5870, n)):
         keys = order[start:end]
         made = published(keys, signatures[keys], made, flat_bytes=0)
-    assert made is not None
     assert len(made.segments) == 5
     noise = np.random.default_rng(7).normal(0, 6, (80, length))
     queries = np.clip(signatures[40::70][:80] + noise, 0, 255).astype(np.uint8)
@@ -271,7 +255,7 @@ def test_segments_find_as_much_as_one_file(walk: Walk, published: Publish, tmp_p
 
 
 @pytest.fixture
-def worn(walk: Walk, published: Publish, tmp_path: Path) -> tuple[Path, Path]:
+def worn(walk, published, tmp_path):
     """Two versions of one segment, of which a frame is gone in the second; and what says so."""
     signatures = walk(40, LENGTH)
     first = published(np.arange(40), signatures)
@@ -281,30 +265,25 @@ def worn(walk: Walk, published: Publish, tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path / "map", path
 
 
-def test_a_list_of_what_is_gone_that_is_damaged_is_passed_over(worn: tuple[Path, Path]) -> None:
+def test_a_list_of_what_is_gone_that_is_damaged_is_passed_over(worn):
     folder, path = worn
     found = newest(folder, "model", LENGTH)
-    assert found is not None
     assert (found.number, len(found)) == (2, 39)
     for data in (b"", bytes(7), bytes(8), path.read_bytes() + bytes(8), None):
         path.unlink()
         if data is not None:
             path.write_bytes(data)
         found = newest(folder, "model", LENGTH)
-        assert found is not None
         assert (found.number, len(found)) == (1, 40)  # readers know of the deletion themselves
 
 
 @pytest.mark.parametrize(
     ("gone", "why"), [([7, 40], "not in the segment"), ([9, 7], "not in ascending order")]
 )
-def test_a_list_of_other_frames_is_refused(
-    worn: tuple[Path, Path], gone: list[int], why: str
-) -> None:
+def test_a_list_of_other_frames_is_refused(worn, gone, why):
     """Sound bytes, of somebody's own making."""
     folder, _ = worn
     found = newest(folder, "model", LENGTH)
-    assert found is not None
     data = np.array(gone, "<i8").tobytes()
     name = f"{hashlib.sha256(data).hexdigest()}.gone"
     (folder / name).write_bytes(data)

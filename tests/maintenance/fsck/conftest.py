@@ -5,22 +5,17 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import zlib
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.maintenance.fsck.check import fsck
-from sceneprint.maintenance.fsck.findings import Finding
-from sceneprint.models import Model, open_table, write_model
+from sceneprint.models import open_table, write_model
 from sceneprint.settings import Settings
 from sceneprint.store.maps import add_map, store_model
-from sceneprint.types import DepthFrame
 from sceneprint_client.api import FrameMeta, GivenPose, JobState, Query
 from tests.whole_engine import Engine
 
@@ -39,7 +34,7 @@ class Upload:
 class House:
     """A data folder with its cache folder, and actions on them."""
 
-    def __init__(self, place: Path) -> None:
+    def __init__(self, place):
         self.place, self.data = place, place / "data"
         self.settings = Settings(
             data_dir=self.data, cache_dir=place / "cache", database_url=None, index_dir=None,
@@ -47,13 +42,13 @@ class House:
         )  # fmt: skip
 
     @property
-    def is_sqlite(self) -> bool:
+    def is_sqlite(self):
         return make_url(self.settings.database).get_backend_name() == "sqlite"
 
-    def look(self, **how: Any) -> list[Finding]:
+    def look(self, **how):
         return list(fsck(self.settings, **how))
 
-    def files(self) -> dict[str, int | None]:
+    def files(self):
         """Return the checksum of every file, and the names of folders."""
         return {
             str(path.relative_to(self.place)): (
@@ -62,7 +57,7 @@ class House:
             for path in self.place.rglob("*")
         }
 
-    def sql(self, asked: str, *values: object) -> list[tuple[Any, ...]]:
+    def sql(self, asked, *values):
         """Query or change the database without its checks, and without a log."""
         if self.is_sqlite:
             with closing(sqlite3.connect(self.data / "sceneprint.db")) as database:
@@ -75,10 +70,10 @@ class House:
             result = connection.exec_driver_sql(asked.replace("?", "%s"), values)
             return [tuple(row) for row in result] if result.returns_rows else []
 
-    def blob(self, digest: str) -> Path:
+    def blob(self, digest):
         return self.data / "blobs" / digest[:2] / digest
 
-    def index_files(self, kind: str) -> list[Path]:
+    def index_files(self, kind):
         """Return files of a kind of the newest version of `hall`, or its manifest."""
         manifest = max((self.data / "index").glob("hall*/*.json"))
         if kind == "json":
@@ -86,7 +81,7 @@ class House:
         named = manifest.read_text()
         return [path for path in manifest.parent.glob(f"*.{kind}") if path.name in named]
 
-    def damage(self, path: Path, condition: str = "damaged", at: int = 7, bit: int = 0) -> bytes:
+    def damage(self, path, condition="damaged", at=7, bit=0):
         """Flip a bit of a file or remove it; return the remaining bytes."""
         data = bytearray(path.read_bytes())
         data[at] ^= 1 << bit
@@ -95,10 +90,10 @@ class House:
             path.write_bytes(data)
         return bytes(data)
 
-    def quarantined(self) -> list[bytes]:
+    def quarantined(self):
         return [path.read_bytes() for path in self.data.glob("quarantine/*")]
 
-    def work(self) -> list[JobState | None]:
+    def work(self):
         """Run all jobs, and publish due indexes."""
         with Engine(self.settings) as engine:
             states = []
@@ -107,7 +102,7 @@ class House:
             engine.publish_due()
         return states
 
-    def answers(self, uploads: list[Upload], without: str = "") -> list[Any]:
+    def answers(self, uploads, without=""):
         """Return the answers of `hall` without a frame and without parts that always differ."""
         found = []
         with Engine(self.settings) as engine:
@@ -121,11 +116,10 @@ class House:
 
 
 @pytest.fixture(scope="session")
-def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]) -> list[Upload]:
+def uploads(room_frames, small_image):
     """24 small frames with poses, from four offsets of each of six views."""
     found = []
     for number, frame in enumerate(room_frames):
-        assert frame.pose is not None
         for place in range(4):
             data, camera = small_image(frame, *divmod(place, 2))
             pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
@@ -136,9 +130,7 @@ def uploads(room_frames: tuple[DepthFrame, ...], small_image: Callable[..., Any]
 
 
 @pytest.fixture(scope="session")
-def master(
-    uploads: list[Upload], small_whitened: Model, tmp_path_factory: pytest.TempPathFactory
-) -> House:
+def master(uploads, small_whitened, tmp_path_factory):
     """A read-only store: `hall` with two versions of its index, and `attic`.
 
     `attic` has a signed frame, a deleted one and a waiting one.
@@ -151,7 +143,7 @@ def master(
             for name in ("hall", "attic"):
                 add_map(connection, name, None, small_whitened.id)
 
-        def add(name: str, some: list[Upload]) -> None:
+        def add(name, some):
             for each in some:
                 engine.add_frame(name, each.data, each.meta)
 
@@ -170,10 +162,10 @@ def master(
 
 
 @pytest.fixture(scope="session")
-def copied(master: House) -> Callable[[Path], House]:
+def copied(master):
     """A function that returns a writable copy of `master`."""
 
-    def copy(place: Path) -> House:
+    def copy(place):
         shutil.copytree(master.place, place)
         return House(place)
 
@@ -181,11 +173,11 @@ def copied(master: House) -> Callable[[Path], House]:
 
 
 @pytest.fixture
-def house(copied: Callable[[Path], House], tmp_path: Path) -> House:
+def house(copied, tmp_path):
     return copied(tmp_path / "house")
 
 
 @pytest.fixture(scope="session")
-def truth(master: House, copied: Any, uploads: Any, tmp_path_factory: Any) -> list[Any]:
+def truth(master, copied, uploads, tmp_path_factory):
     """The answers of the undamaged `hall`."""
     return copied(tmp_path_factory.mktemp("truth") / "house").answers(uploads[:HALL])

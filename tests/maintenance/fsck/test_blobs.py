@@ -5,14 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sceneprint.maintenance.fsck.check import check_frames
-from sceneprint.maintenance.fsck.findings import GONE, Finding, Folder
+from sceneprint.maintenance.fsck.findings import GONE, Folder
 from sceneprint.store.maps import find_map
 from sceneprint.store.queue import JobFile, add_files, files_of, find_job
 from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
@@ -23,21 +20,21 @@ FIRST = "SELECT f.id, f.blob, geometry FROM frames f JOIN signatures ON frame_nu
 WAITING = "SELECT id, blob, state, reason FROM frames WHERE state IN ('received', 'failed')"
 
 
-def age(path: Path, seconds: float) -> None:
+def age(path, seconds):
     then = time.time() - seconds
     os.utime(path, (then, then))
 
 
-def only(found: list[Finding]) -> Finding:
+def only(found):
     (one,) = found
     return one
 
 
 @pytest.fixture
-def lost(house: Any) -> Callable[[str], tuple[Path, str]]:
+def lost(house):
     """Returns the file of a blob of a kind, and what fsck calls it."""
 
-    def place(kind: str) -> tuple[Path, str]:
+    def place(kind):
         if kind in ("upload", "artifact"):
             frame_id, upload, artifact = house.sql(f"{FIRST} ORDER BY number")[0]
             blob = upload if kind == "upload" else artifact
@@ -71,9 +68,7 @@ REPAIRS = {
 
 @pytest.mark.parametrize("condition", ["damaged", "missing"])
 @pytest.mark.parametrize("kind", REPAIRS)
-def test_a_lost_blob_is_named_and_repaired(
-    house: Any, lost: Callable[[str], tuple[Path, str]], kind: str, condition: str
-) -> None:
+def test_a_lost_blob_is_named_and_repaired(house, lost, kind, condition):
     path, what = lost(kind)
     assert house.look() == []
     damaged = house.damage(path, condition, at=3)
@@ -97,14 +92,13 @@ def test_a_lost_blob_is_named_and_repaired(
             assert list(files_of(connection, job.number)) == ["picture.png"]
         if kind == "tile":
             row = find_map(connection, "hall")
-            tile = only(tiles_to_rebuild(connection, row.number, 10))  # type: ignore[arg-type]
-            assert (tile.blob, tile.rebuilt_to) == (None, 0)  # type: ignore[attr-defined]
+            tile = only(tiles_to_rebuild(connection, row.number, 10))
+            assert (tile.blob, tile.rebuilt_to) == (None, 0)
             surface = find_surface(connection, row.number)
-            assert surface is not None
             assert surface.edits < surface.pose_edits  # so that workers look at it
 
 
-def test_a_repair_looks_again_before_it_writes(house: Any, lost: Any) -> None:
+def test_a_repair_looks_again_before_it_writes(house, lost):
     """Of a frame that was healed, and of one that was deleted, since they were looked at."""
     path, _ = lost("upload")
     path.rename(house.place / "away")
@@ -123,9 +117,7 @@ def test_a_repair_looks_again_before_it_writes(house: Any, lost: Any) -> None:
     assert house.quarantined() == []
 
 
-def test_a_lost_artifact_is_made_again_and_nobody_has_to_learn_of_it(
-    house: Any, lost: Any, truth: Any, uploads: Any
-) -> None:
+def test_a_lost_artifact_is_made_again_and_nobody_has_to_learn_of_it(house, lost, truth, uploads):
     path, _ = lost("artifact")
     sound = path.read_bytes()
     house.damage(path)
@@ -139,7 +131,7 @@ def test_a_lost_artifact_is_made_again_and_nobody_has_to_learn_of_it(
 
 
 @pytest.mark.parametrize("state", ["indexed", "received"])
-def test_a_lost_upload_may_come_again(house: Any, state: str, truth: Any, uploads: Any) -> None:
+def test_a_lost_upload_may_come_again(house, state, truth, uploads):
     rows = house.sql(f"{FIRST} ORDER BY number" if state == "indexed" else WAITING)
     name, (frame_id, blob) = "hall" if state == "indexed" else "attic", rows[0][:2]
     sound = house.blob(blob).read_bytes()
@@ -162,7 +154,7 @@ def test_a_lost_upload_may_come_again(house: Any, state: str, truth: Any, upload
 
 
 @pytest.mark.parametrize("state", ["indexed", "received"])
-def test_an_upload_that_is_found_again_clears_the_reason(house: Any, state: str) -> None:
+def test_an_upload_that_is_found_again_clears_the_reason(house, state):
     frame_id, blob = house.sql(FIRST if state == "indexed" else WAITING)[0][:2]
     house.blob(blob).rename(house.place / "away")
     house.look(repair=True)
@@ -177,9 +169,7 @@ def test_an_upload_that_is_found_again_clears_the_reason(house: Any, state: str)
 
 
 @pytest.mark.parametrize("made", ["artifact", "signature"])
-def test_what_was_made_of_a_lost_upload_cannot_be_made_again(
-    house: Any, made: str, truth: Any, uploads: Any
-) -> None:
+def test_what_was_made_of_a_lost_upload_cannot_be_made_again(house, made, truth, uploads):
     """Two faults at once: nothing is left but to say so, until the upload comes again."""
     frame_id, upload, artifact = house.sql(f"{FIRST} ORDER BY number")[0]
     house.blob(upload).unlink()
@@ -201,7 +191,7 @@ def test_what_was_made_of_a_lost_upload_cannot_be_made_again(
     assert {(each.severity, each.frame_id) for each in again} == {("note", frame_id)}
 
 
-def test_a_repair_removes_nothing_under_a_backup(house: Any) -> None:
+def test_a_repair_removes_nothing_under_a_backup(house):
     """It may refer to what nothing here refers to any more."""
     frame_id, blob, _ = house.sql(FIRST)[0]
     with Engine(house.settings) as engine:
@@ -220,7 +210,7 @@ def test_a_repair_removes_nothing_under_a_backup(house: Any) -> None:
 
 
 @pytest.mark.sqlite_only("compares every file of the data folder")
-def test_old_leftovers_are_removed_and_other_files_are_not(house: Any) -> None:
+def test_old_leftovers_are_removed_and_other_files_are_not(house):
     """A young one may be an upload between its blob and its commit."""
     blobs = house.data / "blobs"
     for name in ("ab", "12"):
@@ -232,7 +222,7 @@ def test_old_leftovers_are_removed_and_other_files_are_not(house: Any) -> None:
     notes = sorted(("foreign-file", str(path), "note", False) for path in foreign)
     left = sorted(("unreferenced-file", str(path), "leftover", True) for path in unneeded)
 
-    def look(**how: Any) -> list[Any]:
+    def look(**how):
         return sorted((one.kind, one.what, one.severity, one.left) for one in house.look(**how))
 
     before = house.files()
@@ -249,7 +239,7 @@ def test_old_leftovers_are_removed_and_other_files_are_not(house: Any) -> None:
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_blobs_beside_a_database_that_knows_no_frame_are_left_alone(house: Any) -> None:
+def test_blobs_beside_a_database_that_knows_no_frame_are_left_alone(house):
     for path in house.data.glob("sceneprint.db*"):
         path.unlink()
     kept = house.data / "kept"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from sqlalchemy import insert
@@ -12,9 +10,8 @@ from sqlalchemy import insert
 from sceneprint.maintenance.fsck import findings
 from sceneprint.maintenance.fsck.findings import Folder
 from sceneprint.settings import Settings
-from sceneprint.store import Store
 from sceneprint.store.maps import find_map
-from sceneprint.store.tables import MapRow, frames
+from sceneprint.store.tables import frames
 from sceneprint_client.api import NewMap
 from tests.whole_engine import Engine
 
@@ -22,14 +19,14 @@ N, BLOCK = 2_000, 100
 
 
 @pytest.fixture
-def engine(tmp_path: Path) -> Iterator[Engine]:
+def engine(tmp_path):
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as opened:
         for name in ("hall", "yard"):
             opened.create_map(NewMap(name=name))
         yield opened
 
 
-def fill(store: Store, *maps: MapRow) -> None:
+def fill(store, *maps):
     values = {"state": "received", "received_at": 0.0, "blob": "0" * 64, "bytes": 1,
               "intrinsics": {}, "tags": [], "content_id": "c" * 64, "depth_scale": 1.0,
               "depth_along_ray": False}  # fmt: skip
@@ -41,9 +38,7 @@ def fill(store: Store, *maps: MapRow) -> None:
 
 @pytest.mark.sqlite_only("counts SQLite's steps")
 @pytest.mark.parametrize("map_name", [None, "hall"])
-def test_a_late_block_costs_no_more_than_the_first(
-    engine: Engine, monkeypatch: pytest.MonkeyPatch, map_name: str | None
-) -> None:
+def test_a_late_block_costs_no_more_than_the_first(engine, monkeypatch, map_name):
     """Reading all before it again made the whole quadratic: a million frames took hours."""
     store = engine.store
     with store.database.read() as connection:
@@ -57,10 +52,9 @@ def test_a_late_block_costs_no_more_than_the_first(
     )  # fmt: skip
     with store.database.read() as connection:
         raw = connection.connection.driver_connection
-    assert raw is not None
     steps, costs, seen = [0], list[int](), list[int]()
 
-    def count() -> int:
+    def count():
         steps[0] += 1
         return 0
 

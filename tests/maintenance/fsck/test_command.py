@@ -9,9 +9,6 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,13 +22,11 @@ from tests.whole_engine import Engine
 
 
 @pytest.fixture
-def fsck(
-    house: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., str]:
+def fsck(house, capsys, monkeypatch):
     """Runs the command in this process and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_CACHE_DIR", str(house.settings.cache_dir))
 
-    def run(*options: object, expect: int) -> str:
+    def run(*options, expect):
         capsys.readouterr()
         code = main(["fsck", "--data", str(house.data), *map(str, options)])
         said = capsys.readouterr()
@@ -41,9 +36,7 @@ def fsck(
     return run
 
 
-def test_it_says_what_it_would_do_and_what_it_did(
-    house: Any, fsck: Callable[..., str], tmp_path: Any
-) -> None:
+def test_it_says_what_it_would_do_and_what_it_did(house, fsck, tmp_path):
     assert fsck(expect=0).splitlines() == [
         "checked 1 models, 15 frames, 13 signatures, 27 blobs, 27 files, 1 indexes",
         "no problems found",
@@ -76,9 +69,7 @@ def test_it_says_what_it_would_do_and_what_it_did(
 
 
 @pytest.mark.sqlite_only("PostgreSQL holds no such row")
-def test_what_cannot_be_checked_or_repaired_has_its_own_code(
-    house: Any, fsck: Callable[..., str]
-) -> None:
+def test_what_cannot_be_checked_or_repaired_has_its_own_code(house, fsck):
     assert fsck("--map", "cellar", expect=2).startswith("sceneprint fsck: There is no map 'cellar'")
     house.sql("UPDATE frames SET tags = '[' WHERE number = 3")
     assert "would: restore a backup" in fsck("--repair", expect=1)
@@ -94,9 +85,7 @@ def test_what_cannot_be_checked_or_repaired_has_its_own_code(
     assert said.count("\n") == 1
 
 
-def test_what_is_not_there_is_not_made(
-    house: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_not_there_is_not_made(house, tmp_path, capsys):
     typo, out = tmp_path / "typo", tmp_path / "out"
     shutil.rmtree(house.data / "blobs")
     for command in (
@@ -111,7 +100,7 @@ def test_what_is_not_there_is_not_made(
     assert not any(path.exists() for path in (typo, out, house.data / "blobs"))
 
 
-def variant(upload: Any, n: int) -> bytes:
+def variant(upload, n):
     """The upload, n millimetres farther away: another content, and another blob."""
     out, samples = io.BytesIO(), np.array(Image.open(io.BytesIO(upload.data)))
     Image.fromarray(np.where(samples > 0, samples + n, 0).astype(np.uint16)).save(out, "PNG")
@@ -119,7 +108,7 @@ def variant(upload: Any, n: int) -> bytes:
 
 
 @pytest.mark.thorough
-def test_beside_a_service_nothing_is_lost(house: Any, uploads: Any) -> None:
+def test_beside_a_service_nothing_is_lost(house, uploads):
     """Robots upload and delete while fsck repairs without grace: worse than an operator does."""
     record = house.place / "found.json"
     command = [
@@ -128,7 +117,7 @@ def test_beside_a_service_nothing_is_lost(house: Any, uploads: Any) -> None:
     ]  # fmt: skip
     ended, found = [], []
 
-    def check() -> None:
+    def check():
         while len(ended) < 2:
             done = subprocess.run(command, capture_output=True, text=True)
             ended.append((done.returncode, done.stderr))

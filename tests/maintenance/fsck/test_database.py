@@ -5,8 +5,6 @@ from __future__ import annotations
 import shutil
 import sqlite3
 from contextlib import closing
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,14 +19,14 @@ FLIPS = 30
 CHECKED = ('INSERT INTO "signatures"', 'INSERT INTO "frame_tags"')
 
 
-def dump(path: Path) -> set[str]:
+def dump(path):
     """What is in a database."""
     with closing(sqlite3.connect(path)) as database:
         return set(database.iterdump())
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house: Any) -> None:
+def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house):
     """It is found, or harmless; and where it is found, a repair leaves every blob where it is."""
     path = house.data / "sceneprint.db"
     sound, rng = path.read_bytes(), np.random.default_rng(11)
@@ -68,7 +66,7 @@ def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house: Any) -> None:
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house: Any) -> None:
+def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house):
     """Else a frame whose row names another blob would seem to have lost its upload."""
     ((blob,),) = house.sql("SELECT blob FROM frames WHERE number = 1")
     path = house.data / "sceneprint.db"
@@ -92,7 +90,7 @@ def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house: Any) -> 
         }
 
 
-def test_a_row_that_refers_to_none_keeps_all_hands_off(house: Any) -> None:
+def test_a_row_that_refers_to_none_keeps_all_hands_off(house):
     house.sql("UPDATE maps SET model_id = 'ff' || SUBSTR(model_id, 3) WHERE name = 'hall'")
     found = house.look(repair=True)
     assert found[0].kind == "dangling-row"
@@ -101,7 +99,7 @@ def test_a_row_that_refers_to_none_keeps_all_hands_off(house: Any) -> None:
     assert house.sql("SELECT COUNT(*) FROM signatures") == [(13,)]
 
 
-def test_a_damaged_model_that_ships_is_put_back(house: Any) -> None:
+def test_a_damaged_model_that_ships_is_put_back(house):
     with Engine(house.settings) as engine:
         engine.create_map(NewMap(name="other", model="depth"))
     ((sound,),) = house.sql("SELECT content FROM models WHERE name = 'depth'")
@@ -117,9 +115,7 @@ def test_a_damaged_model_that_ships_is_put_back(house: Any) -> None:
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.parametrize("name", ["blobs", "sceneprint.db"])
-def test_a_folder_that_is_not_there_is_not_taken_for_one_that_has_lost_all(
-    house: Any, name: str
-) -> None:
+def test_a_folder_that_is_not_there_is_not_taken_for_one_that_has_lost_all(house, name):
     """As of a disk that is not mounted; a repair makes no database, and removes no upload."""
     (house.data / name).rename(house.place / "away")
     before = house.files()
@@ -131,7 +127,7 @@ def test_a_folder_that_is_not_there_is_not_taken_for_one_that_has_lost_all(
     assert house.look() == []
 
 
-def test_an_empty_folder_of_blobs_is_not_taken_for_the_loss_of_all(house: Any) -> None:
+def test_an_empty_folder_of_blobs_is_not_taken_for_the_loss_of_all(house):
     (house.data / "blobs").rename(house.place / "away")
     (house.data / "blobs").mkdir()  # the mount point of a disk that is not mounted
     before = house.sql("SELECT state, reason FROM frames ORDER BY number")
@@ -141,7 +137,7 @@ def test_an_empty_folder_of_blobs_is_not_taken_for_the_loss_of_all(house: Any) -
     assert {one.kind for one in house.look()} >= {"missing-upload"}  # looking goes on
 
 
-def test_a_later_schema_is_refused(house: Any) -> None:
+def test_a_later_schema_is_refused(house):
     house.sql("UPDATE alembic_version SET version_num = '9999'")
     house.sql("UPDATE schema_range SET least_revision = '9999'")
     before = house.files()
@@ -150,7 +146,7 @@ def test_a_later_schema_is_refused(house: Any) -> None:
     assert house.files() == before
 
 
-def test_a_quick_look_sees_what_is_missing(house: Any) -> None:
+def test_a_quick_look_sees_what_is_missing(house):
     ((blob, other),) = house.sql(
         "SELECT a.blob, b.blob FROM frames a, frames b WHERE a.number = 1 AND b.number = 2"
     )
@@ -161,7 +157,7 @@ def test_a_quick_look_sees_what_is_missing(house: Any) -> None:
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_a_log_that_was_not_emptied_is_read_and_left(house: Any, tmp_path: Any) -> None:
+def test_a_log_that_was_not_emptied_is_read_and_left(house, tmp_path):
     """Of a service that was killed: the last commits are in it."""
     with Engine(house.settings) as engine:
         engine.get_map("hall")

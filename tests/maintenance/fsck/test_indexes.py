@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from sceneprint_client.api import Query
@@ -11,9 +9,7 @@ from tests.whole_engine import Engine
 
 
 @pytest.mark.parametrize("kind", ["keys", "faiss", "json"])
-def test_a_damaged_index_is_removed_and_made_again(
-    house: Any, kind: str, truth: Any, uploads: Any
-) -> None:
+def test_a_damaged_index_is_removed_and_made_again(house, kind, truth, uploads):
     path = house.index_files(kind)[0]
     house.damage(path)
     (found,) = house.look(repair=True)
@@ -32,7 +28,7 @@ def test_a_damaged_index_is_removed_and_made_again(
     assert house.answers(uploads[:12]) == truth
 
 
-def test_an_index_that_differs_from_the_database_is_made_again(house: Any, uploads: Any) -> None:
+def test_an_index_that_differs_from_the_database_is_made_again(house, uploads):
     """All its checksums hold: it was made of other signatures."""
     house.sql(  # both frames have the signature of the second, with its checksum
         "UPDATE signatures SET (vector, checksum) = (SELECT vector, checksum FROM signatures"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
 from tests.whole_engine import Engine
 
 
-def query_of(letter: str, *, listed: bool = True) -> NewQuery:
+def query_of(letter, *, listed=True):
     return NewQuery(
         id=letter * 32, at=time.time(), map="hall", maps=None, robot=None, session=None,
         status="found", cause=None, reason="", pose_parent=None, pose=None, confidence=None,
@@ -37,7 +36,7 @@ def query_of(letter: str, *, listed: bool = True) -> NewQuery:
     )  # fmt: skip
 
 
-def fill(engine: Engine) -> tuple[str, str]:
+def fill(engine):
     """Add something of each kind; ids of the job, and of a deletion that can be undone."""
     engine.create_map(NewMap(name="hall", model="depth"))
     job, _ = engine.begin_task("reconstruct", "hall", {})
@@ -60,7 +59,7 @@ def fill(engine: Engine) -> tuple[str, str]:
 
 
 @pytest.mark.sqlite_only("restores to a database of its own in the folder")
-def test_a_backup_has_all_that_is_kept_and_can_be_restored(tmp_path: Path) -> None:
+def test_a_backup_has_all_that_is_kept_and_can_be_restored(tmp_path):
     settings = Settings(data_dir=tmp_path / "data", database_url=None)
     with Engine(settings) as engine:
         job_id, deletion = fill(engine)

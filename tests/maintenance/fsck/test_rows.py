@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import zlib
-from typing import Any
 
 import numpy as np
 import pytest
@@ -88,13 +87,13 @@ FAULTS = {
 }
 
 
-def faults(findings: Any) -> list[Any]:
+def faults(findings):
     """Leave out what one of these faults brings with it."""
     return [one for one in findings if one.kind != "damaged-model"]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_named_and_repaired(house: Any, fault: str) -> None:
+def test_a_fault_is_named_and_repaired(house, fault):
     changes, kind, asked, after = FAULTS[fault]
     for change in changes if isinstance(changes, tuple) else (changes,):
         house.sql(change)
@@ -109,7 +108,7 @@ def test_a_fault_is_named_and_repaired(house: Any, fault: str) -> None:
     assert faults(house.look()) == []
 
 
-def test_what_a_map_is_counted_to_hold(house: Any) -> None:
+def test_what_a_map_is_counted_to_hold(house):
     asked = "SELECT used_frames, used_bytes FROM maps ORDER BY number"
     before = house.sql(asked)
     house.sql("UPDATE maps SET used_frames = used_frames + 1 WHERE name = 'hall'")
@@ -121,7 +120,7 @@ def test_what_a_map_is_counted_to_hold(house: Any) -> None:
     assert (house.sql(asked), house.look()) == (before, [])
 
 
-def test_what_is_repaired_is_signed(house: Any, truth: Any, uploads: Any) -> None:
+def test_what_is_repaired_is_signed(house, truth, uploads):
     house.sql(f"DELETE FROM signatures WHERE frame_number = {FIRST}")
     house.sql(f"UPDATE jobs SET state = 'cancelled' WHERE frame_number = {WAITING}")
     assert [one.left for one in house.look(repair=True)] == [False, False]
@@ -130,7 +129,7 @@ def test_what_is_repaired_is_signed(house: Any, truth: Any, uploads: Any) -> Non
     assert house.answers(uploads[:12]) == truth
 
 
-def test_one_map_is_looked_at_alone(house: Any) -> None:
+def test_one_map_is_looked_at_alone(house):
     house.sql(f"INSERT INTO frame_tags VALUES ({FIRST}, 'other')")  # of `hall`
     house.sql(f"UPDATE jobs SET state = 'cancelled' WHERE frame_number = {WAITING}")  # of `attic`
     (house.data / "blobs" / "notes.txt").write_text("mine")
@@ -145,7 +144,7 @@ def test_one_map_is_looked_at_alone(house: Any) -> None:
 
 
 @pytest.mark.sqlite_only("PostgreSQL holds no such row")
-def test_a_row_that_cannot_be_read_does_not_hide_the_others(house: Any) -> None:
+def test_a_row_that_cannot_be_read_does_not_hide_the_others(house):
     """Its tags are no JSON; nothing can say what they were."""
     house.sql("UPDATE frames SET tags = '[\"all' WHERE number = 3")
     house.sql("UPDATE frames SET state = 'indexee' WHERE number = 4")
@@ -157,7 +156,7 @@ def test_a_row_that_cannot_be_read_does_not_hide_the_others(house: Any) -> None:
     assert position.kind == "stale-value"
 
 
-def test_a_damaged_signature_is_made_again(house: Any, truth: Any, uploads: Any) -> None:
+def test_a_damaged_signature_is_made_again(house, truth, uploads):
     """Its bytes, its length, and counts that cannot be read; meanwhile it is not compared."""
     asked = "SELECT * FROM signatures ORDER BY frame_number"
     sound, checksum = house.sql(asked), zlib.crc32(b"\0")  # which fits: the length does not
@@ -188,7 +187,7 @@ def test_a_damaged_signature_is_made_again(house: Any, truth: Any, uploads: Any)
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.parametrize("times", [4, pytest.param(12, marks=pytest.mark.thorough)])
 @pytest.mark.parametrize("kind", ["keys", "faiss", "json", "upload", "artifact", "signature"])
-def test_a_flipped_bit_is_named_and_nothing_else_is(house: Any, kind: str, times: int) -> None:
+def test_a_flipped_bit_is_named_and_nothing_else_is(house, kind, times):
     rng = np.random.default_rng(7)
     stored = house.sql(
         "SELECT f.id, f.blob, s.geometry, s.vector FROM frames f JOIN signatures s"

@@ -10,7 +10,6 @@ from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_server
 from sceneprint.errors import StoreAway
 from sceneprint.maintenance.fsck.check import fsck
-from sceneprint.maintenance.fsck.findings import Finding
 from sceneprint.settings import Settings
 from sceneprint_client.api import JobState
 from tests.whole_engine import Engine
@@ -24,23 +23,23 @@ WAITING = "(SELECT MAX(number) FROM frames WHERE state = 'received')"
 class Fleet:
     """A store on PostgreSQL, and what happens to it."""
 
-    def __init__(self, settings: Settings, url: str) -> None:
+    def __init__(self, settings, url):
         self.settings, self._url = settings, url.replace("+psycopg", "")
 
-    def sql(self, *asked: str) -> list[tuple]:
+    def sql(self, *asked):
         """Ask or change the database past all that would refuse it."""
         with psycopg.connect(self._url, autocommit=True) as connection:
             connection.execute("SET session_replication_role = replica")
             found = [connection.execute(one) for one in asked][-1]
             return found.fetchall() if found.description else []
 
-    def look(self, **how: object) -> list[Finding]:
+    def look(self, **how):
         return list(fsck(self.settings, **how))
 
-    def kinds(self, **how: object) -> list[str]:
+    def kinds(self, **how):
         return [one.kind for one in self.look(**how)]
 
-    def work(self) -> set[JobState | None]:
+    def work(self):
         with Engine(self.settings) as engine:
             states = set()
             while (claimed := engine.claim("w")) is not None:
@@ -49,7 +48,7 @@ class Fleet:
 
 
 @pytest.fixture(scope="session")
-def bundles(copied, tmp_path_factory) -> str:
+def bundles(copied, tmp_path_factory):
     place = tmp_path_factory.mktemp("bundles")
     # of a copy: SQLite leaves an empty log beside what it has only read
     take_backup(copied(place / "house").settings, str(place / "bundles"))
@@ -57,7 +56,7 @@ def bundles(copied, tmp_path_factory) -> str:
 
 
 @pytest.fixture
-def fleet(bundles, master, postgres_url, tmp_path) -> Fleet:
+def fleet(bundles, master, postgres_url, tmp_path):
     settings = Settings(
         data_dir=tmp_path / "node", database_url=SecretStr(postgres_url), index_dir=None,
         cache_dir=master.settings.cache_dir,
