@@ -39,12 +39,13 @@ def assert_equal(here: ReadSurface, there: ReadSurface) -> None:
         (here.surface.points, there.surface.points),
         (here.surface.triangles, there.surface.triangles),
         (here.surface.offset, there.surface.offset),
-        (here.surface.up, there.surface.up),
     ):
         if a is None or b is None:
             assert a is b
         else:
             assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    # the last bits of products depend on the threads and the memory of a process
+    assert there.surface.up == pytest.approx(here.surface.up, abs=1e-12)
     names = ("units", "up_from", "notes", "units_per_metre", "file_points", "voxel")
     assert [getattr(here, name) for name in names] == [getattr(there, name) for name in names]
 
