@@ -170,7 +170,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(views, tmp_p
         sources = {one.frame_id: one.source for one in coverage.views}
         assert sources[lost] == "geometry"
         assert [one.frame_id for one in coverage.left_out] == [deleted]
-        assert "a new frame has its id" in coverage.left_out[0].reason
+        assert "replaced by a new frame" in coverage.left_out[0].reason
         # what the query saw is not kept beyond the job, and all goes with it
         before = files(tmp_path)
         client.delete_product(Reconstruction, None, made.job_id)

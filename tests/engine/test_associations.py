@@ -389,7 +389,7 @@ def test_too_many_frames_are_refused_in_words(engine, monkeypatch):
     [
         ({"sessions": ["a", "a"]}, "list the session once"),
         ({"sessions": ["a", "b"], "apart": 5}, "only for one session"),
-        ({"sessions": ["a", "b"], "robots": ["ann"]}, "one for each session"),
+        ({"sessions": ["a", "b"], "robots": ["ann"]}, "one robot for each session"),
         ({"sessions": ["a"], "filter": {"not_within_s": 3}}, "outside of the filter"),
         ({"sessions": []}, "at least 1"),
         ({"sessions": ["a"], "k": 11}, "less than or equal to 10"),

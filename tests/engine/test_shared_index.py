@@ -298,7 +298,7 @@ def test_who_lost_the_turn_publishes_nothing(built):
                 f"AND classid = {0x5CE80} AND objid = 7 AND database = "
                 "(SELECT oid FROM pg_database WHERE datname = current_database())"
             )
-        with pytest.raises(UnusableStore, match="built again"):
+        with pytest.raises(UnusableStore, match="build the index again"):
             mine()
 
 
