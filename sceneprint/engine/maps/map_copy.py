@@ -206,9 +206,10 @@ def pull_map(
         head, parts = client.map_copy(map_name, [*pull.own, *pull.fetched])
         if pull.own:
             with store.database.read() as connection:
-                if _find_copy(connection, head) is None:
-                    pull.own.clear()  # these rows belong to another map
-            continue
+                is_copy = _find_copy(connection, head) is not None
+            if not is_copy:
+                pull.own.clear()  # these rows belong to another map
+                continue
         before = len(pull.fetched)
         for digest, data in parts.items():
             rows = _read_part(map_name, digest, data)
