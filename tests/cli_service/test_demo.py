@@ -142,7 +142,7 @@ def test_demo_needs_frames_for_the_map_and_to_look_up(
     _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert len(err.splitlines()) == 1
-    assert "1 frames for the map and 0 to query" in err
+    assert "1 frames for the map and 0 queries" in err
 
 
 @pytest.fixture

@@ -61,5 +61,5 @@ def test_split_files_decide_where_they_are(scene: Path) -> None:
     assert {one.session for one in choice.database} == {"seq-02"}
     assert (len(choice.database), len(choice.queries)) == (2, 3)
     (scene / "TestSplit.txt").unlink()
-    with pytest.raises(DatasetError, match="2 frames for the map and 0 to query"):
+    with pytest.raises(DatasetError, match="2 frames for the map and 0 queries"):
         choose_frames(scene)

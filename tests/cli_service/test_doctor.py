@@ -359,6 +359,6 @@ def test_the_first_use_says_what_it_waits_for(tmp_path, monkeypatch):
     monkeypatch.setattr(compilation, "_run", lambda *_: waits.append(True))  # not told to stop
     prepare_presets(Settings(data_dir=tmp_path), said.append)
     first, last = said
-    assert "compiling kernels for signing and validation, once" in first
+    assert "compiling kernels for signing and validation; this" in first
     assert re.fullmatch(r"compilation finished in \d+ s", last)
     assert waits == [True, True]

@@ -158,7 +158,7 @@ def test_what_cannot_be_asked_again(served, asked, shots, refused):
     served.client.post("/v1/maps", json={"name": "again-paper", "model": "paper"})
     body = {"maps": ["again-paper"], "query_id": asked["query_id"]}
     reply = served.client.post("/v1/queries", json=body)
-    refused(reply, 409, "not-indexed", "not signed with the model")
+    refused(reply, 409, "not-indexed", "signed with another model")
 
 
 def test_stored_results_that_are_not_there(served, asked, shots, refused):
