@@ -36,14 +36,14 @@ def measure(
 ) -> list[str]:
     """Query frames over HTTP and with the library; return the tables.
 
+    Raise AssertionError if the answers of service and library differ, so the times are not
+    comparable.
+
     Parameters
     ----------
     map_frames : number of frames of the map; if `frames` are fewer, random frames are added and
         answers are not compared with those of the library, because R grows with the map
     n_queries : number of queries
-
-    Raise AssertionError if the answers of service and library differ, so the times are not
-    comparable.
     """
     places = {int(i) for i in np.linspace(1, len(frames) - 2, n_queries)}
     database = [frame for i, frame in enumerate(frames) if i not in places]

@@ -30,7 +30,7 @@ from sceneprint_client.api import Frame, FrameState
 
 #: Time limits of the workers to finish the queue, and of events to arrive, seconds.
 PATIENCE_S, EVENTS_S = 600.0, 20.0
-#: Number of frames whose neighbours are compared between services, and of queried frames.
+#: Number of frames whose neighbours are compared between services, and maximum of queried frames.
 COMPARED, LOOKED_UP = 20, 1_000
 #: States in which a frame is stored but not searched, with a reason.
 STATED = (FrameState.REJECTED, FrameState.FAILED, FrameState.REDUNDANT)

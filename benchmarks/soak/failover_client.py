@@ -73,12 +73,12 @@ class FailoverClient(ExitStack):
     def send(self, kind: str, method: str, path: str, **request: Any) -> httpx.Response:
         """Send an idempotent request to the addresses until one of them answers.
 
+        Raise NoAnswer if no address has answered for too long.
+
         Parameters
         ----------
         kind : kind of the request, for the log
         method, path, request : arguments of httpx
-
-        Raise NoAnswer if no address has answered for too long.
         """
         begun, tries = time.monotonic(), 0
         while time.monotonic() < begun + PATIENCE_S:

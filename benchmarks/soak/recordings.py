@@ -49,12 +49,12 @@ def recordings(data: Path | None, frames: int) -> Iterator[Path]:
 def walks(data: Path, n: int, frames: int) -> list[list[Shot]]:
     """Return `n` walks of `frames` frames each, the same in each call.
 
+    Raise DatasetError if the recordings have too few frames.
+
     Parameters
     ----------
     data : folder of recordings
     n, frames : number of walks, and of the frames of each
-
-    Raise DatasetError if the sequence has fewer frames.
     """
     recorded = [
         [frame for frame in sequence.frames if frame.kind == "depth"]

@@ -200,8 +200,8 @@ class _Run:
                 fleet, plan, partial(_answers, key=key, shot=self._stable[0]), self._rng
             )  # fmt: skip
             self._walk(clients[0], key, [*listeners, *offline, *readers, *sampling], injector)
-            for client in (*offline, *readers):
-                client.finish(OFFLINE_PATIENCE_S)
+            for thread in (*offline, *readers):
+                thread.finish(OFFLINE_PATIENCE_S)
             for url in fleet.urls:
                 await_service(url)
             await_idle(clients[0])

@@ -29,13 +29,13 @@ _PIECE = 1 << 20
 def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
     """Return the content of a regular file of at most `limit` bytes.
 
+    Raise `error` if the file is missing, is not a regular file (reading a pipe could block
+    forever), is too large, or is not readable.
+
     Parameters
     ----------
     limit : maximum size of the file, bytes
     error : class of the error to raise
-
-    Raise `error` if the file is missing, is not a regular file (reading a pipe could block
-    forever), is too large, or is not readable.
     """
     try:
         status = path.stat()
@@ -130,6 +130,8 @@ def npy_header(
 ) -> NpyHeader:
     """Return the header of an NPY file with a two-dimensional floating-point array.
 
+    Raise `error` if the header cannot be read, or the array has another type or shape.
+
     Parameters
     ----------
     data : the file, or its first 10,016 bytes
@@ -137,8 +139,6 @@ def npy_header(
     advice : sentence for the error if the array has another type
     shapes : sentences for the error if the array has another shape
     whole : whether to accept uint16 too
-
-    Raise `error` if the header cannot be read, or the array has another type or shape.
     """
     fields, start = _fields(data, error)
     dtype = _dtype(fields["descr"], error, advice, _FLOATING + _WHOLE if whole else _FLOATING)
@@ -297,12 +297,12 @@ _LIVOX_POINT = 19
 def read_livox_scan(data: bytes, *, ros1: bool = False) -> SerializedCloud:
     """Return a serialised CustomMsg of livox_ros_driver or livox_ros_driver2 as a PointCloud2.
 
+    Raise UnreadableCloud if the bytes are not such a message, are truncated, or have trailing data.
+
     Parameters
     ----------
     data : message in the serialisation of ROS 2, or of ROS 1
     ros1 : whether ROS 1 serialised the message
-
-    Raise UnreadableCloud if the bytes are not such a message, are truncated, or have trailing data.
     """
     if not ros1 and not _is_encapsulated(data):
         raise UnreadableCloud(

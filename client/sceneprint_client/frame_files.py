@@ -222,6 +222,9 @@ def meta_of(
 ) -> FrameMeta:
     """Return the metadata that an upload sends with a frame of a data set.
 
+    Raise InvalidPose if the pose file does not hold a rigid transform. Raise InvalidRequest if a
+    name is empty, too long or not printable.
+
     Parameters
     ----------
     reference : the frame
@@ -234,9 +237,6 @@ def meta_of(
     with_name : whether to send the original name and the index in the sequence, which queries
         ignore
     trust_depth : whether to accept an image that does not look like depth
-
-    Raise InvalidPose if the pose file does not hold a rigid transform. Raise InvalidRequest if a
-    name is empty, too long or not printable.
     """
     if up is None:
         source = reference.camera or reference.cloud
@@ -495,13 +495,13 @@ def camera_of(
 ) -> CameraIntrinsics:
     """Return the camera of an image.
 
+    Raise InvalidIntrinsics if `camera` has another type or is not a valid camera.
+
     Parameters
     ----------
     camera : CameraIntrinsics, Open3D's PinholeCameraIntrinsic, a (3, 3) matrix without skew, or
         (fx, fy, cx, cy), pixels
     size : width and height, pixels, for a `camera` that lacks them
-
-    Raise InvalidIntrinsics if `camera` has another type or is not a valid camera.
     """
     if isinstance(camera, CameraIntrinsics):
         return camera

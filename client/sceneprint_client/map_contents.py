@@ -167,8 +167,8 @@ class MapMethods(ServiceConnection):
         content_id : hash of samples and camera, or of points and viewpoint
         name : prefix of the name, such as "frame-000123"
         find : prefix of the id, name or session
-        order : "asc": oldest first; "desc": newest first; "taken", with one session: order of
-            capture
+        order : "asc": order of upload; "desc": newest upload first; "taken", with one session:
+            order of capture
 
         Raises
         ------

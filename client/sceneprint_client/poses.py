@@ -219,12 +219,12 @@ TOLERANCE = 1e-2  #: maximum error of a rotation matrix, and of the length of a 
 def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a pose whose rotation is orthonormal to machine precision.
 
+    `matrix`: (4, 4) T_parent_sensor, with a rotation that is orthonormal to 1e-2. Raise InvalidPose
+    if the matrix is not 4 x 4, not finite, or not rigid.
+
     Returns
     -------
     T_parent_sensor : (4, 4) float64, with the nearest rotation
-
-    `matrix`: (4, 4) T_parent_sensor, with a rotation that is orthonormal to 1e-2. Raise InvalidPose
-    if the matrix is not 4 x 4, not finite, or not rigid.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)

@@ -221,12 +221,12 @@ def is_calibrated(info: Any) -> bool:
 def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
     """Return the intrinsics of a CameraInfo.
 
+    Raise InvalidIntrinsics if it does not describe a camera, or the lens model is not supported.
+
     Parameters
     ----------
     info : sensor_msgs CameraInfo
     rectified : whether the images are rectified, so that their camera is P without distortion
-
-    Raise InvalidIntrinsics if it does not describe a camera, or the lens model is not supported.
     """
     k, p = _numbers(info, "k", 9), _numbers(info, "p", 12)
     if k is None:

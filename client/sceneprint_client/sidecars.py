@@ -47,14 +47,14 @@ _OPTIONAL = ("depth_scale", "distortion", "depth_along_ray", "up")
 class Camera:
     """Intrinsics of a depth camera, and its encoding of depth.
 
+    Raise InvalidIntrinsics if the depth scale is not positive, or `up` is not a unit vector.
+
     Parameters
     ----------
     intrinsics : intrinsics of the depth images, with distortion
     depth_scale : stored units per metre
     along_ray : whether depth is the range along the pixel's ray instead of z
     up : unit vector in the camera's axes if the camera is carried level; None if unknown
-
-    Raise InvalidIntrinsics if the depth scale is not positive, or `up` is not a unit vector.
     """
 
     intrinsics: Intrinsics

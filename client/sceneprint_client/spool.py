@@ -515,7 +515,7 @@ class Spool:
     def _reserve_journal(self) -> None:
         """Reserve disk space for the journal, which retains its size after each transaction.
 
-        Removing frames writes to the journal, so this must work on a full disk.
+        Removing frames writes to the journal, so without the reserve a full disk would stay full.
         """
         journal = self._path.with_name(self._path.name + "-journal")
         if journal.is_file() and journal.stat().st_size >= _RESERVE * _PAGE:

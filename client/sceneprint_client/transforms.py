@@ -91,6 +91,8 @@ class TransformTree:
     ) -> bool:
         """Add a sample of a transform; a sample that is not rigid is ignored and recorded.
 
+        Raise DatasetError if there are more than 5 million samples; `forget` removes old samples.
+
         Parameters
         ----------
         parent, child : names of the frames; a leading slash of ROS 1 is removed
@@ -101,8 +103,6 @@ class TransformTree:
         Returns
         -------
         added : False if the sample was ignored
-
-        Raise DatasetError if there are more than 5 million samples; `forget` removes old samples.
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)
@@ -162,7 +162,7 @@ class TransformTree:
         self._origin_ns = None
 
     def forget(self, span_ns: int) -> None:
-        """Remove samples of moving transforms that are `span_ns` older than the latest sample."""
+        """Remove samples of moving transforms more than `span_ns` older than the latest one."""
         for edges in self._edges.values():
             for edge in edges.values():
                 if not edge.fixed:

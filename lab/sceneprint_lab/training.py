@@ -227,15 +227,15 @@ def train(
 ) -> Model:  # fmt: skip
     """Train a model; the result depends on the arguments, but not on the number of processes.
 
+    Raise TrainingError if there is too little data, the frames show fewer than two places, or a
+    level does not exist.
+
     Parameters
     ----------
     model_p, mixture_p : parameters of the model, such as the results of `preset_parameters`
     references : the user's frames, each with the name of its place, in addition to the rooms
     jobs : number of processes that create and segment frames; 1 uses this process
     report : callback for progress
-
-    Raise TrainingError if there is too little data, the frames show fewer than two places, or a
-    level does not exist.
     """
     from threadpoolctl import threadpool_limits
 
@@ -321,12 +321,12 @@ def whitened(
 ) -> Model:  # fmt: skip
     """Return the model with a whitening, fitted to `p.whitening_rooms` and the user's frames.
 
+    Raise TrainingError if there are too few frames for the dimension of the whitening.
+
     Parameters
     ----------
     model : result of `calibrated`
     p, references, jobs, report : arguments of `train`
-
-    Raise TrainingError if there are too few frames for the dimension of the whitening.
     """
     from threadpoolctl import threadpool_limits
 

@@ -118,13 +118,13 @@ class AnswerScene:
     ) -> None:  # fmt: skip
         """Add an answer as the next moment.
 
+        Raise UnknownQuery if the service does not store the answer.
+
         Parameters
         ----------
         answer : stored answer with the stage `validate`
         text : description of the answer
         camera : camera of the query; None for a cloud
-
-        Raise UnknownQuery if the service does not store the answer.
         """
         named = dict.fromkeys(match.map for match in placed(answer.matches))
         for map_name in answer.maps if len(answer.maps) == 1 else named:

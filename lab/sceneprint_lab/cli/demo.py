@@ -221,12 +221,12 @@ class DemoQuery:
 def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
     """Upload the database and wait until all frames are signed.
 
+    Raise DatasetError if no frame could be signed. Raise ServiceError if some frames were not
+    signed in time.
+
     Returns
     -------
     indexed : indexed frames by id
-
-    Raise DatasetError if no frame could be signed. Raise ServiceError if some frames were not
-    signed in time.
     """
     client.create_map(DEMO_MAP, model=model)
     indexed: dict[str, DemoFrame] = {}
@@ -393,6 +393,8 @@ _READY = "sceneprint: serving "
 def serving(data: Path, workers: int) -> Iterator[str]:
     """Run `sceneprint serve` on a free loopback port until the context ends.
 
+    Raise Unreachable if the service did not start; the message includes the end of its log.
+
     Parameters
     ----------
     data : folder for the database, blobs and log
@@ -401,8 +403,6 @@ def serving(data: Path, workers: int) -> Iterator[str]:
     Yields
     ------
     url : URL of the ready service
-
-    Raise Unreachable if the service did not start; the message includes the end of its log.
     """
     log = data / "service.log"
     arguments = ["--port", "0", "--data", str(data), "--workers", str(workers)]

@@ -91,7 +91,8 @@ def run_synth(options: argparse.Namespace) -> int:
         )
     if options.out.exists() and any(options.out.iterdir()):
         raise DatasetError(
-            f"{options.out}: The folder is not empty. Use a new folder, or empty this one."
+            f"{options.out}: The folder is not empty, and frames of two runs must not be mixed. "
+            "Use a new folder, or empty this one."
         )
     options.out.mkdir(parents=True, exist_ok=True)
     with tqdm(total=options.rooms, desc="synth", unit="room", disable=None) as bar:

@@ -275,11 +275,11 @@ RINGS, SECTORS, RADIUS, LIFT = 20, 60, 80.0, 2.0
 def ring_descriptor(points: Floats32 | Floats) -> Floats32:
     """Return the maximum height in each ring and sector around the sensor.
 
+    `points`: (N, 3) metres, with the sensor at the origin and z up; azimuth is from x towards y.
+
     Returns
     -------
     (RINGS, SECTORS) float32, height plus `LIFT`; 0 for cells without a point
-
-    `points`: (N, 3) metres, with the sensor at the origin and z up; azimuth is from x towards y.
     """
     x, y, z = np.asarray(points, np.float64).T
     flat = np.hypot(x, y)
@@ -307,12 +307,12 @@ def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -
 
 
 @kernel
-def _best_shift(
+def _least_distance(
     a: Floats, a_filled: NDArray[np.bool_], b: Floats, b_filled: NDArray[np.bool_]
-) -> tuple[float, int]:
-    """Return the minimum mean of 1 - cosine over all column shifts of `b`, and the shift."""
+) -> float:
+    """Return the minimum over all shifts of `b` of the mean of 1 - cosine of filled columns."""
     sectors, rings = a.shape
-    best, at = 2.0, 0
+    best = 2.0
     for shift in range(sectors):
         total, count = 0.0, 0
         for s in range(sectors):
@@ -324,8 +324,8 @@ def _best_shift(
                 total += 1.0 - cosine
                 count += 1
         if count and total / count < best:
-            best, at = total / count, shift
-    return best, at
+            best = total / count
+    return best
 
 
 def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
@@ -336,9 +336,9 @@ def _columns(descriptor: Floats32) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def ring_distances(query: Floats32, database: Floats32) -> Floats:
-    """Return the distances (N,) from a descriptor to N descriptors (N, rings, sectors)."""
+    """Return the yaw-independent distances (N,), 0 to 2, to descriptors (N, rings, sectors)."""
     own = _columns(query)
-    return np.array([_best_shift(*own, *_columns(other))[0] for other in database], float)
+    return np.array([_least_distance(*own, *_columns(other)) for other in database], float)
 
 
 class Rings(Baseline):
@@ -372,12 +372,12 @@ BASELINES: dict[str, Callable[[float], Baseline]] = {
 def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
     """Return baselines by name, and check that their libraries are installed.
 
+    Raise MissingDependency if a library is absent.
+
     Parameters
     ----------
     names : keys of BASELINES
     maximum : range of the sensor, metres
-
-    Raise MissingDependency if a library is absent.
     """
     opened = [BASELINES[name](maximum) for name in names]
     for baseline in opened:

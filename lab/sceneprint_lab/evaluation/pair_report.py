@@ -409,9 +409,9 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
         for name in BINS:
             own = [(trial.others or {}).get(method) for trial in beside if trial.drawn.bin == name]
             by_bin[name] = {
-                "start": _shares([trial.start if trial else Error() for trial in own], limits),
-                "icp": _shares([trial.icp if trial else Error() for trial in own], limits),
-                "ours": _shares([trial.ours if trial else Error() for trial in own], limits),
+                "start": _shares([other.start if other else Error() for other in own], limits),
+                "icp": _shares([other.icp if other else Error() for other in own], limits),
+                "ours": _shares([other.ours if other else Error() for other in own], limits),
             }
         both = [
             (trial.milliseconds, trial.others[method].milliseconds)

@@ -519,15 +519,15 @@ def evaluate_pairs(
 ) -> PairEvaluation:  # fmt: skip
     """Sample pairs by true overlap, validate them, and compute their errors.
 
+    Raise DatasetError if no two frames can be used, or none make a pair. Raise MissingDependency if
+    baselines need Open3D, which cannot be imported.
+
     Parameters
     ----------
     paths : paths of sequences with poses; frames of different scenes are negatives
     signer : result of `open_signer`
     store : empty store
     watch : callback for progress
-
-    Raise DatasetError if no two frames can be used, or none make a pair. Raise MissingDependency if
-    baselines need Open3D, which cannot be imported.
     """
     if settings.baselines:
         open3d("A baseline of registration")  # detects a missing library before frames are read

@@ -421,8 +421,6 @@ def travelled(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -
     Returns
     -------
     (Q, N) metres; negative if the database frame is later, infinite for another run
-
-    Names of frames of one run are equal up to the last slash, and their order is that of time.
     """
     along = {name: place for run in _runs((*queries, *database)) for name, place in run.items()}
     of_queries, of_database = ([_run(m) for m in members] for members in (queries, database))
@@ -649,6 +647,9 @@ def choose(
     The ranges of a path have precedence over `database` and `queries`, and these over the split
     files of its scenes.
 
+    Raise DatasetError if the use of a path's frames is unspecified, a range lies outside its path,
+    a frame is selected twice, two scenes have the same name, or there is no query.
+
     Parameters
     ----------
     parts : paths with optional ranges
@@ -657,9 +658,6 @@ def choose(
     database_step, query_step : steps for ranges without a step
     shared : whether frames may have both uses; frames of paths without ranges then have both
     find : function that returns the sequences of a path; it is called once per path
-
-    Raise DatasetError if the use of a path's frames is unspecified, a range lies outside its path,
-    a frame is selected twice, two scenes have the same name, or there is no query.
     """
     gathered = _Gathered(shared=shared, find=find)
     every = (Range(None, None, None),)

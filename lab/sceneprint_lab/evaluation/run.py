@@ -155,15 +155,15 @@ def evaluate(
 ) -> Evaluation:  # fmt: skip
     """Sign all frames, answer all queries, and compute the errors of the answers.
 
+    Raise DatasetError if no query or no database frame is usable. Raise MissingDependency if the
+    library of a baseline is missing.
+
     Parameters
     ----------
     protocol : result of `choose`
     signer : result of `open_signer`
     store : empty store
     watch : callback for progress
-
-    Raise DatasetError if no query or no database frame is usable. Raise MissingDependency if the
-    library of a baseline is missing.
     """
     # This detects missing libraries before the work.
     baselines = open_baselines(settings.baselines, signer.model.parameters.depth.maximum_depth)

@@ -57,6 +57,8 @@ def synthesise_room(
 
     The result depends only on the arguments, so rooms can be generated in any order and process.
 
+    Raise MissingDependency if Embree cannot be imported.
+
     Parameters
     ----------
     seed, index : seed of the collection, and index of the room in it
@@ -65,8 +67,6 @@ def synthesise_room(
     step : use every n-th frame along the path
     noise : sensor noise; None for ideal depth
     intrinsics : camera
-
-    Raise MissingDependency if Embree cannot be imported.
     """
     room, rng = room_and_rng(seed, index)
     sensor = own_sensor(noise, intrinsics, rng) if noise else None
@@ -172,6 +172,8 @@ def synthesise_survey(
 
     The result depends only on the arguments, so sites can be generated in any order and process.
 
+    Raise MissingDependency if Embree cannot be imported.
+
     Parameters
     ----------
     seed, index : seed of the collection, and index of the site in it
@@ -180,8 +182,6 @@ def synthesise_survey(
     kind : "hall", "storey" or "block"; default: depends on the index
     sensor : scanner; default: a random scanner for each site
     perfect : whether to disable errors and losses of the scanner
-
-    Raise MissingDependency if Embree cannot be imported.
     """
     premises, rng = premises_and_rng(seed, index, kind)
     drawn = own_scanner(rng)

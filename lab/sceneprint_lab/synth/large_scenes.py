@@ -474,7 +474,7 @@ def _garden_wall(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
-    """Return a cube in the centre of an empty square hall, which is the origin.
+    """Return a cube in the centre of an empty square hall, with the origin under it.
 
     The scene is symmetric under rotations of 90 degrees about z, so a view does not determine
     which side of the cube it shows.

@@ -124,15 +124,15 @@ def synthesise_lookalike_survey(
     The result depends only on the arguments. If the poses of the map drift, the pose of a query
     has the drift of the nearest scan of the map.
 
+    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
+    exist.
+
     Parameters
     ----------
     kind : one of SURVEYED_KINDS
     seed, index : seed of the collection, and index of the site among those of its kind
     queries : number of queries
     perfect : whether to disable errors and losses of the scanner, and drift
-
-    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
-    exist.
     """
     if kind not in SURVEYED_KINDS:
         kinds = ", ".join(SURVEYED_KINDS)
@@ -556,7 +556,7 @@ def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> Su
 
 
 def _pose_beside(premises: Premises, T: Floats, rng: np.random.Generator) -> Floats:
-    """Return a walkable pose 1 to 4 m from another pose, rotated by some degrees."""
+    """Return a walkable pose 1 to 4 m from another pose, rotated by up to about 20 degrees."""
     spots = premises.floor.points[premises.walkable]
     away = np.linalg.norm(spots - T[:2, 3], axis=1)
     spots = spots[(away > 1.0) & (away < 4.0)]

@@ -121,6 +121,9 @@ def synthesise_lookalike(
 
     The result depends only on the arguments.
 
+    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
+    exist.
+
     Parameters
     ----------
     kind : one of KINDS or ORDINARY
@@ -128,9 +131,6 @@ def synthesise_lookalike(
     queries : number of queries
     noise : sensor noise; None for ideal depth
     intrinsics : camera
-
-    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
-    exist.
     """
     kinds = KINDS + ORDINARY
     if kind not in kinds:

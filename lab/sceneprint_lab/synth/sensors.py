@@ -76,6 +76,8 @@ def cast_depth(
 ) -> tuple[Floats32, Floats32]:
     """Return an ideal depth image, and the cosine of incidence of each sample.
 
+    Raise MissingDependency if Embree cannot be imported.
+
     Parameters
     ----------
     caster : scene, metres
@@ -86,8 +88,6 @@ def cast_depth(
     -------
     depth : (H, W) float32, metres along the optical axis; 0 without a hit
     cosine : (H, W) float32, |cos| between ray and normal, [0, 1]; 0 without a hit
-
-    Raise MissingDependency if Embree cannot be imported.
     """
     depth, cosine, _ = cast_faces(caster, T_world_camera, intrinsics)
     return depth, cosine
