@@ -514,8 +514,8 @@ def _offsets(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
     return shift
 
 
-#: Views are distinct if at least this share of pixels within the range REACH_M, metres, differs by
-#: more than DISTINCT_M, metres.
+#: Views are distinct if at least this share of their pixels is within the range REACH_M and differs
+#: by more than DISTINCT_M, metres.
 DISTINCT_SHARE, DISTINCT_M, REACH_M = 0.10, 0.10, 3.5
 _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 

@@ -238,7 +238,8 @@ def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
 def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, list[list[int]]]:
     """Return at most `count` viewpoints (k, 6) and, for each, the indices of its neighbours.
 
-    Neighbours are connected by a clear straight line; an isolated viewpoint is its own neighbour.
+    Neighbours are connected by a clear straight line. If fewer than `count` viewpoints are found,
+    each of them is also its own neighbour, because a single viewpoint has no other.
     """
     anchors: list[Floats] = []
     ways: list[list[int]] = []
