@@ -149,8 +149,8 @@ class Caller:
 
 
 def require_readable(query_id: str, here: Service, caller: Caller) -> QueryRow:
-    """Return the row of a query. Raise UnknownQuery if its answer is not stored, or the caller
-    cannot read all its maps.
+    """Return the row of a query. Raise UnknownQuery, with the same text, if its answer is not
+    stored, or the caller cannot read all its maps.
     """
     row = here.context.query_log.find_row(query_id)
     maps = [*row.searched, *([] if row.frame_map is None else [row.frame_map])]

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 #: Seconds for the current frame after the signal to stop.
 GRACE_S = 20.0
-#: Seconds before a worker that died without a job is replaced, in case that it cannot start.
+#: Seconds before a worker that died without a job is replaced, in case it cannot start.
 RESTART_S = 1.0
 #: Signals that are not caused by the current job.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)

@@ -113,9 +113,9 @@ def run_keys(options: argparse.Namespace) -> int:
 
             with store.database.read() as connection:
                 tenants = list_tenants(connection)
-            for one in tenants:
-                at = datetime.fromtimestamp(one.created_at, UTC)
-                print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(one.name)}  {count_of(one.keys, 'key')}")
+            for row in tenants:
+                at = datetime.fromtimestamp(row.created_at, UTC)
+                print(f"{at:%Y-%m-%dT%H:%M:%SZ}  {one_line(row.name)}  {count_of(row.keys, 'key')}")
         elif options.delete_tenant is not None:
             delete_tenant(store, options.delete_tenant)
             print(f"tenant {one_line(options.delete_tenant)} is deleted")

@@ -31,7 +31,7 @@ def run_completion(options: argparse.Namespace) -> int:
     """
     parsers = [(name, command) for name, _, command in subcommands(parser())]
     # Subcommands come first, because the pattern of their command would match them too.
-    cases = [f'    "{name} "*) words="{" ".join(_words(of))}" ;;' for name, of in parsers[::-1]]
+    cases = [f'    "{name} "*) words="{" ".join(_words(own))}" ;;' for name, own in parsers[::-1]]
     commands = " ".join(name for name, _ in parsers if " " not in name)
     if options.shell == "zsh":
         print("autoload -U +X compinit bashcompinit && compinit && bashcompinit")

@@ -205,7 +205,7 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
             tally.refuse(item.name, "refused" if item.problem is None else item.problem.detail)
             continue
         state = FrameState.RECEIVED
-        if item.status == 200:
+        if item.status == 200:  # an existing frame, possibly signed already
             try:
                 state = client.frame(map_name, item.frame_id).state
             except UnknownFrame:  # deleted

@@ -89,7 +89,7 @@ def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
     frames: dict[str, FrameReference] = {}
     files: set[Path] = set()
     for path in options.paths:
-        several = len(options.paths) > 1 and path.is_dir()
+        several = len(options.paths) > 1 and path.is_dir()  # names of files are unique
         prefix = f"{path.resolve().name}/" if several else ""
         for sequence in sequences_at(path, options):
             for reference in sequence.frames:

@@ -91,7 +91,7 @@ def vector(at: Iterable[float]) -> Vector:
 
 
 def copy_fields(record: type[Record], source: object, /, **own: Any) -> Record:
-    """Return a record with some values of its own, and those that `source` has for other fields."""
+    """Return a record with the values `own`; `source` supplies the other fields by name."""
     names = record.model_fields
     return record(**{k: x for k, x in vars(source).items() if k in names} | own)
 

@@ -92,7 +92,7 @@ class GeometryCache:
         geometry = read_geometry(self._blobs.get(digest))
         entry = _Entry(geometry, int(_OVERHEAD * _array_bytes(geometry)), time.monotonic())
         with self._lock:
-            self._remove(digest)  # in case that another thread has added it
+            self._remove(digest)  # in case another thread has added it
             self._entries[digest] = entry
             self._bytes += entry.size
             while self._bytes > self._most_bytes:

@@ -129,7 +129,7 @@ def surplus_lines(
     Parameters
     ----------
     before : time before which lines are expired, seconds since 1970. Removal stops at the first
-        younger line, in case that a clock was set back
+        younger line, in case a clock was set back
     most_lines : maximum number of lines per tenant
     """
     oldest = connection.execute(

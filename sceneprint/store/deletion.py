@@ -242,8 +242,8 @@ def remove_in_blocks(
 
     Parameters
     ----------
-    find : function that returns up to a number of rows to remove. It is called outside of write
-        transactions, because it usually returns no rows
+    find : function that returns the numbers of rows to remove, up to a limit. It is called outside
+        of write transactions, because it usually returns none
     remove : function that removes the rows
     most : maximum number of rows; the last block may exceed it
 

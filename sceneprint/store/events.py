@@ -359,6 +359,7 @@ def _former_floors(connection: Connection, names: Collection[str], floor: int) -
     for name in names:
         last = last_event(connection, name)
         left = select(events.c.number).where(events.c.map == name).limit(1)
+        # the common floor does not apply to a map whose last event was removed
         yield last if connection.execute(left).first() is None else min(floor, last)
 
 
@@ -369,7 +370,7 @@ def surplus_events(
 
     An index is valid while its anchor exists, the last event of its map at the time of the build.
     Therefore, anchors of existing indexes are not removed, nor is the newest surplus event of each
-    map, which may become the anchor of an index in construction.
+    map, which may become the anchor of an index under construction.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ def renew_upload(
 def set_state(
     connection: Connection, number: int, state: FrameState, reason: str | None = None
 ) -> None:
-    """Set the state of a frame that is not searched; a deleted frame remains deleted."""
+    """Set a state in which a frame is not searched; a deleted frame remains deleted."""
     ended_at = None
     if state == FrameState.REDUNDANT:
         _update_usage(connection, number, state, None)

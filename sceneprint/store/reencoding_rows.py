@@ -167,12 +167,12 @@ def switch_model(connection: Connection, row: MapRow) -> list[str]:
                jobs.c.state == JobState.FAILED)
         .order_by(jobs.c.number)
     )  # fmt: skip
-    rejected = {row.number: row for row in failed}
-    for number, one in rejected.items():
-        set_state(connection, number, FrameState.REJECTED, one.error)
+    rejected = {frame.number: frame for frame in failed}
+    for number, frame in rejected.items():
+        set_state(connection, number, FrameState.REJECTED, frame.error)
         # new revisions, since readers and indexes may still have the frame from an earlier switch
         raise_revisions(connection, row, [number])
-        record_event(connection, "frame.rejected", row.name, one.id, one.job_id)
+        record_event(connection, "frame.rejected", row.name, frame.id, frame.job_id)
     for number, frame_id in former:
         set_state(connection, number, FrameState.RECEIVED)
         job = enqueue(connection, "sign", number, PRIORITY)

@@ -74,9 +74,9 @@ def _read(data: bytes, meta: FrameMeta, decoder: Decoder) -> Read:
     base = None if meta.T_base_sensor is None else base_of(meta.T_base_sensor, None)
     if pose is not None and base is not None and meta.pose is not None and meta.pose.of == "base":
         pose = pose @ base[1]
-    found = format_of(data)
+    cloud_format = format_of(data)
     # an NPY array with a camera is an image
-    if meta.format or (found and (found != "npy" or meta.intrinsics is None)):
+    if meta.format or (cloud_format and (cloud_format != "npy" or meta.intrinsics is None)):
         return _read_cloud(data, meta, pose, decoder)
     _refuse(meta, "depth image", {"viewpoint": "file", "units_per_metre": 1.0, "format": None})
     if meta.intrinsics is None:
@@ -323,7 +323,8 @@ def _matrix(pose: GivenTransform) -> Floats:
     length = float(np.linalg.norm(q))
     if not abs(length - 1.0) <= _TOLERANCE:
         raise InvalidPose(
-            f"The quaternion of the pose has length {length:.3g}. Send a unit quaternion."
+            f"The quaternion of the pose has length {length:.3g}. Send a unit quaternion "
+            "x, y, z, w."
         )
     T = np.eye(4)
     T[:3, :3] = rotation_of(q / length)

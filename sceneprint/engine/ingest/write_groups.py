@@ -2,8 +2,8 @@
 
 The duration of a commit hardly depends on its size, so shared commits increase the throughput.
 
-    run(a), run(b), run(c)  --Grouping, in write commit-->       result of each call
-    receive(a), receive(b)  --NewFrames, in write statement-->   whether each frame was inserted
+    run(a), run(b), run(c)  --Grouping, in one commit-->       result of each call
+    receive(a), receive(b)  --NewFrames, in one statement-->   whether each frame was inserted
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sceneprint.store.new_frames import NewFrame, receive_frames
 T = TypeVar("T")
 W = TypeVar("W")
 
-#: Maximum number of writes in write transaction; other writers wait for its end.
+#: Maximum number of writes in one transaction; other writers wait for its end.
 MOST_TOGETHER = 32
 #: Maximum seconds that a statement with new frames of several maps waits for a locked map.
 MAPS_WAIT_S = 0.25

@@ -89,7 +89,7 @@ def run(
     Parameters
     ----------
     lease_s : duration of the lease after each renewal, seconds
-    longest_s : seconds after which the lease is no longer renewed, in case that signing hangs
+    longest_s : seconds after which the lease is no longer renewed, in case signing hangs
     broke : function to call after an unexpected error, which may have damaged this process
 
     Returns

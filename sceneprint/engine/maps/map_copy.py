@@ -240,7 +240,7 @@ def pull_map(
 
 
 def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
-    """Return the rows of a map in the store by part digest and frame id; empty without the map."""
+    """Return the rows of a map by part digest and frame id; empty if the map does not exist."""
     with store.database.read() as connection:
         row = next((record for record in list_maps(connection) if record.name == map_name), None)
         if row is None:

@@ -113,7 +113,7 @@ class MapSurfaces:
         return record, pending
 
     def remove(self, map_name: str) -> None:
-        """Remove the surface of a map until the next build; raise UnknownMap without the map."""
+        """Remove the surface of a map until the next build; raise UnknownMap if there is no map."""
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
             surface = stored.find_surface(connection, row.number)

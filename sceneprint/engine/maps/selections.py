@@ -107,7 +107,7 @@ def edit_selection(
 
 
 def edited_tags(frame: FrameRow, edit: FramesEdit | SessionEdit) -> list[str]:
-    """Return the tags of a frame after an edit; raise InvalidRequest if they are too many."""
+    """Return the tags of a frame after an edit; raise InvalidRequest if there are too many."""
     removed = set(edit.remove_tags)
     tags = [tag for tag in frame.tags if tag not in removed]
     tags += [tag for tag in dict.fromkeys(edit.add_tags) if tag not in tags]

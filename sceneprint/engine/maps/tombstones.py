@@ -204,7 +204,7 @@ def _require_room(row: MapRow, deletion: Deletion) -> None:
     """Raise QuotaExceeded if the frames of a deletion exceed the quota; their bytes still count."""
     if row.quota_frames is not None and row.used_frames + deletion.frames > row.quota_frames:
         raise QuotaExceeded(
-            f"The deletion has {deletion.frames} frames, which exceeds the quota of map "
-            f"{row.name!r}, so no frame was restored. Restore single frames, or ask the operator "
-            "for a larger quota."
+            f"The quota of map {row.name!r} has no room for the {deletion.frames} frames of the "
+            "deletion, so no frame was restored. Restore single frames, or ask the operator for a "
+            "larger quota."
         )

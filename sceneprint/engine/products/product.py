@@ -100,7 +100,7 @@ class Products(ABC, Generic[Request, Record]):
         return False
 
     def begin(self, map_name: str, request: Request) -> Record:
-        """Queue a job; raise UnknownMap without the map, and InvalidRequest as `start` does."""
+        """Queue a job; raise UnknownMap if there is no map, and InvalidRequest as `start` does."""
         with self._store.database.read() as connection:
             progress = self.start(connection, find_map(connection, map_name), request)
         data = request.model_dump(mode="json", exclude_unset=True)

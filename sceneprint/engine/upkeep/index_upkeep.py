@@ -372,7 +372,7 @@ class Upkeep:
             allow(connection, 0)  # no time limit, since the connection is idle during the build
             now = find_map(connection, row.name)
             if row.model_id == now.next_model_id and is_complete(connection, now):
-                now = replace(now, model_id=row.model_id)
+                now = replace(now, model_id=row.model_id)  # the map is about to switch
             if (now.number, now.model_id) != (row.number, row.model_id):
                 return None  # the map was replaced or has switched its model
             previous = trusted(connection, now, None if rebuild else self._newest(now, model))

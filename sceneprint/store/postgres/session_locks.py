@@ -36,7 +36,7 @@ _COUNTER = "sceneprint_removals"
 _MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
 _READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
 #: Query that increments the sequence; only the holder of the lock uses it. After a crash, `nextval`
-#: could skip up to 32 numbers, and so confuse odd and even numbers.
+#: could skip up to 32 numbers, which would confuse odd and even numbers.
 _NEXT = (
     f"SELECT setval('{_COUNTER}', CASE WHEN is_called THEN last_value ELSE 0 END + 1)"
     f" FROM {_COUNTER}"
