@@ -193,7 +193,7 @@ def test_a_quota_of_frames_holds(full):
     names = list(frames(full))
     deletion = delete(full, names[:3]).deletion
     edit_map(full.store, "hall", {"quota_frames": len(names) - 1})
-    with pytest.raises(QuotaExceeded, match="The deletion has 3 frames"):
+    with pytest.raises(QuotaExceeded, match="no room for the 3 frames"):
         restore(full, deletion)
     assert len(frames(full)) == len(names) - 3
     for name in names[:2]:

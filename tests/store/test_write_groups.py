@@ -159,7 +159,7 @@ def test_ctrl_c_of_one_that_waits_is_its_own(database, monkeypatch):
     interrupted = _Waiting(noting("a", 2))
 
     def wait():
-        group._hand_over()  # before it notices
+        interrupted.leads = True  # passed on before it notices
         raise KeyboardInterrupt
 
     monkeypatch.setattr(interrupted.ready, "wait", wait)
