@@ -239,7 +239,9 @@ def together(group, given, until):
     for one in threads:
         one.start()
     until(lambda: len(group._waiting) == len(given))
-    group._hand_over()
+    leader = group._waiting[0]
+    leader.leads = True
+    leader.ready.set()
     for one in threads:
         one.join()
     assert (group._waiting, group._led) == ([], False)
