@@ -285,7 +285,7 @@ def test_cells_that_became_better_are_told(engine, work_off, rooms):
     assert {frame.session for frame in whole} == {"a", "c"}
     assert not any(frame.look_alikes for frame in whole)
     wider = measured(engine, work_off, **(how | {"cell_m": 1.0}))
-    for other, why in ((rooms.whole, "session of"), (wider.job_id, "0.5 m and 1 m")):
+    for other, why in ((rooms.whole, "differ in session"), (wider.job_id, "0.5 m and 1 m")):
         with pytest.raises(InvalidRequest, match=why):
             engine.coverage.changes("hall", other, before.job_id)
 

@@ -64,7 +64,10 @@ def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(empty, uploads
         cancel(empty.store, again.job_id)
     with pytest.raises(CannotRetry, match="is succeeded and its frame is indexed"):
         empty.retry_job(again.job_id)
-    with pytest.raises(CannotRetry, match=f"was replaced by {again.job_id}, which is succeeded"):
+    replaced = f"was replaced by job {again.job_id}, whose state is succeeded"
+    with pytest.raises(CannotRetry, match=replaced):
+        CannotRetry, match=f"was replaced by job {again.job_id}, whose state is succeeded"
+    ):
         empty.retry_job(added.job_id)
     for ask in (partial(cancel, empty.store), empty.retry_job):
         with pytest.raises(UnknownJob, match="nobody"):

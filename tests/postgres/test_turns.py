@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import func, insert, select, text
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import NewerSchema
+from sceneprint.errors import NewerSchema, StoreLocked
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.tables import events
 
@@ -63,3 +63,17 @@ def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(server_sto
         assert tuple(connection.exec_driver_sql(limits).one()) == after
     with engine.begin() as connection:
         assert tuple(connection.exec_driver_sql(limits).one()) == ("10s", "1min")
+
+
+def test_a_turn_that_does_not_come_in_time_is_an_error_and_is_given_up(server_store):
+    database = server_store.database
+    with database._writers.begin() as other:
+        postgres.take_turn(other, 10.0)
+        database._held = True  # as after a wait in vain: two seconds are enough
+        with pytest.raises(StoreLocked):
+            write(server_store)
+        assert waiting(server_store) == 0
+    write(server_store)
+    with database.read() as connection:
+        late_ones = select(func.count()).where(events.c.kind == "late")
+        assert connection.execute(late_ones).scalar_one() == 1

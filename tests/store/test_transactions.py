@@ -13,6 +13,20 @@ from sceneprint.errors import StoreFull
 from sceneprint.store.maps import find_map, next_revision
 from sceneprint.store.tables import events, frames, maps
 
+COUNTS = """
+from sceneprint.store import open_database
+from sceneprint.store.maps import next_revision
+
+def work(i):
+    database = open_database(ARGS[0])
+    seen = []
+    for _ in range(80):
+        with database.write() as connection:
+            seen.append(next_revision(connection, int(ARGS[1])))
+    return seen
+"""
+
+
 #: One process writes in four threads without a pause; the other counts the commits of the first
 #: that it has to wait for.
 LINE = """
@@ -131,3 +145,12 @@ def test_a_process_that_writes_without_a_pause_keeps_no_other_waiting(url, hall,
     _, waited = race(LINE, 2, url, hall.number, tmp_path / "over")
     assert len(waited) == 30
     assert max(waited) <= 2, waited
+
+
+def test_no_revision_is_lost_or_repeated_between_processes(url, store, hall, race):
+    revisions = race(COUNTS, 2, url, hall.number)
+    assert all(isinstance(each, list) for each in revisions), revisions  # else the error
+    assert all(each == sorted(each) for each in revisions)
+    assert sorted(revisions[0] + revisions[1]) == list(range(1, 161))
+    with store.database.read() as connection:
+        assert find_map(connection, "hall").revision == 160
