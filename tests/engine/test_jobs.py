@@ -66,8 +66,6 @@ def test_a_cancelled_job_is_done_by_nobody_and_can_be_tried_again(empty, uploads
         empty.retry_job(again.job_id)
     replaced = f"was replaced by job {again.job_id}, whose state is succeeded"
     with pytest.raises(CannotRetry, match=replaced):
-        CannotRetry, match=f"was replaced by job {again.job_id}, whose state is succeeded"
-    ):
         empty.retry_job(added.job_id)
     for ask in (partial(cancel, empty.store), empty.retry_job):
         with pytest.raises(UnknownJob, match="nobody"):
