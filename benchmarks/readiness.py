@@ -90,7 +90,7 @@ def _start_times(data: Path, frame: FrameReference) -> tuple[float, float, float
 
 
 def _signing_rate(data: Path, frames: Sequence[FrameReference], n: int) -> float:
-    """Return the frames per second that `n` running workers sign; ValueError for few frames."""
+    """Return the frames per second that `n` workers sign; raise ValueError for too few frames."""
     if len(frames) <= 16:
         raise ValueError(f"{len(frames)} frames are too few to time two workers.")
     with Client.embedded(data) as client:

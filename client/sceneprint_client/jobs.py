@@ -481,7 +481,7 @@ class JobMethods(ServiceConnection):
 
 @contextmanager
 def _opened(path: Path, kind: type[FrameError]) -> Iterator[BinaryIO]:
-    """Open a file for reading; raise an error of the kind if it cannot be read."""
+    """Open a file for reading; raise an error of type `kind` if it cannot be read."""
     try:
         with path.open("rb") as file:
             yield file

@@ -164,7 +164,7 @@ def _number(name: str, value: object, error: type[SceneprintError]) -> float:
 
 
 def _up(value: object, error: type[SceneprintError]) -> Position | None:
-    """Return an optional direction of length 1."""
+    """Return a direction of length 1, or None for None; raise `error` for other values."""
     if value is None:
         return None
     if isinstance(value, list) and len(value) == len("xyz"):
@@ -175,7 +175,7 @@ def _up(value: object, error: type[SceneprintError]) -> Position | None:
 
 
 def _nearest(folder: Path, name: str) -> Path | None:
-    """Return the nearest file of a name, in this folder or up to 4 above."""
+    """Return the nearest file of a name, in this folder or up to 4 above, or None."""
     absolute = folder.resolve() if ".." in folder.parts else folder.absolute()
     places = (absolute, *absolute.parents[:_PARENTS])
     return next((place / name for place in places if (place / name).is_file()), None)

@@ -228,7 +228,7 @@ class _Belief:
     T_map_sensor: Array
     covariance: Array
     confirmed: float  #: stamp of the last answer that confirmed it without a prior
-    undecided: float | None = None  #: distance at the first answer since that did not confirm it
+    undecided: float | None = None  #: distance at the first later answer that did not
 
 
 class TrackerCore:
@@ -319,7 +319,7 @@ class TrackerCore:
     # Odometry.
 
     def _mark(self, stamp: float, T: Array) -> _Mark:
-        """Return the mark at a stamp, added if it is new; raise InvalidRequest if it decreases."""
+        """Return the mark at a stamp; add later stamps; raise InvalidRequest for other new ones."""
         if self._marks and stamp <= self._marks[-1].stamp:
             at = bisect_right([mark.stamp for mark in self._marks], stamp) - 1
             mark = self._marks[max(at, 0)]

@@ -533,7 +533,7 @@ _OWN_RANGES = re.compile(r"(.+)@((?:db|queries)=[^@]*)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Range:
-    """Frames start, start + step, ... before stop; None: from the first, to the last, default."""
+    """Frames start, start + step, ... before stop; None: the first, the end, the default."""
 
     start: int | None
     stop: int | None
