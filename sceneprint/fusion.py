@@ -131,7 +131,11 @@ def _sensor_points(view: DepthFrame) -> Floats:
 def _select_voxel(
     views: Sequence[DepthFrame], points: Sequence[Floats], p: FusionParameters
 ) -> float:
-    """Return the edge of the voxels, metres: `p.voxel_m`, or the smallest edge without gaps."""
+    """Return the edge of the voxels, metres: `p.voxel_m`, or a small edge without gaps.
+
+    An edge that the caller does not specify grows until `p.most_blocks` suffice. Raise
+    InvalidRequest if a specified edge needs more blocks.
+    """
     if p.voxel_m is not None:
         count = _count_blocks(views, points, p.voxel_m)
         if count > p.most_blocks:

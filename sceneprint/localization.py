@@ -48,7 +48,7 @@ from sceneprint.types import Floats, Geometry
 
 LocalizationStatus = Literal["found", "ambiguous", "not_found"]
 #: Evidence that confirmed the answer: strong matches that vote for the pose; the map's frames, if
-#: no match is strong; or the robot's prior, if the map supports several poses.
+#: no match is strong; or the robot's prior, if neither suffices.
 Verifier = Literal["matches", "map", "prior"]
 
 
@@ -297,7 +297,8 @@ def rival_rows(
 
     Returns
     -------
-    rows : first such rows of R, at most `p.rivals`; empty unless a pose was confirmed
+    rows : first such rows of R, at most `p.rivals`; empty unless matches or the map confirmed
+        `estimate`
     """
     p = p or LocalizationParameters()
     if estimate is None or estimate.average is None or estimate.verified_by == "prior":

@@ -131,24 +131,24 @@ def _along_least_extent(points: Floats, valid: NDArray[np.bool_]) -> Vista:
     This axis is vertical for a room, and horizontal for a single wall. Each pixel shows the point
     that is farthest along it.
     """
-    valid_points = np.flatnonzero(valid)
-    if not valid_points.size:
+    indices = np.flatnonzero(valid)
+    if not indices.size:
         return Vista(np.full((1, 1), -1, np.int32), np.zeros(len(points)), "height", _AXES)
-    centred = points - points[valid_points].mean(axis=0)
-    _, axes = np.linalg.eigh(centred[valid_points].T @ centred[valid_points])
+    centred = points - points[indices].mean(axis=0)
+    _, axes = np.linalg.eigh(centred[indices].T @ centred[indices])
     for i in (0, 2):  # orient the axes like the nearest coordinate axes
         axes[:, i] *= np.sign(axes[np.argmax(np.abs(axes[:, i])), i])
     above, right = axes[:, 0], axes[:, 2]
     heights = centred @ above
     flat = np.stack([centred @ np.cross(right, above), centred @ right], axis=1)  # down, right
-    low = flat[valid_points].min(axis=0)
-    size = np.maximum(flat[valid_points].max(axis=0) - low, 1e-6)
-    longer = min(max(math.isqrt(len(valid_points)), _LEAST), _MOST)
+    low = flat[indices].min(axis=0)
+    size = np.maximum(flat[indices].max(axis=0) - low, 1e-6)
+    longer = min(max(math.isqrt(len(indices)), _LEAST), _MOST)
     cell = size.max() / (longer - 1)
-    rows, columns = np.rint((flat[valid_points] - low) / cell).astype(np.intp).T
+    rows, columns = np.rint((flat[indices] - low) / cell).astype(np.intp).T
     pixels: Ints32 = np.full((rows.max() + 1, columns.max() + 1), -1, np.int32)
-    order = np.argsort(heights[valid_points], kind="stable")  # the highest point is written last
-    pixels[rows[order], columns[order]] = valid_points[order]
+    order = np.argsort(heights[indices], kind="stable")  # the highest point is written last
+    pixels[rows[order], columns[order]] = indices[order]
     return Vista(pixels, heights, "height", _AXES)
 
 

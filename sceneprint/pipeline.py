@@ -121,7 +121,7 @@ def geometry_of(seen: Surface, model: Model) -> Geometry:
 
 
 def _scan_image(cloud: Cloud, p: CloudParameters) -> Surface:
-    """Return the range image of a cloud, with spread points if the sensor covers a full turn."""
+    """Return the range image of a cloud, with spread points if the sensor sees all around."""
     shown = range_image(cloud, p)
     if not (isinstance(shown.camera, Sphere) and shown.camera.sees_around):
         return shown
@@ -247,7 +247,7 @@ def validate_guided(
 def validate_without_up(
     query: Geometry, match: Geometry, seed: int, p: ValidationParameters | None, ups: Ups
 ) -> PairValidation | None:
-    """Validate by the surfaces only, for a query whose `up` contradicts all matches: Sec. III-E.
+    """Validate by the surfaces only, for a query without a match that fits `up`: Sec. III-E.
 
     For the result, see `sceneprint.geometry.validation.validation.validate_without_up`.
 

@@ -99,7 +99,7 @@ def raise_descriptors() -> int:
 
 
 def limit_memory(more: int) -> None:
-    """Limit the memory that this process may allocate from now on; then, raise MemoryError.
+    """Limit the memory that this process may allocate from now on; beyond it, MemoryError occurs.
 
     The limit covers private writable memory, but not files that are mapped into memory, such as
     tables and indexes.

@@ -676,8 +676,7 @@ def _is_hidden(parts: tuple[str, ...]) -> bool:
 
 
 def _omitted_folder(parts: tuple[str, ...]) -> tuple[str, ...] | None:
-    """Return the path of a member's first folder whose name indicates colour or infrared; None if
-    none.
+    """Return the path of a member's first folder whose name indicates colour or infrared, if any.
 
     The topmost folder is skipped: it may be the packed data set, whose name is arbitrary.
     """

@@ -266,6 +266,7 @@ def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST)
 # Artifacts as bytes: with them, a frame is validated without its upload.
 #
 #     Geometry  --write_geometry-->  bytes  --read_geometry-->  Geometry
+#
 # The order is: magic number, schema, CRC-32 of the rest, sizes and camera, id of the model, arrays.
 # Numbers are little-endian. Depth images have schema 1, clouds 2, and scans with spread points 3.
 # In schema 3, all offsets and ranges precede the normals.

@@ -40,7 +40,7 @@ Rows = NDArray[Any]
 
 
 def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
-    """Raise UnreadableFrame if samples are not depth, or have swapped bytes or rotated bits.
+    """Check that samples are depth, without swapped bytes or rotated bits.
 
     The check takes 0.6 ms for 640 x 480 samples. Callers skip it if the user sets `trust_depth`.
 
@@ -49,7 +49,7 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
     samples : (H, W) uint16 in stored units, or floating-point metres
     depth_scale : stored units per metre
 
-    Raise UnreadableFrame if the samples are not depth; the message contains the remedy.
+    Raise UnreadableFrame if they are not; the message contains the remedy.
     """
     rows = samples[:: max(1, len(samples) // _ROWS)]
     is_whole = rows.dtype == np.uint16
@@ -87,7 +87,7 @@ def _find_rotation(rows: Rows) -> int | None:
     """
     turned = [(bits, rows << bits | rows >> 16 - bits) for bits in range(1, 16)]
     smooth = [
-        (float(turned.mean()), bits) for bits, turned in turned if 0.0 < _bend(turned) < _SMOOTH
+        (float(samples.mean()), bits) for bits, samples in turned if 0.0 < _bend(samples) < _SMOOTH
     ]
     return min(smooth)[1] if smooth else None
 

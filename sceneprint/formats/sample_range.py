@@ -10,7 +10,7 @@ import numpy as np
 from sceneprint.types import AnyFrame, Cloud, Floats32
 from sceneprint_client.api.frames import SampleRange
 
-#: Approximate number of samples from which percentiles are computed, within a millisecond.
+#: Minimum number of samples for the percentiles of a larger frame; they take a millisecond.
 _SAMPLES = 20_000
 
 

@@ -433,7 +433,7 @@ def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = Non
 
     Each vote (a random sample of `hypotheses` votes if there are more) is tested as the transform,
     and the best vote is refitted to the votes that agree. The weights of a frame's votes are
-    normalized, so that a frame with many matches does not outweigh other frames.
+    divided by their number, so that a frame with many matches does not outweigh other frames.
 
     Parameters
     ----------
@@ -449,8 +449,8 @@ def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = Non
     if n == 0:
         raise ValueError("There are no votes. Pass at least one vote.")
     weights = votes.weights / np.bincount(votes.source)[votes.source]
-    everything = np.ones(n, np.bool_)
-    best = _best_vote(votes, weights, _sample(np.arange(n), seed, p), everything, p)
+    every_vote = np.ones(n, np.bool_)
+    best = _best_vote(votes, weights, _sample(np.arange(n), seed, p), every_vote, p)
     T, agree = _fit_transform(votes, weights, votes.transforms[best], p)
     others, rivals = ~agree, np.zeros(n, np.bool_)
     if others.any():
@@ -532,7 +532,7 @@ def _best_vote(
     votes: Votes, weights: Floats, chosen: NDArray[np.intp], among: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> int:  # fmt: skip
-    """Return the index in `chosen` of the vote that most of `among` support; ties by order."""
+    """Return the vote of `chosen` with the greatest weight of `among` behind it; ties by order."""
     support = [
         float(weights[_agreement_mask(votes, votes.transforms[i], p) & among].sum()) for i in chosen
     ]

@@ -135,11 +135,11 @@ class IndexManifest(StrictRecord):
         """Return the recall of a search: the minimum over the segments."""
         recalls = [segment.recall for segment in self.segments]
         return Recall(
-            share=min((segment.share for segment in recalls), default=1.0),
-            near=max((segment.near for segment in recalls), default=0),
-            sample=sum(segment.sample for segment in recalls),
-            probes=sum(segment.probes for segment in recalls),
-            frames=sum(segment.frames for segment in recalls),
+            share=min((recall.share for recall in recalls), default=1.0),
+            near=max((recall.near for recall in recalls), default=0),
+            sample=sum(recall.sample for recall in recalls),
+            probes=sum(recall.probes for recall in recalls),
+            frames=sum(recall.frames for recall in recalls),
         )
 
 

@@ -167,10 +167,10 @@ def open_version(
             for _ in verify(folder, name, size):
                 pass
     # reuse open segments with their caches, unless a damaged part was written again
-    open_ones = {} if known is None else {segment.record: segment for segment in known.segments}
+    reusable = {} if known is None else {segment.record: segment for segment in known.segments}
     segments = tuple(
-        open_ones[record]
-        if record in open_ones
+        reusable[record]
+        if record in reusable
         and known is not None
         and all(known.inodes[name] == inodes[name] for name, _ in record.files)
         else open_segment(folder, record, manifest.dimension)

@@ -224,7 +224,7 @@ class _Pages:
         self._data, self._page = data, page
         self._payload = page - _CHECKSUM_BYTES
         self._group = max(1, _WINDOW_BYTES // page)  # number of pages in a window
-        self._window, self._parse_number = b"", -1
+        self._window, self._number = b"", -1
 
     def logical(self, physical: int) -> int:
         """Convert an offset in the file to an offset in the payload."""
@@ -250,7 +250,7 @@ class _Pages:
         return b"".join(pieces)
 
     def _in_window(self, number: int) -> bytes:
-        if number != self._parse_number:
+        if number != self._number:
             first = number * self._group * self._page
             window = self._data[first : first + self._group * self._page]
             rows = np.frombuffer(window, np.uint8).reshape(-1, self._page)
@@ -262,7 +262,7 @@ class _Pages:
                     f"The file is damaged: the checksum of its page "
                     f"{number * self._group + int(wrong[0])} is wrong. {_AGAIN}"
                 )
-            self._window, self._parse_number = payloads.tobytes(), number
+            self._window, self._number = payloads.tobytes(), number
         return self._window
 
 

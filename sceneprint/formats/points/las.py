@@ -24,10 +24,12 @@ from sceneprint_client.files import LAS_SIGNATURE
 
 # The optional package lazrs (Rust) decompresses the points of LAZ files.
 #
-# bytes  --inflated_records-->  blocks of records lazrs allocates memory according to the file, and
-# Rust aborts if an allocation fails. Therefore, all numbers that determine allocations are compared
-# with the file's length first (M. Isenburg, LASzip 1.3 and 1.4): the kinds of values in a record,
-# the number of chunks, and, from format 6 on, the lengths of the layers of each chunk.
+# bytes  --inflated_records-->  blocks of records
+#
+# lazrs allocates memory according to the file, and Rust aborts if an allocation fails. Therefore,
+# all numbers that determine allocations are compared with the file's length first (M. Isenburg,
+# LASzip 1.3 and 1.4): the kinds of values in a record, the number of chunks, and, from format 6 on,
+# the lengths of the layers of each chunk.
 
 _VLR = 54  #: size of the header of a variable-length record, bytes
 _MAXIMUM_VLRS = 10_000
@@ -64,7 +66,7 @@ def inflated_records(
     compressor, coder, chunk, kinds = _parse_vlr(vlr)
     layered = compressor == 3
     is_supported = layered == (form >= 6) and coder == 0 and compressor in (2, 3)
-    if not is_supported or not _form_record(kinds, layered, length):
+    if not is_supported or not _is_record(kinds, layered, length):
         raise UnreadableCloud(
             f"The LAZ file stores records of {length} bytes of format {form} as {kinds[:20]} with "
             f"compressor {compressor}, which is contradictory or not supported. {_AGAIN}"
@@ -150,7 +152,7 @@ def _parse_vlr(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
     raise UnreadableCloud(f"The LAZ file does not say how its points are packed. {_AGAIN}")
 
 
-def _form_record(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
+def _is_record(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:
     """Return whether values of these kinds and sizes form a record of `length` bytes.
 
     The point must come first, and each kind may occur once.

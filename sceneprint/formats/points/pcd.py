@@ -33,6 +33,7 @@ from sceneprint_client.sidecars import Position
 # LZF, the compression of binary_compressed PCD files (M. Lehmann's liblzf 3.6).
 #
 # packed, size  --inflate-->  bytes
+#
 # After a control byte c below 32, c + 1 literal bytes follow. Other control bytes are back
 # references: the upper three bits are the number of bytes to repeat minus two (for 7, the next byte
 # is added), and the lower five bits are the upper part of the distance.

@@ -356,7 +356,7 @@ _PROFILE = struct.pack("<I4s", 4, b"ros2")
 
 
 class _Profiled:
-    """An MCAP file whose profile reads as "ros2": the start of the header, after its length."""
+    """An MCAP file that reads as if its header started with the profile "ros2"."""
 
     def __init__(self, file: Any) -> None:
         self._file = file

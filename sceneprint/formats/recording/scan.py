@@ -67,7 +67,7 @@ class BagPart:
     Parameters
     ----------
     first : index of the first frame
-    tree : transforms, and odometry without duplicate transforms
+    tree : transforms, and odometry for edges without transforms
     imus : measurements by coordinate frame of the IMU
     info_stamps_ns, infos : stamp of each calibrated CameraInfo, ns, and index in `BagScan.infos`
     """
@@ -319,7 +319,7 @@ class _Scanner:
 
 
 def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float]]]) -> None:
-    """Add the static transforms, except transforms with contradictory values."""
+    """Add the static transforms, except those with values that contradict each other or tf."""
     for (parent, child), rows in fixed.items():
         moving = tree.samples(parent, child)
         accepted = [

@@ -249,7 +249,7 @@ _WORLD_OF_LOAM = "camera_init"
 
 @dataclass(eq=False)
 class _Motion:
-    """The motion of the sensor in a part of a recording; dictionaries have the indices of frames.
+    """The motion of the sensor in a part of a recording; keys are indices of frames.
 
     Parameters
     ----------

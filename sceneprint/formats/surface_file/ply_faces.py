@@ -41,7 +41,7 @@ _AGAIN = "Copy or write the file again."
 def read_faces(data: FileBytes) -> Ints32 | None:
     """Read the triangles (M, 3) of the element `face`; return None if the file has no faces.
 
-    Indices are not compared with the number of vertices; negative and beyond int32, they become -1.
+    Indices are not compared with the number of vertices; those below 0 or beyond int32 become -1.
 
     Raise UnreadableCloud if the faces have no list of vertices, or fewer or more bytes than
     declared, a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.

@@ -55,7 +55,7 @@ class LevelStatistics:
     total: float
 
 
-#: Number of rows of the table that are prefetched, to hide the latency of memory.
+#: Number of rows of the table by which the prefetch is ahead, to hide the latency of memory.
 _AHEAD = 16
 
 

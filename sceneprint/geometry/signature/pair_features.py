@@ -372,14 +372,14 @@ def _select_leading(
         for k in range(count):
             posteriors[i, k] = np.exp(logits[components[i, k]] - highest)
             total += posteriors[i, k]
-        remainder = np.float32(0.0)
+        new_total = np.float32(0.0)
         for k in range(count):
             posteriors[i, k] /= total
             if posteriors[i, k] < np.float32(LEAST_POSTERIOR):
                 posteriors[i, k] = np.float32(0.0)
-            remainder += posteriors[i, k]
+            new_total += posteriors[i, k]
         for k in range(count):
-            posteriors[i, k] /= remainder
+            posteriors[i, k] /= new_total
 
 
 def compute_bins(

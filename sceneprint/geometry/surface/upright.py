@@ -207,7 +207,7 @@ def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> 
 
 
 def _balance(areas: Floats, chosen: NDArray[np.bool_], places: Floats) -> float:
-    """Return the difference between the areas of both halves, lower first, over their sum."""
+    """Return the area of the lower half minus that of the upper half, over their sum."""
     lower = float(areas[chosen & (places < 0.5)].sum())
     upper = float(areas[chosen & (places >= 0.5)].sum())
     return (lower - upper) / (lower + upper + 0.005 * float(areas.sum()) or 1.0)

@@ -54,9 +54,8 @@ class AcceptanceParameters:
     plane_overlap: float = 0.15  #: minimum plane overlap
     net_weight: float = 3.0  #: net plane overlap = plane overlap - net_weight * violations
     net: float = 0.1  #: minimum net plane overlap
-    many_planes: float = (
-        math.inf
-    )  #: number of distinct planes above which `many_planes_net` applies
+    #: Number of distinct planes above which `many_planes_net` applies.
+    many_planes: float = math.inf
     many_planes_net: float = 0.06  #: minimum net plane overlap if many planes agree
     net_strong: float = 0.1  #: net plane overlap below which an accepted match is weak
     planes: float = 0.0  #: minimum number of distinct planes that agree

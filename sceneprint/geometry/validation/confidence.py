@@ -35,7 +35,7 @@ class PlaceEvidence:
     weight : sum of the weights of votes for the pose, one per viewpoint: 1 for a strong match, less
         for a weak or ambiguous match; see `LocalizationParameters`
     strong : number of viewpoints of strong matches that vote for the pose
-    accepted : number of viewpoints of accepted or guided matches that vote for the pose
+    accepted : number of viewpoints of accepted matches, including guided matches, that lead to it
     suggested : number of viewpoints of candidates that suggest the pose, accepted or not
     similarity : maximum similarity between these candidates' signatures and the query's, 0 to 1
     rival : score of the best other place relative to the score of this place; 0 if there is none

@@ -63,7 +63,7 @@ def _write_visible(
     size: int, depth: Floats32, reach: float, gap: float, views: Floats, limits: Floats,
     elements: Ints32, masks: NDArray[np.uint32],
 ) -> int:  # fmt: skip
-    """Write the elements that are visible on a face of the cube, and their masks; count them."""
+    """Write the visible elements on a face of the cube, and their masks; return their number."""
     count = 0
     half = size / 2.0
     for block in range(len(starts)):
