@@ -44,7 +44,7 @@ class Scrub:
 
     Parameters
     ----------
-    settings : `scrub_mb_per_s` limits the total rate of all workers of the store
+    settings : `blob_check_mb_per_s` limits the total rate of all workers of the store
     """
 
     def __init__(self, settings: Settings, store: Store) -> None:

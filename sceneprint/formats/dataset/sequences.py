@@ -401,13 +401,13 @@ def find_each(
 
     ROS recordings are skipped; see `find_sequences` for the other layouts.
 
+    `root`: absolute path of a folder. Raise DatasetError if there are too many folders, or two
+    scenes have the same name.
+
     Returns
     -------
     sequences : readable sequences; may be empty
     refused : name and error of each unreadable sequence
-
-    `root`: absolute path of a folder. Raise DatasetError if there are too many folders, or two
-    scenes have the same name.
     """
     sequences: list[FrameSequence] = []
     refused = []

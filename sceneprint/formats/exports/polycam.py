@@ -47,12 +47,12 @@ def is_polycam(folder: Path, folders: list[str]) -> bool:
 def polycam_sequence(folder: Path, name: str) -> FrameSequence:
     """Return the frames of an export of Polycam, as a sequence.
 
+    `folder`: folder `keyframes` or its parent. Raise DatasetError if no frame has depth and a
+    camera, or the folder cannot be read.
+
     Returns
     -------
     sequence : sequence whose `note` lists the omitted frames
-
-    `folder`: folder `keyframes` or its parent. Raise DatasetError if no frame has depth and a
-    camera, or the folder cannot be read.
     """
     from sceneprint.formats.dataset.sequences import list_folder
 

@@ -165,12 +165,12 @@ def _parts_of_zip(capture: Path, _changed_ns: int, _size: int) -> dict[str, tupl
 def record3d_sequence(capture: Path, name: str) -> FrameSequence:
     """Return the frames of a capture, as a sequence.
 
+    `capture`: .r3d file, or folder with `metadata` and `rgbd`. Raise DatasetError if the capture is
+    damaged or exported in another format, or no frame has depth.
+
     Returns
     -------
     sequence : sequence whose `note` lists the omitted frames
-
-    `capture`: .r3d file, or folder with `metadata` and `rgbd`. Raise DatasetError if the capture is
-    damaged or exported in another format, or no frame has depth.
     """
     if capture.is_dir() and not (capture / METADATA).is_file():
         raise DatasetError(

@@ -151,13 +151,13 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
     The poses are the optimised poses that rtabmap stores when it closes a database. If they are
     missing, odometry provides the poses, and each session has a separate parent frame.
 
-    Returns
-    -------
-    sequences : at least one sequence; the `note` of each lists the omitted nodes
-
     `name`: name of the sequences; default: name of the file. Raise DatasetError if the file is not
     a database of RTAB-Map, has an unsupported version, is in use or damaged, or no node has depth
     or a three-dimensional laser scan.
+
+    Returns
+    -------
+    sequences : at least one sequence; the `note` of each lists the omitted nodes
     """
     name = name or path.stem
     with _open_database(path) as database:

@@ -139,13 +139,13 @@ def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats
 def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
     """Return the scans of an E57 file in order, without decoding their points.
 
-    Returns
-    -------
-    scans : at least one scan
-
     `data`: the whole file, which must not change while points are decoded. Raise UnreadableCloud if
     the file is not E57, is damaged, has a later version or no scan, a scan has no coordinates or
     more than 200 million points, or a pose is not rigid.
+
+    Returns
+    -------
+    scans : at least one scan
     """
     if len(data) < _HEADER.size or bytes(data[:8]) != E57_SIGNATURE:
         raise UnreadableCloud(f"This is not an E57 file. {_AGAIN}")
