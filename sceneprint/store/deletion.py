@@ -359,9 +359,9 @@ def _old(map_number: int, before: float) -> ColumnElement[bool]:
     return and_(frames.c.map_number == map_number, frames.c.received_at < before, _LIVING)
 
 
-# Rows of frames that have been deleted, rejected or redundant for some days. Readers of signatures
-# learn of deletions from these rows. The map stores the greatest revision of a removed row; readers
-# at earlier revisions must restart.
+# Rows of frames that have been deleted or redundant for some days. Readers of signatures learn of
+# deletions from these rows. The map stores the greatest revision of a removed row; readers at
+# earlier revisions must restart.
 
 
 def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
@@ -407,7 +407,7 @@ def remove_ended(connection: Connection, map_number: int, before: float, limit: 
 
 
 def newest_deletion(connection: Connection, map_number: int, before: float) -> int:
-    """Return the highest revision among frames deleted before a time; 0 without such frames."""
+    """Return the revision of the last frame deleted before a time; 0 without such a frame."""
     statement = (
         select(frames.c.revision)
         .where(_ended(map_number, FrameState.DELETED, before))

@@ -138,7 +138,7 @@ frames = Table(
     Column("name", _string(255)),  # name of the original file or message; never used as a path
     Column("sequence", WHOLE),  # position within the session
     Column("samples", JSON(none_as_null=True)),  # ranges of the samples, and `trust_depth`
-    Column("ended_at", Float),  # time at which the frame was deleted, rejected or redundant
+    Column("ended_at", Float),  # time at which the frame was deleted or redundant
     # first revision of the deletion, if the frame can be restored (tombstone)
     Column("deletion", WHOLE),
     Column("deleted_from", _string(16)),  # former state; null if another frame uses the id now
