@@ -200,12 +200,12 @@ class Events:
 
     def remove_surplus(self) -> int:
         """Remove events beyond the number stored per map, in blocks; return their number."""
-        stored_events, indexes = self._settings.events_per_map, Path(self._settings.indexes)
+        most_events, indexes = self._settings.events_per_map, Path(self._settings.indexes)
 
         def spent(connection: Connection, limit: int) -> list[int]:
-            if not surplus_events(connection, stored_events, (), 1):
+            if not surplus_events(connection, most_events, (), 1):
                 return []  # usual case; avoids reading the indexes
-            return surplus_events(connection, stored_events, anchors(indexes), limit)
+            return surplus_events(connection, most_events, anchors(indexes), limit)
 
         return remove_in_blocks(self._store.database, spent, remove_events, AT_MOST)
 

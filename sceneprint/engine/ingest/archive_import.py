@@ -445,7 +445,7 @@ class Imports:
 
         Raises
         ------
-        UnusableStore : If the store cannot be written; the next call retries.
+        UnusableStore : If the store cannot be written; a later call retries.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0

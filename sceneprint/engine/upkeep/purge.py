@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 AT_ONCE = 100
 #: Maximum duration of a call, seconds; meanwhile, jobs wait.
 TURN_S = 2.0
-#: Seconds between checks for old frames.
+#: Seconds between checks after all old frames and rows were deleted.
 LOOK_S = 60.0
 #: Reason of the deletion in events.
 REASON = "retention"
@@ -71,9 +71,9 @@ class Retention:
         self._next = 0.0
 
     def run(self, now: float | None = None) -> int:
-        """Delete old frames and rows, at most every LOOK_S seconds; return their number.
+        """Delete old frames and rows, if it is due, for about TURN_S seconds; return their number.
 
-        Errors are logged; a later call retries.
+        If any remain, the next call continues. Errors are logged; a later call retries.
 
         Parameters
         ----------
