@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +14,6 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client
 from sceneprint_client.api import FrameMeta
 from tests.cli_service.conftest import write_rooms
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")

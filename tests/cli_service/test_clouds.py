@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import write_pose
 from sceneprint.formats.export import write_ply
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from pydantic import SecretStr
@@ -34,7 +32,6 @@ from sceneprint.settings import Settings
 from sceneprint_client import Client, Status
 from sceneprint_client.api.admin import WorkerSeen
 
-Run = Callable[..., Any]
 #: What is said of a service.
 SERVICE = [
     "service", "ready", "service clock", "store", "scrub", "service disk", "workers",

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-from collections.abc import Callable
 from contextlib import closing
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ import pytest
 from sceneprint.formats.depth_file import encode_png
 from sceneprint_client import Client
 
-Run = Callable[..., Any]
 #: Optical axes to the base of a robot, 0.3 m above the floor.
 LOCAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0.3], [0, 0, 0, 1]])
 

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import pytest
 
 from sceneprint.cli.options import add_filter_options, filter_of
-
-Run = Callable[..., Any]
 
 
 def test_options_are_a_filter():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 
 import pytest
 
@@ -12,8 +11,6 @@ from sceneprint.cli import main
 from sceneprint.settings import Settings
 from sceneprint_client import Client
 from tests.whole_engine import Engine
-
-Run = Callable[..., tuple[str, str]]
 
 
 @pytest.fixture

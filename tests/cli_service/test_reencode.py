@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from typing import Any
 
 from sqlalchemy import update
@@ -15,8 +14,6 @@ from sceneprint.store.tables import jobs
 from sceneprint_client import Client, meta_of
 from sceneprint_client.api import JobState
 from tests.whole_engine import Engine
-
-Run = Callable[..., Any]
 
 
 def test_a_map_is_signed_anew_while_its_service_runs(sceneprint, service_url, data_folder, rooms):

@@ -11,7 +11,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from typing import Any
 
@@ -26,8 +25,6 @@ from sceneprint.formats.dataset import read_pose, write_depth_png
 from sceneprint_client import Client, http
 from sceneprint_client.api import Answer, FrameState, Map
 from sceneprint_lab.cli.demo import serving
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture(scope="session")

@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 import socket
 import time
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
 from importlib.util import find_spec
 from io import BytesIO
-from typing import Any
 
 import pytest
 
@@ -26,7 +24,6 @@ MAP = {
     "created_at": "2026-01-01T00:00:00Z", "frames": {},
 }  # fmt: skip
 ADDED = {"frame_id": "f", "job_id": "j", "state": "received", "reason": None}
-Make = Callable[[list[tuple[int, dict[str, str], object]]], Any]
 
 
 def problem(kind: str, status: int, **more: object) -> tuple[int, dict[str, str], object]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-Settle = Callable[[Page], None]
 OUTCOMES = ("found", "wrong", "ambiguous", "not_found")
 CELLS = """all => all.map(one => ({cell: one.dataset.cell, outcome: one.dataset.outcome,
     x: Number(one.getAttribute("x")), y: Number(one.getAttribute("y")),

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
-Settle = Callable[[Page], None]
 SIDES = ("monday", "tuesday")
 
 

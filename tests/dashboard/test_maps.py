@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -12,7 +11,6 @@ from playwright.sync_api import Page, expect
 
 from benchmarks.rooms import Shot, send, shots
 
-Settle = Callable[[Page], None]
 MARKUP = "<img src=x onerror=alert(1)> & co"
 
 

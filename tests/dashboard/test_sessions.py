@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import expect
 
-Settle = Callable[[Page], None]
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
 #: Session and robot of each of six frames.
 TAKEN = [("monday", "ann")] * 2 + [("monday", None)] + [("tuesday/2", "ann")] * 2 + [(None, None)]
