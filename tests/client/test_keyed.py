@@ -1,4 +1,4 @@
-"""Tests of every client method with a service that requires keys, by scope."""
+"""Tests that every client method requires a key, and of the methods that manage keys."""
 
 from __future__ import annotations
 
@@ -9,12 +9,7 @@ from typing import Any
 
 import pytest
 
-from sceneprint.errors import (
-    Conflict,
-    InvalidRequest,
-    KeyRequired,
-    UnknownKey,
-)
+from sceneprint.errors import Conflict, InvalidRequest, KeyRequired, UnknownKey
 from sceneprint_client import Client
 from sceneprint_client.api.coverage import MapCoverage
 
@@ -35,8 +30,7 @@ OPEN = {"healthy", "status", "close"}
 
 def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
     """Each method of the client, by its signature: a new one is asked as well."""
-    client = remote
-    client._http.headers["X-Forwarded-For"] = "192.0.2.7"  # as behind a proxy
+    remote._http.headers["X-Forwarded-For"] = "192.0.2.7"  # as behind a proxy
     archive = tmp_path / "archive.zip"
     archive.write_bytes(b"PK")
     own = GIVEN | {
@@ -58,7 +52,7 @@ def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
             needed = {"map_name": "hall", "frame_id": ID}
 
         def call(name: str = name, needed: dict[str, Any] = needed) -> None:
-            found = getattr(client, name)(**needed)
+            found = getattr(remote, name)(**needed)
             if isinstance(found, Iterator):
                 next(found)
 
@@ -66,41 +60,40 @@ def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
             call()
         asked.append(name)
     assert len(asked) > 50
-    assert client.healthy()
-    assert (client.status().frames, client.status().jobs) == (None, None)
+    assert remote.healthy()
+    assert (remote.status().frames, remote.status().jobs) == (None, None)
 
 
 def test_keys_are_made_listed_rotated_and_revoked(embedded):
-    client = embedded
     until = datetime.now(UTC) + timedelta(hours=1)
-    made = client.create_key("cart 9", {"hall": "write", "yard": "read"}, until)
+    made = embedded.create_key("cart 9", {"hall": "write", "yard": "read"}, until)
     assert made.secret.startswith("sp_")
     assert (made.name, made.grants) == ("cart 9", {"hall": "write", "yard": "read"})
     assert made.expires_at == until
-    found = client.keys()
+    found = embedded.keys()
     (listed,) = [key for key in found if key.name == "cart 9"]
     assert listed.model_dump() == made.model_dump(exclude={"secret"})
     with pytest.raises(Conflict, match="A key named 'cart 9' already exists"):
-        client.create_key("cart 9", {"*": "read"})
+        embedded.create_key("cart 9", {"*": "read"})
     with pytest.raises(InvalidRequest, match="grants"):
-        client.create_key("empty", {})
-    me = client.me()
+        embedded.create_key("empty", {})
+    me = embedded.me()
     assert (me.name, me.grants) == (None, {"*": "admin"})
-    turned = client.rotate_key("cart 9", 60)
+    turned = embedded.rotate_key("cart 9", 60)
     assert (turned.secret != made.secret, turned.grants) == (True, made.grants)
     assert turned.previous_until is not None
     assert turned.previous_until - datetime.now(UTC) <= timedelta(seconds=60)
     with pytest.raises(UnknownKey, match="'cart 10'"):
-        client.rotate_key("cart 10")
+        embedded.rotate_key("cart 10")
     with pytest.raises(InvalidRequest, match="overlap_s"):
-        client.rotate_key("cart 9", -1)
-    client.revoke_key("cart 9")
-    found = client.keys()
+        embedded.rotate_key("cart 9", -1)
+    embedded.revoke_key("cart 9")
+    found = embedded.keys()
     assert "cart 9" not in [key.name for key in found]
     with pytest.raises(UnknownKey, match="'cart 9'"):
-        client.revoke_key("cart 9")
-    lines = [(one.action, one.target) for one in client.audit() if one.action != "refused"]
+        embedded.revoke_key("cart 9")
+    lines = [(one.action, one.target) for one in embedded.audit() if one.action != "refused"]
     assert lines == [(f"key.{done}", "cart 9") for done in ("revoked", "rotated", "created")]
-    client.create_map("yard", model="depth")
-    assert [one.action for one in client.audit(map_name="yard")] == ["map.created"]
-    assert list(client.audit(actor="cart 9")) == []
+    embedded.create_map("yard", model="depth")
+    assert [one.action for one in embedded.audit(map_name="yard")] == ["map.created"]
+    assert list(embedded.audit(actor="cart 9")) == []

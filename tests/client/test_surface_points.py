@@ -69,7 +69,7 @@ def test_points_of_frames_and_queries(client, map_name, references):
     assert (some.points.shape, some.total) == ((50, 3), told.total)
     back = (some.points - T[:3, 3]) @ T[:3, :3]
     assert all(np.linalg.norm(told.points - one, axis=1).min() < 2e-4 for one in back)
-    with pytest.raises(InvalidRequest, match="frame"):
+    with pytest.raises(InvalidRequest, match="'optical', 'parent' or 'base'"):
         client.frame_points(map_name, frame_id, "world")
     answer = client.query(map_name, references[0])
     np.testing.assert_array_equal(client.query_points(answer.query_id).points, told.points)
