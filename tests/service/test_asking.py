@@ -176,6 +176,9 @@ def test_an_answer_lists_its_stages_and_is_counted_but_its_frame_is_not_kept(ser
     found = json.loads(answer.text, parse_constant=lambda text: pytest.fail(text))
     stages = ["prepare", "retrieve", "diversify", "validate", "total"]
     assert list(found["milliseconds"]) == stages
+    *parts, total = found["milliseconds"].values()
+    assert sum(parts) == pytest.approx(total, abs=0.05)
+    assert min(parts) >= 0
     after = served.client.get(path).json()
     del before["recent_queries"], after["recent_queries"]  # they are counted a moment later
     assert after == before
