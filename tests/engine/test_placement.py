@@ -289,7 +289,7 @@ def test_a_sequence_needs_frames_and_odometry(full, uploads):
     for frames, why in (
         ([one], "The sequence has 1 frames"), ([one] * 11, "The sequence has 11 frames"),
         ([one, other], "frame 1 has no pose"),
-        ([one, (uploads[6].data, uploads[6].meta)], "several parent frames"),
+        ([one, (uploads[6].data, uploads[6].meta)], "the parent frames differ"),
     ):  # fmt: skip
         with pytest.raises(InvalidRequest, match=why):
             full.queries.sequence("hall", frames, Query())

@@ -266,7 +266,7 @@ def test_it_has_one_statement(server_store, row):
     rows = [{"at": 0.0, "kind": "late", "map": "hall", "data": {}}] * 2
     database, many = server_store.database, insert(pending_events)
     with (
-        pytest.raises(ValueError, match="single statement"),
+        pytest.raises(ValueError, match="one set of parameters"),
         database.write(map_number=row.number, single=True) as connection,
     ):
         connection.execute(many, rows)
