@@ -157,7 +157,12 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     # the others are found as before
     told = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, Query(seed=1))
     assert told.matches[0].frame_id == ids(engine)[3]
+    # part of an index whose removal failed after that of its manifest
+    (part,) = tmp_path.rglob("*.keys")
+    left = part.with_name("0" * 64 + part.suffix)
+    left.write_bytes(b"signature of the deleted frame")
     assert engine.purging.now().indexes == 0
+    assert (left.exists(), part.exists()) == (False, True)
 
 
 def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):

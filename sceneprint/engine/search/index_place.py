@@ -203,11 +203,11 @@ class IndexPlace:
             else:
                 self.prune(row, clean=True)
         folder = self.folder(row)
-        if not manifests(folder):
+        if not folder.is_dir():
             return True
-        manifest = None if head is None else self.sync(row)
-        number = None if manifest is None else manifest.number
-        return [number for number, _ in manifests(folder)] == [number] or clear(folder, but=number)
+        manifest = None if head is None or not manifests(folder) else self.sync(row)
+        # even without other versions: a failed or killed removal may have left parts
+        return clear(folder, but=None if manifest is None else manifest.number)
 
     def sweep(self, *, now: bool = False) -> None:
         """Remove indexes of deleted maps from the object store, at intervals, on one host at a
@@ -323,7 +323,7 @@ class IndexPlace:
                     if not _is_here(folder, name, size):
                         self._get(self._store, folder, name, size)
             except UnusableStore:
-                remove_unneeded(folder)  # since purges ignore unlisted parts
+                remove_unneeded(folder)
                 raise
             except (DamagedIndex, FileNotFoundError) as error:
                 remove_unneeded(folder)
@@ -350,7 +350,7 @@ class IndexPlace:
         self.remove_unknown()
         rows = self._known()
         for folder in self._folders():
-            if folder.name in rows and manifests(folder):
+            if folder.name in rows:
                 try:
                     self._purge_folder(rows[folder.name], folder)
                 except (OSError, SceneprintError) as error:
@@ -358,13 +358,17 @@ class IndexPlace:
                     log.warning("purge incomplete", extra=extra)
 
     def _purge_folder(self, row: MapRow, folder: Path) -> None:
+        if not manifests(folder):
+            clear(folder)
+            return
         with suppress(UnusableStore, DamagedIndex):
             self.sync(row)
         number, path = manifests(folder)[0]
         # compare names of key files, which do not change when further frames are deleted
         stale = self.stale_keys(row, read_manifest(path))
-        if stale & self._stale.get(folder.name, frozenset()) or len(manifests(folder)) > 1:
-            clear(folder, but=None if stale else number)
+        is_late = stale & self._stale.get(folder.name, frozenset())
+        is_outdated = is_late or (stale and len(manifests(folder)) > 1)
+        clear(folder, but=None if is_outdated else number)  # also parts that no version lists
         self._stale[folder.name] = stale
 
     def _make_room(self, size: int, keep: Path) -> bool:
