@@ -45,7 +45,7 @@ class Package(Distribution):
     """With kernels it is of this version of Python and this kind of machine, as machine code is."""
 
     def has_ext_modules(self) -> bool:
-        """Whether it fits no other."""
+        """Return whether it fits no other."""
         return COMPILE
 
 

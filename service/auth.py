@@ -139,7 +139,7 @@ class Caller:
 
     @property
     def reads_every(self) -> bool:
-        """Whether the caller may read all maps."""
+        """Return whether the caller may read all maps."""
         return self.may("read")
 
     @property

@@ -64,12 +64,12 @@ class Connection(H11Protocol):
 
     @property
     def silent(self) -> bool:
-        """Whether no request is in progress."""
+        """Return whether no request is in progress."""
         return self.cycle is None or self.cycle.response_complete
 
     @property
     def idle(self) -> bool:
-        """Whether the connection is silent and not closing."""
+        """Return whether the connection is silent and not closing."""
         return self.silent and not self.transport.is_closing()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -195,7 +195,7 @@ class Handshake(asyncio.Protocol):
 
     @property
     def idle(self) -> bool:
-        """Whether the connection is not closing."""
+        """Return whether the connection is not closing."""
         return not self.transport.is_closing()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

@@ -182,7 +182,7 @@ class WorkerTrace:
 
     @property
     def timed_out(self) -> bool:
-        """Whether the worker ended because its job exceeded the time limit."""
+        """Return whether the worker ended because its job exceeded the time limit."""
         return self.text.startswith(_TIMEOUT)
 
 

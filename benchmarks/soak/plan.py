@@ -67,7 +67,7 @@ class Plan:
 
     @property
     def is_crowd(self) -> bool:
-        """Whether there are too many robots to build surfaces."""
+        """Return whether there are too many robots to build surfaces."""
         return self.robots >= CROWD
 
     @property

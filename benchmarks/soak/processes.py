@@ -75,7 +75,7 @@ class Part:
 
     @property
     def is_running(self) -> bool:
-        """Whether the command has started and not ended."""
+        """Return whether the command has started and not ended."""
         return self._process is not None and self._process.poll() is None
 
     def peak_bytes(self) -> int:

@@ -69,7 +69,7 @@ class _Edge:
 
     @property
     def is_constant(self) -> bool:
-        """Whether the transform never moved, like a fixed joint that is published repeatedly."""
+        """Return whether the transform never moved, such as a fixed joint published repeatedly."""
         rows = np.frombuffer(self.samples, np.float64).reshape(-1, 7)
         return self.fixed or bool((np.ptp(rows, axis=0) < 1e-9).all())
 

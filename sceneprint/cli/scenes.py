@@ -29,7 +29,7 @@ class Scene(Protocol):
 
     @property
     def is_empty(self) -> bool:
-        """Whether the scene has no content."""
+        """Return whether the scene has no content."""
 
     def add_answer(
         self, answer: Answer, name: str, text: str, camera: CameraIntrinsics | None,

@@ -145,7 +145,7 @@ class Store:
 
     @property
     def read_only(self) -> bool:
-        """Whether the store was opened read-only, or its disk was later remounted read-only."""
+        """Return whether the store was opened read-only, or its disk became read-only."""
         return self.database.read_only or self.database.turned_read_only or self.blobs.read_only
 
     @cached_property

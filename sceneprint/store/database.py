@@ -298,7 +298,7 @@ class Database:
 
     @property
     def is_sqlite(self) -> bool:
-        """Whether the database is SQLite: a local file with one writer at a time."""
+        """Return whether the database is SQLite: a local file with one writer at a time."""
         return self.dialect == "sqlite"
 
     @property
@@ -314,12 +314,12 @@ class Database:
 
     @property
     def read_only(self) -> bool:
-        """Whether the database was opened read-only, so that `write` raises ReadOnlyStore."""
+        """Return whether the database is open read-only, so that `write` raises ReadOnlyStore."""
         return self._sealed is not None
 
     @property
     def turned_read_only(self) -> bool:
-        """Whether the file has become read-only, for example because its disk was remounted."""
+        """Return whether the file became read-only, for example on a remounted disk."""
         return self.is_sqlite and read_only_file(self._engine.url) is not None
 
     def require_writable(self) -> None:

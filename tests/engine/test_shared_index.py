@@ -380,6 +380,16 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, id
     assert keys(objects)[:2] == [".swept", "0000000002.json"]
     assert [ask(engine, uploads).counts.map for engine in (built, other, service)] == [3, 3, 3]
     assert ask(other, uploads).index_version == 2
+    # parts that no version lists, as a killed removal or download leaves them
+    (folder,) = (tmp_path / "three" / "index").iterdir()
+    left = folder / ("0" * 64 + ".keys")
+    for manifest in (None, *folder.glob("*.json")):
+        if manifest is not None:
+            manifest.unlink()
+        left.write_bytes(secret)
+        service.memory_purging._purged = time.monotonic() - 1
+        service.memory_purging.run()
+        assert not left.exists()
 
 
 def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, host, uploads, ids):

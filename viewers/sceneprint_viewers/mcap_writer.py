@@ -135,7 +135,7 @@ class McapWriter:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was written."""
+        """Return whether nothing was written."""
         return not self._started and not self._waiting
 
     def finish(self) -> None:

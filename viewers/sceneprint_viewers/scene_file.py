@@ -31,7 +31,7 @@ class SceneFile:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing was added."""
+        """Return whether nothing was added."""
         return self._stream.is_empty
 
     def add_answer(

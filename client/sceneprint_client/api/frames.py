@@ -61,7 +61,7 @@ class SampleRange(ApiRecord):
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the range is unusual for a depth camera."""
+        """Return whether the range is unusual for a depth camera."""
         return self.valid is not None and not (
             _MEDIAN_M[0] < self.median < _MEDIAN_M[1]
             and _NEAR_M[0] < self.near < _NEAR_M[1]

@@ -125,12 +125,12 @@ class ValidatedPair:
 
     @property
     def accepted(self) -> bool:
-        """Whether the match was accepted, strong or weak."""
+        """Return whether the match was accepted, strong or weak."""
         return self.validation.status == "accepted"
 
     @property
     def right(self) -> bool:
-        """Whether the error is within `limits`, accepted or not."""
+        """Return whether the error is within `limits`, accepted or not."""
         return self.error.within(*self.limits)
 
 
@@ -173,12 +173,12 @@ class JudgedAnswer:
 
     @property
     def right(self) -> bool:
-        """Whether the status is `found` and the error is within `limits`."""
+        """Return whether the status is `found` and the error is within `limits`."""
         return self.status == "found" and self.error.within(*self.limits)
 
     @property
     def grossly_wrong(self) -> bool:
-        """Whether the status is `found`, but the error exceeds GROSS, scaled like `limits`."""
+        """Return whether the pose is found, but its error exceeds GROSS, scaled like `limits`."""
         gross = [g * limit / r for g, limit, r in zip(GROSS, self.limits, RIGHT, strict=True)]
         return self.status == "found" and not self.error.within(*gross)
 

@@ -100,7 +100,7 @@ class LookalikeSite(Generic[F_co]):
 
     @property
     def same_frame(self) -> bool:
-        """Whether map and queries have the same parent frame, so that poses are comparable."""
+        """Return whether map and queries have one parent frame, so that poses are comparable."""
         return self.kind not in APART
 
 

@@ -268,12 +268,12 @@ class StoreCounts:
 
     @property
     def is_large(self) -> bool:
-        """Whether the store is too large to be counted on every request."""
+        """Return whether the store is too large to be counted on every request."""
         return sum(self.frames.values()) + sum(self.jobs.values()) >= MANY
 
     @property
     def is_old(self) -> bool:
-        """Whether the counts are due for renewal, or the clock was set back."""
+        """Return whether the counts are due for renewal, or the clock was set back."""
         return not 0 <= time.time() - self.at < self.seconds / COUNTING
 
 

@@ -50,7 +50,7 @@ class Read:
 
     @property
     def kind(self) -> Kind:
-        """Whether the upload is a depth image or a point cloud."""
+        """Return whether the upload is a depth image or a point cloud."""
         return "depth" if self.cloud is None else "cloud"
 
 

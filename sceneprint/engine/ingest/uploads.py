@@ -270,7 +270,7 @@ class _Request:
 
     @property
     def is_single(self) -> bool:
-        """Whether the request stores exactly one frame, without a fence."""
+        """Return whether the request stores exactly one frame, without a fence."""
         return len(self.results) == len(self.todo) == 1 and self.fence is None
 
 

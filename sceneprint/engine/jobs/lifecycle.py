@@ -44,7 +44,7 @@ class Work:
 
     @property
     def again(self) -> bool:
-        """Whether the job signs an indexed frame again; the frame stays indexed until the end."""
+        """Return whether the job signs an indexed frame again; meanwhile it stays indexed."""
         return self.job.kind == REENCODE
 
     @property

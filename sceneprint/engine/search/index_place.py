@@ -84,7 +84,7 @@ class IndexPlace:
 
     @property
     def is_shared(self) -> bool:
-        """Whether the indexes are shared through an object store."""
+        """Return whether the indexes are shared through an object store."""
         return self._store is not None
 
     def close(self) -> None:
@@ -366,8 +366,8 @@ class IndexPlace:
         number, path = manifests(folder)[0]
         # compare names of key files, which do not change when further frames are deleted
         stale = self.stale_keys(row, read_manifest(path))
-        is_late = stale & self._stale.get(folder.name, frozenset())
-        is_outdated = is_late or (stale and len(manifests(folder)) > 1)
+        stale_before = self._stale.get(folder.name, frozenset())
+        is_outdated = bool(stale and (stale & stale_before or len(manifests(folder)) > 1))
         clear(folder, but=None if is_outdated else number)  # also parts that no version lists
         self._stale[folder.name] = stale
 

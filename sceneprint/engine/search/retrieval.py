@@ -345,7 +345,7 @@ class Searched:
 
     @property
     def exact(self) -> bool:
-        """Whether all frames that pass the filter were compared."""
+        """Return whether all frames that pass the filter were compared."""
         return all(hit.exact for hit in self.hits)
 
     def signatures(self) -> Bytes:

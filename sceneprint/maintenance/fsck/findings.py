@@ -71,7 +71,7 @@ class Finding:
 
     @property
     def left(self) -> bool:
-        """Whether the fault remains."""
+        """Return whether the fault remains."""
         return self.severity != "note" and self.done is None
 
 

@@ -52,7 +52,7 @@ class Locks(ABC):
 
     @property
     def outlast_turns(self) -> bool:
-        """Whether a removal may continue after the turn in which it began."""
+        """Return whether a removal may continue after the turn in which it began."""
         return False
 
     def removals(self) -> int | None:
@@ -328,7 +328,7 @@ class Blobs(ABC):
 
     @property
     def outlast_turns(self) -> bool:
-        """Whether removals may continue after the turn that found no references."""
+        """Return whether removals may continue after the turn that found no references."""
         return self._locks.outlast_turns
 
     def wait_for_removal(self, digest: str | None = None, seconds: float = REMOVAL_S) -> None:
@@ -379,7 +379,7 @@ class Blobs(ABC):
 
     @property
     def read_only(self) -> bool:
-        """Whether the storage is read-only, as far as this can be checked without writing."""
+        """Return whether the storage is read-only, as far as can be checked without writing."""
         return False
 
     def check(self) -> None:  # noqa: B027
@@ -425,7 +425,7 @@ class FolderBlobs(Blobs):
 
     @property
     def read_only(self) -> bool:
-        """Whether the folder exists and is not writable, for example on a remounted disk."""
+        """Return whether the folder exists and is not writable, for example on a remounted disk."""
         return self._folder.is_dir() and not os.access(self._folder, os.W_OK)
 
     def put(self, data: bytes) -> str:
