@@ -42,10 +42,10 @@ class BuildWithKernels(build_py):
 
 
 class Package(Distribution):
-    """With kernels it is of this version of Python and this kind of machine, as machine code is."""
+    """The distribution; with kernels, its wheel fits one version of Python and one platform."""
 
     def has_ext_modules(self) -> bool:
-        """Return whether it fits no other."""
+        """Return whether the wheel contains machine code."""
         return COMPILE
 
 
