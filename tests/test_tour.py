@@ -142,15 +142,15 @@ def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
     assert documents(less)[0]["location"]["confidence"] >= 0.9
     unvalidated = documents(listed)[0]
     assert (unvalidated["status"], unvalidated["counts"]["selected"]) == ("unvalidated", 5)
-    explained = one(outputs, "Why not that one?")[0]
+    explained = one(outputs, "Why is a frame not a match?")[0]
     assert [each["rank"] for each in explained["explanations"]] == list(range(1, 15))
     assert explained["explained_frame"]["rank"] >= 1
-    filtered = one(outputs, "Among which frames?")
+    filtered = one(outputs, "Search only some frames")
     assert [each["counts"]["passed"] for each in filtered] == [8, 13]
     sure = one(outputs, "How sure is it?")[0]
     assert len(sure["location"]["uncertainty"]["covariance"]) == 36
     assert sure["location"]["base"]["child_frame"] == "base_link"
-    kept = one(outputs, "Look at it again")
+    kept = one(outputs, "Read an answer again")
     assert kept[0] == answer
     where = one(outputs, "Where am I?")[0]
     assert (where["status"], where["pose"]["parent_frame"]) == ("found", "room-001")
@@ -163,10 +163,10 @@ def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
     there = documents(believed)[0]
     assert (there["status"], there["verified_by"]) == ("found", "prior")
     assert "several poses fit, and the prior decided" in believed
-    named, every = one(outputs, "In which of several maps?")[2:]
+    named, every = one(outputs, "Search several maps")[2:]
     assert named["maps"] == ["building", "annex"]
     assert set(every["per_map"]) == {"annex", "building", "cabinet"}
-    stored, sent = one(outputs, "Are these two of one place?")
+    stored, sent = one(outputs, "Compare two frames")
     assert [each["validation"]["status"] for each in (stored, sent)] == ["accepted"] * 2
 
 
@@ -191,7 +191,7 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     jobs = one(outputs, "Jobs")[0]
     assert [job["state"] for job in jobs["items"]] == ["succeeded"] * 3
     assert jobs["next_cursor"] is not None
-    happened = outputs["What happens, as it happens"][0]
+    happened = outputs["Events"][0]
     assert len(documents(happened)[0]["items"]) == 3
     assert "retry: 1000" in happened
     operations = outputs["Operations"][0]
@@ -206,7 +206,7 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
     assert len(audit["items"]) == 3
     assert (rotated["name"], rotated["secret"] != made["secret"]) == ("robot-7", True)
     assert rotated["previous_until"] is not None
-    restored, deleted = one(outputs, "Take out")
+    restored, deleted = one(outputs, "Delete")
     assert restored["state"] == "indexed"
     assert deleted["frames"] == deleted["deletion"]["frames"] == 1
     assert one(outputs, "When something is wrong")[0]["type"] == "/problems/unknown-map"

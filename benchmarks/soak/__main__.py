@@ -71,7 +71,7 @@ def description(figures: SoakFigures) -> Iterator[str]:
 _UNKILLED = {
     FROZEN: f"The primary was frozen {{}} for {FROZEN_S:g} s (SIGSTOP).",
     CUT_OFF: f"A host was cut off {{}} from its servers for {CUT_OFF_S:g} s.",
-    FULL: f"The disk was full {{}} for {FULL_S:g} s.",
+    FULL: f"The disk was full {{}}, for {FULL_S:g} s each time.",
 }
 
 
@@ -206,7 +206,7 @@ def _run(name: str, plan: Plan, page: Path | None, keep: Path | None) -> int:
         *figures.faults[:20], *figures.found.wrong[:20], *broken[:20], *reports, *figures.exceeded
     ):  # fmt: skip
         print(line, file=sys.stderr)
-    command = f"`python -m benchmarks.soak {name}`, within {figures.seconds:.0f} s"
+    command = f"`python -m benchmarks.soak {name}` in {figures.seconds:.0f} s"
     lines = ["", measured_on(command), "", *table(figures)]
     print("\n".join(lines))
     if page is not None:

@@ -254,7 +254,7 @@ def broken_table(figures: BrokenFigures) -> list[str]:
     kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(figures.sent.items()))
     answers = ", ".join(f"{n} of {status}" for status, n in figures.statuses.items())
     return [
-        f"### {sum(figures.sent.values())} broken uploads within {figures.seconds:.0f} s", "",
+        f"### {sum(figures.sent.values())} broken uploads in {figures.seconds:.0f} s", "",
         "| | |", "|---|--:|", f"| files | {kinds} |", f"| answers | {answers} |",
         f"| **5xx, or no answer** | **{len(figures.failed)}** |",
         f"| **processes that ended** | **{figures.crashed}** |",
