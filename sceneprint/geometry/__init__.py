@@ -1,1 +1,1 @@
-"""Pure functions of arrays; the folders follow the sections of the paper."""
+"""Pure functions that take and return arrays; the folders follow the sections of the paper."""

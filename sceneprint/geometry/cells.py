@@ -1,4 +1,4 @@
-"""Fusion of views to the cells of a grid, and comparison of the cells of two sessions.
+"""Fusion of views into the cells of a grid, and comparison of the cells of two sessions.
 
     points of a view  --view_cells-->  CELL_SUM by tile
     CELL_SUM of views  --fuse_cells-->  CELL_SUM
@@ -38,9 +38,9 @@ from sceneprint_client.surface_encoding import CELL, NO_SESSION, NO_TIME, SEEN_S
 
 #: Integer coordinates (x, y, z) of a tile.
 TilePlace = tuple[int, int, int]
-#: A cell with sums over its views: its position in the tile as z, y, x of 6 bits each; the number
-#: of views; sums of the observed positions in 256ths of a cell; the last view's time, number,
-#: session.
+#: A cell with sums over its views: its position in the tile (z, y and x, 6 bits each); the number
+#: of views; the sums of the observed positions, in 256ths of a cell; and the time, number and
+#: session of the last view.
 CELL_SUM = np.dtype(
     [
         ("key", "<u4"), ("views", "<u4"), ("sums", "<u4", 3), ("taken", "<f8"),
@@ -51,11 +51,11 @@ CellSums = NDArray[Any]
 Cells = NDArray[Any]
 #: Ratio of the cell widths of successive levels.
 FACTOR = 4
-#: Number of steps per axis that encode a position within a cell.
+#: Number of steps per axis into which a cell is divided to encode a position within it.
 _FINE = 256
-#: Maximum coordinate of a point, in cells: tile numbers are exact up to this value.
+#: Maximum coordinate of a point, in cells; larger coordinates would give inexact tile coordinates.
 _FARTHEST = 2.0**40
-#: Maximum number of tiles per view. The tiles with the most occupied cells are selected.
+#: Maximum number of tiles per view; a view keeps the tiles with the most occupied cells.
 MOST_TILES = 256
 
 
@@ -65,8 +65,8 @@ class ViewStamp:
 
     Parameters
     ----------
-    number : number of the view; of two views with equal times, the greater number is later
-    taken : seconds since 1970; None if unknown, which sorts before all times
+    number : view number; of two views with equal times, the one with the greater number is later
+    taken : seconds since 1970, or None if unknown; an unknown time sorts before all other times
     session : index of the view's session, or NO_SESSION
     """
 
@@ -97,8 +97,9 @@ def time_scale(first: float, last: float) -> TimeScale:
 def view_cells(points: Floats, cell_m: float, stamp: ViewStamp) -> dict[TilePlace, CellSums]:
     """Return the cells of a view by tile, as CELL_SUM sorted by key.
 
-    A cell has the mean position of its points, as the sum of a single view. The MOST_TILES tiles
-    with the most cells remain. NaN and very distant points are omitted.
+    A cell has the mean position of its points, as the sum of a single view. If there are more than
+    MOST_TILES tiles, those with the most cells are returned. NaN and very distant points are
+    omitted.
 
     Parameters
     ----------
@@ -175,15 +176,15 @@ def encode_cells(rows: CellSums, scale: TimeScale | None) -> Cells:
 
 
 def coarsen_cells(parts: Mapping[TilePlace, Cells]) -> Cells:
-    """Combine finer tiles to the cells (CELL) of a tile of the next, coarser level.
+    """Combine finer tiles into one tile of the next coarser level; return its cells (CELL).
 
-    A coarse cell has the mean position of its finer cells, their maximum `seen`, and the session
-    and time of the finer cell that was last seen.
+    A coarse cell has the mean position of the finer cells in it, their maximum `seen`, and the
+    session and time of the finer cell that was seen last.
 
     Parameters
     ----------
-    parts : CELL of the finer tiles by position; tile (x, y, z) lies in the next level's
-        (x // 4, y // 4, z // 4)
+    parts : cells (CELL) of each finer tile, by tile position; the coarser tile that contains tile
+        (x, y, z) is (x // 4, y // 4, z // 4)
     """
     rows = [np.zeros(0, CELL)]
     for place, part in parts.items():
@@ -210,7 +211,7 @@ def coarsen_cells(parts: Mapping[TilePlace, Cells]) -> Cells:
 
 
 def remove_tile(cells: Cells, place: TilePlace) -> Cells:
-    """Return the cells of a coarser tile that lie outside one tile of the next finer level."""
+    """Return the cells of a tile, except those that cover the finer tile at `place`."""
     corner = np.array(place) % FACTOR
     outside: Cells = cells[(cells["at"] // (STEPS // FACTOR) != corner).any(axis=1)]
     return outside
@@ -231,13 +232,14 @@ def _cell_keys(at: NDArray[np.int64]) -> NDArray[np.int64]:
 SessionCells = dict[TilePlace, CellSums]
 #: States of a cell: not observed by the other session, confirmed by it, or contradicted by it.
 UNSEEN, SAME, CHANGED = 0, 1, 2
-#: Number of frames that must see through a cell for it to be changed; all if there are fewer.
+#: Minimum number of frames that must see through a cell for it to be CHANGED; if the session has
+#: fewer frames, all of them must.
 LEAST_THROUGH = 2
 
 
 @dataclass(frozen=True, eq=False)
 class VerdictCounts:
-    """Counts of verdicts on cells by the frames of another session.
+    """Counts of the verdicts that the frames of another session give on each cell.
 
     Parameters
     ----------
@@ -255,7 +257,7 @@ class VerdictCounts:
 
 
 def empty_counts(count: int) -> VerdictCounts:
-    """Return counts of zero for `count` cells."""
+    """Return verdict counts of zero for `count` cells."""
     return VerdictCounts(np.zeros(count, np.uint16), np.zeros(count, np.uint16))
 
 
@@ -274,7 +276,7 @@ def count_cells(cells: SessionCells) -> int:
 
 
 def cell_positions(cells: SessionCells, cell_m: float) -> Floats:
-    """Return the mean observed position (N, 3) in each cell, metres, in the stored order."""
+    """Return the mean observed position (N, 3) in each cell, metres, in the order of `cells`."""
     positions = [np.zeros((0, 3))]
     for place in sorted(cells):
         rows = cells[place]

@@ -1,15 +1,17 @@
-"""Compilation of loops to machine code, per-frame caches, and parallel halves of computations.
+"""Compilation of loops to machine code, per-frame caches, and two-core execution.
 
 Kernels release the interpreter's lock (`nogil`) and are compiled once per installation (`cache`).
-They never use `parallel`, because a forked child dies in OpenMP, or `fastmath`, so the compiler
-neither reorders sums nor fuses products, and a frame gives the same bytes on every processor.
-Divisions do not check for zero, because the check prevents vectorization: kernels check their
-divisors. For the same reason, an inner loop writes a single array, unless the kernel is disjoint.
+They never use `parallel`, because a forked child dies in OpenMP, or `fastmath`, because the
+compiler would reorder sums and fuse products: without it, a frame gives the same bytes on every
+processor. Divisions do not check for zero, because the check prevents vectorization: kernels check
+their divisors. For the same reason, an inner loop writes a single array, unless the kernel is
+disjoint.
 
     with cores.shared():  run_both(first, second)  -->  both results
 
-Validation refines two independent directions, and a frame's signature and artifact share a surface:
-`run_both` computes such halves on two cores if a core is free. The results are bit-identical.
+Validation refines two independent directions, and the signature and the artifact of a frame are
+computed from the same surface: `run_both` runs two such computations on two cores if a core is
+free. The results are bit-identical.
 """
 
 from __future__ import annotations
@@ -31,8 +33,8 @@ import numpy as np
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: LLVM's name and features of the processors for which wheels and images contain machine code:
-#: x86-64 since 2013.
+#: LLVM name and features of the target for which wheels and images contain machine code: x86-64
+#: processors since 2013.
 TARGET = "x86-64-v3"
 TARGET_FEATURES = (
     "+avx,+avx2,+bmi,+bmi2,+cx16,+f16c,+fma,+lzcnt,+movbe,+popcnt,+sahf,+sse3,+sse4.1,+sse4.2,"
@@ -49,7 +51,7 @@ class Kernel:
     Parameters
     ----------
     function : function of arrays and numbers
-    disjoint : whether the arrays that the function writes share no memory with other arguments
+    disjoint : whether the arrays that the function writes share no memory with its other arguments
     """
 
     def __init__(self, function: Callable[..., Any], *, disjoint: bool = False) -> None:
@@ -119,7 +121,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
 def disjoint_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a loop whose output arrays share no memory with other arguments; see `kernel`.
 
-    Since writes cannot change the inputs, the compiler can vectorize reads of scattered numbers.
+    Because writes cannot change the inputs, the compiler can vectorize reads of scattered numbers.
     """
     return cast(Callable[P, R], Kernel(function, disjoint=True))
 
@@ -127,7 +129,7 @@ def disjoint_kernel(function: Callable[P, R]) -> Callable[P, R]:
 class _Prefetch:
     """A function for kernels that loads a row of a table into the processor's caches.
 
-    It hides the latency of scattered rows. Results do not change.
+    It hides the memory latency of scattered rows and does not change results.
     """
 
     def __call__(self, table: Any, row: Any) -> None:
@@ -170,7 +172,7 @@ def runs_here() -> bool:
 
 
 def _hash_dependencies(function: Callable[..., Any], names: dict[str, Any]) -> str:
-    """Return a digest of the kernels and constants of other files that a kernel may use.
+    """Return a digest of the kernels and constants from other files that a kernel may use.
 
     The stamp of numba covers the kernel's file only. Imports precede definitions in our modules,
     so `names` contains all dependencies on other files.
@@ -188,7 +190,7 @@ def _hash_dependencies(function: Callable[..., Any], names: dict[str, Any]) -> s
     return hashlib.sha256(";".join(sorted(filter(None, texts))).encode()).hexdigest()
 
 
-#: Texts of `_dependency_text` by module, name and identity of the value.
+#: Cached results of `_dependency_text`, by module, name and identity of the value.
 _DEPENDENCIES: dict[tuple[str, str, int], str] = {}
 
 
@@ -241,10 +243,10 @@ F = TypeVar("F")
 def cached_per_frame(
     function: Callable[Concatenate[F, P], R],
 ) -> Callable[Concatenate[F, P], R]:
-    """Cache the results of a function as long as its first argument (such as a surface) exists.
+    """Cache the results of a function for the lifetime of its first argument (such as a surface).
 
     The first argument is compared by identity and must not change. Other arguments are hashable.
-    Callers share results, and must not change them.
+    Callers share the results and must not modify them.
     """
     results: WeakKeyDictionary[F, dict[Hashable, R]] = WeakKeyDictionary()
 
@@ -254,7 +256,7 @@ def cached_per_frame(
         if own is None:
             own = results.setdefault(frame, {})
         key = args, tuple(kwargs.items())
-        if key not in own:  # two threads may compute the same result; either can be stored
+        if key not in own:  # two threads may compute the same result; either may be stored
             own[key] = function(frame, *args, **kwargs)
         return own[key]
 
@@ -266,7 +268,7 @@ B = TypeVar("B")
 
 
 class Cores:
-    """The cores that computations of this process share.
+    """The processor cores that the computations of this process share.
 
     Parameters
     ----------
@@ -281,7 +283,7 @@ class Cores:
 
     @contextmanager
     def shared(self) -> Iterator[None]:
-        """Occupy a core, and allow `run_both` within the `with` block to use a second core."""
+        """Occupy a core during the `with` block, in which `run_both` may use another free core."""
         with self._lock:
             self._busy += 1
         token = _cores.set(self)
@@ -319,7 +321,7 @@ _cores: ContextVar[Cores | None] = ContextVar("cores", default=None)
 
 
 def run_both(first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
-    """Run two computations that write no common memory; return their results.
+    """Run two computations that do not write to shared memory; return their results.
 
     They run in parallel within `Cores.shared` if a core is free, otherwise sequentially. If both
     raise an exception, the exception of `first` is raised.

@@ -1,8 +1,9 @@
-"""The cache of kernels' machine code, in numba's folders or in folders of a wheel or an image.
+"""The cache of the kernels' machine code, in numba's folders or in those of a wheel or image.
 
-numba stores code under the name of the processor that compiled it. Code that is shipped with an
-installation is compiled for `TARGET`, and lies in numba's folder or beside the sources. The folder
-may be read-only. Importing numba takes long, so `kernel` imports this module on the first call.
+numba stores code under the name of the processor on which it was compiled. Code that is shipped
+with an installation is compiled for `TARGET`, and lies in numba's folder or beside the sources. The
+folder may be read-only. Importing numba takes long, so `kernel` imports this module on the first
+call.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class _BesideTheSource(InTreeCacheLocator):
     """A locator of code beside the sources, for installations without a writable folder."""
 
     def ensure_cache_path(self) -> None:
-        """Accept read-only folders: nothing is written to them."""
+        """Do nothing: the folder may be read-only."""
 
 
 class _Locations(CompileResultCacheImpl):

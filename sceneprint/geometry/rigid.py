@@ -89,14 +89,14 @@ def are_near(transforms: Floats, T: Floats, metres: float, radians: float) -> ND
     """Return a mask (n,) of the transforms (n, 4, 4) within `metres` and `radians` of T."""
     near = np.empty(len(transforms), np.bool_)
     cosine = math.cos(radians)
-    # copies, because numba would compile the kernel again for read-only arrays
+    # copies, because numba would compile the kernel a second time for read-only arrays
     _mark_near(np.array(transforms, float), np.array(T, float), metres, cosine, near)
     return near
 
 
 @kernel
 def _is_near(T: Floats, U: Floats, metres: float, cosine: float) -> bool:
-    """Return whether two transforms are within `metres` and an angle of this cosine."""
+    """Return whether two transforms differ by at most `metres` and an angle with this cosine."""
     square, trace = 0.0, 0.0
     for a in range(3):
         square += (T[a, 3] - U[a, 3]) ** 2
@@ -120,8 +120,8 @@ def select_distinct(
 
     Parameters
     ----------
-    transforms, scores : (n, 4, 4) and (n,); higher scores are better
-    metres, radians : tolerances; a transform within both of a better transform is omitted
+    transforms, scores : (n, 4, 4) and (n,); a higher score is better
+    metres, radians : tolerances; a transform within both tolerances of a better one is omitted
     most : maximum number of indices
     """
     order = np.argsort(-scores, kind="stable")
@@ -162,7 +162,7 @@ def nearest_rotation(M: Floats) -> Floats:
 
 @kernel
 def rotation_of_covariance(H: Floats, R: Floats) -> None:
-    """Write to R the rotation (3, 3) that maximises trace(R H^T) for H = sum b a^T (Horn 1987).
+    """Write to R the rotation (3, 3) that maximises trace(R H^T), with H = sum b a^T (Horn 1987).
 
     The quaternion of R is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix,
     computed by cyclic Jacobi rotations.
@@ -291,7 +291,7 @@ class PoseAverage:
     Parameters
     ----------
     T : (4, 4) T_parent_sensor
-    spread_m, spread_rad : root mean square difference of the agreeing votes from T, metres and
+    spread_m, spread_rad : root mean square difference between the agreeing votes and T, metres and
         radians
     support : number of votes that agree
     votes : total number of votes
@@ -307,9 +307,9 @@ class PoseAverage:
 
 
 def average_poses(poses: Floats, p: AveragingParameters | None = None) -> PoseAverage:
-    """Return the mean of the votes near their medoid.
+    """Return the mean of the votes near the medoid.
 
-    The medoid is the vote with the most other votes near it. Ties are resolved by the distance to
+    The medoid is the vote with the most other votes near it. Ties are resolved by the distances to
     these votes, then by rank.
 
     Parameters
@@ -347,7 +347,7 @@ def pose_spread(T: Floats, poses: Floats) -> tuple[float, float]:
 def mean_direction(directions: Floats, within: float) -> Floats | None:
     """Return the mean (3,), a unit vector, of the largest group of unit vectors that agree.
 
-    The result is None unless more than half of all vectors are in the group.
+    Return None if the group does not contain more than half of all vectors.
 
     Parameters
     ----------
@@ -375,7 +375,7 @@ class GravityParameters:
     gate: float = math.radians(15.0)  #: maximum difference of two corresponding patches' slopes
     proposed_tilt: float = math.radians(20.0)  #: maximum tilt of an unrefined hypothesis
     refined_tilt: float = math.radians(10.0)  #: maximum tilt of a refined pose
-    rival_tilt: float = math.radians(20.0)  #: minimum tilt at which a rival is impossible
+    rival_tilt: float = math.radians(20.0)  #: tilt from which a transform cannot be a rival
     floor_tilt: float = math.radians(30.0)  #: maximum angle between a floor's normal and `up`
     floor_stride: int = 7  #: stride of the pixels that are examined for the floor
 
@@ -402,7 +402,7 @@ def tilts(transforms: Floats, ups: Ups) -> Floats:
 
 
 def tilt_of(T: Floats | None, ups: Ups) -> float | None:
-    """Return the tilt of a transform, radians; None if the transform or one of `ups` is unknown."""
+    """Return the tilt of a transform, radians; None if T is None or one of `ups` is unknown."""
     if T is None or ups[0] is None or ups[1] is None:
         return None
     return float(tilts(T[None], ups)[0])

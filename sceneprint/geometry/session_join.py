@@ -1,21 +1,23 @@
-"""Verification of associations between two runs by loops, and estimation of their transform.
+"""Verification of associations between two runs by loops, and the transform between the runs.
 
 edges, paths of both runs  --judge_edges-->  EdgeVerdicts
 votes T_a_b with positions  --join_sessions-->  SessionJoin
 
-A wrong transform may align two frames perfectly. Two edges close to each other form a loop with the
-odometry between their frames; if the loop does not close, one of the edges is wrong. Loops use
-odometry over short distances only, so drift is negligible and the runs need no common origin
-(pairwise consistency: Mangelson et al., ICRA 2018, with the odometry's uncertainty as a tolerance).
+An edge is an association of two frames; a wrong one may align them perfectly. Two nearby edges form
+a loop with the odometry between their frames; if the loop does not close, one of the edges is
+wrong. Loops use odometry over short distances only, so drift is negligible, and the runs need no
+common origin (pairwise consistency: Mangelson et al., ICRA 2018, with the odometry's uncertainty as
+a tolerance).
 
-Edges of the same viewpoint share their errors. Therefore, an edge is supported only if it closes a
-loop with an edge of another viewpoint on either run. Loops cannot distinguish the sides of a
-symmetric object, because all edges are wrong by the same rotation. Therefore, within a run, an edge
-is unsupported if it deviates from the odometry by more than the maximum drift.
+Edges from the same viewpoint have the same errors. Therefore, an edge is supported only if it
+closes a loop with an edge from another viewpoint in at least one of the runs. Loops cannot
+distinguish the sides of a symmetric object, because all wrong edges err by the same rotation.
+Therefore, an edge within one run is unsupported if it deviates from the odometry by more than the
+maximum drift.
 
 An association of a frame of run b with a frame of run a is a vote for the transform between their
-parent frames. Votes are compared at the positions of their frames: a degree moves a distant origin
-by metres.
+parent frames. Votes are compared at the positions of their frames, because one degree moves a
+distant origin by metres.
 """
 
 from __future__ import annotations
@@ -81,7 +83,7 @@ def association_votes(
 
 Ints64 = NDArray[np.int64]
 
-#: Path length that represents a gap in odometry, metres: longer than any loop.
+#: Path length added for a gap in odometry, metres; it is longer than any loop.
 _GAP_M = 1e6
 
 
@@ -170,10 +172,11 @@ class EdgeVerdicts:
     Parameters
     ----------
     accepted : (n,) mask of the edges that other edges do not outvote
-    loops : (n,) number of loops with accepted edges; 0 for unchecked edges
+    loops : (n,) number of loops that the edge forms with accepted edges; 0 if it could not be
+        checked
     closed : (n,) number of these loops that close
-    supported : (n,) mask of the accepted edges that close a loop with an edge of another viewpoint
-        and agree with the odometry of their run
+    supported : (n,) mask of the accepted edges that close a loop with an edge from another
+        viewpoint and, within one run, agree with its odometry
     """
 
     accepted: NDArray[np.bool_]
@@ -186,11 +189,12 @@ def judge_edges(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters | None = None,
     *, within_run: bool = False,
 ) -> EdgeVerdicts:  # fmt: skip
-    """Reject the most outvoted edge repeatedly, until no edge is outvoted; return all verdicts.
+    """Reject the most outvoted edge until no edge is outvoted; return the verdicts on all edges.
 
     Parameters
     ----------
-    source, target : runs of the source and target frames; the same run twice for loop closures
+    source, target : paths of the runs of the source and target frames; for loop closures, the same
+        path twice
     within_run : whether `source` and `target` are the same run
     """
     p = p or CycleParameters()
@@ -213,7 +217,7 @@ def judge_edges(
 
 
 def _match_odometry(edges: LoopEdges, run: RobotPath, p: CycleParameters) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the edges that the odometry of their run does not contradict."""
+    """Return a mask (n,) of the edges that the odometry of the run does not contradict."""
     here, there = run.poses[edges.source], run.poses[edges.target]
     predicted = there @ edges.transforms  # pose of the source frame that the edge implies
     metres = np.linalg.norm(predicted[:, :3, 3] - here[:, :3, 3], axis=1)
@@ -262,7 +266,7 @@ def _loops(
 def _are_elsewhere(
     poses: Floats, firsts: Ints64, seconds: Ints64, p: CycleParameters
 ) -> NDArray[np.bool_]:
-    """Return a mask of the pairs of poses (n, 4, 4) with different viewpoints."""
+    """Return a mask (M,) of the pairs of poses, of (n, 4, 4), whose viewpoints differ."""
     a, b = poses[firsts], poses[seconds]
     metres = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
     cosines = (np.einsum("nij,nij->n", a[:, :3, :3], b[:, :3, :3]) - 1.0) / 2.0
@@ -296,7 +300,7 @@ def _loop_residual(
     here: Floats, there: Floats, transforms: Floats, i: int, j: int
 ) -> tuple[float, float]:
     """Return the residual of the loop over edges i and j at the source of j: metres, radians."""
-    # each edge predicts the position of the source of j in the target's parent frame
+    # each edge predicts the position of j's source frame in the target's parent frame
     R, t = np.zeros((2, 3, 3)), np.zeros((2, 3))
     for k in range(2):
         e = i if k == 0 else j
@@ -357,7 +361,7 @@ def _outvote(
     starts: Ints64, others: Ints64, closing: NDArray[np.bool_], weights: Floats,
     accepted: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Reject the worst edge as long as the votes against it outweigh the votes for it."""
+    """Reject the most outvoted edge until no edge has more weight against it than for it."""
     n = len(accepted)
     against = np.zeros(n)
     for i in range(n):
@@ -386,15 +390,15 @@ class JoiningParameters:
     agree_rad: float = math.radians(6.0)  #: maximum difference in rotation, radians
     sigma_m: float = 0.04  #: standard deviation of a vote's position, metres
     sigma_rad: float = math.radians(1.2)  #: standard deviation of a vote's rotation, radians
-    hypotheses: int = 300  #: maximum number of votes that are tested as the transform
+    hypotheses: int = 300  #: maximum number of votes that are tried as the transform
     rounds: int = 8  #: number of iterations of the fit
     least_votes: int = 3  #: minimum number of agreeing votes
-    least_frames: int = 2  #: minimum number of frames of the agreeing votes in either run
+    least_frames: int = 2  #: minimum number of frames of the agreeing votes, in each run
     view_m: float = 0.1  #: maximum distance between two frames of a viewpoint, metres
     view_rad: float = math.radians(6.0)  #: maximum angle between two frames of a viewpoint, radians
-    rival: float = 0.5  #: share of the support at which another transform prevents a join
+    rival: float = 0.5  #: minimum share of the support with which another transform prevents a join
     strong_votes: int = 10  #: minimum number of agreeing votes of a strong join
-    strong_frames: int = 5  #: minimum number of their frames in either run
+    strong_frames: int = 5  #: minimum number of their frames in each run
     strong_share: float = 0.5  #: minimum share of agreeing votes among all votes
     strong_extent_m: float = 1.0  #: minimum extent of their frames: a single place may mislead
 
@@ -407,10 +411,10 @@ class SessionJoin:
     ----------
     T : (4, 4) T_a_b; None if too few votes agree or another transform has enough support
     agree : (n,) mask of the votes that agree with the best transform, even if it is rejected
-    spread_m, spread_rad : root mean square difference of these votes from it, at their frames,
-        metres and radians
+    spread_m, spread_rad : root mean square difference between these votes and the best transform at
+        their frames, metres and radians
     rival : number of the other votes that agree on the second-best transform
-    strength : strong, or weak if few votes agree; None without a transform
+    strength : strong, or weak if few votes agree; None if there is no transform
     reason : short explanation of the result
     """
 
@@ -431,9 +435,10 @@ class SessionJoin:
 def join_sessions(votes: Votes, seed: int = 0, p: JoiningParameters | None = None) -> SessionJoin:
     """Estimate the transform with the largest support, fitted to the votes that agree with it.
 
-    Each vote (a random sample of `hypotheses` votes if there are more) is tested as the transform,
-    and the best vote is refitted to the votes that agree. The weights of a frame's votes are
-    divided by their number, so that a frame with many matches does not outweigh other frames.
+    Each vote (or, if there are more than `hypotheses`, each of a random sample of that size) is
+    tried as the transform, and the best is refitted to the votes that agree with it. The weight of
+    each vote is divided by the number of votes of its frame, so that a frame with many matches does
+    not outweigh other frames.
 
     Parameters
     ----------
@@ -473,7 +478,7 @@ def _join_strength(
     votes: Votes, weights: Floats, agree: NDArray[np.bool_], rivals: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> tuple[Strength | None, str]:  # fmt: skip
-    """Return the strength of a join, None if it is rejected, and the reason."""
+    """Return the strength of a join (None if it is rejected) and the reason."""
     n, support = len(agree), int(agree.sum())
     frames = min(len(np.unique(identifiers[agree])) for identifiers in (votes.source, votes.target))
     reason = f"{support} of {n} associations agree"
@@ -515,7 +520,7 @@ def _rotation_vectors(votes: Votes, T: Floats) -> Floats:
     axes = np.stack([D[:, 2, 1] - D[:, 1, 2], D[:, 0, 2] - D[:, 2, 0], D[:, 1, 0] - D[:, 0, 1]], 1)
     sines = np.linalg.norm(axes, axis=1)
     angles = np.arctan2(sines, np.trace(D, axis1=1, axis2=2) - 1.0)
-    # near a half turn the axis is undefined, but such distant votes are not fitted
+    # near a half turn, the axis is undefined, but votes that far away are not fitted
     turns: Floats = axes * np.where(sines > 1e-9, angles / np.maximum(sines, 1e-9), 0.5)[:, None]
     half = (sines <= 1e-9) & (angles > 1.0)
     turns[half] = (math.pi, 0.0, 0.0)
@@ -532,7 +537,7 @@ def _best_vote(
     votes: Votes, weights: Floats, chosen: NDArray[np.intp], among: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> int:  # fmt: skip
-    """Return the vote of `chosen` with the greatest weight of `among` behind it; ties by order."""
+    """Return the vote of `chosen` with which votes of the greatest weight agree; ties by order."""
     support = [
         float(weights[_agreement_mask(votes, votes.transforms[i], p) & among].sum()) for i in chosen
     ]
@@ -547,7 +552,7 @@ def _fit_transform(
     for _ in range(p.rounds):
         step = _improve(votes, weights * agree, T, p)
         now = _agreement_mask(votes, step, p)
-        if not now.any():  # the mean of two distant votes may agree with none
+        if not now.any():  # the mean of two distant votes may agree with no vote
             break
         T, agree = step, now
     return T, agree

@@ -11,12 +11,12 @@ seed correspondence and compatible correspondences that are also compatible with
 (second-order compatibility: Chen et al., SC2-PCR, CVPR 2022) determine one transform, which is
 refined over all correspondences that it explains.
 
-The directions of depth images are searched independently, because the agreement of independent
-results is evidence. Scans contain much more surface, so a single search is sufficient; their
-directions are refined separately.
+For depth images, both directions are searched independently, because the agreement of independent
+results is evidence. Scans contain much more surface, so a single search is sufficient; its result
+is refined separately in each direction.
 
-If `up` is known in both frames, gravity excludes transforms that tilt (an IMU measures `up` to half
-a degree). Since `up` may be wrong, the gates have a margin, and if no transform fits, the search is
+If `up` is known in both frames (an IMU measures it to half a degree), transforms that tilt it are
+excluded. Since `up` may be wrong, the gates have a margin, and if no transform fits, the search is
 repeated without `up`. The paper does not use gravity.
 """
 
@@ -96,13 +96,13 @@ class ConsensusParameters:
 
     distance_tolerance: float = 0.12  #: tolerance of lengths and heights, metres
     angle_tolerance: float = 0.5  #: tolerance of the angle between two patches' normals, radians
-    minimum_distance: float = 0.15  #: minimum distance of two patches of a pair, metres
+    minimum_distance: float = 0.15  #: minimum distance between the two patches of a pair, metres
     n_seeds: int = 40  #: number of transforms that are fitted
-    n_support: int = 16  #: number of correspondences in the first fit of a seed
+    n_support: int = 16  #: number of correspondences in the first fit for each seed
     normal_weight: float = 0.05  #: weight of normals relative to positions, square metres
-    rounds: int = 3  #: number of refits to the explained correspondences
-    inlier_distance: float = 0.15  #: maximum distance of patches under a transform, metres
-    inlier_cosine: float = 0.85  #: minimum cosine between the normals of these patches
+    rounds: int = 3  #: number of refits to the correspondences that a transform explains
+    inlier_distance: float = 0.15  #: maximum distance of corresponding patches, metres
+    inlier_cosine: float = 0.85  #: minimum cosine between their normals
 
 
 @kernel
@@ -121,7 +121,7 @@ def _compare(
     p: Floats, n: Floats, q: Floats, m: Floats, i: int,
     tolerance: float, angle: float, minimum: float, verdicts: Bytes, cosines: Floats,
 ) -> None:  # fmt: skip
-    """Compare correspondence i with all later correspondences; arrays are (3, M), cosines (2, M).
+    """Compare correspondence i with all later ones; points and normals are (3, M), cosines (2, M).
 
     They are compatible if lengths, heights above each other's planes, angles between normals and
     the signed triple product, which excludes mirror images, agree. The cosines bound the difference
@@ -188,7 +188,7 @@ def _build_graph(
 
 @kernel
 def _count_common(bits: NDArray[np.uint64], common: Ints32) -> None:
-    """Write the number of correspondences compatible with both i and j; 0 for incompatible i, j."""
+    """Write how many correspondences are compatible with both i and j; 0 for incompatible pairs."""
     count, words = bits.shape
     m1, m2 = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
     m4, h = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
@@ -282,7 +282,7 @@ def _weigh_inliers(
 
 @kernel
 def _write_largest(row: Ints32, order: Ints32) -> None:
-    """Write the indices of the largest values of a row, in descending order; ties by index."""
+    """Write the indices of a row's largest values, largest first, ties by index, to `order`."""
     count = 0
     for j in range(len(row)):
         if count == len(order) and row[j] <= row[order[count - 1]]:
@@ -365,7 +365,7 @@ def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParam
 
 
 def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
-    """Return the angle between `up` (3,) and the nearest dominant direction of the surface, rad.
+    """Return the angle, in radians, between `up` (3,) and the surface's nearest dominant direction.
 
     Visible floors and tables determine the up direction as precisely as an IMU, but ramps mislead,
     and the floor may be out of view. Therefore, the angle is a hint, not evidence.
@@ -380,7 +380,7 @@ def floor_error(frame: Geometry, up: Floats, p: GravityParameters) -> float:
 def contradiction(
     tilt: float, query: Geometry, match: Geometry, ups: Ups, p: GravityParameters
 ) -> str:
-    """Explain the rejection of a transform that fits, but tilts against `up`.
+    """Return why a transform that fits but tilts against `up` was rejected.
 
     Parameters
     ----------
@@ -412,9 +412,9 @@ class AlignmentParameters:
     matching: MatchingParameters = field(default_factory=MatchingParameters)
     consensus: ConsensusParameters = field(default_factory=ConsensusParameters)
     n_refined: int = 16  #: number of hypotheses that are refined
-    n_sliced: int = 4  #: number of hypotheses of slices among them, regardless of their scores
+    n_sliced: int = 4  #: number of slice hypotheses among them, regardless of their scores
     score_stride: int = 2  #: stride of the points that score hypotheses
-    n_fine: int = 6  #: number of hypotheses of scans that are refined finely before ranking
+    n_fine: int = 6  #: number of hypotheses for scans that are refined finely before ranking
     fine_stride: int = 4  #: stride of the pixels in this refinement
     violation_weight: float = 3.0  #: weight of a violation in the score of a hypothesis
     rank_violations: float = 1.0  #: weight of violations in the rank of a refined hypothesis
@@ -430,7 +430,7 @@ class AlignmentParameters:
 
 @dataclass(frozen=True, eq=False)
 class FrameSamples:
-    """A frame with precomputed samples for scoring hypotheses.
+    """A frame with precomputed sample points for scoring hypotheses.
 
     Parameters
     ----------
@@ -458,7 +458,7 @@ def _upright_plan(surface: Surface, p: PlanParameters) -> ScanPlan:
 def frame_samples(
     geometry: Geometry, stride: int, p: PlaneParameters, up: Floats | None = None
 ) -> FrameSamples:
-    """Prepare a frame for `align`; the stride is in pixels."""
+    """Prepare a frame for `align` by sampling every `stride`-th row and column."""
     return FrameSamples(
         geometry, sample_points(geometry.surface, stride), plane_view(geometry, p), up
     )
@@ -472,9 +472,9 @@ class Alignment:
     ----------
     T : (4, 4) T_target_source
     others : (n, 4, 4) other refined hypotheses, best first
-    stiffness : ratio of the smallest to the largest eigenvalue of the information; 0 if a direction
-        is unconstrained
-    refined : last refinement; None if it failed
+    stiffness : ratio of the smallest to the largest eigenvalue of the information matrix; 0 if a
+        direction is unconstrained
+    refined : result of the last refinement; None if it failed
     search : source of the transform
     proposed : (n, 4, 4) all hypotheses before refinement, best first; for scans only
     """
@@ -555,7 +555,7 @@ def align_scans(
     planned, sliced = _search_plans(query, match, p.plan, other_axes=other_axes)
     hypotheses = np.concatenate([voted, sliced, planned])
     scores = _score(query, match, hypotheses, p, overlap_p)
-    priorities = scores.copy()  # slices are too coarse for scores, so the best slices have priority
+    priorities = scores.copy()  # slices are too coarse to be scored, so the best slices come first
     priorities[len(voted) : len(voted) + min(len(sliced), p.n_sliced)] = math.inf
     chosen = select_distinct(hypotheses, priorities, p.same_m, p.same_rad, p.n_refined)
     transforms, index = refine_with_index(a.surface, b.surface, hypotheses[chosen], p.coarse)
@@ -582,9 +582,10 @@ def align_scans(
 def _search_plans(
     query: FrameSamples, match: FrameSamples, p: PlanParameters, *, other_axes: bool
 ) -> tuple[Floats, Floats]:
-    """Return the hypotheses of plans, and, for scanners that see all around, of slices.
+    """Return hypotheses (n, 4, 4) from plans and, if both scanners see all around, from slices.
 
-    Streets require slices, but scanners in streets are upright.
+    Streets require slices; with `other_axes` there are none, because scanners in streets are
+    upright.
     """
     a, b = query.geometry.surface, match.geometry.surface
     if other_axes:
@@ -660,7 +661,7 @@ def _score(
     source: FrameSamples, target: FrameSamples, transforms: Floats, p: AlignmentParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Return the scores (n,) of transforms: shares of inliers minus weighted violations."""
+    """Return the score of each transform (n,): its share of inliers minus weighted violations."""
     total = np.zeros(len(transforms))
     for frame, other, direction in (
         (source, target, transforms), (target, source, inverses(transforms)),

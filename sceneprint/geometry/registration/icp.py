@@ -5,16 +5,16 @@
     covariance  --free_directions-->  directions in which the surfaces can slide
     covariance, R, lever  --transform_covariance-->  covariance in another frame
 
-Projective point-to-plane alignment compares a point with the plane that the target observed in the
-point's direction. Depth errors of structured-light sensors grow with z^2, so distant points have a
-lower weight. If the target has no viewpoint, a point is compared with the plane of the nearest
-point with a similar normal.
+Projective point-to-plane alignment compares each point with the plane that the target observed in
+the direction of that point. The depth errors of structured-light sensors grow with z^2, so distant
+points get a lower weight. If the target has no viewpoint, a point is compared with the plane of the
+nearest point with a similar normal.
 
-The error of T_parent_child is (x, y, z, rx, ry, rz), as in ROS's PoseWithCovariance: x is added to
-its translation, metres along the parent's axes, and the rotation vector r, radians about the
-parent's axes, is applied before its rotation, T_true = [exp(r) R, t + x], to first order. The
-inverse of the Gauss-Newton information is not a covariance, because the errors of neighbouring
-pixels are correlated: docs/uncertainty.md measures the effective number of points.
+The error of T_parent_child is (x, y, z, rx, ry, rz), as in ROS's PoseWithCovariance: T_true =
+[exp(r) R, t + x] to first order, with x in metres along the parent's axes, and the rotation vector
+r in radians about them. The inverse of the Gauss-Newton information is not a covariance, because
+the errors of neighbouring pixels are correlated: docs/uncertainty.md measures the effective number
+of points.
 """
 
 from __future__ import annotations
@@ -59,17 +59,17 @@ class RefinementParameters:
 
     stride: int  #: stride of the source's pixels
     iterations: int  #: number of Gauss-Newton steps
-    first_gate: float  #: maximum distance of a point from the plane in the first step, metres
-    last_gate: float  #: maximum distance from the plane in the last step, metres
+    first_gate: float  #: maximum distance of a point from its plane in the first step, metres
+    last_gate: float  #: maximum distance of a point from its plane in the last step, metres
     normal_cosine: float = 0.7  #: minimum cosine between corresponding normals
     reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / reference_depth)^growth)
     minimum_points: int = 20  #: minimum number of corresponding points
-    growth: int = 2  #: exponent of noise: 2 for a depth sensor, 1 or 0 for a scanner
+    growth: int = 2  #: exponent with which noise grows: 2 for a depth sensor, 1 or 0 for a scanner
     weight_depth: float = 1.0  #: depth at which weights start to fall as 1 / z^4, metres
     nearest: float = 0.1  #: minimum depth of a point in the target's camera, metres
     reach: float = 0.25  #: maximum distance to a point of an unordered target, metres
-    thinning: int = 1  #: stride within the points in the first iterations
-    last_iterations: int = 2  #: number of iterations with all points
+    thinning: int = 1  #: stride of the points that the first iterations use
+    last_iterations: int = 2  #: number of iterations that use all points
 
 
 #: Parameters for a quick check of a hypothesis.
@@ -90,7 +90,7 @@ class Refinement:
     information : (6, 6) J^T W J per point, in rotation (radians) and translation (metres) about the
         target's origin
     points : number of points in the last step
-    mean_square : mean weighted square of the points' residuals, a measure of the noise
+    mean_square : mean weighted square of the residuals of the points, a measure of the noise
     """
 
     T: Floats
@@ -119,7 +119,7 @@ def _nearest_in_line(
     points: Floats32, width: int, column: Ints32, line: Ints32, beside: int,
     x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
 ) -> None:  # fmt: skip
-    """Update the nearest pixel of each point with three pixels, `beside` lines away from its line.
+    """Update each point's nearest pixel from three pixels, `beside` lines away from its own line.
 
     `nearest` are squared distances, and `best` indices of pixels in row-major order.
     """
@@ -146,7 +146,7 @@ def _nearest_on_rays(
     points: Floats32, width: int, camera: Floats, column: Ints32, line: Ints32,
     x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
 ) -> None:  # fmt: skip
-    """Write the nearest of the nine pixels of a pinhole around each point; see `_nearest_in_line`.
+    """Write the nearest of the nine pinhole pixels around each point; see `_nearest_in_line`.
 
     A pixel's point lies on the pixel's ray, so only depths are looked up.
     """
@@ -174,7 +174,7 @@ def _weigh_points(
     x: Floats, y: Floats, z: Floats, depth: Floats, nearest: Floats, best: Ints32, T: Floats,
     gate: float, numbers: Floats, count: int, rows: Floats, weights: Floats,
 ) -> None:  # fmt: skip
-    """Write Jacobians and residuals (7, n) of points at their nearest pixels, and their weights.
+    """Write the Jacobians and residuals (7, n) of points at their nearest pixels, and the weights.
 
     A weight is negative if the point and the pixel do not correspond.
     """
@@ -221,7 +221,7 @@ def _select_compatible(weights: Floats, count: int, places: Ints32) -> int:
 
 @disjoint_kernel
 def _add_all(rows: Floats, weights: Floats, places: Ints32, count: int, sums: Floats) -> None:
-    """Add points to the normal equations in order.
+    """Add points to the normal equations, in order.
 
     `sums` (28,) contains the lower triangle of A by rows, -g and the weighted squares. The loop
     uses scalar variables: numba stores only scalars in registers.
@@ -267,8 +267,8 @@ def _accumulate(
 ) -> tuple[int, float]:  # fmt: skip
     """Write the normal equations of a Gauss-Newton step on points (7, N).
 
-    Return the number of used points and the sum of their weighted squares. The terms of a block are
-    computed together, which can be vectorized, and summed in order.
+    Return the number of points used and the sum of their weighted squared residuals. The terms of a
+    block are computed together, so that the loop can be vectorized, and summed in order.
     """
     height, width = points.shape[0], points.shape[1]
     shown, facing = points.reshape(-1), normals.reshape(-1)
@@ -357,8 +357,9 @@ def _refine_one(
 ) -> tuple[int, float]:  # fmt: skip
     """Refine T by Gauss-Newton steps.
 
-    Return the number of points in the last step (0 if it failed), and their mean weighted square
-    before that step. `whole` and `few` are the points of the last and of the first iterations.
+    Return the number of points in the last step (0 if a step failed), and their mean weighted
+    squared residual before that step. `whole` and `few` are the points of the last and of the first
+    iterations.
     """
     iterations, minimum = int(numbers[0]), int(numbers[5])
     thinned = iterations - int(numbers[10])
@@ -408,7 +409,7 @@ def _refine_one(
 
 @kernel
 def _transpose_samples(source: Floats32, step: int, numbers: Floats) -> Floats32:
-    """Return every `step`-th point, transposed to (7, n), with the fourth power of its depth."""
+    """Return every `step`-th point as (7, n); the seventh row is the fourth power of its depth."""
     kind, per_depth = numbers[8], numbers[7]
     chosen = np.empty((7, (len(source) + step - 1) // step), np.float32)
     chosen[:6] = transpose_points(source, step)
@@ -424,7 +425,7 @@ def refine_in_place(
     heads: Ints32, chain: Ints32, transforms: Floats, numbers: Floats,
     information: Floats, used: Ints64, squares: Floats,
 ) -> None:  # fmt: skip
-    """Refine n transforms (n, 4, 4) in place, and write the results of `_refine_one`."""
+    """Refine n transforms (n, 4, 4) in place, and write what `_refine_one` returns for each."""
     room, indices = np.empty((19, BLOCK)), np.empty((4, BLOCK), np.int32)
     whole = few = _transpose_samples(source, 1, numbers)
     if int(numbers[9]) > 1 and int(numbers[0]) > int(numbers[10]):
@@ -461,8 +462,8 @@ def refine(
 
     Returns
     -------
-    refinement : the result; None if a step is singular, or fewer than `minimum_points` points
-        remain within the gates
+    refinement : the result; None if a step is singular, or fewer than `minimum_points` points are
+        within the gates
     """
     T, information, used, squares = _refine(source, target, T_target_source[None], p, kind)
     return Refinement(T[0], information[0], int(used[0]), float(squares[0])) if used[0] else None
@@ -489,7 +490,7 @@ def refine_all(
 def refine_with_index(
     source: Surface, target: Surface, hypotheses: Floats, p: RefinementParameters
 ) -> tuple[Floats, NDArray[np.intp]]:
-    """Return the result of `refine_all`, and the indices of its hypotheses."""
+    """Return the successfully refined hypotheses, and their indices in `hypotheses`."""
     points = sample_points(source, p.stride)
     T, _, used, _ = _refine(points, target, hypotheses, p, kind_of(source.camera))
     index = np.flatnonzero(used)
@@ -497,9 +498,9 @@ def refine_with_index(
 
 
 Method = Literal["information-scaled", "votes-and-spread"]
-#: Name of the method of `pair_covariance`.
+#: Name of the method by which `pair_covariance` estimates.
 PAIR_METHOD: Method = "information-scaled"
-#: Name of the method of `fuse_votes`.
+#: Name of the method by which `fuse_votes` estimates.
 PLACE_METHOD: Method = "votes-and-spread"
 
 #: Indices that reorder (rotation, translation), as in a refinement, to (translation, rotation).
@@ -511,15 +512,15 @@ class CovarianceParameters:
     """Parameters of covariances; docs/uncertainty.md describes how they were tuned."""
 
     independent: float = 5.3  #: effective number of independent points per direction
-    least_square: float = 1e-7  #: minimum mean weighted square: no sensor is more accurate
-    most: float = 10.0  #: maximum deviation, for unconstrained directions, metres and radians
+    least_square: float = 1e-7  #: minimum mean weighted square: that of the most accurate sensor
+    most: float = 10.0  #: maximum deviation, reached in free directions, metres and radians
     lever: float = 1.0  #: length that counts as one radian, metres
-    free: float = 30.0  #: minimum ratio of a free direction's deviation to the minimum deviation
+    free: float = 30.0  #: minimum ratio of a free direction's deviation to the smallest deviation
 
 
 @dataclass(frozen=True, eq=False)
 class SlidingDirection:
-    """A direction in which the surfaces hardly constrain a transform.
+    """A direction in which the surfaces hardly constrain the transform.
 
     Parameters
     ----------
@@ -577,7 +578,8 @@ def pair_covariance(
 
     Parameters
     ----------
-    there, back : last refinement of T_match_query and of its inverse; None if it failed
+    there, back : last refinement of T_match_query, and of its inverse; None for a refinement that
+        failed
     T : (4, 4) T_match_query
 
     Returns
@@ -609,10 +611,10 @@ def pair_covariance(
 def free_directions(
     covariance: Floats, p: CovarianceParameters | None = None
 ) -> tuple[SlidingDirection, ...]:
-    """Return the directions whose deviation far exceeds the minimum, in descending order.
+    """Return the directions whose deviation far exceeds the smallest deviation, largest first.
 
-    A plane has three: two translations within it, and the rotation about its normal. A corridor has
-    one, its axis; a corner has none.
+    A plane leaves three directions free: two translations within it, and the rotation about its
+    normal. A corridor leaves one free, its axis; a corner leaves none.
     """
     p = p or CovarianceParameters()
     scale = _error_scale(p)
@@ -633,15 +635,15 @@ def fuse_votes(
 ) -> tuple[PoseAverage, Floats]:
     """Return the most likely pose of the votes that agree, and its covariance (6, 6).
 
-    All votes share the query, so only half of their covariances is independent. The spread of the
-    votes is added, because it contains the errors of the map's poses.
+    All votes share the query, so only half of each covariance is independent. The spread of the
+    votes is added, because it reflects the errors of the map's poses.
 
     Parameters
     ----------
     average : result of `average_poses`
     poses : (n, 4, 4) poses that were averaged
     covariances : (n, 6, 6) covariances of the poses
-    inflations : (n,) factors of the covariances in the weights of the votes
+    inflations : (n,) factors by which the covariances are multiplied to weigh the votes
     """
     members, own = poses[average.members], covariances[average.members]
     information = np.linalg.inv(own) / inflations[average.members, None, None]

@@ -1,4 +1,4 @@
-"""The agreement of two surfaces under a transform (Sec. III-E, evidence).
+"""Agreement of two surfaces under a transform (the evidence of Sec. III-E).
 
     points of the source, surface of the target, T  --agreements-->  inliers, violations
     Surface  --lookup_target-->  LookupTarget    LookupTarget, point  --nearest_alike-->  index
@@ -8,11 +8,11 @@ Points are projected into the target's camera. A point in front of the target's 
 free space, because the target would have observed it. If the target has no viewpoint, points are
 looked up by position, and free space is unknown.
 
-Unordered points are stored in a hash table of cubes. Only one point per small cube is stored, so
-the number of points in a cube is bounded.
+Unordered points are stored in a hash table of cubes. Each is divided into small cubes, of which
+only one point is stored, so the number of points in a cube is bounded.
 
 A floor may fill half of a frame, but the coincidence of two floors is weak evidence for a
-transform. Therefore, all patches in a plane share one weight.
+transform. Therefore, all patches in one plane share the weight of one.
 """
 
 from __future__ import annotations
@@ -53,19 +53,20 @@ from sceneprint.types import (
     camera_of,
 )
 
-#: Number of small cubes along the reach; a cube of the hash table is two reaches wide.
+#: Number of small cubes per length of the reach; a cube of the hash table is two reaches wide.
 FINENESS = 5.0
 
 
 class LookupTarget(NamedTuple):
-    """A surface prepared for look-ups: arguments of kernels.
+    """A surface prepared for look-ups; its fields are arguments of kernels.
 
     Parameters
     ----------
     points, normals : (h, w, 3); (1, N, 3) if unordered
     camera : (7,) result of `camera_of`; if unordered, the third number is the reach, and the fourth
-        the secret of the hash table
-    heads, chain : first point of each slot, and successor of each point in its slot; -1 if none
+        is the secret of the hash table
+    heads, chain : index of the first point in each slot, and of the point after each point in its
+        slot; -1 if none
     """
 
     points: Floats32
@@ -134,9 +135,9 @@ def nearest_alike(
 def _first_in_cubes(
     points: Floats32, cube: np.float32, secret: int, table: Ints32, cells: Ints64, firsts: Ints32
 ) -> int:
-    """Write the indices of the points that are first in their cubes; return their number.
+    """Write the indices of the points that are the first in their cubes; return how many there are.
 
-    The number of slots of `table` is a power of two, and they are -1; `cells` (N, 3) are the cubes.
+    `table` has a power of two of slots, all -1; `cells` (N, 3) receives the cube of each point.
     """
     mask, count = len(table) - 1, 0
     for n in range(len(points)):
@@ -144,7 +145,7 @@ def _first_in_cubes(
             int(np.floor(points[n, 0] / cube)), int(np.floor(points[n, 1] / cube)),
             int(np.floor(points[n, 2] / cube)),
         )  # fmt: skip
-        # hash twice, because three indices may not fit in one number
+        # hash twice, because three indices may not fit into one number
         slot = hash_key((hash_key((i << 32) ^ j, secret) << 19) + k, secret) & mask
         while True:
             other = table[slot]
@@ -195,7 +196,7 @@ def lookup_target(surface: Surface, nearest: float, reach: float) -> LookupTarge
 
 
 def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
-    """Thin a surface's unordered points to at most `most`, evenly distributed.
+    """Reduce a surface's unordered points to at most `most`, evenly distributed.
 
     Parameters
     ----------
@@ -205,14 +206,15 @@ def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
 
     Returns
     -------
-    surface : first point in each cube of a sufficiently coarse grid, or all valid points if there
-        are at most `most`
+    surface : the first point in each cube of a sufficiently coarse grid, or all valid points if
+        there are no more than `most`
     """
     points = surface.points[surface.valid]
     indices = np.arange(len(points), dtype=np.int32)
     cube = cube or float(np.ptp(points, axis=0).max(initial=0.0)) / 4096
     while len(indices) > most:
-        # a factor of the root of 2 halves the number of cubes that a surface occupies
+        # cubes that are wider by a factor of sqrt(2) halve the number of cubes that a surface
+        # occupies
         cube *= max((len(indices) / most) ** 0.5, 1.02)
         indices = first_per_cube(points, cube) if cube > 0 else indices[:1]
     return Surface(
@@ -224,7 +226,7 @@ def thin_points(surface: Surface, most: int, cube: float = 0.0) -> Surface:
     )
 
 
-#: Number of pixels of the surface of a depth image: 160 x 120.
+#: Number of pixels in the surface of a depth image: 160 x 120.
 DEPTH_PIXELS = 19_200
 
 
@@ -232,20 +234,20 @@ DEPTH_PIXELS = 19_200
 class OverlapParameters:
     """Parameters of agreement; lengths grow by max(1, (z / `reference_depth`)^`growth`)."""
 
-    surface_tolerance: float = 0.05  #: maximum distance of a point from the target's plane, metres
-    point_tolerance: float = 0.15  #: maximum distance of a point from the target's point, metres
+    surface_tolerance: float = 0.05  #: maximum distance from the target point's plane, metres
+    point_tolerance: float = 0.15  #: maximum distance from the target's point, metres
     normal_cosine: float = 0.7  #: minimum cosine between normals that agree
-    free_space_margin: float = 0.1  #: minimum distance of a violation before the surface, metres
+    free_space_margin: float = 0.1  #: minimum distance of a violation from the surface, metres
     reference_depth: float = 5.0**0.5  #: depth from which tolerances grow, metres
-    edge_px: int = 2  #: minimum distance of a violation from a pixel that agrees, pixels
+    edge_px: int = 2  #: minimum distance of a violating point from a pixel that agrees, pixels
     stride: int = 5  #: stride of the pixels that are looked up
-    growth: int = 2  #: exponent of noise: 2 for a depth sensor, 1 or 0 for a scanner
+    growth: int = 2  #: exponent with which noise grows: 2 for a depth sensor, 1 or 0 for a scanner
     nearest: float = 0.1  #: minimum depth of a point in the target's camera, metres
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """Numbers of a source's points by agreement with a target."""
+    """Counts of a source's points by whether they agree with a target."""
 
     points: int  #: total number of points
     inliers: int  #: points on the target's surface with similar normals
@@ -263,9 +265,9 @@ def _copy_valid(
     points: Floats32, normals: Floats32, valid: NDArray[np.bool_],
     rows: tuple[int, int], columns: tuple[int, int], out: Floats32,
 ) -> int:  # fmt: skip
-    """Copy points and normals of valid pixels line by line; return their number.
+    """Copy the points and normals of valid pixels to `out`, line by line; return their number.
 
-    `rows` and `columns` are the first index and the step.
+    `rows` and `columns` are pairs of the first index and the step.
     """
     count = 0
     for y in range(rows[0], valid.shape[0], rows[1]):
@@ -281,8 +283,8 @@ def _copy_valid(
 def sample_points(surface: Surface, stride: int) -> Floats32:
     """Return the valid points and normals of every `stride`-th row and column, (N, 6) float32.
 
-    Frames of all sensors contribute about equally: unless the stride is 1, it is increased for
-    spheres with more than `DEPTH_PIXELS` pixels.
+    Unless the stride is 1, it is increased for spheres with more than `DEPTH_PIXELS` pixels, so
+    that frames of all sensors contribute about the same number of points.
     """
     if surface.spread is not None and stride > 1:
         points, normals = surface.spread.points[0], surface.spread.normals[0]
@@ -301,7 +303,7 @@ def sample_points(surface: Surface, stride: int) -> Floats32:
     return both[:count].copy()
 
 
-#: Verdicts of a target on a point: unobserved, on its surface, or in its free space.
+#: Verdicts on a point: not observed by the target, on its surface, or in its free space.
 UNKNOWN, AGREES, VIOLATES = 0, 1, 2
 #: Preliminary verdict of `_compare`; `_saw_through` replaces it.
 _BEFORE = 3
@@ -312,7 +314,7 @@ def _compare(
     source: Floats32, start: int, places: Ints32, count: int, points: Floats32, normals: Floats32,
     camera: Floats, moved: Floats, pixels: Ints32, T: Floats, tolerances: Floats, verdicts: Bytes,
 ) -> None:  # fmt: skip
-    """Write the verdict of each point's pixel; `_BEFORE` if the point lies before its surface.
+    """Write the verdict of each point's pixel; `_BEFORE` if the point lies in front of its surface.
 
     `places` are indices of `source` (6, N) relative to `start`; `moved` (4, n) and `pixels` (2, n)
     are transformed coordinates, depths and pixels of these points.
@@ -350,7 +352,7 @@ def _compare(
 def _saw_through(
     points: Floats32, camera: Floats, u: int, v: int, depth: float, tolerances: Floats
 ) -> bool:
-    """Return whether a point lies before the surfaces of its pixel and of all neighbouring pixels.
+    """Return whether a point lies in front of the surfaces of its pixel and of all adjacent pixels.
 
     At an edge, a neighbouring pixel may show the surface of the point.
     """
@@ -432,7 +434,7 @@ def _look_up(
     source: Floats32, transposed: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats, verdicts: Bytes,
 ) -> None:  # fmt: skip
-    """Write the verdicts (N,) of a target on points (N, 6), also transposed, under T."""
+    """Write the verdicts (N,) of a target on points (N, 6) under T; `transposed` is (6, N)."""
     if camera[0] == 2:
         _look_up_near(source, points, normals, camera, heads, chain, T, tolerances, verdicts)
     else:
@@ -444,7 +446,7 @@ def weigh_overlap(
     source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the weights of inliers and of violations of points (N, 6) on a target under T."""
+    """Return the weights of the points (N, 6) that agree with and that violate a target under T."""
     out = np.empty((1, 2))
     _weigh_all(
         source, weights, points, normals, camera, heads, chain, T.reshape((1, 4, 4)), tolerances,
@@ -495,7 +497,7 @@ def agreements(
     p: OverlapParameters,
     weights: Floats32 | None = None,
 ) -> Floats:
-    """Return the weights of inliers and violations, (n, 2), under each of n transforms: Sec. III-E.
+    """Return the weights of inliers and of violations, (n, 2), under n transforms: Sec. III-E.
 
     Parameters
     ----------
@@ -533,7 +535,7 @@ def count_verdicts(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
     chain: Ints32, T: Floats, tolerances: Floats, agree: Ints32, violate: Ints32,
 ) -> int:  # fmt: skip
-    """Add a target's verdicts on points (N, 6) to the counts; return how many points agree."""
+    """Add a target's verdicts on points (N, 6) to the counts; return the number that agree."""
     verdicts, agreeing = np.empty(len(source), np.uint8), 0
     transposed = transpose_points(source, 1)
     _look_up(source, transposed, points, normals, camera, heads, chain, T, tolerances, verdicts)
@@ -555,7 +557,7 @@ def overlap_counts(
 
 @dataclass(frozen=True)
 class PlaneParameters:
-    """Parameters that determine whether patches lie in the same plane."""
+    """Limits within which two patches lie in the same plane."""
 
     coplanar: float = math.radians(15.0)  #: maximum angle between normals
     same_plane: float = 0.06  #: maximum distance of a patch from another patch's plane, metres
@@ -579,11 +581,11 @@ class PlaneView:
 
 @dataclass(frozen=True, eq=False)
 class PlaneAgreement:
-    """The agreement of two frames under transforms, with equal weights for all planes.
+    """Agreement of two frames under each of n transforms, with equal weights for all planes.
 
     Parameters
     ----------
-    share : (n,) agreeing share of both frames, 0 to 1
+    share : (n,) share of both frames that agrees, 0 to 1
     violations : (n,) violations of free space as a share of agreements and violations, 0 to 1
     """
 
@@ -595,7 +597,7 @@ class PlaneAgreement:
 def _count_coplanar(
     means: Floats, normals: Floats, cosine: float, apart: float, out: Ints32
 ) -> None:
-    """Write the number of patches in the plane of each patch; means and normals are (3, P)."""
+    """Write how many patches lie in each patch's plane; means and normals are (3, P)."""
     x, y, z, nx, ny, nz = means[0], means[1], means[2], normals[0], normals[1], normals[2]
     for i in range(len(out)):
         ix, iy, iz, a, b, c = x[i], y[i], z[i], nx[i], ny[i], nz[i]

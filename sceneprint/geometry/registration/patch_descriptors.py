@@ -1,11 +1,12 @@
-"""Histograms of the surroundings of patches, and correspondences by histograms (Sec. III-E).
+"""Histograms of the surroundings of patches, and correspondences from them (Sec. III-E).
 
     Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
     descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
 
-The properties resemble those of Eq. (1) and have the same scale. For every other patch within
-reach, they are its distance in the plane of the patch, its height over that plane, and the angles
-of its normal to the patch's normal and to its direction. All are invariant under rigid motion.
+The properties resemble those of Eq. (1) and have the same scale. Those of another patch within
+reach are its distance in the plane of this patch, its height over that plane, and the angles
+between its normal and, first, this patch's normal and, second, the direction from this patch to it
+in the plane. All are invariant under rigid motion.
 
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching is public. A random sample
 of the source's patches is compared with all patches of the target; a patch corresponds to the
@@ -30,7 +31,7 @@ ANGLES = 3
 
 @dataclass(frozen=True)
 class PatchDescriptorParameters:
-    """Parameters of the histograms: reach in metres, number of bins of distance and of height."""
+    """Parameters of the histograms: reaches in metres, and numbers of distance and height bins."""
 
     near_radius: float = 0.4
     near_distances: int = 4
@@ -44,7 +45,7 @@ class PatchDescriptorParameters:
 
     @property
     def scales(self) -> Floats:
-        """Return radius, number of distance bins and number of height bins by scale, (3, 3)."""
+        """Return the radius and the numbers of distance and height bins of each scale, (3, 3)."""
         return np.array(
             [
                 (self.near_radius, self.near_distances, self.near_heights),
@@ -85,8 +86,8 @@ class Compression:
         return np.ascontiguousarray(self.matrix.T)
 
 
-#: Maximum absolute value of a component of a unit vector; few of 128 components exceed it. Clipping
-#: prevents a large component, such as that of floors, from outweighing all other components.
+#: Maximum absolute value of a component of a unit vector, which few of 128 components reach; larger
+#: values are clipped, so that no component, such as that of floors, outweighs all others.
 RANGE = 0.25
 
 
@@ -101,7 +102,7 @@ def _squared_distances(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> 
 
 @disjoint_kernel
 def _select_near(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
-    """Write the indices, except `but`, of squared distances below a limit; return their number."""
+    """Write the indices, except `but`, of the squared distances below a limit; return the count."""
     found = 0
     for j in range(count):
         places[found] = j
@@ -116,8 +117,9 @@ def _locate(
 ) -> None:  # fmt: skip
     """Write the positions of other patches relative to patch i.
 
-    `lies` (6, n): squared distance, distance in the plane, height, share of the upper bin of each
-    angle, and area. `bins` (4, n): bins of both angles, of which the second varies fastest.
+    `lies` (6, n): squared distance, distance in the plane, height, the share that falls into the
+    upper bin of each angle, and area. `bins` (4, n): the four pairs of angle bins, the second angle
+    varying fastest.
     """
     x, y, z, nx, ny, nz = points[0], points[1], points[2], normals[0], normals[1], normals[2]
     ix, iy, iz, ax, ay, az = x[i], y[i], z[i], nx[i], ny[i], nz[i]
@@ -128,7 +130,7 @@ def _locate(
         height = dx * ax + dy * ay + dz * az
         cosine = ax * bx + ay * by + az * bz
         flat = np.sqrt(max(squares[j] - height * height, 0.0))
-        # the component of the other normal along its direction in the plane
+        # the component of the other normal along the in-plane direction to the other patch
         radial = (bx * dx + by * dy + bz * dz - height * cosine) / flat
         radial = radial if flat > 1e-3 else 0.0
         e = min(max((cosine + 1.0) * 0.5, 0.0), 1.0) * angles - 0.5
@@ -147,7 +149,7 @@ def _spread(
     lies: Floats, places: Ints32, count: int, radius: float, n_flat: int, n_high: int,
     n_angles: int, weights: Floats, starts: Ints32,
 ) -> None:  # fmt: skip
-    """Write the weights (4, n) of patches in distance and height bins, and the bins' starts."""
+    """Write the weights (4, n) of patches in distance and height bins, and where the bins start."""
     flat, height, area = lies[1], lies[2], lies[5]
     for k in range(count):
         i = np.uint64(places[k])
@@ -170,7 +172,7 @@ def _add_shares(
     lies: Floats, bins: Ints32, places: Ints32, count: int, weights: Floats, starts: Ints32,
     histogram: Floats32,
 ) -> None:  # fmt: skip
-    """Add the 16 shares of each patch to the histogram, in the order of the patches."""
+    """Add the 16 shares of each patch to the histogram, patch by patch."""
     for k in range(count):
         i = np.uint64(places[k])
         fe, fg = lies[3, i], lies[4, i]
@@ -214,7 +216,7 @@ def _accumulate(
 
 @disjoint_kernel
 def _occupied_bins(row: Floats32, first: int, last: int, places: Ints32) -> int:
-    """Write the indices of the occupied bins; return their number."""
+    """Write the indices of a row's occupied bins; return how many there are."""
     count = 0
     for k in range(first, last):
         places[count] = k
@@ -224,9 +226,9 @@ def _occupied_bins(row: Floats32, first: int, last: int, places: Ints32) -> int:
 
 @kernel
 def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
-    """Replace bins by their roots, and normalise each scale to 1 / sqrt(scales) (Hellinger kernel).
+    """Replace bins by their square roots; normalise each scale to 1 / sqrt(scales) (Hellinger).
 
-    Two thirds of the bins are empty and are skipped.
+    Empty bins, two thirds of all, are skipped.
     """
     places = np.empty(out.shape[1], np.int32)
     for i in range(len(out)):
@@ -236,7 +238,7 @@ def _normalise(scales: Floats, angles: int, out: Floats32) -> None:
             count, total = _occupied_bins(row, start, end, places), 0.0
             for n in range(count):
                 total += row[places[n]]
-            if count > 0:  # the squared length of the roots is the sum
+            if count > 0:  # the sum of the bins is the squared length of their roots
                 factor = 1.0 / np.sqrt(total * len(scales))
                 for n in range(count):
                     k = places[n]
@@ -264,9 +266,9 @@ _BINS = 256
 
 @disjoint_kernel
 def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floats32) -> None:
-    """Write rows times matrix (D, d), minus the offset; most bins of a histogram are empty.
+    """Write `histograms` @ `matrix` (D, d), minus the offset; most bins of a histogram are empty.
 
-    Four bins are added at a time, in their order, to reduce reads and writes of a row by 75 %.
+    Bins are added in order, four at a time, which reduces reads and writes of a row by 75 %.
     """
     places = np.empty(_BINS, np.int32)
     for i in range(len(histograms)):
@@ -341,7 +343,7 @@ def fit_compression(histograms: Floats32, dimension: int) -> Compression:
 
 @dataclass(frozen=True)
 class MatchingParameters:
-    """Parameters of matching."""
+    """Parameters of matching by descriptors."""
 
     n_sources: int = 100  #: number of sampled patches of the source
     n_nearest: int = 3  #: number of correspondences per patch
@@ -352,7 +354,7 @@ def _match_nearest(
     source: Bytes, target: Bytes, drawn: Ints32, n_nearest: int, slopes: Floats, onto: Floats,
     gate: float, pairs: Ints32,
 ) -> int:  # fmt: skip
-    """Write the nearest targets of each sampled source; return the number of pairs."""
+    """Write pairs of each sampled source patch and its nearest target patches; return the count."""
     count, length = target.shape
     farthest = np.int32(2147483647)
     squares = np.empty(count, np.int32)
@@ -385,7 +387,7 @@ def _match_nearest(
 
 @dataclass(frozen=True, eq=False)
 class SlopeGate:
-    """A gate for correspondences: patches must have similar angles to up in both frames.
+    """A gate that admits only pairs of patches whose normals have similar angles to up.
 
     Parameters
     ----------
@@ -412,11 +414,12 @@ def correspondences(
     source : (P, d) uint8 descriptors
     target : (P', d) uint8 descriptors
     rng : random generator for the sample
-    gate : gate by slopes; None accepts all pairs
+    gate : slope gate; None admits all pairs
 
     Returns
     -------
-    (M, 2) int32 correspondences, indices in source and in target; nearest first for each patch
+    (M, 2) int32 correspondences, as indices in source and in target; nearest first for each source
+    patch
 
     Raises
     ------

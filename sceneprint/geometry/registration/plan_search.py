@@ -1,12 +1,13 @@
-"""Transforms between scans by correlation of their plans, as seen from above (Sec. III-E).
+"""Search for transforms between scans by correlating their plans from above (Sec. III-E).
 
     Surface  --draw_plan-->  ScanPlan
     ScanPlan, ScanPlan  --plan_hypotheses, slice_hypotheses-->  (n, 4, 4)
 
-Scans from distant viewpoints share few patches with similar surroundings, so correspondences yield
-no correct transform, but the scans' plans fit. Upright surfaces are drawn, with their normals, into
-an image as seen from above. The image is rotated through all yaws and correlated with the other
-image. Level surfaces determine the height. This method is not part of the paper.
+Scans from distant viewpoints have few patches with similar surroundings in common, so
+correspondences may yield no correct transform although the plans of the scans fit. Upright surfaces
+of each scan are drawn, with their normals, into an image as seen from above. One image is rotated
+through all yaws and correlated with the other. Level surfaces determine the height. This method is
+not part of the paper.
 
 In streets, few surfaces are as large as the walls of a hall, and the normals of trees and cars are
 unreliable. Therefore, the points above the ground are also drawn without normals, in three slices
@@ -27,17 +28,17 @@ from sceneprint.geometry.registration.overlap import first_per_cube
 from sceneprint.geometry.rigid import select_distinct
 from sceneprint.types import Bytes, Floats, Floats32, Ints32, Sphere, Surface
 
-#: Minimum cosine at which a normal votes for a candidate for up, and maximum cosine at which a
-#: perpendicular normal gives half a vote.
+#: Minimum cosine to a candidate for up at which a normal votes for it, and maximum cosine at which
+#: a normal counts as perpendicular and gives half a vote.
 _ALONG, _ACROSS = math.cos(math.radians(6.0)), math.sin(math.radians(4.0))
-#: The same limits for the normals that refine up.
+#: The same two limits, for the normals that refine up.
 _NEAR, _LEVEL = math.cos(math.radians(8.0)), math.sin(math.radians(8.0))
-#: Maximum number of candidates for up and of voting normals, and number of refinement steps.
+#: Maximum number of candidates for up, maximum number of voting normals, and number of refinements.
 _MOST_CANDIDATES, _MOST_VOTERS, _REFINEMENTS = 100, 1500, 8
-#: Minimum vertical component of the normals of level surfaces, and maximum of upright surfaces.
+#: Minimum vertical component of a level surface's normal, and maximum of an upright surface's.
 _FLAT, _UPRIGHT = 0.9, 0.5
-#: Edges of the slices of heights above the ground, and width of the squares whose lowest points are
-#: the ground, in cells.
+#: Edges of the height slices above the ground, and width of the squares whose lowest points define
+#: the ground; in cells.
 _SLICE_EDGES, _GROUND_CELLS = (0.8, 2.4, 5.2, 24.0), 8.0
 
 
@@ -47,20 +48,20 @@ class PlanParameters:
 
     cell: float = 0.1  #: width of a cell of the plan image, metres
     side: int = 128  #: width of the plan image, cells
-    voxel: float = 0.08  #: width of the cubes, metres; one point of each is drawn
+    voxel: float = 0.08  #: width of the cubes of which one point each is drawn, metres
     tilt: float = math.radians(50.0)  #: maximum angle between up and the scanner's axis
     n_yaws: int = 72  #: number of yaws
     kept_yaws: int = 24  #: number of yaws whose plans are correlated
     n_peaks: int = 6  #: number of shifts per yaw
-    n_kept: int = 50  #: number of transforms that differ by two cells or one and a half yaws
+    n_kept: int = 50  #: number of transforms kept; they differ by two cells or 1.5 steps of yaw
     n_heights: int = 2  #: number of heights per transform
-    height_step: float = 0.05  #: step of the histogram of heights, metres
+    height_step: float = 0.05  #: width of a bin of the height histogram, metres
     height_range: float = 3.0  #: maximum absolute value of a height in the histogram, metres
     blur: float = 0.7  #: standard deviation of the Gaussian blur, cells
     flat_weight: float = 0.3  #: weight of the vertical component of normals
-    sliced_yaws: int = 18  #: number of yaws, apart from half turns, whose slices are correlated
-    n_sliced: int = 25  #: `n_kept` of slices
-    slice_blur: float = 0.5  #: `blur` of slices
+    sliced_yaws: int = 18  #: number of yaws (modulo half turns) whose slices are correlated
+    n_sliced: int = 25  #: `n_kept` for slices
+    slice_blur: float = 0.5  #: `blur` for slices
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +70,10 @@ class ScanPlan:
 
     Parameters
     ----------
-    R : (3, 3) R_level_sensor; its rows are two level axes and up
+    R : (3, 3) R_level_sensor; its rows are two horizontal axes and up
     points, normals : (N, 3) float32, one row per voxel, in the axes of R
-    slices : (N,) uint8, slice of heights above the ground, from 1; 0 outside of all slices
-    azimuths : (n_yaws,) histogram of the directions that upright surfaces face
+    slices : (N,) uint8, height slice of each point, from 1; 0 outside all slices
+    azimuths : (n_yaws,) histogram of the directions in which upright surfaces face
     heights : (2, n) histograms of the heights of surfaces that face up and down
     """
 
@@ -84,23 +85,23 @@ class ScanPlan:
     heights: Floats
 
 
-#: Pairs of source and target.
+#: Pairs of a source plan and a target plan.
 Plans = list[tuple[ScanPlan, ScanPlan]]
 
 
 def dominant_up(normals: Floats, axis: Floats, tilt: float) -> Floats:
-    """Estimate the direction to which most surfaces are perpendicular or parallel.
+    """Estimate up: the direction to which most surfaces are perpendicular or parallel.
 
     Parameters
     ----------
     normals : (N, 3)
     axis : (3,) unit vector
     tilt : maximum angle between the axis and the normals that are tried, radians; the refined
-        result can be slightly beyond it
+        result may exceed it slightly
 
     Returns
     -------
-    (3,) unit vector on the side of the axis; the axis if no normal is near it
+    (3,) unit vector within 90 degrees of the axis; the axis itself if no normal is near it
     """
     cosines = normals @ axis
     near = np.abs(cosines) > math.cos(tilt)
@@ -177,10 +178,10 @@ def draw_plan(
 
 
 def other_plans(source: Surface, target: Surface, p: PlanParameters) -> Plans:
-    """Return pairs of plans for scanners that were not upright.
+    """Return pairs of plans that assume that scanners were not upright.
 
-    In a pair, only the source was on its side or upside down, or both scanners were mounted on the
-    same side.
+    A pair assumes that only the source scanner was on its side or upside down, or that both
+    scanners were mounted on the same side.
     """
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     usual_source, usual_target = scanner_axis(source), scanner_axis(target)
@@ -195,14 +196,14 @@ def other_plans(source: Surface, target: Surface, p: PlanParameters) -> Plans:
 
 
 def scanner_axis(surface: Surface) -> Floats:
-    """Return the axis (3,) of a scanner's rotation in its coordinates; z if unknown."""
+    """Return the rotation axis (3,) of a scanner in its own coordinates; z if unknown."""
     axis = np.zeros(3)
     axis[surface.camera.pole if isinstance(surface.camera, Sphere) else 2] = 1.0
     return axis
 
 
 def _azimuth_histogram(normals: Floats, n_yaws: int) -> Floats:
-    """Return the histogram (n_yaws,) of upright surfaces' directions.
+    """Return a histogram (n_yaws,) of the directions in which upright surfaces face.
 
     Square roots limit the influence of a single wall.
     """
@@ -215,7 +216,7 @@ def _azimuth_histogram(normals: Floats, n_yaws: int) -> Floats:
 
 
 def _height_histograms(points: Floats, normals: Floats, p: PlanParameters) -> Floats:
-    """Return smoothed roots of the height histograms of surfaces that face up and down, (2, n)."""
+    """Return smoothed roots of the height histograms of surfaces facing up, and down, (2, n)."""
     n = 2 * round(p.height_range / p.height_step)
     rows = []
     for sign in (1.0, -1.0):
@@ -227,7 +228,7 @@ def _height_histograms(points: Floats, normals: Floats, p: PlanParameters) -> Fl
 
 
 def _height_offsets(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> list[float]:
-    """Return heights of the source's origin over the target's origin that align level surfaces."""
+    """Return the heights of the source over the target that best align level surfaces, metres."""
     scores = sum(
         np.correlate(b, a, "full") for a, b in zip(source.heights, target.heights, strict=True)
     )
@@ -276,7 +277,7 @@ def _draw(
 
 @kernel
 def _take_peaks(scores: Floats32, n: int, values: Floats, cells: Ints32) -> None:
-    """Write the n highest peaks of a torus (side, side), three cells apart or more, and their
+    """Write the n highest peaks of a torus (side, side), at least three cells apart, and their
     cells.
     """
     side = len(scores)
@@ -296,10 +297,11 @@ def _take_peaks(scores: Floats32, n: int, values: Floats, cells: Ints32) -> None
 def _draw_slices(
     points: Floats32, slices: Bytes, cosine: float, sine: float, cell: float, image: Floats32
 ) -> None:
-    """Write the roots of the numbers of points per cell, at most three, to (n_slices, side, side).
+    """Write the roots of the point counts per cell, at most sqrt(3), to (n_slices, side, side).
 
-    The roots and the limit reduce the influence of a single wall. Cell 0 is centred on the scanner,
-    and negative cells follow the positive cells, so that a half turn reverses both axes.
+    The square root and the limit reduce the influence of a single wall. Cell 0 is centred on the
+    scanner, and negative cells come after the positive cells, so that a half turn reverses both
+    axes.
     """
     side = image.shape[1]
     for i in range(len(points)):
@@ -312,7 +314,7 @@ def _draw_slices(
 
 
 def _slice_heights(points: Floats, p: PlanParameters) -> Bytes:
-    """Return the slice (N,) of each level point by its height above the lowest neighbour."""
+    """Return the height slice (N,) of each point, by its height above its lowest neighbour."""
     reach = math.ceil(p.side / _GROUND_CELLS)  # no point is drawn beyond it
     squares = np.floor(np.clip(points[:, :2] / (_GROUND_CELLS * p.cell), -reach, reach)).astype(int)
     squares += reach + 1
@@ -326,14 +328,14 @@ def _slice_heights(points: Floats, p: PlanParameters) -> Bytes:
 
 
 def _spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.complex64]:
-    """Return the Fourier transform of the image of normals at a yaw, (3, side, side / 2 + 1)."""
+    """Return the Fourier transform of a plan's normal image at a yaw, (3, side, side / 2 + 1)."""
     image = np.zeros((3, p.side, p.side), np.float32)
     _draw(plan.points, plan.normals, math.cos(yaw), math.sin(yaw), p.cell, p.flat_weight, image)
     return np.fft.rfft2(image).astype(np.complex64, copy=False)
 
 
 def _slice_spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.complex64]:
-    """Return the Fourier transform of the images of slices, (n_slices, side, side / 2 + 1)."""
+    """Return the Fourier transform of a plan's slice images, (n_slices, side, side / 2 + 1)."""
     image = np.zeros((len(_SLICE_EDGES) - 1, p.side, p.side), np.float32)
     _draw_slices(plan.points, plan.slices, math.cos(yaw), math.sin(yaw), 2 * p.cell, image)
     counts = np.bincount(plan.slices, minlength=len(_SLICE_EDGES))[1:, None, None]
@@ -343,7 +345,7 @@ def _slice_spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np
 
 
 def _blur(spectrum: NDArray[np.complex64], blur: float) -> NDArray[np.complex64]:
-    """Return the spectrum of a blurred image; a blur of both images is a squared Gaussian."""
+    """Return a spectrum blurred twice, as if both images of a correlation were blurred."""
     side = spectrum.shape[1]
     squares = np.fft.fftfreq(side)[:, None] ** 2 + np.fft.rfftfreq(side)[None] ** 2
     result: NDArray[np.complex64] = spectrum * np.exp(-((2 * math.pi * blur) ** 2) * squares)
@@ -351,7 +353,7 @@ def _blur(spectrum: NDArray[np.complex64], blur: float) -> NDArray[np.complex64]
 
 
 def _yaw_agreement(source: ScanPlan, target: ScanPlan) -> Floats:
-    """Return the correlation (n_yaws,) of two histograms of azimuths at each yaw of the source."""
+    """Return the correlation (n_yaws,) of two azimuth histograms for each yaw of the source."""
     yaws = np.arange(len(source.azimuths))
     result: Floats = source.azimuths[yaws - yaws[:, None]] @ target.azimuths
     return result
@@ -413,15 +415,16 @@ def _transforms_at_peaks(
     source: ScanPlan, target: ScanPlan, angles: Floats, products: Iterable[NDArray[np.complex64]],
     cell: float, n_kept: int, p: PlanParameters,
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    """Return the transforms (n, 4, 4) at the peaks of correlations, and the correlations.
+    """Return the transforms (n, 4, 4) at the peaks of the correlations, and their correlations.
 
     Parameters
     ----------
     source, target : two plans
-    angles : yaw of the source in each correlation, radians
+    angles : yaw of the source for each correlation, radians
     products : products of the spectra of both images, (channels, side, side / 2 + 1)
     cell : width of a cell, metres
-    n_kept : number of distinct yaws and shifts; n is this number times the number of heights
+    n_kept : number of distinct yaws and shifts to keep; n is this number times the number of
+        heights
     """
     values = np.empty(len(angles) * p.n_peaks)
     cells = np.empty((len(values), 2), np.int32)
@@ -434,7 +437,7 @@ def _transforms_at_peaks(
     flat[:, 0, 0], flat[:, 0, 1] = np.cos(yaws), -np.sin(yaws)
     flat[:, 1, 0], flat[:, 1, 1] = np.sin(yaws), np.cos(yaws)
     flat[:, :2, 3] = ((cells[:, ::-1] + p.side // 2) % p.side - p.side // 2) * cell
-    # neighbouring yaws propose the same shifts, and would displace different transforms
+    # adjacent yaws propose the same shifts, which would displace other transforms
     best = select_distinct(flat, values, 2 * cell, 3 * math.pi / p.n_yaws, n_kept)
     lifts = _height_offsets(source, target, p)
     level = np.repeat(flat[best], len(lifts), axis=0)

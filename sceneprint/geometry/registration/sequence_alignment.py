@@ -1,4 +1,4 @@
-"""Correspondences of patches by alignment of neighbour sequences, as in the paper (Sec. III-E).
+"""Patch correspondences by alignment of neighbour sequences, as in the paper (Sec. III-E).
 
     Patches  --neighbour_sequences-->  Sequences
     Patches, Patches  --sequence_correspondences-->  pairs (M, 2)
@@ -6,9 +6,9 @@
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching (GASP, 3DV 2014) is public.
 The descriptor of a patch is the sequence of the patches around it, sorted by azimuth about its
 normal; it does not depend on the viewpoint. These cyclic sequences are compared by their
-Damerau-Levenshtein distance: the cost of replacing, inserting, omitting and swapping neighbours.
-"It suffices to validate at a coarse hierarchical level" (Sec. III-F): the neighbours are coarse
-patches.
+Damerau-Levenshtein distance: the minimum cost of replacing, inserting, omitting and swapping
+neighbours. "It suffices to validate at a coarse hierarchical level" (Sec. III-F): the neighbours
+are coarse patches.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ class SequenceParameters:
     """Parameters of sequences and of their alignment."""
 
     n_coarse: int = 60  #: number of coarse patches
-    opposite_distance: float = 0.5  #: distance that opposite normals add, metres
+    opposite_distance: float = 0.5  #: distance that opposite normals add between seeds, metres
     n_neighbours: int = 12  #: number of nearest neighbours of a patch
     minimum_distance: float = 0.1  #: minimum distance of a neighbour, metres
     radius: float = 1.6  #: maximum distance of a neighbour, metres
-    length_scale: float = 0.35  #: difference between lengths that costs one half, metres
-    angle_scale: float = 1.0  #: difference between angles that costs one half, radians
+    length_scale: float = 0.35  #: difference in length that costs one half, metres
+    angle_scale: float = 1.0  #: difference in angle that costs one half, radians
     gap_cost: float = 0.5  #: cost of an inserted or omitted neighbour; a replacement costs 1
-    swap_cost: float = 0.1  #: cost of a swap, without the costs of the differences
+    swap_cost: float = 0.1  #: cost of a swap, in addition to the costs of the differences
     n_sources: int = 100  #: number of sampled patches of the source
     n_nearest: int = 3  #: number of correspondences per patch
 
@@ -59,7 +59,7 @@ class Sequences:
 
 
 def coarse_patches(patches: Patches, p: SequenceParameters) -> Patches:
-    """Combine patches to up to `n_coarse` patches, the means of the patches around distant seeds.
+    """Combine patches into up to `n_coarse` patches, the means of the patches around distant seeds.
 
     The largest patch is the first seed, and each further seed is the patch farthest from all
     previous seeds, so the selection does not depend on rigid motion.
@@ -102,7 +102,7 @@ def _write_sequences(
     found = np.empty((most, 4))
     for i in range(len(means)):
         n = normals[i]
-        # any direction in the plane can be azimuth 0: the start is selected later
+        # any direction in the plane can be azimuth 0, because the start is selected later
         k = 0
         for d in range(1, 3):
             if abs(n[d]) < abs(n[k]):
@@ -143,7 +143,7 @@ def _write_sequences(
             m += 1
         lengths[i] = m
         order = np.argsort(azimuths[:m], kind="mergesort")
-        # after the widest gap, a swap across the start of the sequence is least likely
+        # neighbours across the widest gap are least likely to be swapped
         start, widest = 0, -1.0
         for s in range(m):
             before = azimuths[order[s - 1]] - (2 * np.pi if s == 0 else 0.0)
@@ -162,7 +162,7 @@ def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters)
     Parameters
     ----------
     patches : P patches
-    about : potential neighbours, the result of `coarse_patches`
+    about : potential neighbours: the result of `coarse_patches`
     """
     symbols = np.zeros((len(patches), p.n_neighbours, 4))
     lengths = np.zeros(len(patches), np.int32)
@@ -189,10 +189,10 @@ def _replacement_costs(
 def _edit_cost(
     costs: Floats, m: int, n: int, turn: int, gap: float, swap: float, most: float, rows: Floats
 ) -> float:
-    """Return the Damerau-Levenshtein cost between sequence 1 and sequence 2 from position `turn`.
+    """Return the Damerau-Levenshtein cost between sequence 1 and sequence 2, started at `turn`.
 
     In this variant (optimal string alignment), a swapped pair is not edited again. The result is
-    infinite if it must exceed `most`. `rows` (3, n + 1) is scratch space.
+    infinite if the cost is certain to exceed `most`. `rows` (3, n + 1) is scratch space.
     """
     for j in range(n + 1):
         rows[0, j] = j * gap
@@ -211,7 +211,7 @@ def _edit_cost(
                 cost = min(cost, earlier[j - 2] + both + swap)
             now[j] = cost
             least = min(least, cost)
-        if least > most and least_before > most:  # a swap uses the cost of two rows before
+        if least > most and least_before > most:  # a swap uses the cost from two rows before
             return np.inf
         least_before = least
     result: float = rows[m % 3, n]
@@ -223,11 +223,11 @@ def _cyclic_cost(
     a: Floats, m: int, b: Floats, n: int, length: float, angle: float, gap: float, swap: float,
     most: float, costs: Floats, rows: Floats,
 ) -> float:  # fmt: skip
-    """Return the minimum cost over the starts of sequence 2, as a share of the maximum cost."""
+    """Return the minimum cost over all starts of sequence 2, as a share of the maximum cost."""
     if m == 0 or n == 0:
         return 1.0
     _replacement_costs(a, m, b, n, length, angle, costs)
-    # a fast lower bound excludes most pairs: each neighbour is replaced or omitted
+    # a fast lower bound excludes most pairs: it replaces or omits each neighbour
     bound = 0.0
     for i in range(m):
         nearest = gap
@@ -241,7 +241,7 @@ def _cyclic_cost(
     for turn in range(n):
         cost = _edit_cost(costs, m, n, turn, gap, swap, best, rows)
         best = min(best, cost)
-    # limit / whole can be rounded to less than `most` and would displace an equal cost
+    # limit / whole can round to less than `most`, and would then displace an equal cost
     return best / whole if best < limit else 1.0
 
 

@@ -1,16 +1,16 @@
-"""Ranking of stored signatures by distance, and a diverse selection (Sec. III-C and III-D).
+"""Ranking of stored signatures by distance, and diverse selection (Sec. III-C and III-D).
 
     query (n,), database (N, n) uint8  --distances-->  (N,)  --rank-->  Ranking: R of Sec. III-C
     distances to the query (R,), among R (R, R)  --diversify-->  Selection (k of R)
 
-Tests compare all search indexes with these functions. Distances are exact integers; of equal
-distances, the lower index comes first.
+Tests compare all search indexes with these functions. Distances are exact integers; if two are
+equal, the lower index comes first.
 
 The kernel of Sec. III-D is L_XY = rho_X rho_Y exp(s(X, Y) / sigma) with rho_X = exp(s(X, Q) / (2
-omega)) and s = -distance. The most probable set of k maximises det L_C; the greedy algorithm
-repeatedly selects the candidate that increases the determinant by the largest factor. This factor
-is rho_X^2 times the conditional variance of X given the selection under exp(-D / sigma), so
-logarithms of quality and diversity neither overflow nor underflow.
+omega)) and s = -distance. The most probable set C of k members maximises det L_C; the greedy
+algorithm repeatedly selects the candidate that increases the determinant by the largest factor.
+This factor is rho_X^2 times the conditional variance of X given the selection under exp(-D /
+sigma), so logarithms of quality and diversity neither overflow nor underflow.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from sceneprint.types import Bytes, Floats
 
 Ints64 = NDArray[np.int64]
 
-#: Number of rows per tile of columns; number of bytes of all queries' tiles, which must fit into a
-#: core's cache; and minimum length of a tile, because shorter tiles need more calls.
+#: Number of rows per tile of columns; maximum size of the tiles of all queries, in bytes, which
+#: must fit into a core's cache; and minimum length of a tile, because short tiles need more calls.
 GROUP, _CACHED, _SHORTEST = 16, 262144, 4096
 
-#: Number of bytes that are summed in 32 bits: the maximum power of 2 whose squares fit.
+#: Number of bytes that are summed in 32 bits: the largest power of 2 at which sums of squares fit.
 BLOCK = 32768
 
 
@@ -45,7 +45,7 @@ def scan(
     ----------
     queries : (Q, n) uint8, in C order
     database : (N, n) uint8, in C order
-    rows : (r,) indices of the database from 0 to N - 1, which are not checked
+    rows : (r,) row indices of the database, which are not checked
     squared : whether to sum squares
     half : whether to compute only entries (q, i) with q < i; all other entries are undefined
     """
@@ -58,7 +58,7 @@ def scan(
 
 
 def read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a read-only view, so that mapped files and arrays use the same machine code."""
+    """Return a read-only view, so that mapped files and other arrays use the same machine code."""
     view = array.view()
     view.flags.writeable = False
     return view
@@ -69,7 +69,7 @@ def _sum_absolute(a: Bytes, b: Bytes) -> int:
     """Return the sum of |a - b| over at most BLOCK bytes."""
     total = np.int32(0)
     for i in range(len(a)):
-        # only a 32-bit magnitude that is added to 32 bits compiles to a single instruction
+        # compiles to one instruction only if a 32-bit magnitude is added to a 32-bit sum
         d = np.int32(np.int32(a[i]) - np.int32(b[i]))
         total = np.int32(total + abs(d))
     return int(total)
@@ -113,7 +113,7 @@ def _sum_tiles(
 #: "l1": sum of |x - y|, as in the paper; "l2": squared Euclidean distance, sum of (x - y)^2.
 Metric = Literal["l1", "l2"]
 
-#: Size of a ranking: share of the map, minimum and maximum number of frames.
+#: Size of a ranking: share of the map's frames, and minimum and maximum number of frames.
 RANKING_SHARE, SMALLEST_RANKING, LARGEST_RANKING = 0.4, 50, 200
 
 
@@ -129,12 +129,12 @@ def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None
 
     Returns
     -------
-    (N,) or (r,) int64, exact, in units of a byte, or of a squared byte for "l2"
+    (N,) or (r,) int64, exact, in steps of a byte, or in squared steps for "l2"
 
     Raises
     ------
-    ValueError : If the lengths differ, the arrays do not contain bytes, or the metric or a row does
-        not exist
+    ValueError : If the lengths differ, the arrays are not uint8, or the metric or a row does not
+        exist
     """
     if query.ndim != 1:
         raise ValueError(f"The query has shape {query.shape}. Pass the bytes of one signature.")
@@ -153,7 +153,7 @@ def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None
 
 @dataclass(frozen=True, eq=False)
 class Ranking:
-    """The ranking R of Sec. III-C: the nearest first, ties by index.
+    """The ranking R of Sec. III-C: nearest first, ties by index.
 
     Parameters
     ----------
@@ -218,7 +218,8 @@ def _require_signatures(queries: Bytes, database: Bytes, metric: Metric) -> None
         )
     if queries.dtype != np.uint8 or database.dtype != np.uint8:
         raise ValueError(
-            f"The signatures are {queries.dtype} and {database.dtype}. Pass uint8 arrays."
+            f"The signatures have the types {queries.dtype} and {database.dtype}. "
+            "Pass uint8 arrays."
         )
     if metric not in get_args(Metric):
         raise ValueError(f"The metric {metric!r} does not exist. Pass one of {get_args(Metric)}.")
@@ -237,7 +238,7 @@ def _distances(
 
 
 def similarity(distances: Ints64, unrelated_distance: float) -> Floats:
-    """Return 1 - d / d0, at least 0: 1 for equal, 0 for unrelated signatures (Sec. III-C).
+    """Return 1 - d / d0, at least 0: 1 for equal and 0 for unrelated signatures (Sec. III-C).
 
     Parameters
     ----------
@@ -257,7 +258,7 @@ def similarity(distances: Ints64, unrelated_distance: float) -> Floats:
 
 
 def distance_share(distances: Ints64, unrelated_distance: float, metric: Metric) -> Floats:
-    """Return distances as shares of d0, or the roots of these shares for squared distances.
+    """Return distances as shares of d0; for squared distances, the square roots of these shares.
 
     Parameters
     ----------
@@ -274,7 +275,7 @@ def distance_share(distances: Ints64, unrelated_distance: float, metric: Metric)
 
 
 def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
-    """Rank the nearest `size` rows of a database, ties by index: R of Sec. III-C.
+    """Rank the `size` nearest rows of a database, ties by index: R of Sec. III-C.
 
     Parameters
     ----------
@@ -323,10 +324,10 @@ def ranking_size(n_map: int) -> int:
     return min(wanted, n_map)
 
 
-#: Exact distances of this module, or distances in floating point.
+#: Distances: exact, as this module computes them, or in floating point.
 Distances = Floats | NDArray[np.int64]
 
-#: Conditional variance below which a candidate is a duplicate of a selected member.
+#: A candidate with a smaller conditional variance is a duplicate of a selected member.
 DUPLICATE = 1e-9
 
 
@@ -345,7 +346,8 @@ class Selection:
     Parameters
     ----------
     indices : (k,) ascending positions in the ranking, always including 0
-    gains : (k,) added diversity: conditional variance given the previously selected members, (0, 1]
+    gains : (k,) diversity added by each member: its variance given the previously selected members,
+        in (0, 1]
     """
 
     indices: NDArray[np.intp]
@@ -367,7 +369,7 @@ def kernel_matrix(to_query: Distances, among: Distances, sigma: float, omega: fl
 
     Notes
     -----
-    Reading R6 (docs/paper.md): kappa scales all determinants of size k by one factor; it is 1.
+    Reading R6 (docs/paper.md): kappa scales all determinants of size k equally; it is 1 here.
     """
     rho = np.exp(-0.5 * to_query / omega)
     kernel: Floats = rho[:, None] * rho[None, :] * np.exp(-among / sigma)  # Eq. (3)
@@ -445,7 +447,7 @@ def _scale_of(among: Floats, p: DiversityParameters) -> float:
 
 def _log_quality(to_query: Floats, omega: float) -> Floats:
     """Return log rho^2 up to a constant; the constant does not affect the selection."""
-    if omega <= 0:  # equal distances, or quality is disabled: only diversity decides
+    if omega <= 0:  # with equal distances, or if quality is disabled, only diversity decides
         return np.zeros(len(to_query))
     quality: Floats = (to_query[0] - to_query) / omega
     return quality
@@ -471,7 +473,7 @@ def select_greedily(
     Parameters
     ----------
     log_quality : (n,) log rho^2, up to a constant
-    similarity_of : function that returns the similarities (n,) of an index to all indices
+    similarity_of : function that maps an item's index to its similarities (n,) to all items
     k : number of items to select, at most n
 
     Returns

@@ -1,1 +1,1 @@
-"""Conversion of surfaces to patches, pairs of patches and signatures."""
+"""Conversion of surfaces to patches, patch pairs and signatures."""

@@ -55,7 +55,7 @@ class LevelStatistics:
     total: float
 
 
-#: Number of rows of the table by which the prefetch is ahead, to hide the latency of memory.
+#: Number of table rows by which the prefetch runs ahead, to hide the memory latency.
 _AHEAD = 16
 
 
@@ -63,10 +63,11 @@ _AHEAD = 16
 def _accumulate(
     counts: Floats32, table: Floats32, components: NDArray[np.int16], sums: Floats
 ) -> None:
-    """Add up sums (G, 32): first 12, second 12, zeroth in the 25th; the rest fills a cache line.
+    """Add up `sums` (G, 32): 12 first, 12 second, 1 zeroth; the rest fills a cache line.
 
-    `components` is the memory of the packed table as int16. A quarter of the bins contain pairs.
-    Their rows are scattered over a table that exceeds all caches, so they are prefetched.
+    `components` is the memory of the packed table as int16. The rows of the bins that contain
+    pairs, a quarter of all, are scattered over a table that exceeds all caches, so they are
+    prefetched.
     """
     used, n = np.empty(len(counts), np.int32), 0
     for b in range(len(counts)):
@@ -93,7 +94,7 @@ def _accumulate(
 def statistics_of_counts(
     counts: PairCounts, table: PairTable, n_components: int
 ) -> LevelStatistics:
-    """Compute the statistics of a level from its counted pairs; `n_components` is G."""
+    """Compute the statistics of a level from its pair counts; `n_components` is G."""
     d, sums = FEATURE_DIMENSION, np.zeros((n_components, 32))
     _accumulate(counts.weights, table.packed, table.packed.view(np.int16), sums)
     return LevelStatistics(
@@ -102,7 +103,7 @@ def statistics_of_counts(
 
 
 def statistics_of_features(features: Floats, weights: Floats, mixture: Mixture) -> LevelStatistics:
-    """Compute the statistics of pairs with all posteriors; tests compare the table with them.
+    """Compute the statistics of pairs from all posteriors, as an oracle for the table in tests.
 
     Parameters
     ----------
@@ -124,13 +125,13 @@ def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
 
     Returns
     -------
-    phi : (25 G,) m0, m1 (12), m2 (12) of each component, before square root and normalization
+    phi : (25 G,) m0, m1 (12), m2 (12) of each component, before the square root and normalization
 
     Notes
     -----
     Readings R2-R4, R9 (docs/paper.md): true posteriors; the weighted mean over all pairs;
-    d^2 / var - 1 in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed form of the
-    inverse Fisher information's factor.
+    d^2 / var - 1 in each dimension; 1/sqrt(p_g) and 1/sqrt(2 p_g) are the closed-form factors of
+    the inverse Fisher information.
     """
     p, nu, variance = mixture.weights, mixture.means, mixture.variances
     root = np.sqrt(p)[:, None]
@@ -146,10 +147,10 @@ def fisher_vector(s: LevelStatistics, mixture: Mixture) -> Floats:
 def normalise(phi: Floats) -> Floats:
     """Return the signed square root of phi (n,), normalised to unit l2 norm (after Eq. 2).
 
-    The result for a level without pairs is zero.
+    A level without pairs results in zeros.
     """
     rooted = np.sign(phi) * np.sqrt(np.abs(phi))
-    norm = float(np.sqrt(np.abs(phi).sum()))  # without BLAS, whose sums depend on threads
+    norm = float(np.sqrt(np.abs(phi).sum()))  # not by BLAS, whose sums depend on the threads
     result: Floats = rooted / norm if norm > 0 else rooted
     return result
 
@@ -176,7 +177,7 @@ Ints32 = NDArray[np.int32]
 #: Integer that represents 1 in psi. By the Cauchy-Schwarz inequality, the product with a row of the
 #: basis fits into 32 bits for up to 16 levels of 25,000 components.
 UNITS = 1 << 14
-#: Root mean square of the stored components; few components reach the limit of 127.
+#: Root mean square of the stored components; few of them reach the limit of 127.
 GAIN = 26.0
 
 
@@ -185,20 +186,20 @@ class WhiteningParameters:
     """Parameters of the stored signature."""
 
     dimension: int = 448  #: d, number of bytes of a stored signature
-    exponent: float = 1.0  #: exponent of the standard deviation that divides an axis
+    exponent: float = 1.0  #: power of the standard deviation by which an axis is divided
 
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
     """An affine map from psi to the stored signature, fitted once per model.
 
-    Basis and psi are integers, so their products are exact and independent of the order of sums.
+    The basis and psi are integers, so products are exact and independent of the summation order.
 
     Parameters
     ----------
     levels : (h,) ascending indices of the levels in psi; 0 is the finest level
     basis : (d, D) int8, axes of psi, by descending variance
-    scales : (d,) float64, factors that whiten the products of the axes with psi
+    scales : (d,) float64, factors by which the products of the axes with psi are whitened
     offsets : (d,) float64, products of the axes with the mean psi
     unrelated_distance : d0, median squared distance between signatures of unrelated frames
     """
@@ -216,7 +217,7 @@ class Whitening:
 
     @property
     def gain(self) -> float:
-        """Return the factor between a unit vector and the stored components."""
+        """Return the factor from the components of a unit vector to the stored components."""
         return GAIN * math.sqrt(self.dimension)
 
 
@@ -249,7 +250,7 @@ def whiten(psi: Floats, whitening: Whitening) -> Bytes:
 
     Raises
     ------
-    ValueError : If the length of psi does not fit the basis
+    ValueError : If the length of psi differs from that of the axes
     """
     if psi.shape != whitening.basis.shape[1:]:
         raise ValueError(
@@ -277,7 +278,8 @@ def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) 
 
     Returns
     -------
-    whitening : whitening with an unrelated distance of 1; the caller must measure it
+    whitening : whitening with the placeholder 1 for `unrelated_distance`, which the caller must
+        measure
 
     Raises
     ------
@@ -297,6 +299,6 @@ def fit_whitening(psi: Ints16, levels: tuple[int, ...], p: WhiteningParameters) 
     axes *= signs[:, None]
     units = np.abs(axes).max(axis=1) / 127
     basis: Ints8 = np.rint(axes / units[:, None]).astype(np.int8)
-    # single precision discards the last bits, which differ between processors
+    # single precision discards the last bits, which depend on the processor
     scales = (units * variances ** (-p.exponent / 2)).astype(np.float32).astype(np.float64)
     return Whitening(levels, basis, scales, basis @ mean, 1.0)

@@ -1,4 +1,4 @@
-"""A Gaussian mixture with diagonal covariances (Sec. III-B, generative model)."""
+"""A Gaussian mixture with diagonal covariances: the generative model of Sec. III-B."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class MixtureParameters:
 
     n_components: int = 1250  #: G
     iterations: int = 8  #: number of iterations of expectation maximisation
-    variance_floor: float = 0.02  #: added to all variances; features have variance 1
+    variance_floor: float = 0.02  #: value added to all variances; features have variance 1
     prior_variance: float = 0.02  #: prior of the components' variances
     prior_count: float = 5.0  #: weight of the prior, in samples
     minimum_weight: float = 1e-6  #: minimum p_g
@@ -74,7 +74,7 @@ def posteriors(features: Floats, mixture: Mixture) -> Floats:
 def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[Mixture]:
     """Fit a mixture by expectation maximisation from a K-Means++ start (Sec. III-F).
 
-    To show progress, the function yields the start, and the mixture after each of `p.iterations`
+    To allow callers to show progress, yield the start and the mixture after each of `p.iterations`
     iterations. The last mixture is the result.
 
     Parameters
@@ -101,7 +101,7 @@ def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[M
 def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture:
     """Return the mixture after an iteration of expectation maximisation.
 
-    Features (M, 12) are processed in blocks, because all posteriors would fill gigabytes.
+    Features (M, 12) are processed in blocks, because the posteriors of all would fill gigabytes.
     """
     zeroth, first, second = moments(features, mixture)
     count = np.maximum(zeroth, 1e-9)[:, None]

@@ -1,4 +1,4 @@
-"""The 13-D properties of patch pairs, and counts of pairs in a table (Sec. III-A).
+"""The 13-D properties of patch pairs, and counts of pairs by bin (Sec. III-A).
 
     Patches (P), pairs (M, 2)  --invariants-->  (M, 4)  --properties-->  f' (M, 13)
     f' (M, 13)  --project-->  f (M, 12)
@@ -62,7 +62,7 @@ def invariants(patches: Patches, pairs: NDArray[np.int64]) -> Floats:
     Parameters
     ----------
     patches : patches with means in metres and unit normals
-    pairs : (M, 2) indices (mu, alpha) of patches whose r and n_mu are not parallel
+    pairs : (M, 2) indices (mu, alpha) of patches for which r and n_mu are not parallel
 
     Returns
     -------
@@ -98,7 +98,7 @@ def properties(invariant: Floats, p: PropertyParameters) -> Floats:
     Notes
     -----
     Reading R1 (docs/paper.md): the printed interval of sgn_e is empty; here the sign is 0 within
-    e_theta of perpendicular, |cos| <= sin(e_theta).
+    e_theta of a right angle, |cos| <= sin(e_theta).
     """
     d, theta_mu, theta_alpha, phi = invariant.T
     m_u, m_v = np.cos(theta_mu), np.sin(theta_mu)  # n_mu = m_u u + m_v v
@@ -171,7 +171,8 @@ def fit_projection(
 
     Returns
     -------
-    projection : projection with positive largest weights, because neither method defines signs
+    projection : projection whose largest weight in each row is positive, because neither method
+        defines signs
 
     Raises
     ------
@@ -226,14 +227,14 @@ class TableLayout:
     """The grid over the four invariants of a pair.
 
     Angular bins are centred on right angles (dihedral bins also on 0 and 180 degrees), because
-    these are frequent in buildings and must not fall on an edge. With 27 bins, the tolerance of 10
-    degrees in Eq. (1) is an edge, so no bin contains the jump of the robust sign. A finer grid with
-    this property needs three times as many bins.
+    these angles are frequent in buildings and must not fall on an edge. With 27 bins, the tolerance
+    of 10 degrees in Eq. (1) falls on an edge, so the robust sign does not jump within a bin. The
+    next finer grid with this property has three times as many bins.
     """
 
     distance_bins: int = 20
-    angle_bins: int = 27  #: bins of an angle to r; odd, so that one is centred on 90 degrees
-    dihedral_bins: int = 20  #: multiple of 4; the bins are offset by half a bin
+    angle_bins: int = 27  #: number of bins of an angle to r; odd, to centre one on 90 degrees
+    dihedral_bins: int = 20  #: number of dihedral bins, a multiple of 4; offset by half a bin
     distance_exponent: float = 1.3  #: distance edges are radius * (i / bins)^exponent
 
     @property
@@ -265,7 +266,7 @@ def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Float
     Returns
     -------
     distance : (distance_bins,) metres
-    angle : (angle_bins,) negative cosines of the angle, ascending from -1; the last is infinite
+    angle : (angle_bins,) negative cosines, ascending from -1; the last edge is infinite
     dihedral : (dihedral_bins + 1,) diamond angles in [0, 4]; the last interval joins the first bin
     """
     distance = p.radius * (np.arange(1, layout.distance_bins + 1) / layout.distance_bins) ** (
@@ -279,13 +280,13 @@ def bin_edges(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Float
 
 
 def search_starts(edges: Floats, origin: float, extent: float, n: int = 4096) -> Ints32:
-    """Return the bin at which the search for a coordinate's bin starts, for `n` equal cells.
+    """Return the first bin whose upper edge exceeds the start of each of `n` equal cells, (n,).
 
     Parameters
     ----------
     edges : (m,) upper edges of the bins
-    origin, extent : start and length of the range of the coordinate
-    n : number of cells; cells must be narrower than all bins
+    origin, extent : start and length of the range that the cells divide
+    n : number of cells; cells must be narrower than every bin
 
     Raises
     ------
@@ -298,14 +299,14 @@ def search_starts(edges: Floats, origin: float, extent: float, n: int = 4096) ->
 
 
 LEADING = 8  #: number of posteriors per bin, with sum 1
-LEAST_POSTERIOR = 1e-3  #: minimum posterior; smaller posteriors become 0
-#: Number of floats of a bin: feature, posteriors, and components as pairs of int16.
+LEAST_POSTERIOR = 1e-3  #: smaller posteriors become 0
+#: Number of floats per bin: feature, posteriors, and components as pairs of int16.
 WIDTH = FEATURE_DIMENSION + LEADING + LEADING // 2
 
 
 @dataclass(frozen=True, eq=False)
 class PairTable:
-    """The contributions of pairs to Eq. (2) by bin, 96 bytes (two cache lines) per bin.
+    """The contribution of a pair in each bin to Eq. (2); 96 bytes per bin, within two cache lines.
 
     Parameters
     ----------
@@ -345,7 +346,7 @@ def _select_leading(
     features: Floats32, constants: Floats32, means: Floats32, precisions: Floats32,
     components: NDArray[np.int16], posteriors: Floats32,
 ) -> None:  # fmt: skip
-    """Write the largest posteriors of each feature; means and precisions are (12, G)."""
+    """Write each feature's largest posteriors and their components; `means` is (12, G)."""
     n, dimension = features.shape
     n_components, n_leading = len(constants), components.shape[1]
     logits = np.empty(n_components, np.float32)
@@ -402,7 +403,7 @@ def compute_bins(
 
 
 # The kernels count all ordered pairs: a sample of pairs would change signatures (docs/paper.md,
-# R11). Their inner loops cover all later patches, so that the compiler can vectorize them.
+# R11). Their inner loops run over all later patches, so that the compiler can vectorize them.
 
 
 @disjoint_kernel
@@ -418,7 +419,7 @@ def _invariants(
     for j in range(i + 1, len(d)):
         rx, ry, rz = x[j] - ix, y[j] - iy, z[j] - iz
         length = np.sqrt(rx * rx + ry * ry + rz * rz)
-        inverse = 1.0 / (length + 1e-300)  # pairs at distance 0 are excluded later
+        inverse = 1.0 / (length + 1e-300)  # pairs with a distance of 0 are excluded later
         along_i = (rx * ax + ry * ay + rz * az) * inverse
         along_j = (rx * nx[j] + ry * ny[j] + rz * nz[j]) * inverse
         cx, cy, cz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
@@ -468,7 +469,7 @@ def _pair_bins(
 def _add(
     there: Ints32, back: Ints32, i: int, weights: Floats32, counts: Floats32, total: float
 ) -> tuple[int, float]:
-    """Add the weights of pairs to their bins; return the number of pairs, and the new `total`."""
+    """Add the weights of pairs to their bins; return the number of pairs and the new `total`."""
     count, own = 0, weights[i]
     for j in range(i + 1, len(there)):
         weight = own * weights[j]
@@ -523,7 +524,7 @@ class PairCounts:
 
 @lru_cache(maxsize=8)
 def _look_up(layout: TableLayout, p: PropertyParameters) -> tuple[Floats, Floats, Floats, Ints32]:
-    """Return the read-only results of `bin_edges` and their search starts (3, n)."""
+    """Return the edges from `bin_edges` and their search starts (3, n), read-only."""
     distance, angle, dihedral = bin_edges(layout, p)
     starts = np.stack(
         [
@@ -558,5 +559,5 @@ def count_pairs(
 
 
 def machine_code_folder() -> tuple[str, bool]:
-    """Return the folder of the pair kernel's machine code, and whether it contains code."""
+    """Return the folder of the pair kernel's machine code, and whether it has valid code."""
     return code_folder(_count)

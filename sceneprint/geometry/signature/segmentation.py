@@ -8,9 +8,9 @@
 Images are segmented by SLIC over position and normal, starting from a grid. The distance has no
 pixel term, so patches end at both creases and depth edges.
 
-Clouds are segmented by VCCS (Papon 2013): seeds on a grid grow over touching voxels by position and
-normal. A patch ends at creases and does not cross gaps. Unlike in VCCS, the distance is the same as
-in k-means, and centres move with their patches.
+Clouds are segmented by a variant of VCCS (Papon 2013): patches grow from seeds on a grid over
+touching voxels, by position and normal. They end at creases and do not cross gaps. Unlike in VCCS,
+the distance is that of k-means, and centres move with their patches.
 
 The hierarchy is an agglomerative K-Means over the positions and normals of the finest patches,
 weighted by area. Farthest-point sampling distributes its seeds evenly over the surface.
@@ -35,10 +35,10 @@ from sceneprint.types import Floats, Floats32, Hierarchy, Intrinsics, Ints32, Pa
 class SegmentationParameters:
     """Parameters of the finest segmentation."""
 
-    n_patches: int = 1000  #: number of grid seeds of a full image
-    iterations: int = 5  #: rounds of assignment and update
+    n_patches: int = 1000  #: number of seeds on the grid of a full image
+    iterations: int = 5  #: number of rounds of assignment and update
     normal_weight: float = 6.0  #: weight of 1 - cos(normals), relative to squared seed spacings
-    minimum_size: float = 0.15  #: patches below this share of a grid cell are dropped
+    minimum_size: float = 0.15  #: patches smaller than this share of a grid cell are dropped
     minimum_pixels: int = 4  #: patches with fewer pixels are dropped
 
 
@@ -46,8 +46,8 @@ class SegmentationParameters:
 def _spread_centres(
     centres: Floats32, row: int, shift: int, cells: Ints32, columns: int, out: Floats32
 ) -> None:
-    """Write the centre `shift` cells beside each pixel of a row of cells to `out` (7, w); 0
-    outside.
+    """Write to `out` (7, w) the centre that lies `shift` cells beside each pixel of a row of cells;
+    0 outside.
     """
     for x in range(len(cells)):
         column = cells[x] + shift
@@ -63,9 +63,10 @@ def _assign_row(
     pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, k: np.int32,
     cells: Ints32, labels: Ints32, nearest: Floats32,
 ) -> None:  # fmt: skip
-    """Assign the pixels of a row to the centres (7, w) beside them if these centres are nearer.
+    """Assign the pixels of a row to the centres (7, w) beside them where these are nearer.
 
-    Unused centres get no pixels. `k` is the index of the centre beside a pixel of the first cell.
+    Unused centres get no pixels. `k` is the index of the centre beside the pixels of the first
+    cell.
     """
     px, py, pz = pixels[0, y], pixels[1, y], pixels[2, y]
     nx, ny, nz = pixels[3, y], pixels[4, y], pixels[5, y]
@@ -89,17 +90,17 @@ def _assign(
     pixels: Floats32, valid: NDArray[np.bool_], centres: Floats32, spacing: float,
     normal_weight: np.float32, columns: int, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Assign each pixel of (6, h, w) to the nearest centre of the nine cells around it.
+    """Assign each pixel of (6, h, w) to the nearest of the centres of the nine cells around it.
 
-    A loop compares all pixels of a row with a centre each, so it can be vectorized. Centres are
-    copied to the pixels once per row of cells.
+    Centres are copied to the pixels once per row of cells, so that a loop over the pixels of a row
+    can be vectorized.
     """
     height, width = valid.shape
     rows = len(centres) // columns
     cells = np.empty(width, np.int32)
     for x in range(width):
         cells[x] = min(int(x / spacing), columns - 1)
-    around = np.zeros((3, 3, 7, width), np.float32)  # three rows of cells, by row modulo 3
+    around = np.zeros((3, 3, 7, width), np.float32)  # three rows of cells, indexed by row modulo 3
     nearest = np.empty(width, np.float32)
     cell, spread = -1, -2
     for y in range(height):
@@ -125,7 +126,7 @@ def _assign(
 def _sums(
     points: Floats32, normals: Floats32, weights: Floats32, labels: Ints32, n: int
 ) -> NDArray[np.float64]:
-    """Sum per label: weights, weighted points (3) and normals (3), number of pixels; (n, 8)."""
+    """Return each label's sums of weights, weighted points, normals and pixels, (n, 8)."""
     height, width = labels.shape
     sums = np.zeros((n, 8))
     for y in range(height):
@@ -144,7 +145,7 @@ def _sums(
 
 @kernel
 def _centres(sums: Floats, spacing: float, focal_length: float, centres: Floats32) -> None:
-    """Write the mean point, mean normal and (1 / metric seed spacing)^2 of each label, (n, 7)."""
+    """Write each label's mean point, mean normal and (1 / metric seed spacing)^2, (n, 7)."""
     for k in range(len(sums)):
         alive = sums[k, 0] > 0
         weight = sums[k, 0] if alive else 1.0
@@ -175,8 +176,8 @@ def _seed_grid(height: int, width: int, n_patches: int) -> tuple[Ints32, float, 
 def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
     """Assign valid pixels to patches.
 
-    Patches below either size limit are dropped: their normals would be noise, and in an image of a
-    thousand patches they cover less than 1 % of the surface.
+    Patches smaller than either limit are dropped: their normals would be noise, and in an image
+    with a thousand patches they cover less than 1 % of the surface.
 
     Parameters
     ----------
@@ -184,7 +185,8 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
 
     Returns
     -------
-    labels : (h, w) int32, 0 to P - 1 in the order of the image; -1 for pixels without a patch
+    labels : (h, w) int32, 0 to P - 1 in the order in which they occur in the image; -1 for pixels
+        without a patch
     """
     height, width = surface.valid.shape
     assert isinstance(surface.camera, Intrinsics)
@@ -207,7 +209,7 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
 
 
 def compact_labels(labels: Ints32, keep: NDArray[np.bool_]) -> Ints32:
-    """Renumber the labels (h, w) in the mask `keep` (n,) without gaps; others become -1."""
+    """Renumber the labels (h, w) selected by `keep` (n,) without gaps; others become -1."""
     renumbered = np.where(keep, np.cumsum(keep) - 1, -1).astype(np.int32)
     result: Ints32 = np.where(labels >= 0, renumbered[labels], -1).astype(np.int32)
     return result
@@ -244,12 +246,12 @@ class HierarchyParameters:
     """Parameters of the hierarchy."""
 
     n_levels: int = 4  #: number of levels, H
-    factor: float = 2.0**0.5  #: ratio of the numbers of patches of successive levels
+    factor: float = 2.0**0.5  #: ratio of the patch counts of successive levels
     iterations: int = 4  #: number of iterations of K-Means
     normal_weight: float = 3.0  #: weight of 1 - cos(normals), relative to squared patch diameters
 
 
-#: Number of consecutive patches that are compared with a centre or skipped together.
+#: Number of consecutive patches that are compared with a centre, or skipped, as a block.
 _BLOCK = 8
 
 
@@ -272,7 +274,7 @@ def _move_nearer(
 
 @kernel
 def _boxes(patches: Floats, boxes: Floats) -> float:
-    """Write the bounding boxes (6, n) of blocks of patches; return the maximum normal length."""
+    """Write the bounding boxes (6, n) of blocks of patches; return the largest normal length."""
     longest = 0.0
     boxes[:3], boxes[3:] = np.inf, -np.inf
     for k in range(patches.shape[1]):
@@ -289,7 +291,7 @@ def _boxes(patches: Floats, boxes: Floats) -> float:
 def _least_distances(
     boxes: Floats, centre: Floats, scale: float, weight: float, longest: float, least: Floats
 ) -> None:
-    """Write lower bounds, including rounding errors, of the distances of blocks from a centre."""
+    """Write lower bounds on the blocks' distances from a centre that allow for rounding errors."""
     cosine = longest * np.sqrt(centre[3] ** 2 + centre[4] ** 2 + centre[5] ** 2)
     of_normals = weight * (1.0 - cosine) - 1e-9 * abs(weight) * (1.0 + cosine)
     shrunk = scale * (1.0 - 1e-9)
@@ -313,7 +315,7 @@ def _seed(
     patches: Floats, areas: Floats, boxes: Floats, longest: float, scale: float, weight: float,
     centres: Floats, labels: Ints32,
 ) -> None:  # fmt: skip
-    """Select centres by farthest-point sampling, starting with the largest patch."""
+    """Select centres by farthest-point sampling from the largest patch; label each patch."""
     n, n_blocks = len(labels), boxes.shape[1]
     nearest, farthest = np.full(n, np.inf), np.full(n_blocks, np.inf)
     least = np.empty(n_blocks)
@@ -337,7 +339,7 @@ def _reassign(
     patches: Floats, boxes: Floats, longest: float, scale: float, weight: float, centres: Floats,
     labels: Ints32,
 ) -> None:  # fmt: skip
-    """Assign each patch to the nearest centre, or to the first of several equally near centres.
+    """Assign each patch to the nearest centre, or to the first of several that are equally near.
 
     The distance to the current centre is an upper bound. Therefore, a block of patches is compared
     only with centres whose lower bound does not exceed it.
@@ -364,9 +366,9 @@ def _reassign(
 def _k_means(
     patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
 ) -> Ints32:
-    """Cluster positions and normals (6, P); return labels. Numbers of empty clusters are unused.
+    """Cluster positions and normals (6, P); return labels, in which empty clusters do not occur.
 
-    The bounds for blocks of neighbours exclude 95 % of the distances.
+    Bounds for blocks of neighbouring patches make 95 % of the distances unnecessary.
     """
     n = patches.shape[1]
     centres, labels = np.empty((n_clusters, 6)), np.zeros(n, np.int32)
@@ -391,7 +393,7 @@ def _k_means(
 
 
 def _cluster(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints32:
-    """Cluster patches; return each patch's parent, numbered without gaps below `n_clusters`."""
+    """Cluster patches; return the label of each, numbered without gaps and below `n_clusters`."""
     scale = n_clusters / float(patches.areas.sum())
     columns = np.ascontiguousarray(np.concatenate([patches.means, patches.normals], axis=1).T)
     labels = _k_means(columns, patches.areas, n_clusters, scale, p.normal_weight, p.iterations)
@@ -401,7 +403,7 @@ def _cluster(patches: Patches, n_clusters: int, p: HierarchyParameters) -> Ints3
 
 
 def hierarchy(surface: Surface, finest: Ints32, p: HierarchyParameters) -> Hierarchy:
-    """Compute the levels {X_h}; all are clustered from the finest patches.
+    """Compute the levels {X_h}, each by clustering the finest patches.
 
     Parameters
     ----------
@@ -428,8 +430,9 @@ class WeightParameters:
     """Parameters of patch weights; zeros give all pairs the same weight, as in the paper.
 
     The paper counts all pairs equally, so the weight of a surface depends on its segmentation, and
-    a patch around a chair leg counts as much as a patch of floor. Weights by size make statistics
-    depend on the surface; weights by coherence reduce the influence of curved patches.
+    a patch around a chair leg counts as much as a patch of floor. Weights by size make the
+    statistics depend on the surface instead; weights by coherence reduce the influence of curved
+    patches.
     """
 
     size_exponent: float = 0.5  #: exponent of a patch's share of the image
@@ -437,17 +440,18 @@ class WeightParameters:
 
 
 def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
-    """Return positive weights (P,) of patches, with mean 1; a pair has the product as weight."""
+    """Return positive weights (P,) of patches, with mean 1; a pair weighs the product of two."""
     weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
     result: Floats = weights / weights.mean()
     return result
 
 
-#: Ratio of depth to width of a seed's cell; above 1, so that a slanted surface lies in one cell.
+#: Ratio of depth to width of a seed's cell; it exceeds 1 so that a slanted surface lies in one
+#: cell.
 _DEPTH = 4.0
-#: Minimum size of a patch, as a share of its seed's cell; it ensures that a spacing is found.
+#: Minimum size of a patch as a share of its seed's cell; it guarantees that some spacing suffices.
 _LEAST = 1e-3
-#: Number of growth rounds, each by a voxel, between updates of the centres.
+#: Number of growth rounds, each by one voxel, between updates of the centres.
 _GROWTH = 2
 
 
@@ -455,7 +459,7 @@ _GROWTH = 2
 def _seed_cells(
     points: Floats32, axes: Floats, centre: Floats, unit: float, spacing: float, cells: Ints64
 ) -> None:
-    """Write the cell of each point, by direction and range / `unit`; by position if it is 0."""
+    """Write each point's cell, by direction and range / `unit`; by position if `unit` is 0."""
     for i in range(len(points)):
         px, py, pz = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = axes[0, 0] * px + axes[0, 1] * py + axes[0, 2] * pz
@@ -474,9 +478,9 @@ def _voxel_centres(
     points: Floats32, normals: Floats32, sides: Floats32, labels: Ints32, spacing: float,
     sums: Floats,
 ) -> None:  # fmt: skip
-    """Write mean point (3), unit mean normal (3) and 1 / spacing^2 per label; 0 for unused labels.
+    """Write each label's mean point, unit mean normal and 1 / spacing^2 to (n, 7); 0 if unused.
 
-    The argument `spacing` is in sides of a voxel; the written spacing is in metres.
+    The argument `spacing` is in voxel sides; the written spacing is in metres.
     """
     sums[:] = 0.0
     for i in range(len(labels)):
@@ -504,7 +508,7 @@ def _grow(
     points: Floats32, normals: Floats32, offsets: Ints64, indices: Ints32, centres: Floats,
     normal_weight: float, labels: Ints32, out: Ints32,
 ) -> None:  # fmt: skip
-    """Assign each voxel to the nearest of its current centre and the centres of touching voxels."""
+    """Assign each voxel to the nearest centre: its own or that of a voxel that touches it."""
     for i in range(len(labels)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
@@ -527,7 +531,7 @@ def _grow(
 
 @kernel
 def _components(offsets: Ints64, indices: Ints32, labels: Ints32, parts: Ints32) -> int:
-    """Number the connected parts of all labels by their first voxels; return how many exist."""
+    """Number the connected parts of all labels, ordered by first voxel; return the count."""
     stack = np.empty(len(labels), np.int32)
     parts[:] = -1
     n = 0
@@ -555,13 +559,13 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
     Parameters
     ----------
     seen : V voxels
-    spacing : distance between the seeds, in sides of a voxel
+    spacing : distance between the seeds, in voxel sides
     most : maximum number of patches; the spacing grows until there are no more
     p : parameters of the segmentation
 
     Returns
     -------
-    labels : (1, V) int32, 0 to P - 1; -1 for voxels in patches below either size limit
+    labels : (1, V) int32, 0 to P - 1; -1 for voxels in patches that are too small
     """
     if not len(seen.sides):
         return np.empty((1, 0), np.int32)
@@ -573,11 +577,11 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
             labels, n = _grow_patches(seen, seeds, spacing, least, p)
             if n <= most:
                 return labels[None]
-        spacing *= 1.03 * (n / most) ** 0.85  # more than the square root: slanted patches are long
+        spacing *= 1.03 * (n / most) ** 0.85  # faster than the root: slanted patches are long
 
 
 def _seeds(seen: Voxels, spacing: float) -> Ints32:
-    """Return the seed (V,) of each voxel: the index of its cell in a grid."""
+    """Return the seed (V,) of each voxel: the number of its cell in a grid."""
     side, unit = float(np.median(seen.sides)), 0.0
     if seen.cloud.has_viewpoint:
         at = seen.points[0] - seen.centre
@@ -592,7 +596,7 @@ def _seeds(seen: Voxels, spacing: float) -> Ints32:
 def _grow_patches(
     seen: Voxels, labels: Ints32, spacing: float, least: float, p: SegmentationParameters
 ) -> tuple[Ints32, int]:
-    """Grow patches from seeds at a spacing; return labels (V,), and the number of patches."""
+    """Grow patches from seeds at a spacing; return labels (V,) and the number of patches."""
     points, normals, links = seen.points[0], seen.normals[0], seen.links
     centres = np.zeros((int(labels.max(initial=-1)) + 1, 8))
     grown = labels.copy()

@@ -25,13 +25,13 @@ from sceneprint.geometry.kernel import disjoint_kernel, kernel
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32
 
 TURN = 2.0 * math.pi
-#: Number of points per block of a kernel. A block's coordinates fit into the first-level cache.
+#: Number of points per block of a kernel: a block's coordinates fit into the first-level cache.
 BLOCK = 256
 
 
 @kernel
 def depth_of(kind: float, x: float, y: float, z: float) -> float:
-    """Return the depth of a point in the camera's frame; 0 for an unknown kind of camera."""
+    """Return the depth of a point, given in the camera's frame; 0 for an unknown kind of camera."""
     if kind == 0:
         return z
     if kind == 1:
@@ -54,16 +54,16 @@ def _project_sphere(camera: Floats, x: float, y: float, z: float) -> tuple[float
     turn = TURN / camera[2]
     column = (np.arctan2(b, a) - camera[3]) / camera[2] + 0.5
     column -= np.floor(column / turn) * turn
-    if column >= camera[6] > 0:  # rounding errors at the seam can exceed the last column
+    if column >= camera[6] > 0:  # at the seam, rounding can yield the column after the last one
         column = 0.0
     return column, (camera[4] - elevation) / camera[2] + 0.5, depth
 
 
 @kernel
 def project(camera: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Project a point; return column (-1 if it is too near), line and depth.
+    """Project a point; return its column (-1 if it is too near), line and depth.
 
-    The integer parts of column and line are the pixel.
+    The integer parts of column and line are the pixel's indices.
     """
     if camera[0] == 0:
         if not z > camera[1]:
@@ -106,9 +106,9 @@ def select_inside(
     projected: Floats, count: int, left: float, right: float, top: float, bottom: float,
     places: Ints32,
 ) -> int:  # fmt: skip
-    """Write the indices of points with column in [left, right) and line in [top, bottom).
+    """Write the indices of points with columns in [left, right) and lines in [top, bottom).
 
-    Return their number.
+    Return how many there are.
     """
     column, line, n_inside = projected[0], projected[1], 0
     for i in range(count):
@@ -145,7 +145,7 @@ def depth_at(camera: Floats, points: Floats32, line: int, column: int) -> float:
 
 @kernel
 def growth_at(depth: float, reference: float, power: float) -> float:
-    """Return the growth of lengths at a depth: (depth / reference)^power, at least 1.
+    """Return the factor by which lengths grow at a depth: (depth / reference)^power, at least 1.
 
     The power is 0, 1 or 2.
     """
@@ -157,15 +157,15 @@ def growth_at(depth: float, reference: float, power: float) -> float:
 
 _BLOCK = 2**18  #: number of samples per block; it limits the memory for a 16-megapixel image
 _STEPS = 20  #: maximum number of Newton steps; real lenses need 4
-_TOLERANCE = 1e-7  #: maximum residual of the inverse in x/z, approximately 1e-4 pixels
+_TOLERANCE = 1e-7  #: maximum residual of the inversion in x/z, approximately 1e-4 pixels
 
 
 def undistort(depth: Floats32, intrinsics: Intrinsics) -> Floats32:
     """Remove lens distortion from a depth image.
 
     Each pixel gets the nearest sample: interpolation would invent points between an edge and its
-    background. Pixels outside the field of view are 0, and so are pixels where the distortion
-    polynomial folds back on itself, because it describes no lens there.
+    background. Pixels outside the field of view become 0, and so do pixels where the distortion
+    polynomial folds back on itself and therefore describes no lens.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
         column = np.minimum(np.floor(u[inside] + 0.5), c.width - 1)
         row = np.minimum(np.floor(v[inside] + 0.5), c.height - 1)
         sources[block][inside] = row * c.width + column
-    sources.flags.writeable = False  # all frames of the camera share it
+    sources.flags.writeable = False  # shared by all frames of the camera
     return sources
 
 
@@ -273,7 +273,7 @@ def _radial(r2: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats, Floats]:
 
 def _distort(x: Floats, y: Floats, k: tuple[float, ...]) -> tuple[Floats, Floats]:
     """Distort directions by the Brown-Conrady model, with a quotient of radial polynomials if k4 to
-    k6 are not 0; `k` has OpenCV's order.
+    k6 are not 0; the coefficients `k` are in OpenCV's order.
     """
     p1, p2 = k[2:4]
     r2 = x * x + y * y
@@ -306,7 +306,7 @@ def _unfolded(x: Floats, y: Floats, k: tuple[float, ...]) -> NDArray[np.bool_]:
 
 
 def _first_fold(k: tuple[float, ...]) -> float:
-    """Return the minimum tan(angle to the axis) at which the radial function stops growing."""
+    """Return the smallest tan(angle to the axis) at which the radial function stops growing."""
     r = np.tan(np.linspace(0.0, math.radians(89.9), 4096))
     with np.errstate(all="ignore"):  # poles of the quotient
         radial, slope, below = _radial(r * r, k)
@@ -317,7 +317,7 @@ def _first_fold(k: tuple[float, ...]) -> float:
 def _invert(
     x_seen: Floats, y_seen: Floats, k: tuple[float, ...]
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Undistort (x_seen, y_seen) by Newton's method; return directions and a validity mask."""
+    """Undistort (x_seen, y_seen) by Newton's method; return the directions and a validity mask."""
     x, y = x_seen, y_seen
     for _ in range(_STEPS):
         x_off, y_off = (a - b for a, b in zip(_distort(x, y, k), (x_seen, y_seen), strict=True))

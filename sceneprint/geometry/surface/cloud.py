@@ -20,7 +20,8 @@ from sceneprint.errors import UselessFrame
 from sceneprint.geometry.kernel import kernel
 from sceneprint.types import Cloud, Floats, Floats32
 
-#: Integer steps of a coordinate in sums of powers, so that sums of 5 million points are below 2^63.
+#: Number of integer steps of a coordinate in sums of powers: sums over 5 million points stay below
+#: 2^63.
 _SQUARED = 2.0**20
 _CUBED = 2.0**13
 
@@ -38,28 +39,28 @@ class CloudParameters:
     voxel_angle: float = 1.0 / 146.0  #: side of a voxel seen from the viewpoint, rad
     voxel_size: float = 0.02  #: side of a voxel without a viewpoint, metres
     seed_px: float = 5.2  #: distance between patches, voxels
-    validation_seed_px: float = 8.2  #: distance between patches for validation, voxels
+    validation_seed_px: float = 8.2  #: the same for validation, voxels
     maximum_patches: int = 1200  #: maximum number of patches; patches grow if there are more
-    maximum_validation_patches: int = 600  #: maximum number of patches for validation
+    maximum_validation_patches: int = 600  #: the same for validation
     maximum_pixels: int = 160 * 120 * 4  #: maximum number; voxels and pixels grow if there are more
-    same_surface: float = 0.03  #: points of a pixel within this share of the range are averaged
+    same_surface: float = 0.03  #: maximum difference of points that are averaged, share of range
     radius_px: int = 3  #: radius of the neighbourhood of a normal, voxels
     range_gate: float = 0.05  #: maximum difference of neighbours in pass 1, share of 1/range
     plane_gate: float = 0.006  #: maximum distance from the plane in pass 2, share of 1/range
     noise_gate: float = 0.006  #: constant term of the maximum distance in pass 2, 1/metres
-    minimum_samples: int = 9  #: minimum number of neighbours of a plane
+    minimum_samples: int = 9  #: minimum number of neighbours that determine a plane
     minimum_spread: float = 0.3  #: minimum determinant of their 2 x 2 covariance, pixel^4
     minimum_cosine: float = 0.12  #: minimum cosine of the angle of incidence
     image_angle: float = 1.0 / 146.0  #: side of a pixel of the range image, rad
     image_radius_px: int = 3  #: radius of the window of a normal of the range image, pixels
-    gap_px: int = 6  #: maximum length of a gap in a range image that is closed, pixels
+    gap_px: int = 6  #: maximum length of a gap that is closed in a range image, pixels
     gap_cosine: float = 0.95  #: minimum cosine between the normals of its two sides
 
 
 def select_in_range(cloud: Cloud, p: CloudParameters) -> Floats32:
     """Return the points (M, 3) within the model's range, float32, C-contiguous.
 
-    If the cloud has no viewpoint, the result contains all points.
+    If the cloud has no viewpoint, return all points.
 
     Raises
     ------
@@ -106,7 +107,7 @@ def _why_useless(cloud: Cloud, within: int, p: CloudParameters) -> str:
 
 @kernel
 def _moments(points: Floats32, scale: float, second: np.ndarray) -> None:
-    """Add x_i x_j of all points to `second` (3, 3) int64, in integer steps."""
+    """Add the products x_i x_j of all points to `second` (3, 3) int64, in integer steps."""
     for i in range(len(points)):
         x = np.int64(np.rint(points[i, 0] * scale))
         y = np.int64(np.rint(points[i, 1] * scale))
@@ -132,9 +133,9 @@ def _skews(points: Floats32, scale: float, axes: Floats, third: np.ndarray) -> N
 def principal_axes(points: Floats32) -> Floats:
     """Return the principal axes of a cloud as the rows of a rotation (3, 3).
 
-    They are sorted by descending second moment. The first two point to positive third moments; the
-    third completes a right-handed frame. Axes with equal moments, such as those of a sphere, are
-    arbitrary. `points @ axes.T` are coordinates along the axes.
+    The axes are sorted by descending second moment. The first two point in the direction of a
+    positive third moment; the third completes a right-handed frame. Axes with equal moments, such
+    as those of a sphere, are arbitrary. `points @ axes.T` are coordinates along the axes.
 
     Parameters
     ----------
@@ -158,9 +159,10 @@ def principal_axes(points: Floats32) -> Floats:
 
 #: Integer steps of a number from 0 to 1 in sums, so that sums of 5 million points are below 2^63.
 _STEPS = 2.0**38
-#: Maximum number of cells per half axis without a viewpoint: three coordinates must fit one key.
+#: Maximum number of cells per half axis of a cloud without a viewpoint: three coordinates must fit
+#: into one key.
 _REACH = 1 << 20
-#: Number of cells above which cells are enlarged, as a multiple of the maximum number.
+#: Cells are enlarged if there are more than this multiple of the maximum number.
 _ROOM = 4
 
 Ints64 = NDArray[np.int64]
@@ -168,7 +170,7 @@ Ints64 = NDArray[np.int64]
 
 @kernel
 def direction_cell(x: float, y: float, z: float, angle: float) -> int:
-    """Return the cell of a direction on a cube with sides divided into equal angles."""
+    """Return the cell of a direction on a cube whose faces are divided into equal angles."""
     n = int(np.ceil(np.pi / 2 / angle))
     ax, ay, az = abs(x), abs(y), abs(z)
     if az >= ax and az >= ay:
@@ -211,9 +213,10 @@ def _gather(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, side: float, step: float,
     unit: float, secret: int, keys: Ints64, bins: Ints64, sums: Ints64,
 ) -> int:  # fmt: skip
-    """Sum the points of each occupied cell; return the number of cells, -1 if there are too many.
+    """Sum the points of each occupied cell; return the cell count, -1 if there are too many.
 
-    The sums are count, unit / r and direction if `seen`; otherwise count, 0 and coordinates / unit.
+    The sums are count, unit / r and direction if `seen`; otherwise they are count, 0 and
+    coordinates / unit.
     """
     size = 16
     while size < 2 * len(keys):
@@ -256,7 +259,7 @@ def _gather(
 
 @kernel
 def _merge_shells(keys: Ints64, bins: Ints64, order: Ints64, sums: Ints64, out: Ints64) -> int:
-    """Write cells in the order of their keys; merge adjacent shells of the same direction."""
+    """Write cells in the order of their keys; merge adjacent shells in the same direction."""
     n, i = 0, 0
     while i < len(order):
         out[n] = sums[order[i]]
@@ -281,15 +284,15 @@ def centroid(points: Floats32) -> Floats:
 def average_cells(
     points: Floats32, axes: Floats, centre: Floats, seen: bool, unit: float, p: CloudParameters
 ) -> tuple[Floats, float]:
-    """Average points by cell; return the means (V, 4) and the side of a cell.
+    """Average points by cell; return the means (V, 4) and the cell side, enlarged for large clouds.
 
     Parameters
     ----------
     points : (N, 3) float32
     axes : (3, 3) axes of the grid, rows
     centre : (3,) origin of the grid
-    seen : whether `centre` is a viewpoint; then cells are bins of direction and range
-    unit : unit of length of the sums, metres
+    seen : whether `centre` is a viewpoint; if so, cells are bins of direction and range
+    unit : length unit of the sums, metres
     """
     side = p.voxel_angle if seen else p.voxel_size
     room = min(_ROOM * p.maximum_pixels, len(points))

@@ -1,4 +1,4 @@
-"""Measures of the surface and volume that several views observe (the paper's last figure).
+"""Measures of the surface and the volume that several views observe (the paper's last figure).
 
 A view is a frame with the pose T_query_view. All lengths are metres in the query's frame.
 """
@@ -16,7 +16,7 @@ from sceneprint.types import Bytes, DepthFrame, Floats, Floats32, Ints32
 
 #: Tolerance within which a view's depth agrees with a point: metres plus a share of the depth.
 AGREES_M, AGREES_SHARE = 0.05, 0.03
-#: Minimum edge of the cells of a volume, metres, and maximum number of cells.
+#: Minimum edge length of the cells of a volume, metres, and maximum number of cells.
 CELL_M, MOST_CELLS = 0.05, 2_000_000
 
 
@@ -57,7 +57,7 @@ def camera_of(view: DepthFrame) -> Floats:
 
 @kernel
 def _depth_error(point: Floats, camera: Floats, depth: Floats32) -> tuple[float, float]:
-    """Return a point's distance behind the view's surface, inf if unobserved, and its depth."""
+    """Return a point's distance behind the view's surface (inf if unobserved) and its depth."""
     x = camera[0] * point[0] + camera[1] * point[1] + camera[2] * point[2] + camera[9]
     y = camera[3] * point[0] + camera[4] * point[1] + camera[5] * point[2] + camera[10]
     z = camera[6] * point[0] + camera[7] * point[1] + camera[8] * point[2] + camera[11]
@@ -98,7 +98,7 @@ def first_seen(
     ----------
     points : (N, 3)
     views : views in their order
-    metres, share : tolerance of the depth; see AGREES_M
+    metres, share : depth tolerance; see AGREES_M
 
     Returns
     -------
@@ -120,7 +120,7 @@ def share_seen(points: Floats, views: Sequence[DepthFrame]) -> float:
 
 
 def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: float) -> Ints32:
-    """Return the index (N,) of the first view that sees each point of a mesh fused from the views.
+    """Return the index (N,) of the first view that sees each point of a mesh fused from `views`.
 
     Parameters
     ----------
@@ -128,14 +128,15 @@ def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: floa
     tolerance : maximum distance of the fused surface from a view's depth, metres
     """
     first, nearest = first_seen(mesh.points, views, tolerance, 0.0)
-    # a point between two pixels or at an edge may agree with no pixel
+    # a point between two pixels or at an edge may not agree with any pixel
     return np.where(first >= 0, first, nearest).astype(np.int32)
 
 
 def added_areas(mesh: TriangleMesh, first: Ints32, views: int) -> Floats:
-    """Return the area (V,) that each view adds to the preceding views' area, square metres.
+    """Return the area (V,) that each view adds to that of the preceding views, square metres.
 
-    A triangle counts for the first view that sees one of its corners; the sum is the mesh's area.
+    A triangle counts for the first view that sees one of its corners; the areas sum to that of the
+    mesh.
 
     Parameters
     ----------
@@ -169,9 +170,9 @@ def _mark(
 
 
 def observed_volume(views: Sequence[DepthFrame]) -> tuple[float, float]:
-    """Return the volume between the cameras and the observed surfaces, and the edge of its cells.
+    """Return the volume between the cameras and the surfaces, and the edge length of its cells.
 
-    The volume is in cubic metres, the edge in metres. Distant views enlarge the edge.
+    The volume is in cubic metres, the edge length in metres. Distant views enlarge the cells.
 
     Parameters
     ----------

@@ -1,11 +1,11 @@
-"""Conversion of a depth image to inverse depth, points and unit normals (Sec. III).
+"""Conversion of a depth image into inverse depth, points and unit normals (Sec. III).
 
     depth (H, W)  --inverse_depth-->  1/z (h, w), with the intrinsics of the reduced map
     1/z (h, w)  --fit_surface-->  points, normals (h, w, 3)
 
 The inverse depth of a plane is linear in the image, 1/z = q + a dx + b dy, and the noise of a
 structured-light sensor is uniform in it. A least-squares fit of (q, a, b) over a window gives the
-normal and the denoised point. The first pass selects samples by depth, the second by distance to
+normal and the denoised point. The first pass selects samples by depth, the second by distance from
 the plane.
 """
 
@@ -27,8 +27,8 @@ class DepthParameters:
 
     minimum_depth: float = 0.3  #: minimum depth of a sample, metres; nearer samples are missing
     maximum_depth: float = 9.0  #: maximum depth of a sample, metres; farther samples are missing
-    same_surface: float = 0.03  #: samples within this share of the nearest depth are averaged
-    focal_length_px: float = 146.0  #: focal length that halvings of the image approximate, pixels
+    same_surface: float = 0.03  #: maximum difference of averaged samples, share of nearest depth
+    focal_length_px: float = 146.0  #: focal length that halving the image approximates, pixels
     maximum_pixels: int = 160 * 120 * 4  #: maximum number of pixels after the halvings
     minimum_valid: int = 64  #: minimum number of valid pixels of a usable frame
     minimum_side: int = 8  #: minimum number of rows and columns of a usable image
@@ -62,13 +62,13 @@ def _halve(q: Floats32, same_surface: float) -> Floats32:
             wb = one if b >= least else zero
             wc = one if c >= least else zero
             wd = one if d >= least else zero
-            # if all four samples are missing, the mean is 0, and so missing
+            # if all four samples are missing, the mean is 0, which means missing
             half[y, x] = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
     return half
 
 
 def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
-    """Return the camera of an image at half its size; pixel centres are at integers.
+    """Return the camera of an image that is halved in size; pixel centres are at integers.
 
     An odd last row or column is removed.
     """
@@ -84,7 +84,7 @@ def halve_camera(intrinsics: Intrinsics) -> Intrinsics:
 
 
 def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
-    """Return the number of halvings after which a pixel covers the model's angle."""
+    """Return the number of halvings after which a pixel covers the angle that the model expects."""
     times, camera = 0, intrinsics
     while min(camera.width, camera.height) >= 4 and (
         camera.fx > p.focal_length_px * 2**0.5 or camera.width * camera.height > p.maximum_pixels
@@ -96,8 +96,8 @@ def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
 def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intrinsics]:
     """Compute the inverse depth of an image, reduced to the resolution of the model.
 
-    A halving averages only those inverse depths of a 2 x 2 block that lie on the nearest surface,
-    so it invents no point between an edge and its background.
+    Of each 2 x 2 block, a halving averages only the inverse depths on the nearest surface, so it
+    does not invent points between an edge and its background.
 
     Parameters
     ----------
@@ -153,7 +153,8 @@ def _why_useless(frame: DepthFrame, p: DepthParameters) -> str:
     )
 
 
-#: Maximum difference of samples on a surface in `double_resolution`, share of the nearest depth.
+#: Maximum difference, in `double_resolution`, between samples of one surface, share of the nearest
+#: depth.
 SAME_SURFACE = 0.05
 
 
@@ -201,8 +202,8 @@ def double_resolution(frame: DepthFrame) -> DepthFrame:
 class NormalParameters:
     """Parameters of the plane fit."""
 
-    radius_px: int = 3  #: half the window's side, pixels of the reduced map
-    depth_gate: float = 0.05  #: maximum difference in the first pass, share of the centre's 1/z
+    radius_px: int = 3  #: half the side of the window, pixels of the reduced map
+    depth_gate: float = 0.05  #: maximum difference in the first pass, share of 1/z at the centre
     plane_gate: float = 0.006  #: second pass: samples within gate * (1 + 1/z) of the plane, 1/m
     minimum_samples: int = 9  #: minimum number of samples of a plane
     minimum_spread: float = 0.3  #: minimum determinant of the samples' covariance (2, 2), pixel^4
@@ -213,7 +214,7 @@ class NormalParameters:
 def _weigh(
     row: Floats32, centre: Floats32, expected: Floats32, gate: Floats32, w: Floats32, wr: Floats32
 ) -> None:
-    """Write the weights (0 or 1) of a row of samples, and weighted differences from the centre."""
+    """Write the weights (0 or 1) of a row of samples, and their weighted offsets from `centre`."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for x in range(len(w)):
         near = abs(row[x] - centre[x] - expected[x]) < gate[x]
@@ -235,8 +236,8 @@ def _fit(
 ) -> None:  # fmt: skip
     """Fit 1/z - centre = c + a dx + b dy around every pixel: out[:, y, x] = c, a, b, n, det.
 
-    A sample counts if |1/z - centre - plane| < constant + relative * centre. Rows are summed offset
-    by offset, so that an inner loop writes a single array and can be vectorized.
+    A sample counts if |1/z - centre - plane| < constant + relative * centre. Rows are summed one
+    offset at a time, so that an inner loop writes a single array and can be vectorized.
     """
     height, width = q.shape
     one = np.float32(1.0)
@@ -328,9 +329,9 @@ def _lift(
 
 
 def fit_surface(q: Floats32, intrinsics: Intrinsics, p: NormalParameters) -> Surface:
-    """Fit planes in inverse depth around each pixel; return the points and unit normals.
+    """Fit a plane in inverse depth around each pixel; return the points and unit normals.
 
-    A pixel is invalid if its window determines no plane or the incidence is grazing.
+    A pixel is invalid if its window does not determine a plane or the incidence is grazing.
 
     Parameters
     ----------

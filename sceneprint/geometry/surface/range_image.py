@@ -2,8 +2,8 @@
 
     points (N, 3)  --range_image-->  Surface (h, w) with camera Sphere
 
-On the sphere around the viewpoint, the inverse range of a plane is linear in the direction u:
-1/r = a . u. A least-squares fit of a over a window gives the normal and the denoised point, as in
+On the sphere around the viewpoint, the inverse range of a plane is linear in the direction u: 1/r =
+a . u. A least-squares fit of `a` over a window gives the normal and the denoised point, as in
 `depth_image.py`.
 """
 
@@ -21,7 +21,7 @@ from sceneprint.geometry.surface.cloud import CloudParameters, select_in_range
 from sceneprint.geometry.surface.voxels import solve
 from sceneprint.types import Cloud, Floats, Floats32, Sphere, Surface
 
-#: Minimum cosine of the angle between an axis and a point near the axis.
+#: Minimum cosine of the angle between an axis and the direction of a point that is near it.
 _NEAR_POLE = math.cos(math.radians(30.0))
 #: Maximum width of an empty wedge within an image, pixels.
 _WEDGE_PX = 8
@@ -41,7 +41,7 @@ def directions(camera: Sphere) -> Floats:
 
 @kernel
 def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> None:
-    """Add the number of points near each axis to `near`."""
+    """Add the number of points that are near each axis to `near`."""
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         limit = least * np.sqrt(x * x + y * y + z * z)
@@ -51,7 +51,7 @@ def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> 
 
 
 def pole_of(points: Floats32) -> int:
-    """Return the axis with the fewest points near it; ties prefer z, then y."""
+    """Return the axis with the fewest points near it; z, then y, wins ties."""
     near = np.zeros(3, np.int64)
     _near_axes(points, np.float32(_NEAR_POLE), near)
     return min((2, 1, 0), key=lambda axis: int(near[axis]))
@@ -94,12 +94,12 @@ def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
         step *= max(math.sqrt(width * height / p.maximum_pixels), 1.01)
 
 
-#: Ratio of the resolutions of `spread_points` and of the range image.
+#: Ratio of the resolution of `spread_points` to that of the range image.
 FINER = 2
-#: Maximum number of stored points of a scan; docs/clouds.md gives the measurements.
+#: Maximum number of points stored for a scan; docs/clouds.md gives the measurements.
 SPREAD_POINTS = 8192
 
-#: Integer steps of a number from 0 to 1 in sums, so that sums of 5 million points are below 2^63.
+#: Number of integer steps from 0 to 1 in sums: sums over 5 million points stay below 2^63.
 _STEPS = 2.0**38
 #: Maximum ratio of a window's width to its height.
 _WIDEST = 8.0
@@ -117,7 +117,8 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
 
     Raises
     ------
-    UselessFrame : If fewer than `minimum_points` are within range, or fewer pixels show points
+    UselessFrame : If fewer than `minimum_points` points are within range, or fewer pixels show
+        points
     """
     pole, angles = _angles_of(cloud, p.minimum_range, p.maximum_range, p.minimum_points)
     camera = fit_camera(angles, pole, p)
@@ -143,7 +144,7 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
 
 @cached_per_frame
 def _angles_of(cloud: Cloud, nearest: float, farthest: float, least: int) -> tuple[int, Floats]:
-    """Return the pole of a cloud and the azimuth, elevation and range of each point, (N, 3)."""
+    """Return the pole of a cloud, and the azimuth, elevation and range of each point, (N, 3)."""
     limits = CloudParameters(
         minimum_range=nearest, maximum_range=farthest, minimum_points=least
     )  # fmt: skip
@@ -154,11 +155,11 @@ def _angles_of(cloud: Cloud, nearest: float, farthest: float, least: int) -> tup
 
 
 def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
-    """Return unordered points of a scan, finer than its range image, for fine refinement.
+    """Return unordered points of a scan, denser than its range image, for fine refinement.
 
     A pixel of the range image covers .9 degrees: half a metre of wall at 30 m, and several metres
-    of ground. Where finer pixels determine no plane, such as between distant rings, the points of
-    the range image are used.
+    of ground. Where finer pixels do not determine a plane, such as between distant rings, the
+    points of the range image are used.
 
     Parameters
     ----------
@@ -185,7 +186,7 @@ def spread_points(cloud: Cloud, image: Surface, p: CloudParameters) -> Surface:
 
 @kernel
 def _nearest(angles: Floats, frame: Floats, pixel: NDArray[np.int64], nearest: Floats) -> None:
-    """Write the pixel of each point, and the nearest range in each pixel."""
+    """Write each point's pixel, and the smallest range in each pixel."""
     height, width = nearest.shape
     step, left, top = frame[0], frame[1], frame[2]
     for i in range(len(angles)):
@@ -193,7 +194,7 @@ def _nearest(angles: Floats, frame: Floats, pixel: NDArray[np.int64], nearest: F
         if turn < 0:
             turn += around
         x = int(turn)
-        if x >= width:  # rounding errors at the seam can exceed either side
+        if x >= width:  # at the seam, rounding can exceed either side
             x = 0 if turn > (width + around) / 2 else width - 1
         y = min(max(int((top - angles[i, 1]) / step + 0.5), 0), height - 1)
         pixel[i] = y * width + x
@@ -223,7 +224,7 @@ def _sum(
 
 @kernel
 def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None:
-    """Write the mean inverse range (n,) and direction (n, 3) from the sums of `_sum`."""
+    """Write the mean inverse range (n,) and mean direction (n, 3) from the sums of `_sum`."""
     for k in range(len(sums)):
         count = float(max(sums[k, 0], 1))
         q[k] = float(sums[k, 1]) / count / _STEPS / least
@@ -232,10 +233,11 @@ def _divide(sums: NDArray[np.int64], least: float, q: Floats, u: Floats) -> None
 
 
 def _average_pixels(angles: Floats, camera: Sphere, p: CloudParameters) -> tuple[Floats, Floats]:
-    """Return the mean inverse range (h, w) and direction (h, w, 3) of each pixel's nearest surface.
+    """Average inverse range (h, w) and direction (h, w, 3) over each pixel's nearest surface.
 
-    The inverse range of an empty pixel is 0. The means of points on a plane 1/r = a . u satisfy the
-    same equation.
+    `angles` (N, 3) are azimuth, elevation and range. An empty pixel has the inverse range 0. Mean
+    directions are not normalised, so the means of points on a plane 1/r = a . u satisfy the same
+    equation.
     """
     shape = (camera.height, camera.width)
     least = max(p.minimum_range, 1e-9)
@@ -260,10 +262,11 @@ def _fit(
     limits: Floats,
     planes: Floats,
 ) -> None:
-    """Fit the plane 1/r = a . u around each pixel with a point, and write a; 0 without a plane.
+    """Fit the plane 1/r = a . u around each pixel with a point, and write `a`; 0 without a plane.
 
-    The first pass selects by range, the second by distance to the plane. `flat` is the cosine of
-    each row's elevation: pixels are narrower towards the poles, so their windows are wider.
+    The first pass selects pixels by range, the second by distance from the plane. `flat` is the
+    cosine of each row's elevation: pixels are narrower towards the poles, so windows contain more
+    of them.
     """
     height, width = q.shape
     b, a = np.zeros(3), np.zeros(3)
@@ -315,7 +318,7 @@ def _close(
     planes: Floats, out: Floats, rays: Floats, q: Floats, longest: int, gates: Floats,
     cosine: float,
 ) -> None:  # fmt: skip
-    """Fill gaps in each column between planes that agree across the gap.
+    """Fill the gaps in each column between planes that agree across the gap.
 
     A gap that contains another surface, such as a wire before a wall, is not filled: nothing was
     observed behind that surface.
@@ -353,7 +356,7 @@ def _lift(
     planes: Floats, rays: Floats, flat: Floats, numbers: Floats,
     points: Floats32, normals: Floats32, areas: Floats32, valid: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Intersect rays and planes; `numbers`: minimum cosine, range limits and squared step."""
+    """Intersect rays with planes; `numbers` are minimum cosine, range limits and squared step."""
     for y in range(len(planes)):
         for x in range(planes.shape[1]):
             a, ray = planes[y, x], rays[y, x]

@@ -1,7 +1,7 @@
 """Estimation of the up direction and the units of an imported surface.
 
 The floor is the largest level plane of a place, and places are wider than high. Furniture indicates
-the lower end, because more surface is near the floor.
+the lower end, because most of its surface is near the floor.
 """
 
 from __future__ import annotations
@@ -16,36 +16,37 @@ from sceneprint.types import Floats, Floats32, Ints32
 
 Integers = NDArray[np.integer]
 
-#: Maximum number of points, and of triangles, that are evenly sampled from the surface.
+#: Maximum number of points, and of triangles; larger surfaces are sampled evenly.
 _MOST_POINTS, _MOST_TRIANGLES = 1_000_000, 1_000_000
-#: Edges of the cells in which planes are fitted, as shares of the extent, and the minimum mean
-#: number of points per cell: the finest edge that reaches it is used.
+#: Edge lengths of the cells in which planes are fitted, as shares of the extent, and minimum mean
+#: number of points per cell; the smallest cells that reach this number are used.
 _EDGES, _CELL_POINTS = (1 / 256, 1 / 128, 1 / 64, 1 / 32, 1 / 16), 12.0
-#: Conditions for a plane: minimum number of points, minimum ratio of its second variance to its
+#: Conditions for a plane: minimum number of points, minimum ratio of the second variance to the
 #: first, and maximum ratio of the third variance to the second.
 _FEWEST, _NO_LINE, _FLAT = 6, 0.05, 0.1
 #: Number of directions on the hemisphere, and of pieces that vote for them.
 _DIRECTIONS, _VOTERS = 1500, 6000
-#: Minimum cosines to a direction at which a piece votes for it, and votes for no other direction.
+#: Minimum cosine to a direction at which a piece votes for it, and at which the piece votes for no
+#: other direction.
 _NEAR, _EXCLUSIVE = math.cos(math.radians(12.0)), math.cos(math.radians(25.0))
 #: Maximum number of dominant directions, and minimum share of the votes for each.
 _MOST_PEAKS, _LEAST_SHARE = 5, 0.03
-#: Minimum cosines at which an estimate snaps to the usual axis, or to another axis of the file.
-#: The tolerances allow for sloping ground.
+#: Minimum cosine at which an estimate snaps to the usual axis, and to another axis of the file. The
+#: tolerances allow for sloping ground.
 _SNAP_USUAL, _SNAP = math.cos(math.radians(7.0)), math.cos(math.radians(3.0))
 #: Thickness of a floor, as a share of the extent.
 _LAYER = 0.02
-#: Quantiles that bound the extent: stray points must not widen it.
+#: Quantiles that bound the extent, so that stray points do not widen it.
 _LOW, _HIGH = 0.01, 0.99
 #: Weights of the usual axis relative to other axes, and of its usual end relative to its other end.
 _USUAL, _USUAL_SIGN = 1.8, 0.6
-#: Weights of an uneven distribution of mass along a direction: for the direction and for its end
-#: with more mass.
+#: Weights of an uneven distribution of mass along a direction, in favour of the direction, and of
+#: its end with more mass as the lower end.
 _LEAN_GAIN, _LEAN_WEIGHT = 8.0, 3.0
-#: Minimum cosine to up of level surfaces, maximum cosine of walls, and share of the height that
-#: counts as an end of a place.
+#: Minimum cosine between up and the normals of level surfaces, maximum cosine for walls, and share
+#: of the height of a place that counts as its end.
 _LEVEL, _UPRIGHT, _END = 0.97, 0.3, 0.08
-#: Minimum evidence for an end, and minimum ratio of scores, for a clear answer.
+#: Minimum evidence for an end, and minimum ratio of the two best scores, of a clear result.
 _CLEAR_SIGN, _CLEAR = 0.4, 1.3
 
 
@@ -119,8 +120,8 @@ def estimate_up(points: Floats32, triangles: Ints32 | None, usual: Floats) -> Up
     return Upright(sign * candidates[best], bool(clear))
 
 
-#: Maximum height of a place in metres, minimum and maximum number of units for centimetres, and
-#: maximum ratio of extent to height for centimetres: maps of hills in metres are flatter.
+#: Maximum height, in units, of a place in metres and of a place in centimetres; and maximum ratio
+#: of extent to height of a place in centimetres: maps of hills in metres are flatter.
 _TALLEST_M, _TALLEST_CM, _FLATTEST = 150.0, 1000.0, 12.0
 #: Maximum extent of a place, metres.
 _WIDEST_M = 20_000.0
@@ -129,7 +130,7 @@ _WIDEST_M = 20_000.0
 def estimate_units(points: Floats32, up: Floats) -> float:
     """Estimate the units of a surface per metre: 1, 100 or 1000.
 
-    The result is 1 unless the place would be too high or too wide in metres.
+    Return 1 unless the place would be too high or too wide in metres.
 
     Parameters
     ----------
@@ -149,7 +150,7 @@ def estimate_units(points: Floats32, up: Floats) -> float:
 
 
 def _snap(direction: Floats, usual: Floats) -> Floats:
-    """Return an axis of the file if it is near a direction, otherwise the direction."""
+    """Return the axis of the file that is near a direction, or else the direction itself."""
     if abs(float(direction @ usual)) > _SNAP_USUAL:
         return usual
     k = int(np.abs(direction).argmax())
@@ -161,7 +162,7 @@ def _snap(direction: Floats, usual: Floats) -> Floats:
 
 
 def _ends(points: Floats32, direction: Floats) -> tuple[float, float]:
-    """Return the ends of the surface along a direction, without 1 % of the points at each end."""
+    """Return the ends of the surface along a direction, ignoring 1 % of the points at each end."""
     step = -(-len(points) // _MOST_POINTS)
     low, high = np.quantile(points[::step] @ direction, (_LOW, _HIGH))
     return float(low), float(high)
@@ -176,7 +177,7 @@ def _mass(points: Floats32, pieces: Pieces) -> tuple[Floats, Floats]:
 
 
 def _layers(pieces: Pieces, direction: Floats, thickness: float) -> float:
-    """Return the share of the largest layer across a direction, plus half of the second's."""
+    """Return the share of the largest layer across a direction, plus half that of the second."""
     across = np.abs(pieces.normals @ direction) > _NEAR
     if not across.any():
         return 0.0
@@ -190,10 +191,10 @@ def _layers(pieces: Pieces, direction: Floats, thickness: float) -> float:
 
 
 def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> float:
-    """Return the excess of furniture in the lower half, [-1.75, 1.75].
+    """Return the excess of furniture in the lower half, within [-1.75, 1.75].
 
-    Walls do not count. Level pieces have an additional weight of one half. Floor and ceiling have
-    a small weight: furniture hides the floor, but cameras look down.
+    Walls do not count. Level pieces have an additional weight of one half. Floor and ceiling have a
+    small weight, because furniture hides the floor, but cameras look down.
     """
     places = (pieces.centres @ direction - low) / height
     cosines = np.abs(pieces.normals @ direction)
@@ -207,7 +208,7 @@ def _furniture(pieces: Pieces, direction: Floats, low: float, height: float) -> 
 
 
 def _balance(areas: Floats, chosen: NDArray[np.bool_], places: Floats) -> float:
-    """Return the area of the lower half minus that of the upper half, over their sum."""
+    """Return the area in the lower half minus that in the upper half, over their sum."""
     lower = float(areas[chosen & (places < 0.5)].sum())
     upper = float(areas[chosen & (places >= 0.5)].sum())
     return (lower - upper) / (lower + upper + 0.005 * float(areas.sum()) or 1.0)
@@ -263,7 +264,7 @@ def _fit_planes(inside: Floats, sample: Floats, cells: Integers, counts: Integer
 
 
 def dominant_directions(pieces: Pieces) -> Floats:
-    """Return the directions (k, 3) that most pieces face with either side, strongest first.
+    """Return the directions (k, 3) that most pieces face with either side, most frequent first.
 
     The directions differ by at least 25 degrees.
     """
@@ -271,7 +272,7 @@ def dominant_directions(pieces: Pieces) -> Floats:
     total = float(areas.sum())
     if total <= 0:
         return np.empty((0, 3))
-    # even steps in the cumulative area give a deterministic sample, weighted by area
+    # equal steps of the cumulative area give a deterministic sample, weighted by area
     ranks = np.searchsorted(np.cumsum(areas), (np.arange(_VOTERS) + 0.5) * total / _VOTERS)
     voters = normals[np.minimum(ranks, len(areas) - 1)]
     directions = _hemisphere(_DIRECTIONS)

@@ -1,14 +1,14 @@
-"""Voxels of a cloud, each with the plane through its neighbours (Sec. III).
+"""Voxels of a cloud, each with a plane fitted to its neighbours (Sec. III).
 
     Cloud (N)  --voxels-->  Voxels (V), a Surface (1, V)
     inverse ranges (N), directions (N, 3), Links  --fit_inverse_planes-->  planes
     places (N, 3), Links                          --fit_planes-->          normals, feet
     places (N, 3), heights (N)                    --link_points-->         Links
 
-Around a viewpoint, voxels grow with range, as in VCCS for a cloud of one camera (Papon 2013): a
-cell is a bin of direction, on a cube, and of the logarithm of range. Without a viewpoint, all cells
-have the same size. The grid is aligned with the cloud's principal axes, so it rotates with the
-cloud.
+Around a viewpoint, voxels grow with range, as in VCCS for the cloud of a single camera (Papon
+2013): each fills a cell of a direction grid on the faces of a cube, and an interval of the
+logarithm of range. Without a viewpoint, all cells have the same size. The grid is aligned with the
+cloud's principal axes, so it rotates with the cloud.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Ints64 = NDArray[np.int64]
 def solve(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, b: Floats, out: Floats
 ) -> float:
-    """Solve A x = b for a symmetric A (3, 3); return det A. Write x to `out` only if det A > 0."""
+    """Solve A x = b for a symmetric A (3, 3); write x to `out` if det A > 0; return det A."""
     cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
     det = xx * cxx + xy * cxy + xz * cxz
     if det > 0:
@@ -55,9 +55,9 @@ def fit_inverse_planes(
     q: Floats, u: Floats, offsets: Ints64, indices: Ints32, gates: Floats, limits: Floats,
     planes: Floats,
 ) -> None:  # fmt: skip
-    """Fit the plane 1/r = a . u to the neighbours of each point, and write a; 0 without a plane.
+    """Fit the plane 1/r = a . u to the neighbours of each point, and write `a`; 0 without a plane.
 
-    The first pass selects neighbours by range, the second by distance to the plane.
+    The first pass selects neighbours by range, the second by distance from the plane.
     """
     a, b = np.zeros(3), np.zeros(3)
     for i in range(len(q)):
@@ -135,9 +135,8 @@ def fit_planes(
 ) -> None:  # fmt: skip
     """Fit planes to the neighbours of each point; write their normals, towards the origin.
 
-    The projections of the points onto their planes are written to `at`. The first pass uses all
-    neighbours, the second only neighbours near the plane. Normals are 0 if the neighbours determine
-    no plane.
+    Each point's projection onto its plane is written to `at`. The first pass uses all neighbours,
+    the second only those near the plane. A normal is 0 if the neighbours do not determine a plane.
     """
     m, values, axis, mean = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3)
     for i in range(len(places)):
@@ -153,7 +152,7 @@ def fit_planes(
                     if not abs(off) < gate:
                         continue
                 n += 1
-                for d in range(3):  # relative coordinates are precise far from the origin
+                for d in range(3):  # relative coordinates are precise even far from the origin
                     first[d] += places[j, d] - places[i, d]
                     for e in range(3):
                         second[d, e] += (places[j, d] - places[i, d]) * (
@@ -186,7 +185,7 @@ _REACH = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """Neighbours of N points: those of point i are `indices[offsets[i] : offsets[i + 1]]`.
+    """The neighbours of N points; those of point i are `indices[offsets[i] : offsets[i + 1]]`.
 
     Parameters
     ----------
@@ -198,7 +197,7 @@ class Links:
     indices: Ints32
 
     def select(self, keep: NDArray[np.bool_], linked: NDArray[np.bool_]) -> Links:
-        """Return the links of mask `linked` (M,) between points of mask `keep` (N,), renumbered."""
+        """Return the links in mask `linked` (M,) between points in mask `keep` (N,), renumbered."""
         number = np.cumsum(keep) - 1
         sources = np.repeat(keep, np.diff(self.offsets))
         selected = linked & sources & keep[self.indices]
@@ -210,14 +209,14 @@ class Links:
     def touching(
         self, places: Floats, reach: float, at: Floats, normals: Floats, gaps: Floats
     ) -> NDArray[np.bool_]:
-        """Return a mask (M,) of the short links that do not cross a gap in the surface.
+        """Return a mask (M,) of the links that are short and do not cross a gap in the surface.
 
         Parameters
         ----------
         places : (N, 3) argument of `link_points`
         reach : maximum length of a link, in the units of `places`
         at, normals : (N, 3) points and normals of the planes
-        gaps : (N,) distance from both planes at which a gap separates two points, metres
+        gaps : (N,) distance from both planes beyond which a gap separates two points, metres
         """
         keep = np.empty(len(self.indices), np.bool_)
         _touch(places, reach * reach, at, normals, gaps, self.offsets, self.indices, keep)
@@ -226,7 +225,7 @@ class Links:
 
 @kernel
 def _grid(cells: Ints64, order: Ints64, secret: int, table: Ints64, starts: Ints64) -> int:
-    """Insert runs of points with equal cells (sorted by `order`) into a hash table; count them."""
+    """Insert the runs of points with equal cells into a hash table; return how many there are."""
     mask = len(table) - 1
     n = 0
     for i in range(len(order)):
@@ -248,7 +247,7 @@ def _link(
     places: Floats, heights: Floats, cells: Ints64, order: Ints64, secret: int, table: Ints64,
     starts: Ints64, n_cells: int, counts: Ints64, begins: Ints64,
 ) -> Ints32:  # fmt: skip
-    """Return the neighbours of each point in one array, and write their starts and counts."""
+    """Return all points' neighbours in one array; write each point's first index and count."""
     mask = len(table) - 1
     indices = np.empty(16 * len(order) + 16, np.int32)
     total = 0
@@ -327,7 +326,7 @@ def _touch(
     places: Floats, square: float, at: Floats, normals: Floats, gaps: Floats, offsets: Ints64,
     indices: Ints32, keep: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Write whether two points are close and one of them lies on the plane of the other."""
+    """Write whether the points of each link are close and one lies on the plane of the other."""
     for i in range(len(at)):
         for k in range(offsets[i], offsets[i + 1]):
             j = indices[k]
@@ -345,11 +344,11 @@ def _touch(
             keep[k] = min(one, other) <= max(gaps[i], gaps[j])
 
 
-#: Side of a square with the area of the neighbourhood's disc, in radii.
+#: Side of the square that has the area of the neighbourhood's disc, in radii.
 _SQUARE = math.sqrt(math.pi)
-#: Maximum distance between the means of adjacent cells, in sides.
+#: Maximum distance between the means of adjacent cells, in cell sides.
 _TOUCHING = 2.0
-#: Maximum distance of points on a surface from its plane, in sides of a voxel.
+#: Maximum distance of points on a surface from its plane, in voxel sides.
 _GAP = 0.25
 
 
@@ -374,7 +373,7 @@ class Voxels(Surface):
 
     @property
     def plain(self) -> Surface:
-        """Return a surface of the points and normals only."""
+        """Return a surface that contains the points and normals only."""
         return Surface(self.points, self.normals, self.valid, self.areas, None)
 
 
@@ -445,7 +444,7 @@ def _metric_voxels(cloud: Cloud, points: Floats32, p: CloudParameters) -> Voxels
     normals, feet = np.zeros_like(at), at.copy()
     fit_planes(at, near.offsets, near.indices, side, limits, normals, feet)
     keep = (normals != 0).any(axis=1)
-    # number of cells that a plane crosses, per squared side
+    # number of cells that a plane crosses per squared side
     crossed = np.where(keep, np.abs(normals @ axes.T).sum(axis=1), 1.0)
     return _build(
         cloud, axes, centre, keep, near, places, _TOUCHING * side / reach,

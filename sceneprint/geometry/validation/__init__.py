@@ -1,1 +1,1 @@
-"""Decisions about transforms: acceptance, ambiguity, verification in the map."""
+"""Decisions on transforms: acceptance, ambiguity, and verification in the map."""

@@ -1,17 +1,17 @@
-"""The acceptance of a transform by its evidence and its rivals (Sec. III-E).
+"""Decision whether to accept a transform, from its evidence and rival transforms (Sec. III-E).
 
     Evidence  --objection-->  reason to reject     Evidence, ambiguity  --belief-->  strength
     Evidence, deviation  --sparse_evidence_suffices-->  whether sparse evidence is enough
     T, hypotheses, planes  --best_alternative-->  Rival
 
-A box looks the same from its four sides, and a corridor the same at every door. Two frames of such
-a place agree perfectly under a wrong transform; only the existence of equally good transforms
-reveals the error. Therefore, rivals are searched among the other hypotheses of correspondences, and
-among versions of the transform that are rotated by quarter turns about the normals of the main
-planes or shifted along these planes, because rooms and furniture repeat in these ways.
+A box looks the same from its four sides, and a corridor looks the same at every door. Two frames of
+such a place can agree perfectly under a wrong transform; only other, equally good transforms reveal
+the error. Therefore, rivals are sought among the other hypotheses from correspondences, and among
+copies of the transform that are rotated by quarter turns about the normals of the main planes or
+shifted along these planes, because rooms and furniture repeat in these ways.
 
-The agreement of a rival is weighted by planes (`overlap.py`). If up is known in both frames, a
-transform that tilts is not a rival.
+All planes have the same weight in the agreement of a rival (`overlap.py`). If up is known in both
+frames, a transform that tilts is not a rival.
 """
 
 from __future__ import annotations
@@ -43,32 +43,32 @@ class AcceptanceParameters:
     """Parameters of acceptance; docs/evaluation.md describes how they were tuned.
 
     "blind" limits apply if free space is unknown, "sparse" limits if the frames share little
-    surface or only one search found the transform, and "apart" limits if the refinements of such a
-    transform differ by more than `residual_m`.
+    surface or only one search found the transform, and "apart" limits if the two refinements of
+    such a transform differ by more than `residual_m`.
     """
 
-    residual_m: float = 0.08  #: maximum residual of the composed directions: epsilon_val, metres
-    residual_rad: float = math.radians(5.0)  #: maximum residual in either direction, radians
+    residual_m: float = 0.08  #: epsilon_val: maximum residual of the composed directions, metres
+    residual_rad: float = math.radians(5.0)  #: maximum residual of the composed directions, radians
     violation_weight: float = 5.0  #: evidence = overlap - violation_weight * violations
     evidence: float = 0.2  #: minimum evidence
     plane_overlap: float = 0.15  #: minimum plane overlap
     net_weight: float = 3.0  #: net plane overlap = plane overlap - net_weight * violations
     net: float = 0.1  #: minimum net plane overlap
-    #: Number of distinct planes above which `many_planes_net` applies.
+    #: With more distinct planes than this, `many_planes_net` replaces `net`.
     many_planes: float = math.inf
     many_planes_net: float = 0.06  #: minimum net plane overlap if many planes agree
-    net_strong: float = 0.1  #: net plane overlap below which an accepted match is weak
+    net_strong: float = 0.1  #: minimum net plane overlap of a strong match
     planes: float = 0.0  #: minimum number of distinct planes that agree
-    plane_violations: float = 1.0  #: maximum share of violations by planes
+    plane_violations: float = 1.0  #: maximum share of violations, with equal weights for planes
     worst_violations: float = 0.05  #: maximum share of violations in either direction
-    strong: float = 0.3  #: evidence below which an accepted match is weak
-    weak: float = 0.05  #: minimum ambiguity at which an accepted match is weak
-    ambiguous: float = 0.14  #: minimum ambiguity at which no match is accepted
+    strong: float = 0.3  #: minimum evidence of a strong match
+    weak: float = 0.05  #: ambiguity from which an accepted match is weak
+    ambiguous: float = 0.14  #: ambiguity from which no match is accepted
     ambiguous_share: float = 0.5  #: maximum ambiguity as a share of `plane_overlap`
-    stiffness: float = 1e-5  #: minimum ratio of the eigenvalues of the information
+    stiffness: float = 1e-5  #: minimum `stiffness` of the evidence
     blind_evidence: float = 0.4  #: minimum evidence
     blind_plane_overlap: float = 0.3  #: minimum plane overlap
-    blind_ambiguous_share: float = 0.75  #: replaces both limits, because fewer rivals are refuted
+    blind_ambiguous_share: float = 0.75  #: replaces both ambiguity limits: fewer rivals are refuted
     sparse_evidence: float = 0.1  #: minimum evidence
     sparse_plane_overlap: float = 0.1  #: minimum plane overlap
     sparse_planes: float = 5.0  #: minimum number of distinct planes
@@ -90,11 +90,11 @@ class Evidence:
     ----------
     residual_m, residual_rad, overlap, plane_overlap : see PairValidation
     violations : see PairValidation; None if free space is unknown
-    stiffness : smaller stiffness of the two directions; see Alignment
+    stiffness : smaller of the stiffnesses of the two directions; see Alignment
     one_sided : whether free space of one of the frames is unknown
     planes : number of distinct planes that agree, averaged over both frames
     plane_violations : share of free-space violations, with equal weights for all planes
-    worst_violations : share of violations of the frame with more violations
+    worst_violations : share of violations of the frame that has more of them
     """
 
     residual_m: float
@@ -121,7 +121,7 @@ _IN_FREE_SPACE = "of the points lie where the other frame saw free space"
 
 
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
-    """Return the reason to reject a transform regardless of its rivals, if any: Sec. III-E.
+    """Return the reason to reject a transform regardless of rivals, None without one: Sec. III-E.
 
     Mode "paper" checks the residual only.
     """
@@ -163,17 +163,17 @@ def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status,
 def sparse_evidence_suffices(
     e: Evidence, deviation_m: float, p: AcceptanceParameters, *, alone: bool = False
 ) -> bool:
-    """Return whether sparse evidence suffices, because all of it supports the transform.
+    """Return whether sparse evidence suffices because all of it supports the transform.
 
     Two frames that share a tenth of their surfaces cannot reach the overlap that `objection`
     requires, and one of the searches may miss the transform. For such a transform, the refinements
-    in both directions and several planes must agree, almost no points may lie in free space of
-    either frame, and the surfaces must constrain it well. Distorted depth separates the refinements
-    of a correct transform by a few centimetres; then many planes must agree.
+    in both directions and several planes must agree, almost no points may lie in the free space of
+    either frame, and the surfaces must constrain it well. If the two refinements differ by a few
+    centimetres, as those of a correct transform do under distorted depth, many planes must agree.
 
     Parameters
     ----------
-    e : evidence with the residual of the two refinements
+    e : evidence, with the residual between the two refinements
     deviation_m : standard deviation of the translation, metres
     alone : whether only one of the two searches found the transform
     """
@@ -206,7 +206,7 @@ def sparse_evidence_suffices(
 def belief(
     e: Evidence, ambiguity: float, p: AcceptanceParameters
 ) -> tuple[Status, Strength | None, str]:
-    """Return the status, strength and reason of a transform without objection, by its ambiguity."""
+    """Return the status, strength and reason of a transform without an objection."""
     most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
     if e.violations is None:  # free space is unknown, so it refutes no rival
         most = p.blind_ambiguous_share * e.plane_overlap
@@ -218,7 +218,7 @@ def belief(
         return "accepted", "weak", "another transform is possible too"
     if e.total(p) < p.strong or e.net(p) < p.net_strong:
         return "accepted", "weak", f"{e.overlap:.0%} of the surfaces agree"
-    if e.one_sided:  # violations of the unknown free space are not detected
+    if e.one_sided:  # violations of unknown free space cannot be detected
         return "accepted", "weak", "the surfaces agree, but free space is known for one frame only"
     return "accepted", "strong", "the surfaces agree, and there is no evidence against it"
 
@@ -234,36 +234,36 @@ class AmbiguityParameters:
 
     n_axes: int = 2  #: number of main directions of normals
     n_planes: int = 3  #: number of largest planes per direction
-    same_direction: float = math.radians(12.0)  #: maximum angle of parallel normals
+    same_direction: float = math.radians(12.0)  #: maximum angle between parallel normals
     shift: float = 0.5  #: step along a corridor, metres; small enough that refinements converge
     n_shifts: int = 6  #: number of steps in each direction
     least_crossing: float = 0.5  #: minimum sine of the angle between the main families of planes
-    n_proposed: int = 16  #: number of hypotheses of plans that are refined as rivals
+    n_proposed: int = 16  #: number of hypotheses from plans that are refined as rivals
     planes: PlaneParameters = field(default_factory=PlaneParameters)
     first: RefinementParameters = QUICK  #: refinement of all rivals
     hopeful_share: float = 0.04  #: minimum share that a rival explains after the first refinement
-    hopeful_violations: float = 0.15  #: maximum share of its violations after this refinement
+    hopeful_violations: float = 0.15  #: maximum share of a rival's violations after it
     then: RefinementParameters = COARSE  #: refinement of the remaining rivals
-    refuted: float = 0.02  #: violations that refute a rival, unless the transform has more
+    refuted: float = 0.02  #: share of violations that refutes a rival, unless T has more
     rival_m: float = 0.25  #: minimum difference of a rival from the transform, metres
-    rival_rad: float = math.radians(15.0)  #: or minimum rotation from the transform, radians
+    rival_rad: float = math.radians(15.0)  #: or minimum rotation relative to it, radians
 
 
 @cached_per_frame
 def symmetries(patches: Patches, p: AmbiguityParameters) -> Floats:
     """Return motions (n, 4, 4) that map the main planes of the patches onto themselves.
 
-    These are rotations by 90, 180 and 270 degrees about the centre of each plane, and shifts along
-    the intersection of the two main families of planes, such as along a corridor. n is at most
-    3 n_axes n_planes + 2 n_shifts.
+    These are rotations by 90, 180 and 270 degrees about the normal through the centre of each
+    plane, and shifts along the intersection of the two main families of planes, such as along a
+    corridor. n is at most 3 n_axes n_planes + 2 n_shifts.
     """
     motions = np.zeros((3 * p.n_axes * p.n_planes + 2 * p.n_shifts, 4, 4))
     means, normals = (np.ascontiguousarray(x.T) for x in (patches.means, patches.normals))
-    found = _write_symmetries(
+    count = _write_symmetries(
         means, normals, patches.areas, p.n_axes, p.n_planes, math.cos(p.same_direction),
         p.planes.same_plane, p.least_crossing, p.shift, p.n_shifts, motions,
     )  # fmt: skip
-    return motions[:found]
+    return motions[:count]
 
 
 @kernel
@@ -273,7 +273,7 @@ def _write_symmetries(
 ) -> int:  # fmt: skip
     """Write the motions of `symmetries`; return their number. Means and normals are (3, P)."""
     left, mass, axes = areas.copy(), np.empty(len(areas)), np.zeros((n_axes + 2, 3))
-    found = 0
+    count = 0
     for number in range(n_axes):
         _sum_parallel(normals, left, cosine, mass)
         most = int(np.argmax(mass))
@@ -289,7 +289,7 @@ def _write_symmetries(
                 for k in range(3):
                     axis[k] += normals[k, i] * areas[i] * np.sign(dot)
         axis /= np.sqrt((axis * axis).sum())
-        found = _write_turns(means, across, axis, n_planes, same_plane, mass, motions, found)
+        count = _write_turns(means, across, axis, n_planes, same_plane, mass, motions, count)
         axes[number] = axis
     along = np.array([  # 0 without two axes
         axes[0, 1] * axes[1, 2] - axes[0, 2] * axes[1, 1],
@@ -300,21 +300,21 @@ def _write_symmetries(
     if length > least_crossing:
         for step in range(2 * n_shifts):
             metres = shift * (step + 1) if step < n_shifts else -shift * (step + 1 - n_shifts)
-            motions[found] = np.eye(4)
-            motions[found, :3, 3] = along / length * metres
-            found += 1
-    return found
+            motions[count] = np.eye(4)
+            motions[count, :3, 3] = along / length * metres
+            count += 1
+    return count
 
 
 @kernel
 def _write_turns(
     means: Floats, areas: Floats, axis: Floats, n_planes: int, same_plane: float, mass: Floats,
-    motions: Floats, found: int,
+    motions: Floats, count: int,
 ) -> int:  # fmt: skip
     """Append quarter turns about the centres of the largest planes across an axis to `motions`.
 
-    Planes consist of patches with positive areas; these areas are set to 0. `found` is the number
-    of motions before, and the result is the number afterwards.
+    Planes consist of patches with positive areas; these areas are set to 0. `count` is the number
+    of motions in it before; return the number afterwards.
     """
     x, y, z = axis[0], axis[1], axis[2]
     offsets, R = x * means[0] + y * means[1] + z * means[2], np.empty((3, 3))
@@ -337,19 +337,19 @@ def _write_turns(
                 for b in range(3):
                     R[a, b] = sine * cross[a, b] + (1.0 - cosine) * axis[a] * axis[b]
                     R[a, b] += cosine if a == b else 0.0
-            motions[found, :3, :3], motions[found, 3, 3] = R, 1.0
+            motions[count, :3, :3], motions[count, 3, 3] = R, 1.0
             for a in range(3):
                 turned = R[a, 0] * middle[0] + R[a, 1] * middle[1] + R[a, 2] * middle[2]
-                motions[found, a, 3] = middle[a] - turned
-            found += 1
-    return found
+                motions[count, a, 3] = middle[a] - turned
+            count += 1
+    return count
 
 
 @disjoint_kernel
 def _sum_parallel(normals: Floats, areas: Floats, cosine: float, mass: Floats) -> None:
     """Write, for each patch, the total area of parallel patches; normals are (3, P).
 
-    The inner loop is over the sums, not over the terms of a sum, so that it is vectorized.
+    The inner loop runs over the sums, not over the terms of a sum, so that it is vectorized.
     """
     x, y, z = normals[0], normals[1], normals[2]
     mass[:] = 0.0
@@ -362,7 +362,7 @@ def _sum_parallel(normals: Floats, areas: Floats, cosine: float, mass: Floats) -
 
 @disjoint_kernel
 def _sum_level(offsets: Floats, areas: Floats, apart: float, mass: Floats) -> None:
-    """Write, for each patch, the total area of patches with a similar offset."""
+    """Write, for each patch, the total area of the patches with a similar offset."""
     mass[:] = 0.0
     for j in range(len(areas)):
         offset, area = offsets[j], areas[j]
@@ -382,9 +382,9 @@ class Rival(NamedTuple):
     Parameters
     ----------
     share : share of the frames that the rival explains, with equal weights for all planes, 0 to 1;
-        0 without a rival
-    T : (4, 4) transform; None without a rival
-    tilted : maximum share that a transform explains, among transforms that only `up` refutes
+        0 if there is no rival
+    T : (4, 4) transform; None if there is no rival
+    tilted : largest share that any transform explains that only `up` refutes
     """
 
     share: float
@@ -403,7 +403,8 @@ def best_alternative(
     ----------
     query, match : results of `plane_view`
     T : (4, 4) T_match_query
-    violations : violations of T by planes; violations up to this share do not refute a rival
+    violations : share of violations of T, with equal weights for planes; up to this share,
+        violations do not refute a rival
     voted : (n, 4, 4) other refined hypotheses
     proposed : (m, 4, 4) unrefined hypotheses, best first; the best hypotheses that are rivals of T
         and of each other are refined

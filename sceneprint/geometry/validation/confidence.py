@@ -1,13 +1,14 @@
-"""Confidences of candidate poses: the probabilities that they are right.
+"""Confidences of candidate poses: the probabilities that the poses are right.
 
     PlaceEvidence of all candidates  --compute_confidences-->  P(right) of each, sum <= 1
     PlaceEvidence  --weakest_evidence-->  clause on the evidence with the largest penalty
 
 At most one of the candidates is right. The log odds of a candidate, relative to the case that all
-are wrong, are the log odds of a pose with the best evidence minus a penalty per kind of evidence.
-Penalties are piecewise linear functions that do not increase with better evidence, so more support
-cannot lower a confidence, and a better rival cannot raise it. `sceneprint_lab.confidence` fits the
-penalties to synthetic places; docs/trust.md shows the calibration on recordings.
+are wrong, are the log odds of a pose with the best possible evidence, minus a penalty for each kind
+of evidence. Penalties are piecewise linear functions that never increase with better evidence, so
+more support cannot lower a confidence, and a better rival cannot raise it.
+`sceneprint_lab.confidence` fits the penalties to synthetic places; docs/trust.md shows the
+calibration on recordings.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class PlaceEvidence:
-    """The evidence for and against a pose of the query.
+    """The evidence for and against a candidate pose of the query.
 
     Parameters
     ----------
@@ -31,15 +32,19 @@ class PlaceEvidence:
     planes : number of distinct planes of the query that agree with the map
     frames : number of frames of the map that agree
     viewpoints : number of viewpoints of these frames
-    excess : share of free-space violations of both sides, minus the share among the map's frames
-    weight : sum of the weights of votes for the pose, one per viewpoint: 1 for a strong match, less
-        for a weak or ambiguous match; see `LocalizationParameters`
+    excess : share of free-space violations of query and map, minus the share among the map's own
+        frames
+    weight : sum of the weights of the votes for the pose, one vote per viewpoint: 1 for a strong
+        match, less for a weak or ambiguous match; see `LocalizationParameters`
     strong : number of viewpoints of strong matches that vote for the pose
-    accepted : number of viewpoints of accepted matches, including guided matches, that lead to it
-    suggested : number of viewpoints of candidates that suggest the pose, accepted or not
-    similarity : maximum similarity between these candidates' signatures and the query's, 0 to 1
-    rival : score of the best other place relative to the score of this place; 0 if there is none
-    rival_weight : maximum weight of the votes for another place
+    accepted : number of viewpoints of accepted matches, including guided matches, that lead to the
+        pose
+    suggested : number of viewpoints of candidates, accepted or not, that suggest the pose
+    similarity : maximum similarity between the signatures of these candidates and the query's, 0 to
+        1
+    rival : score of the best other place, relative to the score of this place; 0 if there is no
+        other
+    rival_weight : largest `weight` of any other place
     rendered : whether most of the agreeing frames are views that were rendered from a surface
     """
 
@@ -87,7 +92,7 @@ class Penalty:
         return self.worst, self.poor, self.fair, 0.0
 
 
-#: Four values of each kind of evidence, worst first; penalties are linear between these knots.
+#: Knots: four values of each kind of evidence, worst first; penalties are linear between them.
 KNOTS: Mapping[str, tuple[float, float, float, float]] = {
     "score": (0.05, 0.15, 0.3, 0.6),
     "planes": (3.0, 6.0, 12.0, 24.0),
@@ -109,7 +114,7 @@ class ConfidenceParameters:
 
     Parameters
     ----------
-    best : log odds of a pose with the best evidence of all kinds
+    best : log odds of a pose with the best possible evidence of every kind
     score, planes, ... : penalty of each kind of evidence
     """
 
@@ -129,11 +134,11 @@ class ConfidenceParameters:
 
 @dataclass(frozen=True)
 class ConfidenceModel:
-    """Parameters of confidences by the kind of map.
+    """Parameters of confidences for each kind of map.
 
     Views that were rendered from a surface agree perfectly with each other, even if the surface is
-    wrong, and have no violations among themselves. Therefore, violations of a real frame are weaker
-    evidence for such maps, and other kinds of evidence have more weight.
+    wrong, and have no violations among themselves. Therefore, violations by a real frame are weaker
+    evidence on such maps, and other kinds of evidence have more weight.
 
     Parameters
     ----------
@@ -161,13 +166,13 @@ def compute_penalties(e: PlaceEvidence, p: ConfidenceParameters) -> dict[str, fl
 
 
 def compute_confidences(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -> list[float]:
-    """Return the probabilities that the candidate poses of a query are right.
+    """Return the probability that each candidate pose of a query is right.
 
     The probability that all are wrong is 1 minus their sum.
 
     Parameters
     ----------
-    evidence : evidence for all candidates of a query; the candidates are at different places
+    evidence : evidence for each candidate of a query; the candidates are at different places
     """
     odds = [math.exp(p.of(e).best - sum(compute_penalties(e, p.of(e)).values())) for e in evidence]
     total = 1.0 + sum(odds)
@@ -175,7 +180,7 @@ def compute_confidences(evidence: Sequence[PlaceEvidence], p: ConfidenceModel) -
 
 
 def weakest_evidence(e: PlaceEvidence, p: ConfidenceModel) -> str:
-    """Return a clause on the evidence that reduces the confidence of a pose most."""
+    """Return a clause about the evidence that lowers the confidence of a pose most."""
     penalties = compute_penalties(e, p.of(e))
     name = max(penalties, key=penalties.__getitem__)
     return {

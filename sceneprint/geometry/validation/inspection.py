@@ -1,4 +1,4 @@
-"""Point-by-point evidence of a validation, for display (Sec. III-E).
+"""Evidence for a validation, point by point, for display (Sec. III-E).
 
     Geometry, Geometry, T  --trace-->  Traces: corresponding patches, inliers, violations
     points, Surface, T  --point_verdicts-->  agreements and violations of free space
@@ -29,9 +29,9 @@ from sceneprint.geometry.registration.overlap import (
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Surface
 
-#: Verdicts: unobserved or beside the surface; on the surface; in free space.
+#: Verdicts on a point: unobserved or beside the surface; on the surface; in free space.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
-#: Maximum residual, and codes of verdicts, as `sceneprint.formats.export` encodes them.
+#: Maximum residual, and codes of verdicts, in the encoding of `sceneprint.formats.export`.
 TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254
 
 Verdicts = NDArray[np.uint8]
@@ -45,7 +45,7 @@ class Traces:
     ----------
     pairs : (M, 2) indices of coinciding patches of the query and of the match
     distances : (M,) distances between the means of these patches, metres
-    query, match : (N, 6) points and normals of the evidence, in the coordinates of the frame
+    query, match : (N, 6) points and normals of each frame, in its own coordinates
     of_query, of_match : (N,) NEITHER, AGREES or VIOLATES
     """
 
@@ -76,7 +76,7 @@ def _write_verdicts(
 def point_verdicts(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """Return a verdict on each of a source's points (N, 6): NEITHER, AGREES or VIOLATES, (N,)."""
+    """Return the verdict on each source point (N, 6): NEITHER, AGREES or VIOLATES, (N,)."""
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
     _write_verdicts(
@@ -115,7 +115,7 @@ def _write_residuals(
 def residuals(
     source: Floats32, target: Surface, T_target_source: Floats, p: OverlapParameters
 ) -> Verdicts:
-    """Return the distances of a source's points from the target's surface, in steps.
+    """Return the distance of each source point from the target's surface, in steps.
 
     Parameters
     ----------
@@ -123,9 +123,9 @@ def residuals(
 
     Returns
     -------
-    (N,) minimum k from 1 to TOLERANCE such that the point agrees within k / TOLERANCE of
-        `surface_tolerance`, which grows with distance; VIOLATION if the point violates free space;
-        OUTSIDE if no pixel sees it, or if it lies beside or behind the surface
+    (N,) smallest k from 1 to TOLERANCE such that the point agrees within k / TOLERANCE times
+    `surface_tolerance`, which grows with distance; VIOLATION if the point violates free space;
+    OUTSIDE if no pixel sees the point, or if it lies beside or behind the surface
     """
     out = np.zeros(len(source), np.uint8)
     t = overlap_target(target, p)
@@ -182,7 +182,7 @@ Colour = Literal["source", "normal", "residual"]
 
 #: Colours of the source's points and of the target's points.
 SOURCE, TARGET = (217, 119, 43), (43, 108, 176)
-#: Upper limits of residuals, and colours of points within each limit, of points outside, and of
+#: Upper limits of residuals, and the colours of points within each limit, of OUTSIDE points and of
 #: violations.
 STEPS = (50, 100, TOLERANCE)
 STEP_COLOURS = np.array(
@@ -194,14 +194,14 @@ def overlay(
     source: Surface, target: Surface, T_target_source: Floats, colour: Colour = "source",
     p: OverlapParameters | None = None,
 ) -> tuple[Floats, Floats, Bytes]:  # fmt: skip
-    """Combine both surfaces to a coloured cloud; the source's points come first.
+    """Combine both surfaces into a coloured cloud; the source's points come first.
 
     Parameters
     ----------
     source, target : surfaces; all of their valid pixels are included
     T_target_source : (4, 4) transform that aligns the surfaces
     colour : "source" distinguishes the frames, "normal" shows normals (x, y, z in the target's
-        frame from -1 to 1 as red, green, blue from 0 to 255), "residual" shows the distances from
+        frame from -1 to 1 as red, green, blue from 0 to 255), "residual" shows the distance from
         the other surface (`STEPS`)
     p : limits of agreement and of violations
 
@@ -258,8 +258,8 @@ def _assign_patches(
 def patches_at(points: Floats32, patches: Patches) -> Ints32:
     """Return the nearest patch with a similar normal for each point, (N,); -1 if there is none.
 
-    Artifacts do not store the labels of points. For patches of similar sizes, the results nearly
-    equal the labels.
+    Artifacts do not store which patch a point belongs to. For patches of similar sizes, the results
+    are nearly the original labels.
 
     Parameters
     ----------

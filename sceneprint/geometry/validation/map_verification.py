@@ -1,11 +1,11 @@
-"""Comparison of a query's poses with all frames of the map that would see its surfaces.
+"""Comparison of candidate poses on all frames of the map that would see the query's surfaces.
 
     query, poses, MapViews  --compare_poses-->  ScoredPose of each place, best first
 
 Two frames can agree under a wrong transform: a cabinet can look the same from both sides. Other
-frames around it distinguish the poses, because a pose predicts the observations of the query.
-Therefore, a pose is scored on many views: a surface of the query may be visible in only some of
-them, and free space in most of them contradicts the pose.
+frames around it distinguish the poses, because each pose predicts what the query would observe.
+Therefore, a pose is scored on many views: only some may see a given surface of the query, but free
+space in most of them contradicts a wrong pose.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class MapParameters:
 
     n_views: int = 10  #: maximum number of views that score a pose
     look_ahead: float = 1.5  #: distance from a camera to the centre of its view, metres
-    reach: float = 3.5  #: maximum distance of the centres of overlapping views, metres
+    reach: float = 3.5  #: maximum distance between the centres of overlapping views, metres
     around_reach: float = 4.0  #: `reach` if a sensor may look in any direction, metres
     same_surfaces: float = 8.0  #: maximum distance between sensors with common surfaces, metres
     near: float = 2.0  #: radius of the first search for frames of the map, metres
@@ -49,12 +49,12 @@ class MapParameters:
     start_shift: float = 0.5  #: maximum distance between an initial pose and its prior, metres
     least_agreeing: float = 0.03  #: minimum share of agreeing points for a view to count
     violation_weight: float = 2.0  #: weight of the violations of either side in the score
-    n_poses: int = 40  #: number of poses that are scored on the candidates
+    n_poses: int = 40  #: number of poses that are scored on the candidate frames
     n_places: int = 6  #: number of best places that are scored on all frames
-    hopeful: float = 0.2  #: minimum score of a refined place, as a share of the best score
-    n_refined: int = 3  #: number of places that are refined
+    hopeful: float = 0.2  #: minimum score of a place to refine, as a share of the best score
+    n_refined: int = 3  #: number of places to refine
     n_refining: int = 3  #: number of views on which a pose is refined
-    n_noise: int = 4  #: number of map frames whose violations measure the noise
+    n_noise: int = 4  #: number of map frames among which noise is measured
     least_noise: float = 0.02  #: share of violations above which noise is measured
     same_m: float = 0.1  #: maximum difference between equal poses, metres
     same_rad: float = math.radians(6.0)  #: maximum difference between equal poses, radians
@@ -66,14 +66,14 @@ class MapParameters:
 
 @dataclass(frozen=True, eq=False)
 class MapFrame:
-    """A frame with a pose, prepared for scoring poses of a query.
+    """A frame with a known pose, prepared for scoring poses of a query.
 
     Parameters
     ----------
     geometry : geometry of the frame
     target : surface of the frame, prepared for look-ups
     T : (4, 4) T_parent_sensor; T_query_sensor for a frame of the query
-    weighing : parameters that determine whether patches lie in the same plane
+    weighing : limits within which patches lie in the same plane
     """
 
     geometry: Geometry
@@ -94,7 +94,7 @@ class MapFrame:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose:
-    """A pose of the query with its score on the map's frames.
+    """A pose of the query, with its score on the map's frames.
 
     Parameters
     ----------
@@ -104,10 +104,10 @@ class ScoredPose:
         planes
     planes : mean number of distinct planes of a query frame that agree
     violations : violations as a share of agreements and violations, for the query's surface
-    hidden : share of violations of the map's surfaces in the query's free space
+    hidden : share of the map's surfaces that violate the query's free space
     noise : violations among the map's frames at the pose; 0 if unmeasured
-    views : pairs of query frame and map frame that agree, by descending agreement
-    starts : (4, 4) poses that were refined to this pose or to its place
+    views : indices (query frame, map frame) of the pairs that agree, by descending agreement
+    starts : (4, 4) poses from which refinement led to this pose or to its place
     """
 
     T: Floats
@@ -121,7 +121,7 @@ class ScoredPose:
     starts: tuple[Floats, ...] = ()
 
     def is_of(self, T: Floats, p: MapParameters) -> bool:
-        """Return whether a pose (4, 4) is at this place, or at a place that was refined to it."""
+        """Return whether a pose (4, 4) is at this place, or near a pose that was refined to it."""
         return bool(at_place(np.stack([self.T, *self.starts]), T, p).any())
 
 
@@ -133,15 +133,15 @@ class MapViews:
         p: MapParameters, overlap_p: OverlapParameters, candidates: Sequence[int] = (),
         ahead: Sequence[bool] | None = None, rendered: Sequence[bool] | None = None,
     ) -> None:  # fmt: skip
-        """Store the poses of frames.
+        """Store the poses of frames, and how to open the frames.
 
         Parameters
         ----------
         poses : (n, 4, 4) T_parent_sensor
-        open_geometry : function that returns the artifact of frame i; None if it is unreadable
-        candidates : indices of open frames for the first comparison; empty selects all frames
-        ahead : whether each sensor looks along z, as depth cameras do; None means that all do
-        rendered : whether each frame is a view rendered from a surface; None means that none is
+        open_geometry : function that returns the artifact of frame i, or None if it is unreadable
+        candidates : indices of the frames for the first comparison; if empty, it uses all frames
+        ahead : whether each sensor looks along z, as depth cameras do; None if all do
+        rendered : whether each frame is a view rendered from a surface; None if none is
         """
         self.poses, self._open, self._p, self._overlap = poses, open_geometry, p, overlap_p
         self.candidates = np.array(candidates, np.intp)
@@ -159,17 +159,18 @@ class MapViews:
         return self._frames[i]
 
     def mostly_rendered(self, frames: Sequence[int] | NDArray[np.intp]) -> bool:
-        """Return whether most of the `frames`, or of all frames if empty, are rendered views."""
+        """Return whether most of `frames` (if empty, of all frames) are rendered views."""
         among = self._rendered[list(frames)] if len(frames) else self._rendered
         return 2 * int(among.sum()) > len(among)
 
     def near(self, T: Floats, ahead: bool, among: NDArray[np.intp] | None = None) -> list[int]:
-        """Return the frames that most likely see the surfaces of a sensor at T, nearest first.
+        """Return the frames that most likely see what a sensor at T sees, nearest view first.
 
         Parameters
         ----------
         T : (4, 4) T_parent_sensor
-        ahead : whether the sensor looks along z; if so, directions of other such sensors count too
+        ahead : whether the sensor looks along z; if so, its direction is compared with those of
+            other such sensors
         among : indices of the frames to search; None searches all frames
         """
         p = self._p
@@ -185,7 +186,7 @@ class MapViews:
 def map_frame(
     geometry: Geometry, T: Floats, p: MapParameters, overlap_p: OverlapParameters
 ) -> MapFrame:
-    """Prepare a frame for comparison with other frames; T is `MapFrame.T`."""
+    """Prepare a frame for comparison with other frames; `T` becomes `MapFrame.T`."""
     target = overlap_target(geometry.surface, overlap_p)
     return MapFrame(geometry, target, T, p.planes)
 
@@ -193,7 +194,7 @@ def map_frame(
 def looks_ahead(geometry: Geometry) -> bool:
     """Return whether the sensor looks along z, as depth cameras do.
 
-    The axes of clouds are arbitrary, and many scanners see all around.
+    Clouds have arbitrary axes, and many scanners see all around.
     """
     return isinstance(geometry.surface.camera, Intrinsics)
 
@@ -203,14 +204,14 @@ def view_separations(
 ) -> Floats:
     """Return the separations (n,) between the views of sensors and the view of a sensor at T.
 
-    Views with a separation of 1 or more are too far apart to share surfaces.
+    Views with a separation of 1 or more are too far apart to show the same surfaces.
 
     Parameters
     ----------
     poses : (n, 4, 4) T_parent_sensor
     look_ahead : (n,) mask of the sensors that look along z
-    T, ahead : (4, 4) pose of the sensor, and whether it looks along z; if both sensors do,
-        directions count too
+    T, ahead : (4, 4) pose of the sensor, and whether it looks along z; if both sensors do, their
+        directions are compared too
     """
     axes = poses[:, :3, 2]
     middles = poses[:, :3, 3] + np.where(look_ahead, p.look_ahead, 0.0)[:, None] * axes
@@ -273,7 +274,7 @@ def map_noise(
 ) -> float:
     """Return the median violations among the map's frames that agree with a pose.
 
-    Drift of poses and moved objects cause violations at correct poses too.
+    Drift of poses, and moved objects, cause violations even at correct poses.
     """
     noises = []
     agreeing = np.unique([i for _, i in pose.views])
@@ -289,7 +290,7 @@ def map_noise(
 def refine_pose(
     frames: Sequence[MapFrame], pose: ScoredPose, views: MapViews, p: MapParameters
 ) -> Floats | None:
-    """Refine a pose on its best views; return the average (4, 4), None if all views fail."""
+    """Refine a pose on its best views; return the average (4, 4), or None if all views fail."""
     refined = []
     for number, i in pose.views[: p.n_refining]:
         frame, view = frames[number], views[i]
@@ -303,7 +304,7 @@ def refine_pose(
 
 
 def prior_starts(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
-    """Return a pose, and six poses shifted by a standard deviation along the axes, (7, 4, 4).
+    """Return a pose, and six copies shifted by a standard deviation along the axes, (7, 4, 4).
 
     Parameters
     ----------
@@ -323,7 +324,7 @@ def refine_starts(
     frames: Sequence[MapFrame], starts: Floats, views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> Floats:  # fmt: skip
-    """Refine poses of a prior (n, 4, 4) on the map; return the successful results (m, 4, 4)."""
+    """Refine a prior's starts (n, 4, 4) on the map; return the successful results (m, 4, 4)."""
     refined = []
     for start in starts:
         T = refine_pose(frames, score_pose(frames, start, views, p, overlap_p), views, p)
@@ -338,8 +339,9 @@ def compare_poses(
 ) -> list[ScoredPose]:  # fmt: skip
     """Return the best pose of the query at each place, best first.
 
-    All poses are scored on the candidates, and the best places on all frames that would see them.
-    The best places are also refined on the map: an error of a few centimetres causes violations.
+    Each pose is scored on the candidate frames, and the best places are scored on all frames that
+    would see the same surfaces. The best places are also refined on the map, because an error of a
+    few centimetres causes violations.
 
     Parameters
     ----------
@@ -365,10 +367,9 @@ def _refine_places(
     frames: Sequence[MapFrame], places: list[ScoredPose], views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> list[ScoredPose]:  # fmt: skip
-    """Refine places, best first, until `n_refined` different places remain.
+    """Refine places, best first, until there are `n_refined` different refined places.
 
-    Poses that converge to the same result are in its basin of attraction. They are the same place,
-    and must not count as rivals of the result.
+    Poses that converge to the same result are the same place, and must not count as its rivals.
     """
     hopeful = _select_hopeful(places, p)
     settled: list[ScoredPose] = []
@@ -391,12 +392,12 @@ def _refine_places(
 
 
 def _select_hopeful(places: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
-    """Return the places whose refined score may approach the score of the first (best) place."""
+    """Return the places that may, once refined, score nearly as well as the first (best) place."""
     return places[:1] + [pose for pose in places[1:] if pose.score >= p.hopeful * places[0].score]
 
 
 def best_per_place(scored: list[ScoredPose], p: MapParameters) -> list[ScoredPose]:
-    """Return the best pose of each place, best first; ties remain in order."""
+    """Return the best pose at each place, best first; ties remain in order."""
     places: list[ScoredPose] = []
     for pose in sorted(scored, key=lambda pose: -pose.score):
         if not places or not at_place(np.stack([place.T for place in places]), pose.T, p).any():
@@ -415,6 +416,6 @@ def at_place(poses: Floats, T: Floats, p: MapParameters) -> NDArray[np.bool_]:
 
 
 def distinct_viewpoints(viewpoints: Floats, p: MapParameters) -> list[int]:
-    """Return the index of the first view (n, 4, 4) from each viewpoint."""
+    """Return the index of the first of `viewpoints` (n, 4, 4) at each distinct viewpoint."""
     order = -np.arange(len(viewpoints), dtype=float)
     return select_distinct(viewpoints, order, p.same_m, p.same_rad, len(viewpoints))

@@ -1,4 +1,4 @@
-"""Alignment of two frames by a rigid transform, and the decision about acceptance (Sec. III-E).
+"""Alignment of two frames by a rigid transform, and the decision to accept it (Sec. III-E).
 
     Geometry, Geometry, seed  --validate-->  PairValidation
     validations  --rank_accepted-->  C_vld
@@ -9,9 +9,9 @@ the transform must also explain both frames: enough of both surfaces must agree,
 points may lie in free space of the other frame.
 
 It also accepts too little: if two depth images share only a tenth of their surfaces, the search in
-one direction may miss the transform that the other direction finds. Such a transform is refined in
-both directions. Little agreement suffices for a weak match if several planes agree and nothing
-contradicts the transform; then the result of the other direction is one of the rivals.
+one direction may miss the transform that the search in the other direction finds. Such a transform
+is refined in both directions. Little agreement suffices for a weak match if several planes agree
+and nothing contradicts the transform; the result of the other direction is then one of the rivals.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ Direction = Literal["query_to_match", "match_to_query"]
 THERE: Direction = "query_to_match"
 BACK: Direction = "match_to_query"
 _NONE = np.empty((0, 4, 4))
-#: Reason if a transform that `up` excludes may be right, because `up` may be wrong.
+#: Reason of a rejection if `up` excludes a transform that may be right, because `up` may be wrong.
 _MORE_TILTED = (
     "a transform that tilts against `up` explains the frames better. Check the IMU and the axes of "
     "`up`"
@@ -109,8 +109,8 @@ class PairValidation:
 
     Parameters
     ----------
-    status : accepted, rejected, or ambiguous if a rival transform explains the frames equally well
-        or a direction is unconstrained
+    status : accepted, rejected, or, if a rival transform explains the frames equally well or a
+        direction is unconstrained, ambiguous
     strength : strong; weak if a rival is close, little agrees, or a frame has no viewpoint; None
         unless the match is accepted
     reason : short explanation of the status
@@ -118,16 +118,17 @@ class PairValidation:
         directions or, if they disagree, the direction with more evidence; None without any
         hypothesis
     residual_m, residual_rad : residual of T_match_query T_query_match, the composition of both
-        directions; infinite if one is missing. For an accepted match with `T_other`, or with one
-        direction only, the residual of its two refinements
+        directions; infinite if one is missing. For an accepted match with `T_other` or with a
+        single direction, the residual between its two refinements
     overlap : share of both frames' points that agree under the transform, 0 to 1
-    plane_overlap : overlap with equal weights for all planes, 0 to 1; low if only a floor or a wall
-        agrees
+    plane_overlap : overlap with equal weights for all planes, 0 to 1; it is low if only a floor or
+        a wall agrees
     violations : free-space violations as a share of violations and inliers, 0 to 1; None if neither
         frame has a viewpoint
     inliers : number of points of both frames that agree under the transform
-    ambiguity : agreeing share of both frames, with equal weights for all planes, under the best
-        rival that free space does not refute, 0 to 1; 0 if the transform is rejected anyway
+    ambiguity : share of both frames that agrees, with equal weights for all planes, under the best
+        rival that free space does not refute, 0 to 1; 0 if the transform is rejected for other
+        reasons
     T_rival : (4, 4) best rival; None without a rival
     seed : seed of the random choices
     covariance : (6, 6) covariance of T_match_query, see `icp.py`; None unless accepted
@@ -136,12 +137,12 @@ class PairValidation:
     plane_violations : `violations` with equal weights for all planes
     search : source of the transform: correspondences, plans of two scans, or the map's poses
     directions : directions of the search that found the transform
-    T_other : (4, 4) result of the other direction if the directions disagree; else None
+    T_other : (4, 4) result of the other direction if the two directions disagree; otherwise None
     hypotheses : (n, 4, 4) T_match_query of the best refined hypotheses of both directions and of
         `T_rival`, for verification in a map
     ups : (3,) unit vectors, up in the query's and in the match's coordinates; None if unknown
-    tilt_rad : tilt of the transform against `ups`; None if one of them is unknown
-    contradicts_up : whether the transform would be accepted by the surfaces, but tilts too much
+    tilt_rad : tilt of the transform against `ups`; None if either is unknown
+    contradicts_up : whether the surfaces support the transform, but it tilts too much
     predicted : (4, 4) T_match_query that the map's poses predict; None unless the match is guided
     """
 
@@ -173,7 +174,7 @@ class PairValidation:
 
     @property
     def guided(self) -> bool:
-        """Return whether other matches predicted the transform: its vote is not independent."""
+        """Return whether other matches predicted the transform, so its vote is not independent."""
         return self.predicted is not None
 
 
@@ -190,8 +191,8 @@ def refine_transform(
 ) -> Floats | None:
     """Refine a transform in both directions; return the transform halfway between the results.
 
-    If the initial transform is a reference, the change measures the errors of sensors and reference
-    poses.
+    If the initial transform is a reference, the change measures the errors of the sensors and of
+    the reference poses.
 
     Returns
     -------
@@ -228,12 +229,13 @@ def validate(
     ----------
     query, match : geometry artifacts of one model
     seed : non-negative seed of the random choices; equal seeds give equal results
-    mode : "full", or "paper" to accept by the residual of the two directions only
+    mode : "full", or "paper" to accept or reject by the residual of the two directions only
     matching : method of matching
     ups : (3,) unit vectors that point up in the query's and in the match's coordinates; None if
-        unknown. If both are known, transforms that tilt are excluded; for scans, one helps too
-    other_axes : for two scans with unknown `ups`, whether to consider that the scanners were not
-        upright
+        unknown. If both are known, transforms that tilt are excluded; for scans, even one of them
+        helps
+    other_axes : for two scans with unknown `ups`, whether to try hypotheses for scanners that were
+        not upright
 
     Raises
     ------
@@ -292,8 +294,8 @@ def validate_guided(
     """Check a transform that other matches and the map's poses predict: Sec. III-E, without search.
 
     The prediction is refined in both directions. The results must agree, be near the prediction,
-    and have the evidence that `validate` requires. The function searches for neither hypotheses nor
-    rivals, so an accepted transform improves the precision of a pose, but is not evidence for it.
+    and have the evidence that `validate` requires. There is no search for hypotheses or rivals, so
+    an accepted transform makes a pose more precise, but is no evidence for it.
 
     Parameters
     ----------
@@ -334,7 +336,7 @@ def validate_without_up(
     """Validate by the surfaces only, to check `up` after a query without matches.
 
     An accepted transform that does not tilt is a match. A strong transform that tilts indicates a
-    wrong `up` or a similar place; it is rejected with this reason.
+    wrong `up` or a similar place; it is rejected for this reason.
 
     Parameters
     ----------
@@ -383,7 +385,7 @@ class _Proposal:
     ----------
     T : (4, 4) T_match_query
     directions : directions of the search that found T
-    refined_by : one alignment, or two alignments; T lies halfway between the two
+    refined_by : one alignment, or two alignments with T halfway between them
     evidence, inliers : see Evidence and PairValidation
     """
 
@@ -396,7 +398,7 @@ class _Proposal:
     def covariance(self, p: ValidationParameters) -> Floats | None:
         """Return the covariance (6, 6) of T; None if it was not refined in both directions.
 
-        The difference between the two refinements is part of the error.
+        The covariance includes the difference between the two refinements.
         """
         refined = [alignment.refined for alignment in self.refined_by]
         if len(refined) < 2 or refined[0] is None or refined[1] is None:
@@ -458,7 +460,7 @@ def _judge(
     query: FrameSamples, match: FrameSamples, proposal: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters, mode: Mode,
 ) -> _Verdict:  # fmt: skip
-    """Decide on a transform by the agreement of the directions, the evidence, and the rivals."""
+    """Decide on a transform by the agreement of the directions, the evidence and the rivals."""
     e = proposal.evidence
     against = objection(e, p.acceptance, mode) or _tilt_objection(
         tilt_of(proposal.T, (query.up, match.up)), p
@@ -498,14 +500,14 @@ def _accept_sparse(
     query: FrameSamples, match: FrameSamples, proposal: _Proposal,
     there: Alignment | None, back: Alignment | None, p: ValidationParameters,
 ) -> tuple[_Proposal, _Verdict] | None:  # fmt: skip
-    """Accept a transform of depth images as weak if its evidence is sparse but consistent.
+    """Accept a transform between depth images as weak if its evidence is sparse but consistent.
 
-    A transform that only one search found is refined in both directions first; then the result of
-    the other search is a rival.
+    If only one search found the transform, it is first refined in both directions, and the result
+    of the other search is a rival.
 
     Returns
     -------
-    the transform and its verdict; None if the transform remains rejected
+    the (refined) transform and its verdict; None if the rejection stands
     """
     if proposal.refined_by[0].search != "correspondences" or are_scans(
         query.geometry, match.geometry
@@ -537,7 +539,7 @@ def _accept_sparse(
 def _refine_proposal(
     query: FrameSamples, match: FrameSamples, proposal: _Proposal, p: ValidationParameters
 ) -> _Proposal | None:
-    """Refine the transform of a single search in both directions; None if it explains little."""
+    """Refine the result of a single search in both directions; None if it explains too little."""
     e = proposal.evidence
     half = p.acceptance.sparse_plane_overlap / 2
     if e.plane_overlap - e.plane_violations < half or e.plane_violations > 2 * half:
@@ -557,7 +559,7 @@ def _collect_hypotheses(
     there: Alignment | None, back: Alignment | None, estimates: Sequence[Floats],
     T_rival: Floats | None, each: int,
 ) -> Floats:  # fmt: skip
-    """Return the estimates, the rival, and the `each` next hypotheses per direction, (n, 4, 4)."""
+    """Return the estimates, the rival, and the next `each` hypotheses per direction, (n, 4, 4)."""
     hypotheses = [*estimates] if T_rival is None else [*estimates, T_rival]
     if there is not None:
         hypotheses += [*there.others[:each]]
@@ -567,7 +569,7 @@ def _collect_hypotheses(
 
 
 def _tilt_objection(tilt: float | None, p: ValidationParameters) -> tuple[Status, str] | None:
-    """Return a rejection if a transform tilts more than the search allows; otherwise None."""
+    """Return a rejection if a transform tilts more than the search allows, otherwise None."""
     if tilt is None or tilt <= p.alignment.gravity.refined_tilt:
         return None
     return "rejected", f"it tilts by {math.degrees(tilt):.0f} deg against `up`"
@@ -576,10 +578,10 @@ def _tilt_objection(tilt: float | None, p: ValidationParameters) -> tuple[Status
 def _combine_directions(
     there: Alignment | None, back: Alignment | None, p: AcceptanceParameters
 ) -> tuple[tuple[float, float], dict[tuple[Direction, ...], Floats]]:
-    """Return the residual of the two directions, and T_match_query by the directions that found it.
+    """Return the residual of the two directions, and T_match_query by the directions it is from.
 
-    If the directions agree, the only transform lies halfway between them; otherwise, each direction
-    has a transform.
+    If the directions agree, there is a single transform, halfway between theirs; otherwise, each
+    direction has its own.
     """
     if there is not None and back is not None:
         composed = there.T @ back.T  # reading R5: the residual transform T_Q^X T_X^Q itself
@@ -627,21 +629,22 @@ def _collect_evidence(
     return e, inliers
 
 
-#: Error of a depth camera's transform per radian between the two views, metres. Its causes are
-#: distortion and drift of reference poses; the covariance of a refinement does not contain them.
+#: Error of a depth camera's transform per radian between the two views, metres. It is caused by
+#: distortion and by drift of reference poses, which the covariance of a refinement does not
+#: include.
 _ERROR_PER_RADIAN = 0.04
 
 
 def rank_accepted(validations: Sequence[PairValidation]) -> list[int]:
-    """Return the indices of accepted validations, strong before weak, by descending precision.
+    """Return the indices of accepted validations, strong before weak, most precise first.
 
-    The paper preserves the order of R. A weak match has a rival that explains the frames nearly as
-    well, so strong matches precede it. Matches of cameras are ranked by expected error, and matches
-    of frames that see all around by the distance between their sensors.
+    The paper preserves the order of R. A weak match may have a rival that explains the frames
+    nearly as well, so strong matches precede it. Matches between cameras are ranked by expected
+    error, and matches between frames that see all around by the distance between their sensors.
 
     Parameters
     ----------
-    validations : validations in the order of R
+    validations : validations of the frames in the order of R
     """
     accepted = [i for i, v in enumerate(validations) if v.status == "accepted"]
     around = all(validations[i].around for i in accepted)
@@ -658,7 +661,7 @@ def rank_accepted(validations: Sequence[PairValidation]) -> list[int]:
 
 
 def expected_error(validation: PairValidation) -> float:
-    """Return the expected error of a transform between cameras, metres; infinite if unknown.
+    """Return the expected error of a transform between two cameras, metres; infinite if unknown.
 
     It is the quadrature sum of the translation's standard deviation and an error that grows with
     the angle between the views.

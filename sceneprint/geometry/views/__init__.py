@@ -1,4 +1,4 @@
-"""Views of an imported surface, as a sensor inside the surface would observe it.
+"""Views of an imported surface, as a sensor inside it would observe them.
 
 surface, parameters  --choose_views-->  ViewPlan, poses (V, 4, 4)
 Renderer(surface, parameters).view(pose)  -->  depth (H, W), or points (K, 3)

@@ -3,9 +3,9 @@
     surfels  --find_floors-->  Floors
     Floors, parameters  --candidate_places-->  places (C, 3)
 
-All coordinates are in level axes with z upwards. Floors are the lowest surface that is level over a
-few metres, and further such surfaces at least a storey above it. `lookout.py` checks whether a
-place is free.
+All coordinates are in level axes with z upwards. The lowest surface that is level over a few metres
+is a floor, and so are further such surfaces, each at least a storey above the last. `lookout.py`
+checks whether a place is free.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ _LEVEL = 0.9
 _STEP = 0.15
 #: Minimum height of a storey, metres.
 _STOREY = 2.0
-#: Minimum share of the cells around a column that the lowest floor fills, and that a higher floor
-#: fills.
+#: Minimum share of the cells around a column that the lowest floor must fill, and that a higher
+#: floor must fill.
 _LEAST_FLOOR, _LEAST_STOREY = 0.12, 0.3
-#: Maximum share of a camera's surface below its floor. If there is more, the level surface is a
-#: table in a room whose floor was not observed. Outdoors, more surface may lie below the ground.
+#: Maximum share of a surface seen by cameras that may lie below a floor. If more does, the level
+#: surface is a table in a room whose floor was not observed. For scanners there is no limit:
+#: outdoors, much surface may lie below the ground.
 _MOST_BELOW = 0.07
-#: Maximum number of places in a grid, and of bins (columns times heights).
+#: Maximum number of places in a grid, and maximum number of bins (columns times heights).
 _MOST_COLUMNS, _MOST_BINS = 1_000_000, 8_000_000
-#: Maximum number of storeys, and of heights of places without a floor.
+#: Maximum number of storeys, and maximum number of heights for places without a floor.
 _MOST_HEIGHTS = 50
 _MOST_STOREYS = 12
 
@@ -47,7 +48,7 @@ class Floors:
     ----------
     low : (2,) corner of the grid, metres
     side : width of a column, metres
-    heights : (S, nx, ny) heights by storey, metres; NaN without a floor
+    heights : (S, nx, ny) height of each storey's floor, metres; NaN where there is none
     level : (L, 3) points of level surfaces
     """
 
@@ -58,13 +59,13 @@ class Floors:
 
     @property
     def lowest(self) -> float | None:
-        """Return the median height of the lowest floor; None without a floor."""
+        """Return the median height of the lowest floor; None if there is no floor."""
         known = self.heights[0][np.isfinite(self.heights[0])]
         return float(np.median(known)) if len(known) else None
 
 
 def robust_extent(pieces: Surfels) -> tuple[Floats, Floats]:
-    """Return the lower and the upper corner of a surface, ignoring distant stray points."""
+    """Return the lower and upper corners of a surface's extent, ignoring distant stray points."""
     n = len(pieces.points)
     stray = max(n // 2000, min(n // 100, 4))
     ordered = np.sort(pieces.points.astype(np.float64), axis=0)
@@ -77,10 +78,10 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
     Parameters
     ----------
     pieces : surfels in level axes
-    side : width of a column, metres; it grows if there are too many columns
+    side : minimum width of a column, metres; columns are wider if there would be too many
     has_tables : whether level surfaces may be furniture, as in a depth camera's surface
     """
-    # both sides count: a mesh may be inside out, and no place above a ceiling is free
+    # both sides count: a mesh may be inside out, and places above a ceiling are not free
     level = pieces.points[np.abs(pieces.normals[:, 2]) > _LEVEL].astype(np.float64)
     low, high = robust_extent(pieces)
     level = level[((level >= low) & (level <= high)).all(axis=1)]
@@ -104,7 +105,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
         exists = is_floor.any(axis=2)
         if not exists.any():
             break
-        # the noise of a floor may fill several bins; select the fullest bin
+        # a noisy floor may fill several bins; select the fullest bin
         first = is_floor.argmax(axis=2)
         near = np.abs(np.arange(shape[2]) - first[..., None]) <= 1
         at = np.where(near, counts, -1.0).argmax(axis=2)[..., None]
@@ -124,7 +125,7 @@ def find_floors(pieces: Surfels, side: float, *, has_tables: bool = True) -> Flo
 
 
 def _sum_neighbours(values: Floats) -> Floats:
-    """Return, for each bin, the sum over 3 x 3 columns and over the bins above and below."""
+    """Return, for each bin, the sum over 3 x 3 columns and over the bin itself, above and below."""
     for axis in range(3):
         padded = np.pad(values, [(1, 1) if a == axis else (0, 0) for a in range(3)])
         before, own, after = (padded.take(range(k, k + values.shape[axis]), axis) for k in range(3))
@@ -136,8 +137,8 @@ def candidate_places(floors: Floors, pieces: Surfels, p: ViewParameters, spacing
     """Return places at the heights of the sensor above the floors, (C, 3) in level axes.
 
     In a cloud, a place requires a floor below it. In a mesh, places above an unobserved floor are
-    included too, because the front of a mesh indicates free space. Without a floor, places are
-    distributed over all heights.
+    included too, because the front of a mesh indicates free space. If no floor was found, places
+    are distributed over all heights.
 
     Parameters
     ----------
@@ -192,4 +193,4 @@ def _has_floor(level: Floats, places: Floats, heights: Floats, reach: float) -> 
             for dz in (-1, 0, 1):
                 near |= np.isin(key(at + np.array([dx, dy, dz])), occupied)
             around += near
-    return around >= 6  # fewer of the nine cells would admit places beside a floor
+    return around >= 6  # a smaller number of the nine cells would admit places beside a floor

@@ -1,4 +1,4 @@
-"""Visibility of a surface from places.
+"""Visibility of a surface from a place.
 
     Surfels, place  --Lookout.look-->  Sight
 
@@ -21,15 +21,15 @@ from sceneprint.geometry.views.render import cube_faces, rays_of
 from sceneprint.geometry.views.samples import Surfels, sort_into_blocks
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 
-#: Number of pixels along an edge of the cube, of three degrees each.
+#: Number of pixels along an edge of the cube; each is three degrees wide.
 _FACE_PX = 28
 #: Maximum elevation of horizontal directions from a place, rad.
 _BESIDE = math.radians(30.0)
 #: Number of azimuths from which a piece can be seen, and number of octaves of distance.
 SIDES, OCTAVES = 6, 3
-#: Bit of a mask for a piece that is seen from behind, against its normal.
+#: Bit of a mask that is set if a piece is seen from behind, against its normal.
 BEHIND = np.uint32(1 << 31)
-#: Tolerance of the depth buffer: a share of the distance, plus a number of cells.
+#: Tolerance of the depth buffer: a share of the distance, plus a multiple of the cell side.
 _SAME_SHARE, _SAME_CELLS = 0.03, 1.5
 
 
@@ -41,8 +41,8 @@ class Sight:
     ----------
     elements : (E,) int32 visible elements
     masks : (E,) uint32; bit d is set if view d shows the element, BEHIND if it is seen from behind
-    hit : (D,) share of each view with a surface within range
-    beside : share of the directions from the horizon to 30 degrees above it with a surface
+    hit : (D,) share of each view that shows a surface within range
+    beside : share of the directions from the horizon to 30 degrees above it that show a surface
     back : (D,) share of the surface in each view that is seen from behind
     close : (D,) share of the surface in each view that is too near
     nearest : distance of the nearest piece, metres
@@ -63,7 +63,7 @@ def _write_visible(
     size: int, depth: Floats32, reach: float, gap: float, views: Floats, limits: Floats,
     elements: Ints32, masks: NDArray[np.uint32],
 ) -> int:  # fmt: skip
-    """Write the visible elements on a face of the cube, and their masks; return their number."""
+    """Write the visible elements on a face of the cube, and their masks; return the count."""
     count = 0
     half = size / 2.0
     for block in range(len(starts)):
@@ -111,7 +111,7 @@ def _sum_solid_angles(
     depth: Floats32, item: Ints32, normals: Floats32, rays: Floats, lengths: Floats,
     inside: NDArray[np.bool_], forward: Floats, farthest: float, close: float, sums: Floats,
 ) -> None:  # fmt: skip
-    """Sum, for each view, the solid angles of rays, hits, hits from behind, and hits too near."""
+    """Sum the solid angles of each view's rays, hits, hits from behind, and hits too near."""
     for n in range(len(depth)):
         distance, weight, i = depth[n] * lengths[n], lengths[n] ** -3.0, item[n]
         behind = False
@@ -128,14 +128,14 @@ def _sum_solid_angles(
 
 
 class Lookout:
-    """A computer of the visibility of a surface's pieces from places.
+    """Computes which pieces of a surface are visible from a place.
 
     Parameters
     ----------
     pieces : surfels in level axes
     reach : maximum distance of a visible piece, metres
     farthest : range of the sensor, metres
-    close : depth below which a surface is too near, metres
+    close : minimum depth; a nearer surface is too near, metres
     views : (D, 3, 3) R_level_view, at most 24
     camera : camera of the views; None for a sensor that sees all around
     elevation : maximum elevation of such a sensor above and below the horizon, rad

@@ -1,6 +1,6 @@
 """Parameters of views, derived from a model and a robot's sensor.
 
-Lengths are shares of the sensor's range; heights above the floor depend on the robot.
+Lengths scale with the sensor's range; heights above the floor depend on the robot.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
 from sceneprint.types import Intrinsics
 
-#: Maximum range of a depth camera's model, metres. Models for scanners have a longer range.
+#: Maximum range of a model for depth cameras, metres. Models for scanners have a longer range.
 _FARTHEST_CAMERA = 20.0
-#: Default camera, a Kinect at half its resolution.
+#: Default camera: a Kinect at half resolution.
 DEFAULT_CAMERA = Intrinsics(width=320, height=240, fx=292.5, fy=292.5, cx=159.5, cy=119.5)
-#: Default heights of the sensor above the floor, metres: for cameras on a small robot, on a large
+#: Default heights of the sensor above the floor, metres: for a camera on a small robot, on a large
 #: robot and in a hand, and for a scanner on a robot.
 CAMERA_HEIGHTS: tuple[float, ...] = (0.4, 1.0, 1.6)
 SCANNER_HEIGHTS: tuple[float, ...] = (1.0,)
@@ -32,11 +32,11 @@ class SensorModel(Protocol):
 
     @property
     def depth(self) -> DepthParameters:
-        """Return the parameters of depth images, with the range of a camera."""
+        """Return the parameters for depth images, which include the range of a camera."""
 
     @property
     def cloud(self) -> CloudParameters:
-        """Return the parameters of clouds, with the range and resolution of a scanner."""
+        """Return the parameters for clouds, which include the range and resolution of a scanner."""
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,10 @@ def view_parameters(
 
     Parameters
     ----------
-    model : parameters of the model; a range above 20 m means a scanner
-    camera : camera of the robot, without lens distortion; None selects a scanner for models of
-        scanners, and a default camera for other models
-    heights : heights of the sensor above the floor, metres; None selects defaults of the sensor
+    model : parameters of the model; with a range above 20 m, it is for scanners
+    camera : camera of the robot, without lens distortion; None selects a scanner if the model is
+        for scanners, otherwise a default camera
+    heights : heights of the sensor above the floor, metres; None selects the sensor's defaults
 
     Raises
     ------

@@ -3,8 +3,8 @@
     surface, parameters  --choose_views-->  ViewPlan
 
 Candidates are views from free places above the floors that show enough surface. A greedy loop
-selects the view that adds most to the coverage. Coverage is counted by piece of surface, side and
-distance, because robots may see a piece from any side and distance.
+selects the view that adds most to the coverage. Coverage is counted for each combination of a piece
+of surface, a side and a distance, because robots may see a piece from any side and distance.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ from sceneprint.geometry.views.parameters import ViewParameters
 from sceneprint.geometry.views.samples import Surfels, surfels
 from sceneprint.types import Floats, ReferenceSurface
 
-#: Maximum number of pieces of surface, and of places.
+#: Maximum number of pieces of surface, and maximum number of places.
 _MOST_PIECES, _MOST_PLACES = 60_000, 3_000
 #: Maximum distance of a covered piece, as a share of the range.
 _REACH = 0.5
-#: Minimum share of a view that shows a surface, for a camera, for a scanner, and for the horizontal
-#: directions of a scanner.
+#: Minimum share of a view that must show a surface: for a camera, for a scanner, and for the
+#: horizontal directions of a scanner.
 _LEAST_HIT, _LEAST_AROUND, _LEAST_BESIDE = 0.45, 0.25, 0.25
 #: Minimum median depth of a camera's view, as a share of the range.
 _LEAST_DEPTH = 1.0 / 11.0
-#: Minimum share of directions with a surface at places that vote on the front of a mesh.
+#: Minimum share of directions that show a surface at a place that votes on the front of a mesh.
 _INDOORS = 0.6
-#: Maximum share of surface that is seen from behind in a camera's view of a mesh, in a scanner's
-#: view, which shows both sides of partitions, and in a cloud, whose sides are estimated.
+#: Maximum share of surface seen from behind: in a camera's view of a mesh; in a scanner's view,
+#: which shows both sides of partitions; and in a view of a cloud, whose sides are estimated.
 _MOST_BACK, _MOST_BACK_AROUND, _MOST_BACK_GUESSED = 0.1, 0.5, 0.3
 #: Maximum cosine between up and the normal of a wall.
 _WALL = 0.7
-#: Maximum share of votes for the back of a one-sided piece of a cloud.
+#: Maximum ratio of votes for the back to votes for the front of a one-sided piece of a cloud.
 _ONE_SIDED = 0.1
-#: Number of yaws, and pitches in degrees, of a camera's views from one place.
+#: Number of yaws, and pitches in degrees, of a camera's views from a place.
 _TURNS, _PITCHES = 8, (-25.0, 10.0)
-#: Gains of the first, the second and all further views of an element.
+#: Gain of the first, of the second and of each further view of an element.
 _WORTH = np.array([1.0, 0.5, 0.0])
-#: Share of the first view's gain at which the selection ends, for a camera, and for a scanner: it
-#: sees all around and needs fewer views.
+#: Share of the first view's gain at which the selection ends, for a camera and for a scanner; a
+#: scanner sees all around and needs fewer views.
 _LEAST_GAIN, _LEAST_GAIN_AROUND = 0.01, 0.03
 #: Number of the map's views per test view, and minimum and maximum number of test views.
 _VIEWS_A_TEST, _LEAST_TESTS, _MOST_TESTS = 4, 20, 60
@@ -61,7 +61,7 @@ class ViewPlan:
     ----------
     poses : (V, 4, 4) T_map_sensor in the order of selection, in the coordinates of the surface
         without its offset
-    held_out : (H, 4, 4) poses of test views, not in the map
+    held_out : (H, 4, 4) poses of test views, which are not part of the map
     floor : height of the lowest floor along `up`, metres; None without a floor
     candidates : number of candidate views
     covered : share of the surface visible from free space that the selected views show
@@ -77,7 +77,7 @@ class ViewPlan:
 def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewPlan:
     """Select poses in the free space of a surface whose views cover the surface.
 
-    The result is deterministic; it has no poses if there is no free space.
+    The result is deterministic. If there is no free space, it has no poses.
     """
     if not len(surface.points if surface.triangles is None else surface.triangles):
         return ViewPlan(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), None, 0, 0.0)
@@ -131,7 +131,7 @@ def level_axes(up: Floats) -> Floats:
 
 
 def camera_turns() -> Floats:
-    """Return R_level_camera (D, 3, 3) of a camera's views from a place."""
+    """Return R_level_camera (D, 3, 3) for each of a camera's views from a place."""
     turns = []
     for yaw in np.arange(_TURNS) * (2.0 * math.pi / _TURNS):
         for pitch in np.radians(_PITCHES):
@@ -143,7 +143,7 @@ def camera_turns() -> Floats:
 
 
 def _is_free(sight: Sight, p: ViewParameters, one_sided: bool) -> bool:
-    """Return whether a place has room for the sensor, surface beside it, and no ceiling below."""
+    """Return whether a place has room for the sensor, a surface beside it and no ceiling below."""
     if sight.nearest < p.clearance:
         return False
     if p.camera is None:
@@ -154,7 +154,7 @@ def _is_free(sight: Sight, p: ViewParameters, one_sided: bool) -> bool:
 def _select_front(
     free: list[tuple[Floats, Sight]], pieces: Surfels, lookout: Lookout, p: ViewParameters
 ) -> list[tuple[Floats, Sight]]:
-    """Return the places that see the front of surfaces."""
+    """Return the free places from which surfaces are seen from the front."""
     if pieces.one_sided:
         # a mesh that is inside out shows its back in all free space
         shares = np.array([sight.back.mean() for _, sight in free if sight.hit.mean() > _INDOORS])
@@ -163,7 +163,7 @@ def _select_front(
         if p.camera is None:
             free = [(place, sight) for place, sight in free if sight.back[0] <= _MOST_BACK_AROUND]
         return free
-    # only walls distinguish the sides of a surface: all places see floors from above
+    # only walls tell the sides of a surface apart, because all places see floors from above
     is_wall = (lookout.normals != 0).any(axis=1) & (np.abs(lookout.normals[:, 2]) < _WALL)
     votes = np.zeros((len(lookout.points), 2))
     for _, sight in free:
@@ -192,7 +192,7 @@ def _gain(
     elements: NDArray[np.int32], masks: NDArray[np.uint32], bit: int, counts: NDArray[np.uint8],
     worth: Floats,
 ) -> float:  # fmt: skip
-    """Return the gain of a view; it depends on the number of selected views of each element."""
+    """Return the gain of a view, which depends on how many selected views show each element."""
     gain, of_view = 0.0, np.uint32(1) << np.uint32(bit)
     for i in range(len(elements)):
         if masks[i] & of_view:
@@ -216,9 +216,9 @@ def _cover(
     sights: Sequence[Sight], views: Sequence[tuple[int, int]], universe: int, most: int,
     least_gain: float,
 ) -> tuple[list[int], float]:  # fmt: skip
-    """Select views greedily until gains are small; return their indices and the covered share.
+    """Select views greedily until gains are small; return their indices and the share covered.
 
-    Gains only decrease during the selection, so most of them need not be recomputed.
+    Gains can only decrease during the selection, so most need not be recomputed.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Rasterization of triangles and discs to the depth buffer of a pinhole camera.
+"""Rasterization of triangles and discs into the depth buffer of a pinhole camera.
 
     triangles or discs, camera (4,)  --draw_triangles, draw_discs-->  depth (H, W), item (H, W)
 
@@ -18,15 +18,15 @@ from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 NEAREST = 1e-3
 #: Maximum radius of a disc, pixels.
 _WIDEST_PX = 64.0
-#: Radius below which a disc is one pixel.
+#: Minimum radius of a disc, pixels; a smaller disc is drawn as one pixel.
 _SMALLEST_PX = 0.7
-#: Maximum distance along the ray between the plane of such a disc and its centre, in pixel widths
-#: beyond the radius. At larger distances, the pixel shows the centre.
+#: Maximum distance along the ray between the centre of such a disc and its plane, as the radius
+#: plus this many pixel widths. At larger distances, the pixel gets the depth of the centre.
 _GRAZING = 3.0
 
 
 def pinhole(camera: Intrinsics) -> Floats:
-    """Return the array fx, fy, cx, cy of a camera, for the kernels of this module."""
+    """Return fx, fy, cx, cy of a camera as an array for the kernels of this module."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
@@ -53,8 +53,8 @@ def draw_triangles(
     starts, ends : (B,) range of each visible block
     T : (4, 4) T_camera_points
     camera : result of `pinhole`
-    depth : (H, W) depth of the nearest triangle, metres, inf without a triangle; updated
-    back : (H, W) uint8, 1 if the nearest triangle is seen from behind
+    depth : (H, W) depth of the nearest triangle, metres; inf where there is none; updated
+    back : (H, W) uint8, 1 if the nearest triangle is seen from behind; updated
     """
     height, width = depth.shape
     fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]

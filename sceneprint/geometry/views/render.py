@@ -2,7 +2,7 @@
 
     surface, pose  --Renderer.view-->  depth (H, W) of a camera, or points (K, 3) of a scanner
 
-A scanner is rendered through the six faces of a cube around it.
+For a scanner, the six faces of a cube around it are rendered.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from sceneprint.geometry.views.samples import (
 )
 from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurface
 
-#: Radius of a point's disc, as a share of the spacing of points.
+#: Radius of the disc of a point, as a share of the spacing of points.
 _OVERLAP = 0.7
 #: Radius of the disc of a point without a plane, such as on a wire or a leaf, as the same share.
 _LONELY = 0.3
-#: Width of the cells for the neighbours of a normal, in spacings of points.
+#: Width of the cells whose points determine a normal, in spacings of points.
 _NEIGHBOURHOOD = 3.0
 #: Side of a block, as a share of the sensor's range.
 _BLOCK = 1.0 / 20.0
-#: Share of a view's pixels below which a side of the surface is hidden.
+#: Minimum share of a view's pixels that show a side of the surface; a smaller share is hidden.
 LEAST_SIDE = 0.3
 
 
@@ -61,11 +61,11 @@ def rays_of(camera: Intrinsics) -> Floats32:
 
 
 class Renderer:
-    """A renderer of a surface for a sensor."""
+    """Renders a surface as a sensor sees it."""
 
     def __init__(self, surface: ReferenceSurface, parameters: ViewParameters) -> None:
         self._p = p = parameters
-        # for read-only arrays, numba would compile the kernels again
+        # numba would compile the kernels a second time for read-only arrays
         points = np.require(surface.points, np.float32, ["C", "W"])
         side = p.farthest * _BLOCK
         if surface.triangles is None:
@@ -123,7 +123,7 @@ class Renderer:
         return np.concatenate(points)
 
     def _face(self, T_map_sensor: Floats, R: Floats) -> tuple[Floats32, NDArray[np.bool_]]:
-        """Return the depth of an image, inf if empty, and a mask of pixels seen from behind."""
+        """Return the depth of each pixel (inf if empty), and a mask of pixels that show a back."""
         turn = np.eye(4)
         turn[:3, :3] = R
         T, camera = inverse(T_map_sensor @ turn), pinhole(self._camera)

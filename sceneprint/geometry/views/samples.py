@@ -1,4 +1,4 @@
-"""Samples of a surface: points with normals, one per cell of a grid.
+"""Samples of a surface: points with normals, approximately one per cell of a grid.
 
 points (N, 3)  --average_cells-->  points (n, 3)
 points (n, 3)  --project_to_planes-->  points (n, 3), normals (n, 3), spacing (n,)
@@ -17,12 +17,12 @@ from sceneprint.geometry.kernel import kernel
 from sceneprint.geometry.surface.voxels import least_axis
 from sceneprint.types import Floats, Floats32, Ints32, Ints64, ReferenceSurface
 
-#: Maximum number of cells per axis: three indices must fit one key.
+#: Maximum number of cells per axis: three indices must fit into one key.
 _MOST_CELLS = 1 << 20
-#: Maximum ratio of the smallest to the middle variance of neighbours on a plane.
+#: Maximum ratio of the smallest to the middle variance of neighbours that lie on a plane.
 _FLAT = 0.15
-#: Half the maximum number of samples of a mesh. If a mesh has more triangles, only some of its
-#: single-sample triangles are sampled.
+#: Half the maximum number of samples of a mesh. If a mesh has more triangles, some of those that
+#: are small enough for a single sample are skipped.
 _MOST_SAMPLES = 2_000_000
 
 
@@ -49,12 +49,12 @@ def cell_keys(points: Floats32, cell: float) -> tuple[Ints64, Ints64]:
 
 
 def fitting_cell(points: Floats32, cell: float) -> float:
-    """Return the side of a cell, enlarged if keys cannot number all cells."""
+    """Return `cell`, the side of a cell, enlarged if keys could not number all cells."""
     return max(cell, float(np.ptp(points, axis=0).max(initial=0.0)) / (_MOST_CELLS - 4))
 
 
 def average_cells(points: Floats32, cell: float) -> Floats32:
-    """Return the mean of the points in each cell, (n, 3); a single point is returned unchanged.
+    """Return the mean of the points in each cell, (n, 3); the mean of a single point is exact.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def _fit_cells(
     points: Floats32, order: Ints64, starts: Ints64, keys: Ints64, shape: Ints64, flat: float,
     normals: Floats32, heights: Floats, crowds: Floats,
 ) -> None:  # fmt: skip
-    """Fit a plane n . x = h to the points around each cell; write n, h, and points per cell."""
+    """Fit a plane n . x = h to the points around each cell; write n, h and the points per cell."""
     m, values, axis = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for cell in range(len(keys)):
         first, second, n, cells = np.zeros(3), np.zeros((3, 3)), 0, 0
@@ -113,7 +113,7 @@ def _fit_cells(
 
 
 def project_to_planes(points: Floats32, cell: float) -> tuple[Floats32, Floats32, Floats32]:
-    """Project the points of a cloud onto the planes of their neighbours.
+    """Project each point of a cloud onto the plane of its neighbours.
 
     Drift makes the walls of a map thick; without projection, a rendered sensor would see the
     nearest points of the walls instead of their middle.
@@ -127,7 +127,7 @@ def project_to_planes(points: Floats32, cell: float) -> tuple[Floats32, Floats32
     -------
     moved : (N, 3); points whose neighbours lie on no plane are not moved
     normals : (N, 3) normals of either sign; 0 if the neighbours lie on no plane
-    spacing : (N,) spacing of the neighbours if they were evenly distributed on a plane, metres
+    spacing : (N,) spacing that the neighbours would have if evenly distributed on a plane, metres
     """
     cell = fitting_cell(points, cell)
     keys, shape = cell_keys(points, cell)
@@ -153,8 +153,8 @@ class Surfels:
     Parameters
     ----------
     points : (S, 3) float32, metres
-    normals : (S, 3) float32 unit vectors, towards the front of a mesh or either side of a cloud; 0
-        if unknown
+    normals : (S, 3) float32 unit vectors, towards the front of a mesh or to either side of a cloud;
+        0 if unknown
     cell : side of a cell, metres
     one_sided : whether normals point to the front
     """
@@ -192,7 +192,7 @@ def surfels(surface: ReferenceSurface, cell: float, most: int) -> Surfels:
 
 @kernel
 def _count_samples(points: Floats32, triangles: Ints32, step: float, every: int) -> float:
-    """Return an upper bound of the number of samples that `_write_samples` writes."""
+    """Return an upper bound on the number of samples that `_write_samples` writes."""
     total = 0.0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
@@ -209,7 +209,7 @@ def _write_samples(
     points: Floats32, triangles: Ints32, step: float, every: int, places: Floats32,
     normals: Floats32,
 ) -> int:  # fmt: skip
-    """Write points on a grid over each triangle (its centre if it is small), and its normal."""
+    """Write points on a grid over each triangle (the centre of a small one), and their normals."""
     n = 0
     for m in range(len(triangles)):
         a, b, c = points[triangles[m, 0]], points[triangles[m, 1]], points[triangles[m, 2]]
@@ -235,7 +235,7 @@ def _write_samples(
 
 
 def _sample_mesh(points: Floats32, triangles: Ints32, step: float) -> tuple[Floats32, Floats32]:
-    """Sample points and normals on a mesh at a spacing of `step`, or more for large meshes."""
+    """Sample points and normals on a mesh at a spacing of `step`, or wider for large meshes."""
     points = np.require(points, np.float32, ["C", "W"])
     triangles = np.require(triangles, np.int32, ["C", "W"])
     every = max(len(triangles) // _MOST_SAMPLES, 1)
@@ -249,7 +249,7 @@ def _sample_mesh(points: Floats32, triangles: Ints32, step: float) -> tuple[Floa
 
 @kernel
 def bounding_balls(points: Floats32, triangles: Ints32, middles: Floats32, reach: Floats32) -> None:
-    """Write the mean of each triangle's corners, and the maximum distance of a corner from it."""
+    """Write each triangle's centroid (m, 3), and its largest distance from a corner (m,)."""
     for m in range(len(triangles)):
         for axis in range(3):
             total = 0.0
