@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,6 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from sceneprint.types import Floats
 from sceneprint_client.poses import quaternion_of, rotation_of
 
 #: Offset of all stamps, seconds: a date, so that frames get `captured_at`.
@@ -26,7 +23,7 @@ K = (70.0, 71.0, 39.5, 29.5)
 WIDTH, HEIGHT = 80, 60
 
 
-def transform(x: float, y: float, z: float, *quaternion: float) -> Floats:
+def transform(x, y, z, *quaternion):
     T = np.eye(4)
     q = np.array(quaternion or (0, 0, 0, 1), float)
     T[:3, :3], T[:3, 3] = rotation_of(q / np.linalg.norm(q)), (x, y, z)
@@ -49,7 +46,7 @@ T_BASE_CAMERA = transform(0.21, -0.05, 0.93, -0.53, 0.49, -0.47, 0.51)
 class BagWriter:
     """Writer of ROS 1 or ROS 2 messages with rosbags."""
 
-    def __init__(self, writer: Any, *, ros1: bool) -> None:
+    def __init__(self, writer, *, ros1):
         self.ros1, self.writer = ros1, writer
         self.types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         if ros1:  # rosbags supports it only for ROS 2
@@ -61,7 +58,7 @@ class BagWriter:
         self.connections: dict[str, Any] = {}
         self.late = 0.0  #: seconds from the stamp of a message to its recording
 
-    def make(self, name: str, /, **fields: Any) -> Any:
+    def make(self, name, /, **fields):
         kind = self.types.types[name]
         if self.ros1 and name == "std_msgs/msg/Header":
             fields["seq"] = 0
@@ -69,22 +66,22 @@ class BagWriter:
             fields = {k.upper() if k in "dkrp" else k: v for k, v in fields.items()}
         return kind(**fields)
 
-    def header(self, t: float, frame: str) -> Any:
+    def header(self, t, frame):
         ns = round(t * 1e9)
         stamp = self.make(
             "builtin_interfaces/msg/Time", sec=START + ns // 10**9, nanosec=ns % 10**9
         )
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
-    def write(self, topic: str, name: str, t: float, message: Any) -> None:
+    def write(self, topic, name, t, message):
         self.raw(topic, name, t, self.serialized(name, message))
 
-    def serialized(self, name: str, message: Any) -> bytes:
+    def serialized(self, name, message):
         if self.ros1:
             return bytes(self.types.serialize_ros1(message, name))
         return bytes(self.types.serialize_cdr(message, name))
 
-    def raw(self, topic: str, name: str, t: float, data: bytes) -> None:
+    def raw(self, topic, name, t, data):
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
         self.writer.write(
@@ -93,10 +90,7 @@ class BagWriter:
 
     # Messages that robots record.
 
-    def transforms(
-        self, t: float, edges: dict[tuple[str, str], Floats], topic: str = "/tf", *,
-        length: float = 1.0,
-    ) -> None:  # fmt: skip
+    def transforms(self, t, edges, topic="/tf", *, length=1.0):
         """Write transforms with quaternions of a given length."""
         made = []
         for (parent, child), T in edges.items():
@@ -117,7 +111,7 @@ class BagWriter:
         message = self.make("tf2_msgs/msg/TFMessage", transforms=made)
         self.write(topic, "tf2_msgs/msg/TFMessage", t, message)
 
-    def odometry(self, t: float, T: Floats, topic: str = "/odom", child: str = "base_link") -> None:
+    def odometry(self, t, T, topic="/odom", child="base_link"):
         x, y, z, w = quaternion_of(T[:3, :3])
         tx, ty, tz = T[:3, 3]
         zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
@@ -140,8 +134,8 @@ class BagWriter:
         )
         self.write(topic, "nav_msgs/msg/Odometry", t, message)
 
-    def imu(self, t: float, acceleration: Any, turn: Any = (0, 0, 0), frame: str = "imu") -> None:
-        def vector(values: Any) -> Any:
+    def imu(self, t, acceleration, turn=(0, 0, 0), frame="imu"):
+        def vector(values):
             x, y, z = map(float, values)
             return self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
@@ -158,11 +152,19 @@ class BagWriter:
         self.write("/imu", "sensor_msgs/msg/Imu", t, message)
 
     def camera_info(
-        self, t: float, topic: str = "/camera/depth/camera_info", *, frame: str = "camera",
-        k: tuple[float, ...] = K, size: tuple[int, int] = (WIDTH, HEIGHT), d: Any = (),
-        model: str = "plumb_bob", p: tuple[float, ...] | None = None, **more: Any,
-    ) -> None:  # fmt: skip
-        def matrix(fx: float, fy: float, cx: float, cy: float) -> list[float]:
+        self,
+        t,
+        topic="/camera/depth/camera_info",
+        *,
+        frame="camera",
+        k=K,
+        size=(WIDTH, HEIGHT),
+        d=(),
+        model="plumb_bob",
+        p=None,
+        **more,
+    ):
+        def matrix(fx, fy, cx, cy):
             return [fx, 0, cx, 0, fy, cy, 0, 0, 1]
 
         projection = np.zeros((3, 4))
@@ -180,10 +182,16 @@ class BagWriter:
         self.write(topic, "sensor_msgs/msg/CameraInfo", t, message)
 
     def image(
-        self, t: float, samples: Any, encoding: str = "16UC1",
-        topic: str = "/camera/depth/image_raw", *, frame: str = "camera", padding: int = 0,
-        big: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        t,
+        samples,
+        encoding="16UC1",
+        topic="/camera/depth/image_raw",
+        *,
+        frame="camera",
+        padding=0,
+        big=False,
+    ):
         """Write an image, optionally with padded rows or big-endian samples."""
         kind = np.dtype({"32FC1": "f4", "rgb8": "u1"}.get(encoding, "u2"))
         data = np.asarray(samples).astype(kind.newbyteorder(">" if big else "<"))
@@ -198,10 +206,17 @@ class BagWriter:
         self.write(topic, "sensor_msgs/msg/Image", t, message)
 
     def compressed(
-        self, t: float, samples: Any, encoding: str = "16UC1",
-        topic: str = "/camera/depth/image_raw/compressedDepth", *, a: float = 0.0, b: float = 0.0,
-        form: str | None = None, frame: str = "camera",
-    ) -> None:  # fmt: skip
+        self,
+        t,
+        samples,
+        encoding="16UC1",
+        topic="/camera/depth/image_raw/compressedDepth",
+        *,
+        a=0.0,
+        b=0.0,
+        form=None,
+        frame="camera",
+    ):
         """Write depth of compressed_depth_image_transport: a header of 12 bytes and a PNG, or
         only the PNG in other forms.
         """
@@ -219,9 +234,8 @@ class BagWriter:
         self.write(topic, "sensor_msgs/msg/CompressedImage", t, message)
 
     def points(
-        self, t: float, rows: np.ndarray, topic: str = "/points", *, frame: str = "lidar",
-        height: int = 1, padding: int = 0, big: bool = False, **more: Any,
-    ) -> None:  # fmt: skip
+        self, t, rows, topic="/points", *, frame="lidar", height=1, padding=0, big=False, **more
+    ):
         """Write the points of a structured array with the layout of its fields."""
         numbers = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
         fields = [
@@ -244,10 +258,7 @@ class BagWriter:
         )  # fmt: skip
         self.write(topic, "sensor_msgs/msg/PointCloud2", t, message)
 
-    def livox_message(
-        self, t: float, points: np.ndarray, seconds: np.ndarray, tags: Any = 0, *,
-        package: str = LIVOX[1], frame: str = "livox_frame",
-    ) -> Any:  # fmt: skip
+    def livox_message(self, t, points, seconds, tags=0, *, package=LIVOX[1], frame="livox_frame"):
         """Return a CustomMsg of points (N, 3) with their times after the stamp."""
         rows = zip(points, seconds, np.broadcast_to(tags, len(points)), strict=True)
         return self.make(
@@ -264,16 +275,23 @@ class BagWriter:
         )  # fmt: skip
 
     def livox(
-        self, t: float, points: np.ndarray, seconds: np.ndarray, tags: Any = 0,
-        topic: str = "/livox/lidar", *, package: str = LIVOX[1], frame: str = "livox_frame",
-    ) -> None:  # fmt: skip
+        self,
+        t,
+        points,
+        seconds,
+        tags=0,
+        topic="/livox/lidar",
+        *,
+        package=LIVOX[1],
+        frame="livox_frame",
+    ):
         """Write a CustomMsg."""
         message = self.livox_message(t, points, seconds, tags, package=package, frame=frame)
         self.write(topic, f"{package}/msg/CustomMsg", t, message)
 
 
 @contextmanager
-def open_writer(folder: Path, container: str, name: str, compression: str) -> Iterator[BagWriter]:
+def open_writer(folder, container, name, compression):
     from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
     if container == "ros1":
@@ -291,17 +309,14 @@ def open_writer(folder: Path, container: str, name: str, compression: str) -> It
         yield BagWriter(writer, ros1=False)
 
 
-def path_of(folder: Path, container: str, name: str) -> Path:
+def path_of(folder, container, name):
     """Return the path of a bag: the file of an MCAP, or the folder of a rosbag2 database."""
     if container == "ros1":
         return folder / f"{name}.bag"
     return folder / name / f"{name}.mcap" if container == "mcap" else folder / name
 
 
-def write(
-    folder: Path, fill: Callable[[BagWriter], None], container: str = "mcap", name: str = "run",
-    compression: str = "",
-) -> Path:  # fmt: skip
+def write(folder, fill, container="mcap", name="run", compression=""):
     """Write a bag with the messages of `fill`."""
     folder.mkdir(parents=True, exist_ok=True)
     with open_writer(folder, container, name, compression) as writer:
@@ -312,14 +327,14 @@ def write(
 class MessageWriter(BagWriter):
     """Writer that serialises and decodes messages without a bag."""
 
-    def __init__(self, *, ros1: bool = False) -> None:
+    def __init__(self, *, ros1=False):
         super().__init__(None, ros1=ros1)
         self.written: list[tuple[str, str, Any]] = []  #: topic, type, message
 
-    def raw(self, topic: str, name: str, t: float, data: bytes) -> None:
+    def raw(self, topic, name, t, data):
         read = self.types.deserialize_ros1 if self.ros1 else self.types.deserialize_cdr
         self.written.append((topic, name, read(data, name)))
 
-    def last(self) -> Any:
+    def last(self):
         """Return the last message."""
         return self.written[-1][2]

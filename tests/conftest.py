@@ -11,20 +11,19 @@ import subprocess
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Generator, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
 from importlib import util
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import hypothesis
 import numpy as np
 import pytest
-from sqlalchemy import Connection, NullPool, create_engine
+from sqlalchemy import NullPool, create_engine
 from xdist.scheduler import LoadFileScheduling
 
 from benchmarks.postgres import NoServer, Server
@@ -42,7 +41,7 @@ from sceneprint.geometry.signature.mixture import Mixture
 from sceneprint.geometry.signature.pair_features import Projection, TableLayout
 from sceneprint.geometry.signature.segmentation import HierarchyParameters, SegmentationParameters
 from sceneprint.models import Model, ModelParameters
-from sceneprint.pipeline import Signer, open_signer
+from sceneprint.pipeline import open_signer
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.tables import metadata
@@ -88,11 +87,9 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )  # fmt: skip
 hypothesis.settings.load_profile("suite")
-#: Function that creates a folder by name by calling a function, once per run.
-Once = Callable[[str, Callable[[Path], object]], Path]
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     """Start the database server of the run, if there is one; see tests/on_postgres."""
     # Also for child processes: automatic jobs would change counts.
     os.environ.setdefault("SCENEPRINT_BUILD_SURFACES", "on_request")
@@ -117,7 +114,7 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["SCENEPRINT_TEST_SERVER"] = server.url("")
 
 
-def add_distributions(folder: Path) -> None:
+def add_distributions(folder):
     """Add the entry points of the lab and the viewers to this process and its children.
 
     Their metadata is written to `folder`.
@@ -137,7 +134,7 @@ def add_distributions(folder: Path) -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join(map(str, paths))
 
 
-def unit_of(nodeid: str) -> str:
+def unit_of(nodeid):
     """Return the unit whose tests run in one process: of TOGETHER, or a file."""
     file = nodeid.partition("::")[0]
     folder, _, name = file.removeprefix("tests/").partition("/")
@@ -147,12 +144,12 @@ def unit_of(nodeid: str) -> str:
 class UnitScheduling(LoadFileScheduling):
     """Hands out whole files, and whole units of TOGETHER."""
 
-    def _split_scope(self, nodeid: str) -> str:
+    def _split_scope(self, nodeid):
         return unit_of(nodeid)
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> UnitScheduling | None:
+def pytest_xdist_make_scheduler(config, log):
     """Keep folders with a shared service together, with `--dist loadfile`."""
     return UnitScheduling(config, log) if config.getoption("dist") == "loadfile" else None
 
@@ -161,7 +158,7 @@ _folder = ExitStack()
 
 
 @pytest.fixture(scope="session")
-def folder_stack() -> ExitStack:
+def folder_stack():
     """What is entered here ends with the last test of the unit: services would run on beside the
     tests of others, and take their time.
     """
@@ -169,14 +166,14 @@ def folder_stack() -> ExitStack:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+def pytest_runtest_teardown(item, nextitem):
     """End what lasts as long as a unit."""
     if nextitem is None or unit_of(nextitem.nodeid) != unit_of(item.nodeid):
         _folder.close()
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_collection() -> Generator[None, object, object]:
+def pytest_collection():
     """Exclude objects from before the collection from garbage collection."""
     gc.disable()
     found = yield
@@ -185,12 +182,12 @@ def pytest_collection() -> Generator[None, object, object]:
     return found
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Put long folders and files first."""
     names = (*dict.fromkeys(TOGETHER.values()), *LONG)
     places = {name: place for place, name in enumerate(names)}
 
-    def place(item: pytest.Item) -> int:
+    def place(item):
         unit = unit_of(item.nodeid)
         return places.get(unit, places.get(item.path.name, len(places)))
 
@@ -215,7 +212,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _databases_go(request: pytest.FixtureRequest) -> Iterator[None]:
+def _databases_go(request):
     """On PostgreSQL, drop the databases of a test's folders after the test."""
     if not ON_POSTGRES or "tmp_path" not in request.fixturenames:
         yield
@@ -232,13 +229,13 @@ def _databases_go(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data_folder(tmp_path_factory):
     """Return the folder of the service at `service_url`."""
     return tmp_path_factory.mktemp("service")
 
 
 @pytest.fixture(scope="session")
-def service_url(data_folder: Path, folder_stack: ExitStack) -> str:
+def service_url(data_folder, folder_stack):
     """Start one service with one worker for all clients of it; each test uses maps of its own."""
     with pytest.MonkeyPatch.context() as environment:
         environment.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", f"{2 << 20}")
@@ -246,20 +243,18 @@ def service_url(data_folder: Path, folder_stack: ExitStack) -> str:
 
 
 @pytest.fixture(scope="session")
-def until() -> Callable[..., Any]:
+def until():
     """The function `benchmarks.waiting.until`, which waits for a true value of a condition."""
     return wait_until
 
 
 @pytest.fixture(scope="session")
-def once(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Callable[[str, Callable[[Path], object]], Path]:
+def once(tmp_path_factory):
     """A function that creates a read-only folder once for all processes of the run."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
-    def folder(name: str, make: Callable[[Path], object]) -> Path:
+    def folder(name, make):
         with (shared / f"{name}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             made, begun = shared / name, shared / f"{name}.begun"
@@ -272,13 +267,13 @@ def once(
 
 
 @pytest.fixture(scope="session")
-def building(once: Once) -> Path:
+def building(once):
     """A read-only room of the demo with 30 map frames and 20 query frames of a walk."""
     return once("building", lambda folder: list(write_building(folder, 1)))
 
 
 @pytest.fixture(scope="session")
-def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def postgres(tmp_path_factory):
     """A PostgreSQL server of this process; its `TEMPLATE` has the schema and no rows."""
     try:
         server = Server(tmp_path_factory.mktemp("postgres"))
@@ -294,13 +289,13 @@ def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.fixture(scope="session")
-def _clean(postgres: Server) -> list[str]:
+def _clean(postgres):
     """Clean databases to reuse, since cleaning is twenty times as fast as creating."""
     return []
 
 
 @pytest.fixture
-def postgres_url(postgres: Server, _clean: list[str]) -> Iterator[str]:
+def postgres_url(postgres, _clean):
     """URL of an empty database with the schema of this version."""
     if _clean:
         name = _clean.pop()
@@ -338,11 +333,11 @@ SELECT md5(concat(
 
 
 @cache
-def _shape_of_new(server: Server) -> list[tuple[object, ...]]:
+def _shape_of_new(server):
     return server.execute(_SHAPE, TEMPLATE)
 
 
-def _cleaned(server: Server, name: str) -> bool:
+def _cleaned(server, name):
     """Clean a database; return False if more than its rows was changed."""
     import psycopg
 
@@ -361,11 +356,11 @@ def _cleaned(server: Server, name: str) -> bool:
 
 
 @pytest.fixture(scope="session")
-def truth() -> Callable[[Path], AbstractContextManager[Connection]]:
+def truth():
     """A function that opens a transaction on the database of a data folder, bypassing our code."""
 
     @contextmanager
-    def opened(folder: Path) -> Iterator[Connection]:
+    def opened(folder):
         url = Settings(data_dir=folder, database_url=None).database
         patience = {"timeout": 30} if url.startswith("sqlite") else {}
         engine = create_engine(url, poolclass=NullPool, connect_args=patience)
@@ -376,12 +371,10 @@ def truth() -> Callable[[Path], AbstractContextManager[Connection]]:
 
 
 @pytest.fixture(scope="session")
-def rows(
-    truth: Callable[[Path], AbstractContextManager[Connection]],
-) -> Callable[[Path, str], list[tuple[Any, ...]]]:
+def rows(truth):
     """A function that returns the rows of a query on the database of a data folder."""
 
-    def ask(folder: Path, asked: str) -> list[tuple[Any, ...]]:
+    def ask(folder, asked):
         with truth(folder) as connection:
             return [tuple(row) for row in connection.exec_driver_sql(asked)]
 
@@ -389,14 +382,14 @@ def rows(
 
 
 @pytest.fixture(scope="session")
-def object_server() -> Iterator[ObjectServer]:
+def object_server():
     """An S3 server of this process."""
     with ObjectServer() as server:
         yield server
 
 
 @pytest.fixture
-def bucket(object_server: ObjectServer, monkeypatch: pytest.MonkeyPatch) -> str:
+def bucket(object_server, monkeypatch):
     """URL of a new bucket, with its server in the environment."""
     for name, value in object_server.env.items():
         monkeypatch.setenv(name, value)
@@ -404,7 +397,7 @@ def bucket(object_server: ObjectServer, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def store_url(request, tmp_path):
     """URL of a new database; the test runs with each of the two kinds."""
     if request.param == "postgresql":
         return str(request.getfixturevalue("postgres_url"))
@@ -412,7 +405,7 @@ def store_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 
 @pytest.fixture(scope="session")
-def data_root() -> Path:
+def data_root():
     """Folder of the real recordings; tests that need them are skipped without it."""
     root = Path(os.environ.get("SCENEPRINT_DATA", ROOT.parent / "shared" / "data"))
     if not root.is_dir():
@@ -421,7 +414,7 @@ def data_root() -> Path:
 
 
 @pytest.fixture(scope="session")
-def ros() -> SimpleNamespace:
+def ros():
     """Functions that write ROS messages and bags."""
     spec = util.spec_from_file_location("bag_writer", ROOT / "tests" / "bag_writer.py")
     assert spec is not None
@@ -436,7 +429,7 @@ def ros() -> SimpleNamespace:
 
 
 @pytest.fixture(scope="session")
-def with_open3d() -> None:
+def with_open3d():
     """Skip a test if Open3D's system libraries are missing."""
     done = subprocess.run([sys.executable, "-c", "import open3d"], capture_output=True, text=True)
     if done.returncode != 0:
@@ -444,7 +437,7 @@ def with_open3d() -> None:
 
 
 @pytest.fixture(scope="session")
-def small_model() -> Model:
+def small_model():
     """A model with eight components and two levels, which is fast to load."""
     rng = np.random.default_rng(5)
     bins = PatchDescriptorParameters().dimension
@@ -467,7 +460,7 @@ def small_model() -> Model:
 
 
 @pytest.fixture(scope="session")
-def small_whitened(small_model: Model) -> Model:
+def small_whitened(small_model):
     """The small model with whitened signatures of 24 bytes."""
     rng = np.random.default_rng(6)
     basis = rng.integers(-127, 128, (24, small_model.level_length)).astype(np.int8)
@@ -476,18 +469,16 @@ def small_whitened(small_model: Model) -> Model:
 
 
 @pytest.fixture(scope="session")
-def small_signer(small_model: Model) -> Signer:
+def small_signer(small_model):
     return open_signer(small_model, cached=False)
 
 
 @pytest.fixture(scope="session")
-def room_views(once: Once) -> Callable[..., SynthRoom]:
+def room_views(once):
     """The function `synthesise_room` with noise, cached for all processes of the run."""
 
-    def views(
-        seed: int, index: int, n: int, *, along_path: bool = False, step: int = 1
-    ) -> SynthRoom:
-        def make(folder: Path) -> None:
+    def views(seed, index, n, *, along_path=False, step=1):
+        def make(folder):
             folder.mkdir()
             frames = synthesise_room(seed, index, n, along_path=along_path, step=step).frames
             np.save(folder / "depth.npy", [frame.depth for frame in frames])
@@ -505,7 +496,7 @@ def room_views(once: Once) -> Callable[..., SynthRoom]:
     return views
 
 
-def halved(frame: DepthFrame) -> DepthFrame:
+def halved(frame):
     """Return a frame with every second sample of each row and column."""
     k = frame.intrinsics
     lens = Intrinsics(k.width // 2, k.height // 2, k.fx / 2, k.fy / 2, k.cx / 2, k.cy / 2)
@@ -513,7 +504,7 @@ def halved(frame: DepthFrame) -> DepthFrame:
 
 
 @pytest.fixture(scope="session")
-def room_frames(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
+def room_frames(room_views):
     """Three views of each of two synthetic rooms."""
     rooms = [room_views(21, i, 3) for i in range(2)]
     return tuple(
@@ -524,13 +515,11 @@ def room_frames(room_views: Callable[..., SynthRoom]) -> tuple[DepthFrame, ...]:
 
 
 @pytest.fixture(scope="session")
-def small_image(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Callable[[DepthFrame, int, int], tuple[bytes, CameraIntrinsics]]:
+def small_image(tmp_path_factory):
     """A function that returns every fourth sample of a frame as an image, with an offset."""
     path = tmp_path_factory.mktemp("png") / "small.png"
 
-    def make(frame: DepthFrame, y: int, x: int) -> tuple[bytes, CameraIntrinsics]:
+    def make(frame, y, x):
         k = frame.intrinsics
         write_depth_png(path, np.ascontiguousarray(frame.depth[y::4, x::4]), 1000.0)
         camera = CameraIntrinsics(
@@ -549,10 +538,10 @@ class Said(NamedTuple):
 
 
 @pytest.fixture
-def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
+def run_command(capsys):
     """A function that runs a command in this process and checks its exit code."""
 
-    def run(*arguments: object, expect: int = 0) -> Said:
+    def run(*arguments, expect=0):
         capsys.readouterr()
         code = main([str(one) for one in arguments])
         said = Said(*capsys.readouterr())
@@ -563,7 +552,7 @@ def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., Said]:
 
 
 @pytest.fixture(scope="session")
-def room_mesh() -> bytes:
+def room_mesh():
     """Mesh of a furnished room as a PLY file, in metres, z up."""
     room = make_room(np.random.default_rng(3))
     return write_ply(room.vertices, faces=room.faces)

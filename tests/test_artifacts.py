@@ -1,12 +1,9 @@
 """Tests of geometry artifacts: content, precision and damage."""
 
-from __future__ import annotations
-
 import struct
 import tracemalloc
 import zlib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,31 +17,31 @@ from sceneprint.formats.artifact import (
     unpack_image,
     write_geometry,
 )
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Geometry, Intrinsics, Patches, Surface
+from sceneprint.types import Geometry, Intrinsics, Patches, Surface
 
 #: Bytes of magic, schema and checksum; and of sizes, camera, scale and model id.
 HEAD, BODY = 11, 8 + 5 * 8 + 32
 
 
 @pytest.fixture(scope="module")
-def paper() -> Model:
+def paper():
     return read_model("paper")
 
 
 @pytest.fixture(scope="module")
-def geometries(paper: Model, room_frames: tuple[DepthFrame, ...]) -> list[Geometry]:
+def geometries(paper, room_frames):
     return [geometry_of(see(frame, paper.parameters), paper) for frame in room_frames]
 
 
 @pytest.fixture(scope="module")
-def data(geometries: list[Geometry]) -> bytes:
+def data(geometries):
     return write_geometry(geometries[0])
 
 
-def made(height: int, width: int, patches: int, depth: float = 2.0, length: int = 16) -> Geometry:
+def made(height, width, patches, depth=2.0, length=16):
     """An artifact of a flat wall, or of nothing seen."""
     k = Intrinsics(width, height, 60.0, 60.0, width / 2, height / 2)
     y, x = np.mgrid[:height, :width]
@@ -67,14 +64,14 @@ def made(height: int, width: int, patches: int, depth: float = 2.0, length: int 
     return Geometry(surface, rows, descriptors, "5a" * 32)
 
 
-def sealed(data: bytes, at: int, field: bytes) -> bytes:
+def sealed(data, at, field):
     """The artifact with a field of its body changed, and the checksum that fits."""
     body = bytearray(data[HEAD:])
     body[at : at + len(field)] = field
     return data[: HEAD - 4] + struct.pack("<I", zlib.crc32(body)) + bytes(body)
 
 
-def assert_equal_patches(a: Patches, b: Patches) -> None:
+def assert_equal_patches(a, b):
     for name in ("means", "normals", "areas", "coherences"):
         one, other = getattr(a, name), getattr(b, name)
         assert one.dtype == other.dtype == np.float64
@@ -83,7 +80,7 @@ def assert_equal_patches(a: Patches, b: Patches) -> None:
     np.testing.assert_array_equal(a.sizes, b.sizes)
 
 
-def test_coarse_normals_of_a_camera_are_unpacked_with_their_number() -> None:
+def test_coarse_normals_of_a_camera_are_unpacked_with_their_number():
     surface = made(4, 5, 0).surface
     tilted = np.broadcast_to(np.float32([0.6, 0.0, -0.8]), surface.normals.shape)
     packed, scale = pack_image(replace(surface, normals=tilted), 255)
@@ -92,7 +89,7 @@ def test_coarse_normals_of_a_camera_are_unpacked_with_their_number() -> None:
     np.testing.assert_allclose(back.normals, tilted, atol=0.01)
 
 
-def test_round_trip(geometries: list[Geometry]) -> None:
+def test_round_trip(geometries):
     for geometry in geometries:
         read, was = read_geometry(write_geometry(geometry)), geometry.surface
         seen, valid = read.surface, was.valid
@@ -119,13 +116,13 @@ def test_round_trip(geometries: list[Geometry]) -> None:
         assert_equal_patches(read.patches, geometry.patches)
 
 
-def test_descriptors_are_a_view_that_cannot_be_written(data: bytes) -> None:
+def test_descriptors_are_a_view_that_cannot_be_written(data):
     descriptors = read_geometry(data).descriptors
     with pytest.raises(ValueError, match="read-only"):
         descriptors[0, 0] = 1
 
 
-def test_normals_of_every_direction_come_back() -> None:
+def test_normals_of_every_direction_come_back():
     geometry = made(60, 80, 1)
     normals = np.random.default_rng(1).normal(size=(60, 80, 3))
     normals[0, :6] = [[0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0], [1, 1, 0], [-1, 1, 1e-9]]
@@ -136,7 +133,7 @@ def test_normals_of_every_direction_come_back() -> None:
     assert np.degrees(off.max()) < 0.005
 
 
-def test_the_same_bytes_again(geometries: list[Geometry]) -> None:
+def test_the_same_bytes_again(geometries):
     assert len({write_geometry(geometry) for geometry in geometries}) == len(geometries)
     for geometry in geometries:
         once = write_geometry(geometry)
@@ -145,7 +142,7 @@ def test_the_same_bytes_again(geometries: list[Geometry]) -> None:
         assert write_geometry(read_geometry(once)) == once
 
 
-def test_size_of_a_kinect_frame(geometries: list[Geometry]) -> None:
+def test_size_of_a_kinect_frame(geometries):
     for geometry in geometries:
         data = write_geometry(geometry)
         k, n = geometry.surface.camera, len(geometry.patches)
@@ -154,7 +151,7 @@ def test_size_of_a_kinect_frame(geometries: list[Geometry]) -> None:
         assert len(data) <= 262_144
 
 
-def test_the_layout_is_what_its_schema_says() -> None:
+def test_the_layout_is_what_its_schema_says():
     assert (MAGIC, SCHEMA_VERSION) == (b"SPGEO", 1)
     geometry = made(2, 3, 1, length=4)
     geometry.surface.valid[0, 0] = False
@@ -179,7 +176,7 @@ def test_the_layout_is_what_its_schema_says() -> None:
     assert data[-4:] == geometry.descriptors.tobytes()
 
 
-def test_where_nothing_was_seen() -> None:
+def test_where_nothing_was_seen():
     for height, width, patches, length in ((3, 4, 0, 16), (1, 1, 0, 0), (3, 4, 2, 16)):
         geometry = made(height, width, patches, 0.0, length)
         once = write_geometry(geometry)
@@ -194,7 +191,7 @@ def test_where_nothing_was_seen() -> None:
         assert write_geometry(read) == once
 
 
-def test_depths_far_apart_do_not_become_missing() -> None:
+def test_depths_far_apart_do_not_become_missing():
     # a sample 100,000 times as far as the nearest: less than one step, but still seen
     geometry = made(2, 2, 0, 0.3)
     geometry.surface.points[0, 0, 2] = 30_000.0
@@ -204,7 +201,7 @@ def test_depths_far_apart_do_not_become_missing() -> None:
     np.testing.assert_allclose(read.points[1], geometry.surface.points[1], rtol=1e-6)
 
 
-def test_every_damaged_byte_is_noticed(data: bytes) -> None:
+def test_every_damaged_byte_is_noticed(data):
     rng = np.random.default_rng(2)
     some = rng.integers(HEAD + BODY, len(data), 60).tolist()
     for at in [*range(HEAD + BODY), *some, len(data) - 1]:
@@ -214,7 +211,7 @@ def test_every_damaged_byte_is_noticed(data: bytes) -> None:
             read_geometry(bytes(damaged))
 
 
-def test_what_is_no_artifact(data: bytes) -> None:
+def test_what_is_no_artifact(data):
     other_schema = data[:5] + struct.pack("<H", 4) + data[7:]
     cases = {
         "bytes are not a geometry artifact": [
@@ -231,7 +228,7 @@ def test_what_is_no_artifact(data: bytes) -> None:
             assert isinstance(error.value, SceneprintError)
 
 
-def test_sizes_that_the_bytes_do_not_hold(data: bytes) -> None:
+def test_sizes_that_the_bytes_do_not_hold(data):
     tracemalloc.start()
     try:
         for at in (0, 2, 4, 6):  # width, height, patches, bytes of a descriptor
@@ -246,7 +243,7 @@ def test_sizes_that_the_bytes_do_not_hold(data: bytes) -> None:
         tracemalloc.stop()
 
 
-def test_a_camera_that_is_none() -> None:
+def test_a_camera_that_is_none():
     data = write_geometry(made(2, 3, 0, length=0))
     for at, value in ((8, 0.0), (8, float("nan")), (16, -1.0), (24, float("inf")), (32, 1e9)):
         with pytest.raises(UnreadableGeometry, match="has an invalid camera"):
@@ -257,14 +254,14 @@ def test_a_camera_that_is_none() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e-12, 1e3])
-def test_a_scale_that_is_none(scale: float) -> None:
+def test_a_scale_that_is_none(scale):
     data = write_geometry(made(2, 3, 0, length=0))
     with pytest.raises(UnreadableGeometry, match="invalid depth scale"):
         read_geometry(sealed(data, 40, struct.pack("<d", scale)))
 
 
 @pytest.mark.parametrize("at", [0, 3, 6, 7])  # mean, normal, area, coherence
-def test_patches_that_are_none(at: int, data: bytes) -> None:
+def test_patches_that_are_none(at, data):
     """A checksum can be made by anybody; what validation would make NaN of is refused."""
     first = BODY + 6 * 160 * 120
     allowed = {3: [], 6: [0.0, 1.0], 7: [0.0, 1.0]}.get(at, [0.0, 1.0, -1.0])
@@ -280,7 +277,7 @@ def test_patches_that_are_none(at: int, data: bytes) -> None:
         read_geometry(signalling)
 
 
-def test_more_than_a_model_makes() -> None:
+def test_more_than_a_model_makes():
     most = write_geometry(made(2, 3, 4096, length=1))
     assert len(read_geometry(most).patches) == 4096
     for patches, length in ((4097, 1), (1, 1025)):
@@ -288,7 +285,7 @@ def test_more_than_a_model_makes() -> None:
             read_geometry(write_geometry(made(2, 3, patches, length=length)))
 
 
-def test_points_stay_finite_whatever_the_bytes() -> None:
+def test_points_stay_finite_whatever_the_bytes():
     data = bytearray(write_geometry(made(4, 5, 0, length=0)))
     for number, value in enumerate((1e-3, 1e-3, 1e7, -1e7, 1 / (1e6 * 65535))):
         data[HEAD + 8 + 8 * number : HEAD + 16 + 8 * number] = struct.pack("<d", value)
@@ -299,7 +296,7 @@ def test_points_stay_finite_whatever_the_bytes() -> None:
         assert np.isfinite(array).all()
 
 
-def test_artifacts_read_from_a_file(geometries: list[Geometry], tmp_path: Path) -> None:
+def test_artifacts_read_from_a_file(geometries, tmp_path):
     path = tmp_path / "a.geometry"
     path.write_bytes(write_geometry(geometries[1]))
     read = read_geometry(path.read_bytes())

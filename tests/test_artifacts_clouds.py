@@ -1,7 +1,5 @@
 """Tests of geometry artifacts of clouds: content, precision and errors."""
 
-from __future__ import annotations
-
 import math
 import struct
 import tracemalloc
@@ -15,9 +13,6 @@ from sceneprint.errors import UnreadableGeometry
 from sceneprint.formats.artifact import MAXIMUM_POINTS, read_geometry, write_geometry
 from sceneprint.geometry.surface.range_image import directions
 from sceneprint.types import (
-    Camera,
-    Floats,
-    Floats32,
     Geometry,
     Intrinsics,
     Patches,
@@ -30,12 +25,11 @@ HEAD, BODY = 11, 10 + 4 * 8 + 32
 SPHERE = Sphere(90, 40, math.radians(4.0), 0.3, math.radians(80.0), 1)
 
 
-def unit(v: Floats) -> Floats32:
-    result: Floats32 = (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
-    return result
+def unit(v):
+    return (v / np.linalg.norm(v, axis=-1, keepdims=True)).astype(np.float32)
 
 
-def holding(points: Floats, valid: np.ndarray, camera: Camera | None, patches: int = 3) -> Geometry:
+def holding(points, valid, camera, patches=3):
     """An artifact of these points, with normals of every direction."""
     rng = np.random.default_rng(1)
     shown = valid[..., None]
@@ -49,7 +43,7 @@ def holding(points: Floats, valid: np.ndarray, camera: Camera | None, patches: i
     return Geometry(surface, rows, rng.integers(0, 256, (patches, 16), np.uint8), "5a" * 32)
 
 
-def scan(camera: Sphere = SPHERE, nearest: float = 0.5, farthest: float = 80.0) -> Geometry:
+def scan(camera=SPHERE, nearest=0.5, farthest=80.0):
     """An artifact of a sphere whose ranges are spread evenly over their magnitudes."""
     rng = np.random.default_rng(2)
     shape = camera.height, camera.width
@@ -57,7 +51,7 @@ def scan(camera: Sphere = SPHERE, nearest: float = 0.5, farthest: float = 80.0) 
     return holding(directions(camera) * r[..., None], rng.random(shape) < 0.8, camera)
 
 
-def spinning(count: int = 200) -> Geometry:
+def spinning(count=200):
     """A scan that keeps points spread over what it shows as well."""
     was = scan()
     shown = was.surface
@@ -68,19 +62,19 @@ def spinning(count: int = 200) -> Geometry:
     return replace(was, surface=replace(shown, spread=spread))
 
 
-def fused(count: int, span: float = 20.0, far: float = 0.0) -> Geometry:
+def fused(count, span=20.0, far=0.0):
     points = np.random.default_rng(3).uniform(-span / 2, span / 2, (1, count, 3)) + far
     return holding(points, np.ones((1, count), np.bool_), None)
 
 
-def sealed(data: bytes, at: int, field: bytes) -> bytes:
+def sealed(data, at, field):
     """The artifact with a field of its body changed, and the checksum that fits."""
     body = bytearray(data[HEAD:])
     body[at : at + len(field)] = field
     return data[: HEAD - 4] + struct.pack("<I", zlib.crc32(body)) + bytes(body)
 
 
-def assert_same(read: Geometry, was: Geometry, half_a_step: float) -> None:
+def assert_same(read, was, half_a_step):
     """What is not of the surface is the same, and normals are to 0.005 degrees."""
     np.testing.assert_array_equal(read.surface.valid, was.surface.valid)
     gap = np.abs(read.surface.points - was.surface.points).max()
@@ -95,7 +89,7 @@ def assert_same(read: Geometry, was: Geometry, half_a_step: float) -> None:
 
 
 @pytest.mark.parametrize("pole", [0, 1, 2])
-def test_a_scan_comes_back(pole: int) -> None:
+def test_a_scan_comes_back(pole):
     was = scan(Sphere(90, 40, math.radians(4.0), 0.3, math.radians(80.0), pole))
     data = write_geometry(was)
     read = read_geometry(data)
@@ -108,7 +102,7 @@ def test_a_scan_comes_back(pole: int) -> None:
     assert write_geometry(read) == data
 
 
-def test_a_scan_comes_back_with_its_points() -> None:
+def test_a_scan_comes_back_with_its_points():
     was = spinning()
     data = write_geometry(was)
     assert data[5:7] == b"\3\0"
@@ -135,7 +129,7 @@ def test_a_scan_comes_back_with_its_points() -> None:
     assert old.fitted is old
 
 
-def test_normals_on_the_edge_of_the_octahedron_pack_alike() -> None:
+def test_normals_on_the_edge_of_the_octahedron_pack_alike():
     was = spinning(6)
     assert was.surface.spread is not None
     axes = np.concatenate([np.eye(3), -np.eye(3)])[None].astype(np.float32)
@@ -148,7 +142,7 @@ def test_normals_on_the_edge_of_the_octahedron_pack_alike() -> None:
     assert np.degrees(np.arccos(np.minimum(turned, 1.0))).max() < 0.5
 
 
-def test_points_that_no_scan_has() -> None:
+def test_points_that_no_scan_has():
     data, at = write_geometry(spinning()), BODY
     nan, endless = math.nan, math.inf
     for field, values in ((0, (nan, endless, 1e7)), (2, (nan, -endless)), (3, (nan, 0.0, 17.0))):
@@ -172,7 +166,7 @@ def test_points_that_no_scan_has() -> None:
         read_geometry(sealed(data, 8, bytes([2, 0])))
 
 
-def test_areas_of_a_scan() -> None:
+def test_areas_of_a_scan():
     """Of a sphere seen from its middle they add up to its own, but for the caps left out."""
     camera = Sphere(180, 89, math.radians(2.0), 0.0, math.radians(88.0))
     geometry = holding(directions(camera) * 3.0, np.ones((89, 180), np.bool_), camera)
@@ -182,7 +176,7 @@ def test_areas_of_a_scan() -> None:
     assert float(read.surface.areas.sum()) == pytest.approx(band, rel=1e-3)
 
 
-def test_points_in_no_order_come_back() -> None:
+def test_points_in_no_order_come_back():
     for count, span, far in ((1, 1.0, 0.0), (500, 20.0, 0.0), (500, 60.0, 5000.0), (9, 0.0, 2.0)):
         was = fused(count, span, far)
         data = write_geometry(was)
@@ -193,7 +187,7 @@ def test_points_in_no_order_come_back() -> None:
         assert write_geometry(read_geometry(data)) == data
 
 
-def test_no_more_points_than_pixels_are_kept() -> None:
+def test_no_more_points_than_pixels_are_kept():
     rng = np.random.default_rng(4)
     flat = np.concatenate([rng.uniform(-9, 9, (1, 60_000, 2)), np.zeros((1, 60_000, 1))], axis=2)
     data = write_geometry(holding(flat, np.ones((1, 60_000), np.bool_), None))
@@ -205,7 +199,7 @@ def test_no_more_points_than_pixels_are_kept() -> None:
     assert filled.min() > 5
 
 
-def test_every_damaged_byte_is_noticed() -> None:
+def test_every_damaged_byte_is_noticed():
     rng = np.random.default_rng(5)
     for data in (write_geometry(one) for one in (scan(), fused(300), spinning())):
         some = rng.integers(HEAD + BODY, len(data), 40).tolist()
@@ -219,7 +213,7 @@ def test_every_damaged_byte_is_noticed() -> None:
                 read_geometry(data[:length])
 
 
-def test_numbers_that_no_cloud_has() -> None:
+def test_numbers_that_no_cloud_has():
     nan, endless = math.nan, math.inf
     of_scan, of_points = write_geometry(scan()), write_geometry(fused(300))
     for at, values, match in (
@@ -244,7 +238,7 @@ def test_numbers_that_no_cloud_has() -> None:
         read_geometry(sealed(of_points, 0, struct.pack("<HH", 150, 2)))
 
 
-def test_sizes_that_the_bytes_do_not_hold() -> None:
+def test_sizes_that_the_bytes_do_not_hold():
     for data in (write_geometry(one) for one in (scan(), fused(300), spinning())):
         tracemalloc.start()
         try:
@@ -258,7 +252,7 @@ def test_sizes_that_the_bytes_do_not_hold() -> None:
             tracemalloc.stop()
 
 
-def test_any_numbers_make_finite_points() -> None:
+def test_any_numbers_make_finite_points():
     """What is read, whatever its bytes, can be validated with."""
     rng = np.random.default_rng(6)
     read = 0
@@ -277,7 +271,7 @@ def test_any_numbers_make_finite_points() -> None:
     assert read > 20
 
 
-def test_a_depth_image_keeps_its_schema() -> None:
+def test_a_depth_image_keeps_its_schema():
     camera = Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.0)
     y, x = np.mgrid[:3, :4]
     points = np.dstack([(x - 2) / 5 * 2.0, (y - 1) / 5 * 2.0, np.full((3, 4), 2.0)])

@@ -1,17 +1,10 @@
 """Test that signing stays within its memory, as `make bench` measures it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 from benchmarks.machine import peak_megabytes_of_signing
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
-from sceneprint.types import DepthFrame
 
 
-def test_signing_stays_under_its_memory(
-    room_frames: tuple[DepthFrame, ...], tmp_path: Path
-) -> None:
+def test_signing_stays_under_its_memory(room_frames, tmp_path):
     """The budget is 700 MB; a process that has done its imports alone needs over 50."""
     write_intrinsics(tmp_path, Camera(room_frames[0].intrinsics))
     write_depth_png(tmp_path / "frame.png", room_frames[0].depth, 1000.0)

@@ -20,8 +20,8 @@ from PIL import Image
 from sceneprint import cli
 from sceneprint.cli import main
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.models import Model, save_model
-from sceneprint.pipeline import Signer, sign
+from sceneprint.models import save_model
+from sceneprint.pipeline import sign
 from sceneprint.types import Cloud
 from sceneprint_lab.synth import synthesise_survey
 
@@ -35,11 +35,11 @@ class Said(NamedTuple):
     stderr: str
 
 
-def run(*arguments: object, expect: int = 0) -> Said:
+def run(*arguments, expect=0):
     """Run a command in this process: to start one takes longer than most commands."""
     with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as errors:
         try:
-            code: object = cli.main([str(one) for one in arguments])
+            code = cli.main([str(one) for one in arguments])
         except SystemExit as end:  # of argparse
             code = end.code
     said = Said(out.getvalue(), errors.getvalue())
@@ -47,7 +47,7 @@ def run(*arguments: object, expect: int = 0) -> Said:
     return said
 
 
-def run_process(*arguments: object, expect: int = 0) -> Said:
+def run_process(*arguments, expect=0):
     """Run a command as a shell does."""
     done = subprocess.run(
         [sys.executable, "-m", "sceneprint", *map(str, arguments)], capture_output=True, text=True
@@ -58,7 +58,7 @@ def run_process(*arguments: object, expect: int = 0) -> Said:
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rooms(tmp_path_factory):
     out = tmp_path_factory.mktemp("synth") / "rooms"
     done = run("synth", out, "--rooms", 2, "--views", 2, "--seed", 5, "--jobs", 1)
     assert "2 rooms of 2 views" in done.stdout
@@ -66,13 +66,13 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def model_file(small_model: Model, tmp_path: Path) -> Path:
+def model_file(small_model, tmp_path):
     path = tmp_path / "small.safetensors"
     save_model(small_model, path)
     return path
 
 
-def tree_hash(folder: Path) -> dict[str, str]:
+def tree_hash(folder):
     return {
         str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
         for p in sorted(folder.rglob("*"))
@@ -81,7 +81,7 @@ def tree_hash(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.thorough
-def test_synth_writes_the_layout(rooms: Path, tmp_path: Path) -> None:
+def test_synth_writes_the_layout(rooms, tmp_path):
     names = list(tree_hash(rooms))
     assert names == [
         f"room-00{r}/{name}"
@@ -102,7 +102,7 @@ def test_synth_writes_the_layout(rooms: Path, tmp_path: Path) -> None:
         assert (image.size, image.mode) == ((640, 480), "I;16")
 
 
-def test_synth_does_not_mix_two_runs(rooms: Path) -> None:
+def test_synth_does_not_mix_two_runs(rooms):
     before = tree_hash(rooms)
     done = run("synth", rooms, "--rooms", 1, expect=2)
     assert "is not empty" in done.stderr
@@ -111,8 +111,8 @@ def test_synth_does_not_mix_two_runs(rooms: Path) -> None:
 
 
 def test_sign_says_a_line_and_writes_a_file_for_each_frame(
-    rooms: Path, model_file: Path, small_signer: Signer, tmp_path: Path
-) -> None:
+    rooms, model_file, small_signer, tmp_path
+):
     from sceneprint.formats.dataset import find_sequences
 
     out = tmp_path / "out"
@@ -139,7 +139,7 @@ def test_sign_says_a_line_and_writes_a_file_for_each_frame(
     )
 
 
-def test_a_bad_frame_does_not_stop_the_others(model_file: Path, tmp_path: Path) -> None:
+def test_a_bad_frame_does_not_stop_the_others(model_file, tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
     (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
@@ -163,9 +163,7 @@ def test_a_bad_frame_does_not_stop_the_others(model_file: Path, tmp_path: Path) 
     assert (out / entries[0]["file"]).read_bytes() == (out / entries[4]["file"]).read_bytes()
 
 
-def test_signatures_of_two_models_do_not_mix(
-    rooms: Path, model_file: Path, small_model: Model, tmp_path: Path
-) -> None:
+def test_signatures_of_two_models_do_not_mix(rooms, model_file, small_model, tmp_path):
     out = tmp_path / "out"
     run("sign", rooms / "room-000", "--model", model_file, "--out", out)
     before = tree_hash(out)
@@ -176,7 +174,7 @@ def test_signatures_of_two_models_do_not_mix(
     assert tree_hash(out) == before
 
 
-def test_an_old_signature_does_not_outlive_its_frame(model_file: Path, tmp_path: Path) -> None:
+def test_an_old_signature_does_not_outlive_its_frame(model_file, tmp_path):
     folder, out = tmp_path / "frames", tmp_path / "out"
     folder.mkdir()
     (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
@@ -190,7 +188,7 @@ def test_an_old_signature_does_not_outlive_its_frame(model_file: Path, tmp_path:
     assert list(tree_hash(out)) == ["signatures.json"]
 
 
-def test_names_that_no_line_can_hold(model_file: Path, tmp_path: Path) -> None:
+def test_names_that_no_line_can_hold(model_file, tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
     (folder / "intrinsics.json").write_text(json.dumps(CAMERA))
@@ -203,9 +201,7 @@ def test_names_that_no_line_can_hold(model_file: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_a_reader_that_leaves_does_not_stop_the_writing(
-    rooms: Path, model_file: Path, tmp_path: Path
-) -> None:
+def test_a_reader_that_leaves_does_not_stop_the_writing(rooms, model_file, tmp_path):
     out = tmp_path / "out"
     command = [sys.executable, "-m", "sceneprint", "sign", rooms, "--model", model_file]
     process = subprocess.Popen(
@@ -220,7 +216,7 @@ def test_a_reader_that_leaves_does_not_stop_the_writing(
     assert len(json.loads((out / "signatures.json").read_text())["frames"]) == 4
 
 
-def test_train_for_another_range(tmp_path: Path) -> None:
+def test_train_for_another_range(tmp_path):
     done = run("train", "--out", tmp_path / "m", "--range", "9", "3", expect=2)
     assert "Put the smaller distance first" in done.stderr
     done = run("train", "--out", tmp_path, "--rooms", 2, expect=2)
@@ -228,7 +224,7 @@ def test_train_for_another_range(tmp_path: Path) -> None:
     assert "train: error" in run("train", "--out", "m", "--radius", "-1", expect=2).stderr
 
 
-def test_two_paths_keep_their_names_apart(rooms: Path, model_file: Path, tmp_path: Path) -> None:
+def test_two_paths_keep_their_names_apart(rooms, model_file, tmp_path):
     out = tmp_path / "out"
     run("sign", rooms / "room-000", rooms / "room-001", "--model", model_file, "--out", out)
     entries = json.loads((out / "signatures.json").read_text())["frames"]
@@ -247,9 +243,7 @@ def test_two_paths_keep_their_names_apart(rooms: Path, model_file: Path, tmp_pat
         (["synth", "/dev/null/x"], "/dev/null"),
     ],
 )
-def test_errors_are_one_line_and_exit_code_2(
-    arguments: list[str], message: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_errors_are_one_line_and_exit_code_2(arguments, message, rooms, tmp_path):
     done = run(*(a.format(rooms=rooms, tmp=tmp_path) for a in arguments), expect=2)
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith(f"sceneprint {arguments[0]}: ")
@@ -260,12 +254,12 @@ def test_errors_are_one_line_and_exit_code_2(
     "arguments",
     [["sign"], ["synth", "x", "--rooms", "0"], ["train", "--out", "x", "--rooms", "-1"], ["no"]],
 )
-def test_wrong_usage(arguments: list[str]) -> None:
+def test_wrong_usage(arguments):
     done = run(*arguments, expect=2)
     assert done.stderr.startswith("usage: sceneprint")
 
 
-def test_every_command_is_known() -> None:
+def test_every_command_is_known():
     found = {
         (name.removeprefix("add_").replace("_", "-"), path.stem)
         for path in Path(cli.__file__).parent.glob("*.py")
@@ -284,7 +278,7 @@ HEAVY = {
 }  # fmt: skip
 
 
-def test_a_command_imports_only_what_it_needs() -> None:
+def test_a_command_imports_only_what_it_needs():
     code = (
         "import sys; from sceneprint.cli import main\n"
         "try: main(sys.argv[1:])\n"
@@ -292,7 +286,7 @@ def test_a_command_imports_only_what_it_needs() -> None:
         "print(); print(*sys.modules)"
     )
 
-    def loaded(*arguments: str) -> set[str]:
+    def loaded(*arguments):
         done = subprocess.run(
             [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
         )
@@ -330,9 +324,7 @@ def test_a_command_imports_only_what_it_needs() -> None:
         (("nothing", "--"), []),
     ],
 )
-def test_a_shell_completes_commands_and_options(
-    words: tuple[str, ...], completions: list[str]
-) -> None:
+def test_a_shell_completes_commands_and_options(words, completions):
     code = (
         f"{run('completion', 'bash').stdout}\n"
         'COMP_WORDS=(sceneprint "$@"); COMP_CWORD=$#; _sceneprint; echo "${COMPREPLY[@]}"'
@@ -344,7 +336,7 @@ def test_a_shell_completes_commands_and_options(
     assert run("completion", "zsh").stdout.endswith(run("completion", "bash").stdout)
 
 
-def test_sites_are_written_as_clouds_with_poses(tmp_path: Path) -> None:
+def test_sites_are_written_as_clouds_with_poses(tmp_path):
     out = tmp_path / "sites"
     arguments = ["--rooms", "1", "--views", "2", "--seed", "5", "--jobs", "1"]
     assert main(["synth", str(out), "--sensor", "lidar", *arguments]) == 0

@@ -1,37 +1,30 @@
 """Tests of signatures of clouds: near those of depth images, and invariant to rotation."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from sceneprint.errors import UselessFrame
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.retrieval.ranking import Metric, distances
+from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.geometry.rigid import rotation_angle
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
 from sceneprint.geometry.surface.voxels import Voxels
-from sceneprint.pipeline import Signer, distance, geometry_of, open_signer, prepare, see, sign
-from sceneprint.types import AnyFrame, Bytes, Cloud, DepthFrame, Floats
+from sceneprint.pipeline import distance, geometry_of, open_signer, prepare, see, sign
+from sceneprint.types import Cloud
 
 FAR_M = 0.5
 
 FAR_RAD = np.radians(30.0)
 
 
-def cloud_of(
-    frame: DepthFrame, seed: int, R: Floats | None = None, *, has_viewpoint: bool = True
-) -> Cloud:
+def cloud_of(frame, seed, R=None, *, has_viewpoint=True):
     """All samples of a depth frame that are in range, in no order, turned by R."""
     k, p = frame.intrinsics, DepthParameters()
     y, x = np.nonzero((frame.depth >= p.minimum_depth) & (frame.depth <= p.maximum_depth))
@@ -43,7 +36,7 @@ def cloud_of(
     return Cloud(shuffled.astype(np.float32), has_viewpoint, frame.name, frame.pose)
 
 
-def any_rotation(seed: int) -> Floats:
+def any_rotation(seed):
     """A rotation drawn uniformly: (3, 3)."""
     q, r = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
@@ -52,18 +45,15 @@ def any_rotation(seed: int) -> Floats:
     return np.asarray(q, float)
 
 
-def are_far(frames: Sequence[DepthFrame]) -> NDArray[np.bool_]:
+def are_far(frames):
     """(N, N), by pose."""
     poses = np.stack([frame.pose for frame in frames if frame.pose is not None])
     apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) > FAR_M
     turned = [[rotation_angle(a[:3, :3].T @ b[:3, :3]) > FAR_RAD for b in poses] for a in poses]
-    result: NDArray[np.bool_] = apart | np.array(turned)
-    return result
+    return apart | np.array(turned)
 
 
-def own_is_nearest(
-    queries: Bytes, database: Bytes, own: NDArray[np.intp], far: NDArray[np.bool_], metric: Metric
-) -> tuple[float, float]:
+def own_is_nearest(queries, database, own, far, metric):
     """Share of queries whose own row of the database is nearer than any far one, and the margin.
 
     Parameters
@@ -80,7 +70,7 @@ def own_is_nearest(
     return float(np.mean(np.array(ratios) < 1)), float(np.mean(ratios))
 
 
-def signed(frames: Sequence[AnyFrame], signer: Signer, what: str) -> tuple[Bytes, list[float]]:
+def signed(frames, signer, what):
     """Signatures (N, L), and the seconds that each took."""
     rows, seconds = [], []
     for frame in tqdm(frames, desc=what, unit="frame", disable=None):
@@ -90,13 +80,7 @@ def signed(frames: Sequence[AnyFrame], signer: Signer, what: str) -> tuple[Bytes
     return np.stack(rows), seconds
 
 
-def same_points(
-    frames: Sequence[DepthFrame],
-    chosen: NDArray[np.intp],
-    signer: Signer,
-    *,
-    has_viewpoint: bool = True,
-) -> tuple[float, float, float, float]:
+def same_points(frames, chosen, signer, *, has_viewpoint=True):
     """Of the chosen frames as clouds: see own_depth, own_cloud, margin, milliseconds."""
     far = are_far(frames)
     depth, _ = signed(frames, signer, "depth")
@@ -114,10 +98,7 @@ def same_points(
     return there, back, margin, float(np.median(seconds) * 1e3)
 
 
-def turned(
-    database: Sequence[DepthFrame], queries: Sequence[DepthFrame], signer: Signer, *,
-    has_viewpoint: bool = True,
-) -> tuple[float, float]:  # fmt: skip
+def turned(database, queries, signer, *, has_viewpoint=True):
     """Share of queries with the same first match when turned, and how far turning takes them."""
     d, _ = signed(
         [cloud_of(f, i, has_viewpoint=has_viewpoint) for i, f in enumerate(database)],
@@ -135,22 +116,22 @@ def turned(
     return float(np.mean(same)), float(np.mean(margins))
 
 
-def grid(n: int, low: float, high: float) -> tuple[Floats, Floats]:
+def grid(n, low, high):
     a, b = np.meshgrid(np.linspace(low, high, n), np.linspace(low, high, n))
     return a.reshape(-1), b.reshape(-1)
 
 
-def wall() -> Floats:
+def wall():
     a, b = grid(120, -1.5, 1.5)
     return np.column_stack([np.full(len(a), 2.0), a, b])
 
 
-def clusters() -> Floats:
+def clusters():
     rng = np.random.default_rng(0)
     return np.concatenate([rng.normal(x, 0.05, (2000, 3)) for x in (-3.0, 3.0)])
 
 
-DEGENERATE: dict[str, tuple[Callable[[], Floats], str]] = {
+DEGENERATE = {
     "ten points": (lambda: np.eye(10, 3) + 1, "10 points are too few"),
     "no points": (lambda: np.zeros((0, 3)), "0 points are too few"),
     "one point": (lambda: np.ones((5000, 3)), "fill 1 voxels"),
@@ -163,7 +144,7 @@ DEGENERATE: dict[str, tuple[Callable[[], Floats], str]] = {
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_what_shows_nothing_is_refused_with_a_reason(small_signer: Signer, name: str) -> None:
+def test_what_shows_nothing_is_refused_with_a_reason(small_signer, name):
     make, says = DEGENERATE[name]
     with pytest.raises(UselessFrame, match=f"scan.*{says}"):
         prepare(Cloud(make().astype(np.float32), name="scan"), small_signer)
@@ -171,9 +152,7 @@ def test_what_shows_nothing_is_refused_with_a_reason(small_signer: Signer, name:
 
 @pytest.mark.parametrize("points", [wall, clusters])
 @pytest.mark.parametrize("has_viewpoint", [True, False])
-def test_little_is_signed_all_the_same(
-    small_signer: Signer, points: Callable[[], Floats], has_viewpoint: bool
-) -> None:
+def test_little_is_signed_all_the_same(small_signer, points, has_viewpoint):
     cloud = Cloud(points().astype(np.float32), has_viewpoint)
     signature, geometry = prepare(cloud, small_signer)
     assert signature.n_pairs[0] > 0
@@ -192,9 +171,8 @@ def test_little_is_signed_all_the_same(
     has_viewpoint=st.booleans(),
 )
 def test_any_points_are_signed_or_refused(
-    small_signer: Signer, seed: int, n: int, scale: float, flatness: float, copies: int,
-    has_viewpoint: bool,
-) -> None:  # fmt: skip
+    small_signer, seed, n, scale, flatness, copies, has_viewpoint
+):
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(n, 3)) * [1, 1, flatness] @ any_rotation(seed) + rng.normal(size=3)
     cloud = Cloud(np.tile(points * scale, (copies, 1)).astype(np.float32), has_viewpoint)
@@ -207,9 +185,7 @@ def test_any_points_are_signed_or_refused(
     assert np.isfinite(geometry.patches.means).all()
 
 
-def test_points_in_any_order_are_one_cloud(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_points_in_any_order_are_one_cloud(small_signer, room_frames):
     for has_viewpoint in (True, False):
         made = [
             prepare(cloud_of(room_frames[0], seed, has_viewpoint=has_viewpoint), small_signer)
@@ -221,9 +197,7 @@ def test_points_in_any_order_are_one_cloud(
         assert of_a.descriptors.tobytes() == of_b.descriptors.tobytes()
 
 
-def test_a_cloud_is_near_its_own_depth_image(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_a_cloud_is_near_its_own_depth_image(small_signer, room_frames):
     depth = [sign(frame, small_signer) for frame in room_frames]
     for i, frame in enumerate(room_frames[:3]):
         cloud = sign(cloud_of(frame, i), small_signer)
@@ -233,9 +207,7 @@ def test_a_cloud_is_near_its_own_depth_image(
         assert distance(cloud, turned_) < 0.5 * sorted(d)[1]
 
 
-def test_an_artifact_has_the_range_image(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_an_artifact_has_the_range_image(small_signer, room_frames):
     p = small_signer.model.parameters
     seen = see(cloud_of(room_frames[0], 0), p)
     assert isinstance(seen, Voxels)
@@ -246,7 +218,7 @@ def test_an_artifact_has_the_range_image(
     assert small.surface.valid.size == pytest.approx(made.surface.valid.size / 4, rel=0.05)
 
 
-def test_nearest_by_hand() -> None:
+def test_nearest_by_hand():
     database = np.array([[0, 0], [10, 0], [200, 0]], np.uint8)
     queries = np.array([[2, 0], [9, 0]], np.uint8)
     far = np.array([[False, True, True], [True, False, True]])
@@ -255,7 +227,7 @@ def test_nearest_by_hand() -> None:
     assert (share, margin) == (1.0, pytest.approx((2 / 8 + 1 / 9) / 2))
 
 
-def test_real_clouds_are_near_their_depth_images_and_may_turn(data_root: Path) -> None:
+def test_real_clouds_are_near_their_depth_images_and_may_turn(data_root):
     """A few frames of what docs/evaluation.md tells of clouds."""
     references = find_sequences(data_root / "7scenes" / "redkitchen")[0].frames
     signer = open_signer("paper")

@@ -1,9 +1,6 @@
 """Tests of PLY files, byte by byte and with a separate reader."""
 
-from __future__ import annotations
-
 import struct
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,12 +11,12 @@ from sceneprint.types import Intrinsics, Surface
 _CODES = {"float": "f", "uchar": "B", "int": "i"}
 
 
-def read(data: bytes) -> tuple[dict[str, list[dict[str, Any]]], list[str]]:
+def read(data):
     """Elements and comments of a PLY file, one value at a time, as its header says."""
     head, body = data.split(b"end_header\n", 1)
     lines = head.decode("ascii").splitlines()
     assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
-    shape: list[tuple[str, int, list[list[str]]]] = []
+    shape = []
     comments = []
     for line in lines[2:]:
         word, rest = line.split(" ", 1)
@@ -31,10 +28,10 @@ def read(data: bytes) -> tuple[dict[str, list[dict[str, Any]]], list[str]]:
         else:
             assert word == "property"
             shape[-1][2].append(rest.split())
-    found: dict[str, list[dict[str, Any]]] = {}
+    found = {}
     place = 0
 
-    def take(kind: str) -> Any:
+    def take(kind):
         nonlocal place
         (value,) = struct.unpack_from("<" + _CODES[kind], body, place)
         place += struct.calcsize("<" + _CODES[kind])
@@ -43,7 +40,7 @@ def read(data: bytes) -> tuple[dict[str, list[dict[str, Any]]], list[str]]:
     for name, count, properties in shape:
         found[name] = []
         for _ in range(count):
-            row: dict[str, Any] = {}
+            row = {}
             for p in properties:
                 if p[0] == "list":
                     row[p[3]] = [take(p[2]) for _ in range(take(p[1]))]
@@ -54,7 +51,7 @@ def read(data: bytes) -> tuple[dict[str, list[dict[str, Any]]], list[str]]:
     return found, comments
 
 
-def test_the_bytes_of_one_coloured_point() -> None:
+def test_the_bytes_of_one_coloured_point():
     data = write_ply(
         np.array([[1.0, -2.0, 0.5]]),
         np.array([[0.0, 0.0, -1.0]]),
@@ -71,7 +68,7 @@ def test_the_bytes_of_one_coloured_point() -> None:
     )
 
 
-def test_a_mesh_with_edges_is_read_back() -> None:
+def test_a_mesh_with_edges_is_read_back():
     rng = np.random.default_rng(3)
     points = rng.normal(size=(5, 3)).astype(np.float32)
     faces, edges = np.array([[0, 1, 2], [4, 3, 2]]), np.array([[0, 4]])
@@ -82,12 +79,12 @@ def test_a_mesh_with_edges_is_read_back() -> None:
     assert comments == []
 
 
-def test_nothing_is_a_file_too() -> None:
+def test_nothing_is_a_file_too():
     found, _ = read(write_ply(np.empty((0, 3)), faces=np.empty((0, 3), np.int32)))
     assert found == {"vertex": [], "face": []}
 
 
-def test_a_comment_stays_in_its_line() -> None:
+def test_a_comment_stays_in_its_line():
     data = write_ply(np.zeros((1, 3)), comments=["haus\nelement vertex 9", "Flur, OG \u00fc"])
     found, comments = read(data)
     assert len(found["vertex"]) == 1
@@ -104,12 +101,12 @@ def test_a_comment_stays_in_its_line() -> None:
         {"edges": np.array([[0, 1, 1]])},
     ],
 )
-def test_what_does_not_fit_is_refused(wrong: Any) -> None:
+def test_what_does_not_fit_is_refused(wrong):
     with pytest.raises(ValueError, match=r"not \(|for 2 points"):
         write_ply(np.zeros((2, 3)), **wrong)
 
 
-def test_a_surface_is_its_valid_pixels() -> None:
+def test_a_surface_is_its_valid_pixels():
     points = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
     valid = np.array([[True, False], [False, True]])
     surface = Surface(

@@ -17,7 +17,6 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from functools import cache
@@ -33,7 +32,6 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.models import PRESETS
 from sceneprint.process import SECRETS
 from sceneprint.settings import Settings
-from sceneprint.types import DepthFrame
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
@@ -55,7 +53,7 @@ class Step:
     flags: tuple[str, ...]
     rest: str
 
-    def words(self) -> list[str]:
+    def words(self):
         """The rest as the exec form has it; a ValueError where it is in shell form."""
         try:
             found = json.loads(self.rest)
@@ -64,7 +62,7 @@ class Step:
         return cast(list[str], found)
 
 
-def steps_of(text: str) -> list[Step]:
+def steps_of(text):
     """Instructions in their order, continued lines joined and comments left out."""
     lines = (line for line in text.splitlines() if not line.lstrip().startswith("#"))
     joined = re.sub(r"\\\n\s*", "", "\n".join(lines))
@@ -79,12 +77,12 @@ def steps_of(text: str) -> list[Step]:
     return steps
 
 
-def final(steps: list[Step]) -> list[Step]:
+def final(steps):
     """Steps of the stage that becomes the image."""
     return [step for step in steps if step.stage == steps[-1].stage]
 
 
-def only(steps: list[Step], name: str) -> Step:
+def only(steps, name):
     """The one step of that name in the image's stage."""
     found = [step for step in final(steps) if step.name == name]
     if len(found) != 1:
@@ -92,19 +90,19 @@ def only(steps: list[Step], name: str) -> Step:
     return found[0]
 
 
-def health_check(steps: list[Step]) -> list[str]:
+def health_check(steps):
     """Command of the image's health check."""
     step = only(steps, "HEALTHCHECK")
     return Step(step.stage, "HEALTHCHECK", (), step.rest.removeprefix("CMD ")).words()
 
 
-def environment(steps: list[Step]) -> dict[str, str]:
+def environment(steps):
     """What ENV sets in the image's stage."""
     pairs = [shlex.split(step.rest) for step in final(steps) if step.name == "ENV"]
     return dict(pair.split("=", 1) for words in pairs for pair in words)
 
 
-def image_problems(text: str) -> list[str]:
+def image_problems(text):
     """What our rules have against a Dockerfile that hadolint knows nothing about."""
     steps, found = steps_of(text), []
     for read in (
@@ -141,13 +139,13 @@ def image_problems(text: str) -> list[str]:
     return found
 
 
-def changed(text: str, old: str, new: str) -> str:
+def changed(text, old, new):
     """The text with one part replaced, which must be there once: else nothing would be tried."""
     assert text.count(old) == 1, f"{text.count(old)} of {old!r}"
     return text.replace(old, new)
 
 
-def changed_all(text: str, old: str, new: str) -> str:
+def changed_all(text, old, new):
     """The text with a part replaced wherever it is: parts of a composition have much in common."""
     assert old in text, old
     return text.replace(old, new)
@@ -156,7 +154,7 @@ def changed_all(text: str, old: str, new: str) -> str:
 # Lint
 
 
-def tool(name: str) -> str:
+def tool(name):
     """A tool beside this Python; it comes with the dev extra."""
     path = shutil.which(name, path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
     if path is None:
@@ -164,7 +162,7 @@ def tool(name: str) -> str:
     return path
 
 
-def hadolint(text: str) -> list[str]:
+def hadolint(text):
     """Codes of what hadolint finds."""
     done = subprocess.run(
         [tool("hadolint"), "--no-color", "--format", "json", "-"],
@@ -174,15 +172,15 @@ def hadolint(text: str) -> list[str]:
     return sorted({str(found["code"]) for found in json.loads(done.stdout)})
 
 
-def test_hadolint_has_nothing_against_the_dockerfile() -> None:
+def test_hadolint_has_nothing_against_the_dockerfile():
     assert hadolint(DOCKERFILE) == []
 
 
-def test_our_rules_have_nothing_against_the_dockerfile() -> None:
+def test_our_rules_have_nothing_against_the_dockerfile():
     assert image_problems(DOCKERFILE) == []
 
 
-def test_the_image_says_what_it_is() -> None:
+def test_the_image_says_what_it_is():
     steps = steps_of(DOCKERFILE)
     labels = dict(pair.split("=", 1) for pair in shlex.split(only(steps, "LABEL").rest))
     told = {name.rpartition(".")[2]: value for name, value in labels.items()}
@@ -196,7 +194,7 @@ def test_the_image_says_what_it_is() -> None:
 # What is sent to the builder
 
 
-def is_ignored(path: str, patterns: str = IGNORE) -> bool:
+def is_ignored(path, patterns=IGNORE):
     """Whether .dockerignore keeps a file from the builder; the last pattern that fits decides."""
     ignored = False
     parts = path.split("/")
@@ -210,7 +208,7 @@ def is_ignored(path: str, patterns: str = IGNORE) -> bool:
     return ignored
 
 
-def test_the_builder_gets_the_code_and_nothing_else() -> None:
+def test_the_builder_gets_the_code_and_nothing_else():
     for kept in ("sceneprint/presets/paper.safetensors", "migrations/script.py.mako", "LICENSE"):
         assert not is_ignored(kept), kept
     secret, compiled = (".env", "key.pem", ".git/config"), "sceneprint/__pycache__/types.pyc"
@@ -218,7 +216,7 @@ def test_the_builder_gets_the_code_and_nothing_else() -> None:
         assert is_ignored(left), left
 
 
-def context_files() -> list[str]:
+def context_files():
     """What the builder is sent of a fresh checkout: no file that git does not know or would add."""
     paths = sorted(path for path in tracked_files() if path and (ROOT / path).is_file())
     return [path for path in paths if not is_ignored(path)]
@@ -227,17 +225,17 @@ def context_files() -> list[str]:
 # docker-compose.yml
 
 
-def composed(text: str = COMPOSE) -> dict[str, Any]:
+def composed(text=COMPOSE):
     """The composition, with its merge keys and anchors followed."""
     return cast(dict[str, Any], YAML(typ="safe", pure=True).load(text))
 
 
-def defaults(value: str) -> str:
+def defaults(value):
     """What Compose makes of ${NAME:-default} where NAME is not set."""
     return re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", value)
 
 
-def mount_problem(mount: str, volumes: set[str]) -> str | None:
+def mount_problem(mount, volumes):
     """What is wrong with a mount: a volume that is not declared, or a file that is not in git."""
     source, _, rest = mount.partition(":")
     if not source.startswith("./"):
@@ -247,14 +245,14 @@ def mount_problem(mount: str, volumes: set[str]) -> str | None:
 
 
 @cache
-def tracked_files() -> frozenset[str]:
+def tracked_files():
     """Files that git knows or would add."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     return frozenset(listed.stdout.split("\0"))
 
 
-def waits_rightly(part: str, other: str, condition: str, parts: dict[str, Any]) -> bool:
+def waits_rightly(part, other, condition, parts):
     """Whether a part waits until what it needs is of use; that there are workers no proxy needs."""
     if other not in parts:
         return False
@@ -267,7 +265,7 @@ def waits_rightly(part: str, other: str, condition: str, parts: dict[str, Any]) 
 OF_LIBRARIES = re.compile(r"PGPASSWORD|AWS_[A-Z_]+(?<!_FILE)")
 
 
-def environment_problems(name: str, part: dict[str, Any]) -> list[str]:
+def environment_problems(name, part):
     """What is wrong with what a part is told."""
     given, found = part.get("environment", {}), []
     for key, value in given.items():
@@ -292,7 +290,7 @@ def environment_problems(name: str, part: dict[str, Any]) -> list[str]:
     return found
 
 
-def health_problem(part: dict[str, Any]) -> str | None:
+def health_problem(part):
     """What is wrong with how a part is asked whether it is well."""
     if part["restart"] == "no":
         return None if "healthcheck" not in part else "is over before anybody asks"
@@ -302,7 +300,7 @@ def health_problem(part: dict[str, Any]) -> str | None:
     return None if command[:1] == ["CMD"] and len(command) > 1 else "no health check in exec form"
 
 
-def compose_problems(text: str) -> list[str]:
+def compose_problems(text):
     """What our rules have against a composition."""
     document, found = composed(text), []
     parts, volumes = document["services"], set(document.get("volumes", {}))
@@ -335,19 +333,19 @@ def compose_problems(text: str) -> list[str]:
     return found
 
 
-def test_our_rules_have_nothing_against_the_composition() -> None:
+def test_our_rules_have_nothing_against_the_composition():
     assert compose_problems(COMPOSE) == []
     fleet = {"database", "objects", "bucket", "api", "signer", "proxy"}
     assert set(composed()["services"]) == {"service", "worker", *fleet}
 
 
-def by_schema(path: Path) -> subprocess.CompletedProcess[str]:
+def by_schema(path):
     """What the schema of the Compose specification says; check-jsonschema brings a copy."""
     command = [tool("check-jsonschema"), "--builtin-schema", "vendor.compose-spec", str(path)]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
 
 
-def test_the_composition_is_as_the_specification_has_it(tmp_path: Path) -> None:
+def test_the_composition_is_as_the_specification_has_it(tmp_path):
     done = by_schema(ROOT / "docker-compose.yml")
     assert (done.returncode, done.stderr) == (0, "")
     broken = tmp_path / "docker-compose.yml"
@@ -357,7 +355,7 @@ def test_the_composition_is_as_the_specification_has_it(tmp_path: Path) -> None:
     assert "'initt'" in done.stdout
 
 
-def test_the_two_parts_have_room_for_what_they_run() -> None:
+def test_the_two_parts_have_room_for_what_they_run():
     steps = steps_of(DOCKERFILE)
     service, worker = (composed()["services"][name] for name in ("service", "worker"))
     assert service["image"] == worker["image"] == f"sceneprint:{PROJECT['version']}"
@@ -372,11 +370,11 @@ def test_the_two_parts_have_room_for_what_they_run() -> None:
     assert Path(env["NUMBA_CACHE_DIR"]).is_relative_to(env["SCENEPRINT_CACHE_DIR"])
 
 
-def test_the_workers_health_check_tells_a_worker_from_itself(tmp_path: Path) -> None:
+def test_the_workers_health_check_tells_a_worker_from_itself(tmp_path):
     *shell, code = composed()["services"]["worker"]["healthcheck"]["test"][1:]
     there = changed(code, "/proc", str(tmp_path))
 
-    def checked(*processes: list[str]) -> int:
+    def checked(*processes):
         for number, words in enumerate(processes):
             (tmp_path / f"{number + 1}").mkdir(exist_ok=True)
             (tmp_path / f"{number + 1}/cmdline").write_text("\0".join([*words, ""]))
@@ -407,28 +405,28 @@ class Image:
     skipped: list[str] = field(default_factory=list)
     ran: list[str] = field(default_factory=list)
 
-    def here(self, text: str) -> str:
+    def here(self, text):
         """The text with the image's folders where they are now."""
         return re.sub(rf"(?<![\w.])({'|'.join(FOLDERS)})(?![\w-])", rf"{self.root}\1", text)
 
-    def command(self, words: list[str]) -> list[str]:
+    def command(self, words):
         """Words with their program found as the image would find it."""
         program = shutil.which(words[0], path=self.env["PATH"])
         assert program is not None, f"{words[0]} is not in the image"
         return [program, *words[1:]]
 
 
-def parts_of(shell: str) -> list[str]:
+def parts_of(shell):
     """Commands of a line joined by &&, each as it is written."""
     words = shlex.shlex(shell, posix=False, punctuation_chars="&")
     words.whitespace_split, words.commenters = True, ""
-    parts: list[list[str]] = [[]]
+    parts = [[]]
     for word in words:
         parts.append([]) if word == "&&" else parts[-1].append(word)
     return [" ".join(part) for part in parts]
 
 
-def base_environment(folder: Path) -> dict[str, str]:
+def base_environment(folder):
     """A fresh Python, as the base image has one; and how pip finds its index on this machine."""
     done = subprocess.run([sys.executable, "-m", "venv", folder], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -437,7 +435,7 @@ def base_environment(folder: Path) -> dict[str, str]:
     return {**env, "PATH": f"{folder}/bin:/usr/local/bin:/usr/bin:/bin"}
 
 
-def run_step(image: Image, shell: str, cwd: Path) -> None:
+def run_step(image, shell, cwd):
     """Run what a RUN says, without what is root's."""
     mine = [part for part in parts_of(shell) if part.split()[0] not in OF_ROOT]
     image.skipped += [p.split()[0] for p in parts_of(shell) if p.split()[0] in OF_ROOT]
@@ -454,7 +452,7 @@ def run_step(image: Image, shell: str, cwd: Path) -> None:
         )
 
 
-def copy_step(image: Image, step: Step, files: list[str], cwd: Path) -> None:
+def copy_step(image, step, files, cwd):
     """COPY from the checkout; from another stage it is there already, and must be."""
     *sources, target = step.rest.split()
     if step.flags:
@@ -471,7 +469,7 @@ def copy_step(image: Image, step: Step, files: list[str], cwd: Path) -> None:
             shutil.copy2(ROOT / name, to)
 
 
-def built(folder: Path) -> Image:
+def built(folder):
     """Run every step of the Dockerfile, in their order."""
     steps, files = steps_of(DOCKERFILE), context_files()
     image = Image(folder / "root", {})
@@ -501,7 +499,7 @@ def built(folder: Path) -> Image:
 
 
 @pytest.fixture(scope="module")
-def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
+def image(tmp_path_factory):
     """Made once for this file, in minutes; `--dist loadfile` keeps a file in one process."""
     made = built(tmp_path_factory.mktemp("image"))
     made.env["HOME"] = "/nonexistent"  # the user has none
@@ -509,13 +507,13 @@ def image(tmp_path_factory: pytest.TempPathFactory) -> Image:
 
 
 @pytest.mark.thorough
-def test_every_step_runs_but_what_is_roots(image: Image) -> None:
+def test_every_step_runs_but_what_is_roots(image):
     assert image.skipped == ["groupadd", "useradd", "chown"]
     assert len(image.ran) == sum(step.name == "RUN" for step in steps_of(DOCKERFILE))
 
 
 @pytest.mark.thorough
-def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
+def test_what_is_installed_is_the_lock_and_no_more(image):
     code = (
         "import json; from importlib.metadata import distributions as d;"
         "print(json.dumps({x.name.lower().replace('_', '-'): x.version for x in d()}))"
@@ -524,7 +522,7 @@ def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
         image.command(["python", "-c", code]), env=image.env, capture_output=True, text=True,
         check=True, cwd=image.root,
     )  # fmt: skip
-    there: dict[str, str] = json.loads(told.stdout)
+    there = json.loads(told.stdout)
     assert there.pop("sceneprint") == there.pop("sceneprint-client") == PROJECT["version"]
     lock = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements.lock").read_text(), re.M))
     assert set(there.items()) <= {(name.lower(), version) for name, version in lock}
@@ -534,13 +532,13 @@ def test_what_is_installed_is_the_lock_and_no_more(image: Image) -> None:
 
 
 @pytest.mark.thorough
-def test_kernels_are_compiled_and_tables_built(image: Image) -> None:
+def test_kernels_are_compiled_and_tables_built(image):
     cache = Path(image.env["SCENEPRINT_CACHE_DIR"])
     assert len(list(cache.glob("table-*.bin"))) == len(PRESETS)
     assert len(machine_code(image)) > 20
 
 
-def machine_code(image: Image) -> set[str]:
+def machine_code(image):
     """Files of compiled kernels."""
     return {path.name for path in Path(image.env["NUMBA_CACHE_DIR"]).rglob("*.nbc")}
 
@@ -552,19 +550,19 @@ class Running:
     process: subprocess.Popen[bytes]
     log: Path
 
-    def stop(self, number: signal.Signals, within_s: float) -> int:
+    def stop(self, number, within_s):
         """Its exit code once told to stop."""
         self.process.send_signal(number)
         return self.process.wait(within_s)
 
 
 @pytest.fixture
-def start(image: Image, tmp_path: Path) -> Iterator[Callable[[str, dict[str, str]], Running]]:
+def start(image, tmp_path):
     """Starts a part of the composition; whatever still runs at the end is killed."""
-    started: list[Running] = []
+    started = []
     steps = steps_of(DOCKERFILE)
 
-    def begin(name: str, env: dict[str, str]) -> Running:
+    def begin(name, env):
         part = composed()["services"][name]
         words = only(steps, "ENTRYPOINT").words() + part.get("command", only(steps, "CMD").words())
         log = tmp_path / f"{name}.log"
@@ -584,17 +582,13 @@ def start(image: Image, tmp_path: Path) -> Iterator[Callable[[str, dict[str, str
 
 
 @pytest.mark.thorough
-def test_service_and_worker_run_as_composed(
-    image: Image, start: Callable[[str, dict[str, str]], Running], room_frames: tuple[DepthFrame,
-...],
-    tmp_path: Path,
-) -> None:  # fmt: skip
+def test_service_and_worker_run_as_composed(image, start, room_frames, tmp_path):
     steps, parts = steps_of(DOCKERFILE), composed()["services"]
     compiled = machine_code(image)
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = {"SCENEPRINT_PORT": str(free.getsockname()[1])}
 
-    def exits(words: list[str]) -> int:
+    def exits(words):
         env = {**image.env, **port}
         return subprocess.run(image.command(words), env=env, timeout=PATIENCE_S, cwd=image.root,
                               capture_output=True).returncode  # fmt: skip

@@ -1,12 +1,10 @@
 """Tests of the commands of docs/deployment.md, run in order on real servers."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,14 +23,14 @@ PATH = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
 Run = Callable[..., str]
 
 
-def blocks(title: str) -> list[str]:
+def blocks(title):
     """Blocks of commands below a heading, up to the next one."""
     section = re.split(r"^#+ ", PAGE.split(f"# {title}\n", 1)[1], maxsplit=1, flags=re.MULTILINE)
     return re.findall(r"^```sh\n(.*?)^```", section[0], re.DOTALL | re.MULTILINE)
 
 
 @pytest.fixture(scope="module")
-def primary(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+def primary(tmp_path_factory):
     # as many as a standby has whose configuration nobody has written
     folder = tmp_path_factory.mktemp("primary")
     server = Server(folder, durable=True, options={"max_connections": "100"})
@@ -42,10 +40,10 @@ def primary(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 @pytest.fixture
-def run(primary: Server, bucket: str, tmp_path: Path) -> Run:
+def run(primary, bucket, tmp_path):
     """Run a block with the environment of a node, and of the database's administrator."""
 
-    def shell(block: str, **given: str) -> str:
+    def shell(block, **given):
         told = {
             **os.environ, "PATH": f"{binaries()}:{PATH}", "PGHOST": "127.0.0.1",
             "PGPORT": str(primary.port), "PGUSER": "postgres", "PGPASSWORD": "not a default",
@@ -61,14 +59,14 @@ def run(primary: Server, bucket: str, tmp_path: Path) -> Run:
     return shell
 
 
-def database(*ports: int) -> str:
+def database(*ports):
     """The URL of a fleet's database on servers of this machine, as the environment file has it."""
     hosts = "".join(f"host=127.0.0.1:{port}&" for port in ports)
     return f"postgresql+psycopg://sceneprint@/sceneprint?{hosts}target_session_attrs=read-write"
 
 
 @pytest.mark.thorough
-def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> None:
+def test_commands_in_their_order(primary, run, tmp_path):
     (made,) = blocks("The database")
     run(made)
     one, there_and, back = tmp_path / "one", *blocks("From one machine to a fleet, and back")
@@ -107,7 +105,7 @@ def test_commands_in_their_order(primary: Server, run: Run, tmp_path: Path) -> N
         run(f"pg_ctl stop --mode immediate --silent --pgdata {standby_data}")
 
 
-def test_what_root_does_is_at_least_a_shells() -> None:
+def test_what_root_does_is_at_least_a_shells():
     found = re.findall(r"^```bash\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
     assert found
     for block in found:

@@ -1,7 +1,5 @@
 """Tests of the files of docs/deployment; each check also sees a faulty file."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -11,7 +9,6 @@ import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -31,7 +28,7 @@ UNITS = sorted(FOLDER.glob("*.service"))
 PAGE = (FOLDER.parent / "deployment.md").read_text()
 
 
-def tool(name: str, package: str) -> str:
+def tool(name, package):
     """A program that is no Python package; tests of it are skipped where it is not installed."""
     path = shutil.which(name)
     if path is None:
@@ -39,7 +36,7 @@ def tool(name: str, package: str) -> str:
     return path
 
 
-def said_by_haproxy(text: str, folder: Path) -> tuple[int, str]:
+def said_by_haproxy(text, folder):
     """How haproxy checks a configuration, and what it says."""
     path = folder / "haproxy.cfg"
     path.write_text(text)
@@ -51,7 +48,7 @@ def said_by_haproxy(text: str, folder: Path) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def test_haproxy_takes_its_file(tmp_path: Path) -> None:
+def test_haproxy_takes_its_file(tmp_path):
     text = (FOLDER / "haproxy.cfg").read_text()
     returned, said = said_by_haproxy(text, tmp_path)
     assert (returned, said.strip()) == (0, "Configuration file is valid")
@@ -66,19 +63,19 @@ class _Api(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 128
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name):
         super().__init__(("127.0.0.1", 0), _Answer)
         self.name, self.release, self.held = name, threading.Event(), threading.Semaphore(0)
         threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02}).start()
 
-    def end(self) -> None:
+    def end(self):
         self.release.set()
         self.shutdown()
         self.server_close()
 
 
 class _Answer(BaseHTTPRequestHandler):
-    def do_GET(self) -> None:
+    def do_GET(self):
         api = cast(_Api, self.server)
         if self.path.endswith("/hold"):
             api.held.release()
@@ -89,12 +86,12 @@ class _Answer(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    def log_message(self, *_: object) -> None:
+    def log_message(self, *_):
         pass
 
 
 @pytest.fixture
-def proxied(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, _Api]]]:
+def proxied(tmp_path):
     """The file run by haproxy in front of three processes."""
     apis = {name: _Api(name) for name in ("a", "b", "c")}
     with socket.socket() as free:
@@ -128,7 +125,7 @@ def proxied(tmp_path: Path) -> Iterator[tuple[httpx.Client, dict[str, _Api]]]:
             api.end()
 
 
-def until(holds: Callable[[], bool]) -> None:
+def until(holds):
     """Ask until it holds, at most for some seconds."""
     end = time.monotonic() + PATIENCE_S
     while not holds():
@@ -138,12 +135,12 @@ def until(holds: Callable[[], bool]) -> None:
 MAPS = [f"map-{i}" for i in range(60)]
 
 
-def homes(client: httpx.Client, rest: str = "frames") -> dict[str, str]:
+def homes(client, rest="frames"):
     """Where each map is answered most: a request that has just ended may still count, and the next
     one go elsewhere.
     """
 
-    def home(name: str) -> str:
+    def home(name):
         asked = Counter[str]()
         while max(asked.values(), default=0) < 3:
             asked[client.get(f"/v1/maps/{name}/{rest}").text] += 1
@@ -152,9 +149,7 @@ def homes(client: httpx.Client, rest: str = "frames") -> dict[str, str]:
     return {name: home(name) for name in MAPS}
 
 
-def test_requests_for_one_map_go_to_one_process(
-    proxied: tuple[httpx.Client, dict[str, _Api]],
-) -> None:
+def test_requests_for_one_map_go_to_one_process(proxied):
     client, apis = proxied
     first = homes(client)
     assert homes(client) == homes(client, "query?k=1") == first
@@ -163,9 +158,7 @@ def test_requests_for_one_map_go_to_one_process(
     assert min(counted.values()) >= 8  # of 20 on average
 
 
-def test_a_process_that_ends_moves_only_its_own_maps(
-    proxied: tuple[httpx.Client, dict[str, _Api]],
-) -> None:
+def test_a_process_that_ends_moves_only_its_own_maps(proxied):
     client, apis = proxied
     first = homes(client)
     apis["b"].end()
@@ -176,9 +169,7 @@ def test_a_process_that_ends_moves_only_its_own_maps(
     assert {after[name] for name in moved} == {"a", "c"}
 
 
-def test_a_busy_map_spills_over_to_other_processes(
-    proxied: tuple[httpx.Client, dict[str, _Api]],
-) -> None:
+def test_a_busy_map_spills_over_to_other_processes(proxied):
     """Of 30 open requests for one map, no process has more than 1.5 times the mean, rounded up."""
     client, apis = proxied
     ports = client.base_url.port
@@ -187,9 +178,9 @@ def test_a_busy_map_spills_over_to_other_processes(
             pool.submit(httpx.get, f"http://127.0.0.1:{ports}/v1/maps/busy/hold", timeout=40)
             for _ in range(30)
         ]
-        taken: Counter[str] = Counter()
+        taken = Counter()
 
-        def all_taken() -> bool:
+        def all_taken():
             for name, api in apis.items():
                 while api.held.acquire(blocking=False):
                     taken[name] += 1
@@ -203,9 +194,7 @@ def test_a_busy_map_spills_over_to_other_processes(
     assert max(taken.values()) <= 16
 
 
-def test_without_a_process_that_is_ready_clients_are_told_to_come_back(
-    proxied: tuple[httpx.Client, dict[str, _Api]],
-) -> None:
+def test_without_a_process_that_is_ready_clients_are_told_to_come_back(proxied):
     client, apis = proxied
     for api in apis.values():
         api.end()
@@ -217,7 +206,7 @@ def test_without_a_process_that_is_ready_clients_are_told_to_come_back(
     assert str(error) == "No process of the service is ready. Retry later."
 
 
-def said_of_unit(text: str, name: str, folder: Path) -> str:
+def said_of_unit(text, name, folder):
     """What systemd has against a unit, whose program is not installed here."""
     path = folder / name
     path.write_text(text.replace("/opt/sceneprint/bin/sceneprint", "/bin/true"))
@@ -230,14 +219,14 @@ def said_of_unit(text: str, name: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
-def test_systemd_takes_the_units(path: Path, tmp_path: Path) -> None:
+def test_systemd_takes_the_units(path, tmp_path):
     text = path.read_text()
     assert said_of_unit(text, path.name, tmp_path) == ""
     assert "Restrat" in said_of_unit(text.replace("Restart=", "Restrat="), path.name, tmp_path)
 
 
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
-def test_units_confine_what_they_run(path: Path) -> None:
+def test_units_confine_what_they_run(path):
     lines = set(path.read_text().splitlines())
     assert lines >= {
         "SystemCallFilter=@system-service", "SystemCallFilter=~@privileged", "ProtectClock=yes",
@@ -248,7 +237,7 @@ def test_units_confine_what_they_run(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
-def test_units_let_decoders_lock_themselves_in(path: Path) -> None:
+def test_units_let_decoders_lock_themselves_in(path):
     """What they call for it is in no group of systemd 252."""
     filters = re.findall(r"(?m)^SystemCallFilter=([^~].*)$", path.read_text())
     named = {name for line in filters for name in line.split()}
@@ -258,7 +247,7 @@ def test_units_let_decoders_lock_themselves_in(path: Path) -> None:
     assert set(needed.values()) == used
 
 
-def settings_of(text: str) -> dict[str, str]:
+def settings_of(text):
     """NAME=value of a unit's `Environment=` lines, or of a file of the environment."""
     found = []
     for line in text.splitlines():
@@ -269,24 +258,24 @@ def settings_of(text: str) -> dict[str, str]:
     return dict(one.split("=", 1) for one in found)
 
 
-def test_units_and_environment_set_what_is_read() -> None:
+def test_units_and_environment_set_what_is_read():
     read = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields}
     read |= {"NUMBA_CACHE_DIR", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "PGPASSWORD"}
     read |= {
         f"AWS_{name}" for name in ("REGION", "ACCESS_KEY_ID", "SECRET_ACCESS_KEY", "ENDPOINT_URL")
     }
-    given: dict[str, str] = {}
+    given = {}
     for path in (*UNITS, FOLDER / "sceneprint.env"):
         given |= settings_of(path.read_text())
     assert given.keys() - read == set()
     own = {k.removeprefix("SCENEPRINT_").lower(): v for k, v in given.items() if k[:5] == "SCENE"}
-    told = Settings(**own)  # type: ignore[arg-type]  # as the environment has them: texts
+    told = Settings(**own)  # as the environment has them: texts
     assert told.workers == 0
     assert told.asks_for_keys
     assert "change-me" not in told.database  # in no URL is a secret
 
 
-def test_a_shell_reads_the_environment_as_systemd_does() -> None:
+def test_a_shell_reads_the_environment_as_systemd_does():
     """docs/deployment.md has operators source it; in an unquoted URL `&` ends a command."""
     path = FOLDER / "sceneprint.env"
     expected = {line for line in path.read_text().splitlines() if re.match("[A-Z_]+=", line)}
@@ -300,6 +289,6 @@ def test_a_shell_reads_the_environment_as_systemd_does() -> None:
     assert sourced["SCENEPRINT_DATABASE_URL"] == f"{url}&target_session_attrs=read-write"
 
 
-def test_the_page_names_every_file() -> None:
+def test_the_page_names_every_file():
     missing = [path.name for path in FOLDER.iterdir() if f"deployment/{path.name}" not in PAGE]
     assert missing == []

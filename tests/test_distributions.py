@@ -1,7 +1,5 @@
 """Tests that the service works without the lab and the viewers."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -43,7 +41,7 @@ print(json.dumps({
 """
 
 
-def test_a_service_needs_neither_lab_nor_viewers(tmp_path: Path) -> None:
+def test_a_service_needs_neither_lab_nor_viewers(tmp_path):
     packages, file = tmp_path / "packages", tmp_path / "a.mcap"
     packages.mkdir()
     for one in Path(sysconfig.get_path("purelib")).iterdir():
@@ -71,7 +69,7 @@ def test_a_service_needs_neither_lab_nor_viewers(tmp_path: Path) -> None:
     assert not file.exists()
 
 
-def test_no_text_installs_from_an_index_what_none_has() -> None:
+def test_no_text_installs_from_an_index_what_none_has():
     """No index has our distributions: pip would find nothing, or a package of another owner."""
     listed = subprocess.run(
         ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True

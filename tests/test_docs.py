@@ -1,7 +1,5 @@
 """Tests of the documentation against the code: functions, equations and commands."""
 
-from __future__ import annotations
-
 import ast
 import inspect
 import json
@@ -11,7 +9,6 @@ import shlex
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
@@ -37,18 +34,18 @@ GEOMETRY = sorted((ROOT / "sceneprint/geometry").rglob("*.py"))
 ROWS = re.findall(r"^\| ((?:Eq\.|Sec\.)[^|]+) \| `([^`:]+):(\w+)`", PAPER, re.MULTILINE)
 
 
-def function_of(path: str, name: str) -> object:
+def function_of(path, name):
     module = import_module(path.removesuffix(".py").replace("/", "."))
     return getattr(module, name)
 
 
-def test_there_are_rows() -> None:
+def test_there_are_rows():
     assert len(ROWS) >= 14
     assert len(set(ROWS)) == len(ROWS)
 
 
 @pytest.mark.parametrize(("what", "path", "name"), ROWS)
-def test_every_row_names_a_function_that_names_its_source(what: str, path: str, name: str) -> None:
+def test_every_row_names_a_function_that_names_its_source(what, path, name):
     function = function_of(path, name)
     text = (inspect.getdoc(function) or "") + (ROOT / path).read_text().split('"""')[1]
     source = re.match(r"(Eq\. \(\d+)|(Sec\. III(?:-[A-F])?)", what)
@@ -57,14 +54,14 @@ def test_every_row_names_a_function_that_names_its_source(what: str, path: str, 
     assert named in text or (named == "Sec. III" and "Sec. III" in text)
 
 
-def test_every_function_named_in_passing_is_where_it_is_said_to_be() -> None:
+def test_every_function_named_in_passing_is_where_it_is_said_to_be():
     named = re.findall(r"`(\w+)` in\s+`(sceneprint/[\w/]+\.py)`", PAPER)
     assert named
     for name, path in named:
-        assert inspect.getsourcefile(function_of(path, name)) == str(ROOT / path)  # type: ignore[arg-type]
+        assert inspect.getsourcefile(function_of(path, name)) == str(ROOT / path)
 
 
-def test_every_equation_in_the_code_has_a_row() -> None:
+def test_every_equation_in_the_code_has_a_row():
     marked = {
         (mark, str(path.relative_to(ROOT)))
         for path in GEOMETRY
@@ -80,7 +77,7 @@ def test_every_equation_in_the_code_has_a_row() -> None:
     assert marked <= {(what, path) for what, path, _ in ROWS}
 
 
-def test_every_reading_that_code_cites_is_explained() -> None:
+def test_every_reading_that_code_cites_is_explained():
     cited = {
         number
         for path in GEOMETRY
@@ -91,7 +88,7 @@ def test_every_reading_that_code_cites_is_explained() -> None:
     assert cited <= explained
 
 
-def test_docs_name_the_shipped_models_as_they_are() -> None:
+def test_docs_name_the_shipped_models_as_they_are():
     """Ids and figures of docs/model.md are those of the files in the package."""
     for preset in PRESETS:
         model = read_model(preset)
@@ -102,12 +99,12 @@ def test_docs_name_the_shipped_models_as_they_are() -> None:
         assert f"{model.provenance['pairs_used']:,} pairs" in MODEL
 
 
-def test_no_blank_is_left_to_fill_in() -> None:
+def test_no_blank_is_left_to_fill_in():
     assert [page.name for page in PAGES if "@@" in page.read_text()] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_somewhere(page: Path) -> None:
+def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
         if target.startswith("https://"):
             continue
@@ -120,12 +117,12 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert heading in marks, target
 
 
-def blocks(text: str, language: str) -> list[str]:
+def blocks(text, language):
     return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 @contextmanager
-def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[None]:
+def served(line, folder, environment):
     """The documented service, running."""
     program, *arguments = line.split()
     assert (program, arguments) == (".venv/bin/sceneprint", ["serve"])
@@ -148,24 +145,24 @@ def served(line: str, folder: Path, environment: dict[str, str]) -> Iterator[Non
         assert (process.returncode, out) == (0, f"sceneprint: dashboard {url}/dashboard\n")
 
 
-def commands_of(text: str) -> list[str]:
+def commands_of(text):
     return [line for block in blocks(text, "sh") for line in block.strip().splitlines()]
 
 
-def test_readme_has_two_commands_one_example_and_at_most_700_words() -> None:
+def test_readme_has_two_commands_one_example_and_at_most_700_words():
     assert commands_of(README) == ["make demo", ".venv/bin/sceneprint serve"]
     assert len(blocks(README, "python")) == 1
     assert len(README.split()) <= 700
 
 
-def test_the_index_of_the_documentation_names_every_page() -> None:
+def test_the_index_of_the_documentation_names_every_page():
     docs = ROOT / "docs"
     linked = set(re.findall(r"\]\(([\w/]+\.md)\)", (docs / "README.md").read_text()))
     pages = {page.relative_to(docs).as_posix() for page in docs.rglob("*.md")}
     assert linked == pages - {"README.md"}
 
 
-def test_documented_commands_are_known() -> None:
+def test_documented_commands_are_known():
     lines = commands_of(STARTED + LIBRARY)
     commands = [line.split()[1:] for line in lines if line.startswith(".venv/bin/sceneprint ")]
     assert len(commands) == len(lines) == 17
@@ -174,7 +171,7 @@ def test_documented_commands_are_known() -> None:
         assert known.parse_args(command).command == command[0]
 
 
-def test_commands_of_sensors_and_of_troubleshooting_are_known() -> None:
+def test_commands_of_sensors_and_of_troubleshooting_are_known():
     pages = [ROOT / "docs/troubleshooting.md", *sorted((ROOT / "docs/sensors").glob("*.md"))]
     known = parser()
     for page in pages:
@@ -189,7 +186,7 @@ def test_commands_of_sensors_and_of_troubleshooting_are_known() -> None:
             assert known.parse_args(arguments).command == arguments[0]
 
 
-def test_troubleshooting_quotes_messages_of_the_code() -> None:
+def test_troubleshooting_quotes_messages_of_the_code():
     """Messages are block quotes, and code with blanks in tables; an ellipsis stands for names."""
     page = (ROOT / "docs/troubleshooting.md").read_text()
     quoted = re.findall(r"^> (.*)$", page, re.MULTILINE)
@@ -205,7 +202,7 @@ def test_troubleshooting_quotes_messages_of_the_code() -> None:
     assert unknown == []
 
 
-def messages_of_the_code() -> Iterator[str]:
+def messages_of_the_code():
     """Texts of string literals, a line each; what is put into one at run time is left out."""
     for folder in ("sceneprint", "service", "client/sceneprint_client"):
         for path in sorted((ROOT / folder).rglob("*.py")):
@@ -218,7 +215,7 @@ def messages_of_the_code() -> Iterator[str]:
 
 
 @pytest.mark.thorough
-def test_documented_commands_and_examples_run(tmp_path: Path) -> None:
+def test_documented_commands_and_examples_run(tmp_path):
     """README, Getting started and Library, but for `make`, which the tests themselves run under."""
     serve, *rest = commands_of(STARTED + LIBRARY)
     assert serve == commands_of(README)[1]
@@ -273,7 +270,7 @@ def test_documented_commands_and_examples_run(tmp_path: Path) -> None:
     assert all(name.startswith("room-000/") for name in accepted)
 
 
-def run_example(code: str, folder: Path) -> str:
+def run_example(code, folder):
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=folder, check=True, stdout=subprocess.PIPE, text=True
     )
@@ -287,13 +284,13 @@ PLACES = re.findall(
 
 
 @pytest.mark.parametrize(("path", "name"), sorted(set(PLACES)))
-def test_architecture_names_what_exists(path: str, name: str) -> None:
+def test_architecture_names_what_exists(path, name):
     assert (ROOT / path).exists()
     if name:
         assert name in definitions(ROOT / path)
 
 
-def definitions(path: Path) -> set[str]:
+def definitions(path):
     """Functions and classes of a module, and methods as `Class.method`."""
     found = set()
     for node in ast.parse(path.read_text()).body:
@@ -307,7 +304,7 @@ def definitions(path: Path) -> set[str]:
     return found
 
 
-def test_documented_camera_is_valid_json() -> None:
+def test_documented_camera_is_valid_json():
     from sceneprint.formats.dataset import Camera
     from sceneprint.types import Intrinsics
 
@@ -317,7 +314,7 @@ def test_documented_camera_is_valid_json() -> None:
     assert Camera(Intrinsics(**fields), scale).depth_scale == 1000
 
 
-def test_make_has_the_verbs_the_docs_name() -> None:
+def test_make_has_the_verbs_the_docs_name():
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
     pages = "".join(page.read_text() for page in PAGES)
     named = set(re.findall(r"(?:`|\n)make ([\w-]+)", pages))

@@ -1,13 +1,10 @@
 """Tests of the installation by `make`: consistent locks, uv or pip, and type checkers."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
 import sys
 import tomllib
-from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -17,15 +14,15 @@ ROOT = Path(__file__).resolve().parent.parent
 INSTALL = ROOT / "tools/install"
 
 
-def names_of(requirements: Sequence[str]) -> list[str]:
+def names_of(requirements):
     return [re.split(r"[<>=;\[ ]", requirement)[0] for requirement in requirements]
 
 
-def locked(path: Path) -> dict[str, str]:
+def locked(path):
     """Version and hashes of each package of a lock; each has a hash at least."""
     text = path.read_text()
     assert "://" not in text
-    known: dict[str, str] = {}
+    known = {}
     if text.startswith("-r "):
         first, _, text = text.partition("\n")
         known = locked(path.with_name(first.removeprefix("-r ")))
@@ -35,7 +32,7 @@ def locked(path: Path) -> dict[str, str]:
     return known | {name: f"{version} {hashes}" for name, version, hashes in entries}
 
 
-def test_every_dependency_has_a_reason_and_is_locked() -> None:
+def test_every_dependency_has_a_reason_and_is_locked():
     read = tomllib.loads((ROOT / "pyproject.toml").read_text())
     project, groups = read["project"], read["dependency-groups"]
     extras, runtime = project["optional-dependencies"], project["dependencies"]
@@ -65,7 +62,7 @@ def test_every_dependency_has_a_reason_and_is_locked() -> None:
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Path:
+def machine(tmp_path):
     """Stand-ins of the programs that `tools/install` calls: each call is a line of `calls`."""
     call = f'echo "${{0##*/}} $*" >> "{tmp_path}/calls"'
     scripts = {
@@ -86,9 +83,7 @@ def machine(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def install(
-    machine: Path, python: str, environment: str, **variables: str
-) -> tuple[subprocess.CompletedProcess[str], list[str]]:
+def install(machine, python, environment, **variables):
     """Run `tools/install` and return what it did and each program that it called."""
     inherited = {key: value for key, value in os.environ.items() if "INDEX" not in key}
     done = subprocess.run(
@@ -102,7 +97,7 @@ def install(
 EDITABLE = "--no-deps --no-build-isolation --config-settings editable_mode=compat -e own"
 
 
-def test_uv_installs_the_lock_and_then_our_packages(machine: Path) -> None:
+def test_uv_installs_the_lock_and_then_our_packages(machine):
     done, calls = install(machine, "python", "environment")
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[0] == "Installing some.lock into environment: 1 packages"
@@ -120,9 +115,7 @@ def test_uv_installs_the_lock_and_then_our_packages(machine: Path) -> None:
         ({"UV_FAILS": "some.lock"}, "uv failed"),
     ],
 )
-def test_pip_installs_where_uv_does_not(
-    machine: Path, variables: dict[str, str], reason: str
-) -> None:
+def test_pip_installs_where_uv_does_not(machine, variables, reason):
     done, calls = install(machine, "python", "environment", **variables)
     assert done.returncode == 0, done.stderr
     assert f"{reason} (see above): pip is used, which takes minutes" in done.stdout
@@ -138,7 +131,7 @@ def test_pip_installs_where_uv_does_not(
         ("absent", "./absent does not run. Install Python 3.11 or later"),
     ],
 )
-def test_a_python_that_cannot_do_it_is_named(machine: Path, python: str, message: str) -> None:
+def test_a_python_that_cannot_do_it_is_named(machine, python, message):
     done, calls = install(machine, python, "new")
     assert done.returncode == 2
     assert message in done.stderr
@@ -146,7 +139,7 @@ def test_a_python_that_cannot_do_it_is_named(machine: Path, python: str, message
     assert calls == []
 
 
-def test_type_checkers_find_the_client(tmp_path: Path) -> None:
+def test_type_checkers_find_the_client(tmp_path):
     """As of a user's script in the environment of `make demo`."""
     script = tmp_path / "script.py"
     script.write_text(

@@ -1,13 +1,10 @@
 """Tests of the examples."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +19,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.mark.thorough  # tests/cli_service and tests/engine/test_equal_rooms.py ask all of it
-def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
+def test_the_robot_maps_a_room_and_finds_itself(tmp_path):
     ran = subprocess.run(
         [sys.executable, ROOT / "examples" / "robot_loop.py", "--data", tmp_path / "robot"],
         capture_output=True, text=True, check=False, env={**os.environ, "TMPDIR": str(tmp_path)},
@@ -53,7 +50,7 @@ def test_the_robot_maps_a_room_and_finds_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough  # tests/client/test_tracker.py carries a robot off as well
-def test_a_robot_tracks_itself_and_notices_that_it_was_carried() -> None:
+def test_a_robot_tracks_itself_and_notices_that_it_was_carried():
     ran = subprocess.run(
         [sys.executable, ROOT / "examples" / "tracked_drive.py"],
         capture_output=True, text=True, check=False,
@@ -72,7 +69,7 @@ def test_a_robot_tracks_itself_and_notices_that_it_was_carried() -> None:
     assert max(off) < 10
 
 
-def test_every_example_is_listed() -> None:
+def test_every_example_is_listed():
     listed = (ROOT / "examples" / "README.md").read_text()
     for path in (ROOT / "examples").glob("*.py"):
         assert f"({path.name})" in listed
@@ -82,7 +79,7 @@ def test_every_example_is_listed() -> None:
 
 
 @pytest.fixture(scope="module")
-def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drives(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded") / "drives"
     ran = subprocess.run(
         [sys.executable, ROOT / "examples" / "record_drives.py", folder, "--frames", "8"],
@@ -94,12 +91,10 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def example(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., str]:
+def example(capsys, monkeypatch):
     """Runs an example as a command, in this process, which has compiled code loaded already."""
 
-    def run(name: str, *arguments: object) -> str:
+    def run(name, *arguments):
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         capsys.readouterr()
         runpy.run_path(str(ROOT / "examples" / name), run_name="__main__")
@@ -109,9 +104,7 @@ def example(
 
 
 @pytest.mark.thorough
-def test_a_bag_becomes_live_poses(
-    drives: Path, tmp_path: Path, example: Callable[..., str]
-) -> None:
+def test_a_bag_becomes_live_poses(drives, tmp_path, example):
     (mapping,) = find_sequences(drives / "mapping")
     with Client.embedded(tmp_path) as client:
         client.create_map("office")
@@ -132,7 +125,7 @@ def test_a_bag_becomes_live_poses(
 
 
 @pytest.mark.thorough
-def test_two_recordings_become_one_map(drives: Path, example: Callable[..., str]) -> None:
+def test_two_recordings_become_one_map(drives, example):
     told = example("join_robots.py", drives / "mapping", drives / "later")
     found = re.search(r"later/odom begins in mapping/map at (\S+) (\S+) (\S+) m", told)
     assert found is not None, told

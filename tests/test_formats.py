@@ -31,7 +31,7 @@ DEPTH = {
 }
 
 
-def test_a_name_stands_once_in_its_kind_and_functions_are_there() -> None:
+def test_a_name_stands_once_in_its_kind_and_functions_are_there():
     keys = [(one.kind, one.name) for one in FORMATS]
     assert len(set(keys)) == len(keys)
     assert {one.name for one in formats_of("cloud")} == set(get_args(CloudFormat))
@@ -41,7 +41,7 @@ def test_a_name_stands_once_in_its_kind_and_functions_are_there() -> None:
         assert (one.kind in ("depth", "cloud")) <= bool(one.reader)
 
 
-def test_every_depth_format_is_recognised_measured_and_read() -> None:
+def test_every_depth_format_is_recognised_measured_and_read():
     assert set(DEPTH) == {one.name for one in formats_of("depth")}
     for name, data in DEPTH.items():
         found = format_at(data, "depth", "map", "archive", "recording", "capture")
@@ -51,20 +51,20 @@ def test_every_depth_format_is_recognised_measured_and_read() -> None:
         assert decode_samples(data).shape == (2, 3)
 
 
-def test_every_cloud_format_but_one_is_recognised() -> None:
+def test_every_cloud_format_but_one_is_recognised():
     for data, name in (*array_samples(), *text_samples()):
         assert format_of(data) == (None if name == "kitti" else name)
 
 
 @pytest.mark.parametrize("kind", ["depth", "cloud"])
-def test_an_array_is_a_cloud_by_its_columns_and_type(kind: str) -> None:
+def test_an_array_is_a_cloud_by_its_columns_and_type(kind):
     array = np.ones((5, 3), "<f4" if kind == "cloud" else "<u2")
     assert format_of(encode_npy(array)) == ("npy" if kind == "cloud" else None)
     assert format_of(encode_npy(np.ones((5, 30), "<f4"))) is None
     assert format_of(encode_npy(np.ones((5, 4), ">f8"))) == "npy"
 
 
-def test_names() -> None:
+def test_names():
     assert [is_cloud(name) for name in ("A.PLY", "a.npy", "a.pfm", "a.e57")] == [True] + [False] * 3
     assert titles_of("depth", last="or") == "PNG, NPY, PFM or compressedDepth of ROS"
     found = format_named("run.MCAP", "recording")
@@ -72,7 +72,7 @@ def test_names() -> None:
     assert found.name == "mcap"
 
 
-def test_no_other_file_lists_suffixes() -> None:
+def test_no_other_file_lists_suffixes():
     """A new format is a row of the table and a reader: nothing else knows a suffix."""
     rows = formats_of("depth", "cloud", "map")
     own = {one for row in rows for one in row.suffixes} - {".png", ".npy", ".ply", ".bin"}

@@ -27,7 +27,7 @@ ROOM = np.array([2.0, 1.25, 1.5])
 CAMERA = Intrinsics(160, 120, 80.0, 80.0, 79.5, 59.5)  # sees 90 by 74 degrees
 
 
-def view(yaw: float, at: tuple[float, float, float] = (0, 0, 0), pitch: float = 0.0) -> DepthFrame:
+def view(yaw, at=(0, 0, 0), pitch=0.0):
     """What a camera in the room sees of its walls, floor and ceiling."""
     c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
     e, f = np.cos(np.radians(pitch)), np.sin(np.radians(pitch))
@@ -43,17 +43,17 @@ def view(yaw: float, at: tuple[float, float, float] = (0, 0, 0), pitch: float = 
 
 
 @pytest.fixture(scope="module")
-def around(with_open3d: None) -> list[DepthFrame]:
+def around(with_open3d):
     """All walls of the room, the floor and the ceiling, seen from six sides."""
     return [*(view(yaw) for yaw in (0, 90, 180, 270)), view(0, pitch=90), view(0, pitch=-90)]
 
 
 @pytest.fixture(scope="module")
-def room(around: list[DepthFrame]) -> tuple[TriangleMesh, float]:
+def room(around):
     return fuse(around, FusionParameters(voxel_m=0.026))
 
 
-def test_the_surface_lies_on_the_walls_and_has_their_area(around: list[DepthFrame]) -> None:
+def test_the_surface_lies_on_the_walls_and_has_their_area(around):
     """From the middle of the room in 26 directions: no part of a wall is unseen."""
     whole = [view(yaw, pitch=pitch) for pitch in (-50, 0, 50) for yaw in range(0, 360, 45)]
     mesh, voxel = fuse([*whole, *around[4:]], FusionParameters(voxel_m=0.026))
@@ -72,9 +72,7 @@ def test_the_surface_lies_on_the_walls_and_has_their_area(around: list[DepthFram
     assert (turning > -1e-6).mean() > 0.999
 
 
-def test_the_same_views_give_the_same_bytes(
-    around: list[DepthFrame], room: tuple[TriangleMesh, float]
-) -> None:
+def test_the_same_views_give_the_same_bytes(around, room):
     mesh, _ = fuse(around, FusionParameters(voxel_m=0.026))
     for name in ("points", "normals", "triangles"):
         assert getattr(mesh, name).tobytes() == getattr(room[0], name).tobytes()
@@ -82,7 +80,7 @@ def test_the_same_views_give_the_same_bytes(
     assert (mesh.triangles[:, :1] <= mesh.triangles).all()
 
 
-def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[DepthFrame]) -> None:
+def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around):
     p = FusionParameters(voxel_m=0.05)
     mesh, voxel = fuse(around[:1], p)
     assert voxel == 0.05
@@ -97,7 +95,7 @@ def test_a_finer_voxel_is_taken_as_wanted_until_blocks_run_out(around: list[Dept
     assert fuse(around[:1])[1] == pytest.approx(2 * 1.5 / 80, abs=0.001)
 
 
-def test_out_of_range_is_not_fused(around: list[DepthFrame]) -> None:
+def test_out_of_range_is_not_fused(around):
     with pytest.raises(UselessFrame, match=r"between 0\.3 and 1 m"):
         fuse(around[:1], FusionParameters(farthest_m=1.0))
     holes = replace(around[0], depth=np.where(np.eye(120, 160) > 0, np.nan, around[0].depth))
@@ -105,7 +103,7 @@ def test_out_of_range_is_not_fused(around: list[DepthFrame]) -> None:
     assert (kept.depth[np.eye(120, 160) > 0] == 0).all()
 
 
-def test_a_thinned_view_keeps_its_rays(around: list[DepthFrame]) -> None:
+def test_a_thinned_view_keeps_its_rays(around):
     thin = prepare_view(around[0], FusionParameters(most_samples=5000))
     assert thin.depth.shape == (60, 80)
     for x, y in ((0, 0), (17, 40), (79, 59)):
@@ -115,7 +113,7 @@ def test_a_thinned_view_keeps_its_rays(around: list[DepthFrame]) -> None:
         assert (y - k.cy) / k.fy == pytest.approx((2 * y - whole.cy) / whole.fy, abs=1e-12)
 
 
-def test_what_each_view_adds(around: list[DepthFrame], room: tuple[TriangleMesh, float]) -> None:
+def test_what_each_view_adds(around, room):
     mesh, voxel = room
     views = [around[0], around[0], around[2], *around[1:2], *around[3:]]
     first = first_views(mesh, views, 2 * voxel)
@@ -129,7 +127,7 @@ def test_what_each_view_adds(around: list[DepthFrame], room: tuple[TriangleMesh,
     assert mesh.areas()[ahead & seen].sum() == pytest.approx(3.0 * 2.25, rel=0.08)
 
 
-def test_first_seen_by_hand() -> None:
+def test_first_seen_by_hand():
     """One square of two triangles, the first seen by the second view alone."""
     points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1.0]])
     mesh = TriangleMesh(
@@ -153,7 +151,7 @@ def test_first_seen_by_hand() -> None:
     assert share_seen(points + np.array([0, 0, 0.0830]), views[1:]) == 0.0
 
 
-def test_the_observed_volume_is_that_of_the_view_cone(around: list[DepthFrame]) -> None:
+def test_the_observed_volume_is_that_of_the_view_cone(around):
     # a pyramid to a wall 1.5 m ahead, 160/80 * 1.5 wide and 120/80 * 1.5 high
     ahead = replace(around[0], depth=np.full((120, 160), 1.5, np.float32))
     volume, cell = observed_volume([ahead])
@@ -166,7 +164,7 @@ def test_the_observed_volume_is_that_of_the_view_cone(around: list[DepthFrame]) 
     assert observed_volume([])[0] == 0.0
 
 
-def test_without_open3d_the_message_names_the_packages() -> None:
+def test_without_open3d_the_message_names_the_packages():
     """A system library is missing: all else of the package works."""
     code = """
 import sys

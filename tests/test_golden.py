@@ -4,18 +4,14 @@ Moving or renaming code must not change it. After an intended change, update the
 goldens`, read their diff, and describe the change in CHANGELOG.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from difflib import unified_diff
 from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +20,7 @@ from sceneprint import pipeline
 from sceneprint.cli import all_commands, parser
 from sceneprint.formats.dataset import make_frame
 from sceneprint.settings import Settings
-from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint.types import Intrinsics
 from service.app import create_app
 from tools.site.format_pages import formats_module, formats_page
 
@@ -59,7 +55,7 @@ FROZEN = 2048
 ROW = 64
 
 
-def golden(name: str, lines: Sequence[str]) -> list[str]:
+def golden(name, lines):
     """Return the lines of a file of tests/golden, after writing them if an update is wanted."""
     path = GOLDEN / name
     if UPDATE:
@@ -67,7 +63,7 @@ def golden(name: str, lines: Sequence[str]) -> list[str]:
     return path.read_text(encoding="utf-8").splitlines()
 
 
-def assert_golden(name: str, lines: Sequence[str]) -> None:
+def assert_golden(name, lines):
     """Assert that a file of tests/golden has exactly these lines."""
     kept = golden(name, lines)
     assert kept == lines, "\n".join(unified_diff(kept, lines, name, "now", n=0, lineterm=""))
@@ -76,7 +72,7 @@ def assert_golden(name: str, lines: Sequence[str]) -> None:
 # The table of formats ---------------------------------------------------------------------------
 
 
-def test_formats_of_docs_and_dashboard() -> None:
+def test_formats_of_docs_and_dashboard():
     assert_golden("../../docs/formats.md", formats_page().splitlines())
     module = "../../service/dashboard/pages/frames/formats.js"
     assert_golden(module, formats_module().splitlines())
@@ -85,7 +81,7 @@ def test_formats_of_docs_and_dashboard() -> None:
 # The document of the API ------------------------------------------------------------------------
 
 
-def shortened(document: dict[str, Any]) -> dict[str, Any]:
+def shortened(document):
     """Return a document in which parameters and responses that operations share stand once.
 
     An operation names a shared parameter in place of describing it, and lists the statuses of its
@@ -93,7 +89,7 @@ def shortened(document: dict[str, Any]) -> dict[str, Any]:
     """
     document = deepcopy(document)
     operations = [one for methods in document["paths"].values() for one in methods.values()]
-    shared: dict[str, dict[str, Any]] = {"parameters": {}, "responses": {}}
+    shared = {"parameters": {}, "responses": {}}
     parameters = Counter(
         (one["name"], json.dumps(one, sort_keys=True))
         for operation in operations
@@ -124,7 +120,7 @@ def shortened(document: dict[str, Any]) -> dict[str, Any]:
     return {"shared": shared, **document}
 
 
-def expanded(document: dict[str, Any]) -> dict[str, Any]:
+def expanded(document):
     """Return the document that `shortened` shortened."""
     shared = document["shared"]
     expanded = {key: value for key, value in deepcopy(document).items() if key != "shared"}
@@ -140,7 +136,7 @@ def expanded(document: dict[str, Any]) -> dict[str, Any]:
     return expanded
 
 
-def json_text(value: Any, key: str = "", depth: int = 0) -> str:
+def json_text(value, key="", depth=0):
     """Return a JSON value as lines that can be read and compared.
 
     A value has one line if that is short, or if nothing within it is listed (`LISTED`). Any other
@@ -160,7 +156,7 @@ def json_text(value: Any, key: str = "", depth: int = 0) -> str:
         if depth and key not in LISTED:
             members.sort(key=lambda text: "\n" in text)
         short = [depth > 0 and key not in LISTED and "\n" not in text for text in members]
-    parts: list[str] = []
+    parts = []
     for together, group in groupby(zip(short, members, strict=True), key=lambda pair: pair[0]):
         texts = [text for _, text in group]
         first = " " * (depth + 1) + ", ".join(text.strip() for text in texts)
@@ -168,14 +164,14 @@ def json_text(value: Any, key: str = "", depth: int = 0) -> str:
     return start + opening + ",\n".join(parts).lstrip() + closing
 
 
-def holds_list(value: Any) -> bool:
+def holds_list(value):
     """Return whether something within a JSON value is listed."""
     if isinstance(value, dict):
         return any(key in LISTED or holds_list(one) for key, one in value.items())
     return isinstance(value, list) and any(holds_list(one) for one in value)
 
 
-def test_the_document_of_the_api(tmp_path: Path) -> None:
+def test_the_document_of_the_api(tmp_path):
     document = create_app(Settings(data_dir=tmp_path)).openapi()
     document["info"].pop("version")
     text = json_text(shortened(document))
@@ -187,7 +183,7 @@ def test_the_document_of_the_api(tmp_path: Path) -> None:
 # The command line -------------------------------------------------------------------------------
 
 
-def help_lines(command: argparse.ArgumentParser) -> Iterator[str]:
+def help_lines(command):
     """Yield the help of a command and its subcommands.
 
     Not as argparse writes it, which differs between versions of Python.
@@ -209,11 +205,11 @@ def help_lines(command: argparse.ArgumentParser) -> Iterator[str]:
             yield from help_lines(subcommand)
 
 
-def option_name(action: argparse.Action) -> str:
+def option_name(action):
     return ", ".join(action.option_strings) or str(action.metavar or action.dest)
 
 
-def option_line(action: argparse.Action) -> str:
+def option_line(action):
     """Return an option with its value, how often it may be there, its default and its help."""
     words = [option_name(action)]
     if action.option_strings and isinstance(action.metavar, str):
@@ -232,7 +228,7 @@ def option_line(action: argparse.Action) -> str:
     return f"{' '.join(words)}: {help_text}".rstrip(": ")
 
 
-def test_the_help_of_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_help_of_every_command(monkeypatch):
     monkeypatch.setattr(os, "cpu_count", lambda: None)  # some defaults depend on this machine
     for variable in ("SCENEPRINT_URL", "SCENEPRINT_KEY"):
         monkeypatch.delenv(variable, raising=False)
@@ -245,7 +241,7 @@ def test_the_help_of_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
 # Signatures and an answer -----------------------------------------------------------------------
 
 
-def pose_of(x: float, y: float, z: float, yaw: float) -> Floats:
+def pose_of(x, y, z, yaw):
     """T_room_camera (4, 4) of a level camera; its axes are x right, y down, z forward."""
     T = np.eye(4)
     T[:3, 0] = np.sin(yaw), -np.cos(yaw), 0
@@ -255,7 +251,7 @@ def pose_of(x: float, y: float, z: float, yaw: float) -> Floats:
     return T
 
 
-def view(name: str) -> DepthFrame:
+def view(name):
     """The room in whole millimetres, which no processor rounds otherwise."""
     k = Intrinsics(160, 120, 145.0, 145.0, 79.5, 59.5)
     T = pose_of(*VIEWS[name])
@@ -273,7 +269,7 @@ def view(name: str) -> DepthFrame:
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_signatures(preset: str) -> None:
+def test_signatures(preset):
     signer = pipeline.open_signer(preset)
     for name in VIEWS:
         made = pipeline.sign(view(name), signer).vector[:FROZEN]
@@ -285,11 +281,11 @@ def test_signatures(preset: str) -> None:
         assert (off == 0).mean() >= 0.99, name
 
 
-def test_an_answer() -> None:
+def test_an_answer():
     """A found place, and one that is another corner of the room."""
     signer = pipeline.open_signer("depth")
     query, *database = (pipeline.prepare(view(name), signer)[1] for name in VIEWS)
-    found: dict[str, Any] = {}
+    found = {}
     for name, match in zip(list(VIEWS)[1:], database, strict=True):
         one = pipeline.validate(query, match, seed=7)
         found[name] = {

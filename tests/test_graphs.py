@@ -1,9 +1,6 @@
 """Tests of g2o files with two readers, and of their meaning."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,22 +8,21 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.formats.export import PoseEdge, g2o, information_of
 from sceneprint.geometry.rigid import inverse
-from sceneprint.types import Floats
 
 
-def rigid(rng: np.random.Generator, metres: float = 2.0, radians: float = 2.0) -> Floats:
+def rigid(rng, metres=2.0, radians=2.0):
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec(rng.normal(0, radians, 3)).as_matrix()
     T[:3, 3] = rng.normal(0, metres, 3)
     return T
 
 
-def positive(rng: np.random.Generator) -> Floats:
+def positive(rng):
     A = rng.normal(0, 1, (6, 6))
     return A @ A.T + np.eye(6)
 
 
-def a_graph(n: int = 5) -> tuple[list[Floats], list[PoseEdge]]:
+def a_graph(n=5):
     rng = np.random.default_rng(3)
     poses = [rigid(rng) for _ in range(n)]
     edges = [
@@ -36,10 +32,10 @@ def a_graph(n: int = 5) -> tuple[list[Floats], list[PoseEdge]]:
     return poses, edges
 
 
-def read_strictly(text: str) -> tuple[dict[int, Floats], list[tuple[int, int, Floats, Floats]]]:
+def read_strictly(text):
     """Vertices and edges; every line must be one, with all its numbers."""
     assert text.endswith("\n")
-    vertices: dict[int, Floats] = {}
+    vertices = {}
     edges = []
     for line in text[:-1].split("\n"):
         kind, *rest = line.split(" ")
@@ -58,14 +54,14 @@ def read_strictly(text: str) -> tuple[dict[int, Floats], list[tuple[int, int, Fl
     return vertices, edges
 
 
-def matrix(numbers: Floats) -> Floats:
+def matrix(numbers):
     T = np.eye(4)
     assert np.linalg.norm(numbers[3:]) == pytest.approx(1.0, abs=1e-8)
     T[:3, :3], T[:3, 3] = Rotation.from_quat(numbers[3:]).as_matrix(), numbers[:3]
     return T
 
 
-def test_there_and_back() -> None:
+def test_there_and_back():
     poses, edges = a_graph()
     vertices, read = read_strictly(g2o(poses, edges))
     for pose, numbers in zip(poses, vertices.values(), strict=True):
@@ -77,7 +73,7 @@ def test_there_and_back() -> None:
         np.testing.assert_allclose(information, scale @ edge.information @ scale, rtol=1e-8)
 
 
-def test_its_error_costs_what_the_information_says() -> None:
+def test_its_error_costs_what_the_information_says():
     """g2o's cost of a small error, by its own definition, against ours in metres and radians."""
     rng = np.random.default_rng(1)
     for _ in range(10):
@@ -92,7 +88,7 @@ def test_its_error_costs_what_the_information_says() -> None:
         assert theirs @ read[0][3] @ theirs == pytest.approx(error @ information @ error, rel=1e-4)
 
 
-def test_information_of_a_covariance_in_other_axes() -> None:
+def test_information_of_a_covariance_in_other_axes():
     """Drawn errors of the kind that `geometry.covariance` speaks of, told as T exp(xi)."""
     rng = np.random.default_rng(2)
     T = rigid(rng)
@@ -110,7 +106,7 @@ def test_information_of_a_covariance_in_other_axes() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:spsolve requires A be CSC")  # of the reader's own solver
-def test_a_standard_reader_takes_it_and_optimises(tmp_path: Path) -> None:
+def test_a_standard_reader_takes_it_and_optimises(tmp_path):
     graphslam = pytest.importorskip("graphslam.graph")
     poses, edges = a_graph()
     exact = [PoseEdge(e.first, e.second, inverse(poses[e.first]) @ poses[e.second], e.information)

@@ -1,8 +1,5 @@
 """Tests of candidates whose transform follows from earlier matches and the map's poses."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,14 +11,10 @@ from sceneprint.geometry.validation.validation import ValidationParameters, vali
 from sceneprint.localization import localize
 from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, unguided_validations
 from sceneprint.places import QueryFrame
-from sceneprint.types import Floats, Geometry
-from sceneprint_lab.synth import SynthRoom
-
-Room = tuple[list[Geometry], list[Floats]]
 
 
 @pytest.fixture(scope="module")
-def walk(room_views: Callable[..., SynthRoom]) -> Room:
+def walk(room_views):
     """Six frames along a path through a room, more than 10 cm apart; the third asks the others."""
     signer = open_signer("depth")
     frames = room_views(21, 0, 36, along_path=True, step=6).frames
@@ -30,7 +23,7 @@ def walk(room_views: Callable[..., SynthRoom]) -> Room:
     return [prepare(frame, signer)[1] for frame in frames], poses
 
 
-def asked_of(walk: Room, rows: list[int], poses: dict[int, Floats]) -> list[PairMatch]:
+def asked_of(walk, rows, poses):
     """The first frame asked of others, whose poses are as given."""
     geometries, _ = walk
     n = len(rows)
@@ -42,11 +35,11 @@ def asked_of(walk: Room, rows: list[int], poses: dict[int, Floats]) -> list[Pair
     return sorted(matches, key=lambda match: rows.index(match.index))
 
 
-def kinds(matches: list[PairMatch]) -> list[str]:
+def kinds(matches):
     return [match.validation.search for match in matches]
 
 
-def test_two_matches_guide_the_rest_to_the_truth(walk: Room) -> None:
+def test_two_matches_guide_the_rest_to_the_truth(walk):
     geometries, poses = walk
     rows = [1, 2, 3, 4, 5]
     matches = asked_of(walk, rows, dict(enumerate(poses)))
@@ -66,11 +59,11 @@ def test_two_matches_guide_the_rest_to_the_truth(walk: Room) -> None:
     again = validate_guided(geometries[0], geometries[3], first.predicted)
     assert again is not None
     assert again.T_match_query is not None
-    assert again.T_match_query.tobytes() == first.T_match_query.tobytes()  # type: ignore[union-attr]
+    assert again.T_match_query.tobytes() == first.T_match_query.tobytes()
     assert (again.overlap, again.inliers) == (first.overlap, first.inliers)
 
 
-def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk: Room) -> None:
+def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk):
     geometries, poses = walk
     matches = asked_of(walk, [1, 2, 3, 4, 5], dict(enumerate(poses)))
     found = localize([QueryFrame(geometries[0], matches)], poses)
@@ -93,7 +86,7 @@ def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk: Room) 
     assert unsure.alternatives[0].support == 2
 
 
-def test_copies_of_one_view_guide_nothing(walk: Room) -> None:
+def test_copies_of_one_view_guide_nothing(walk):
     _, poses = walk
     walk[0].append(walk[0][1])
     try:
@@ -104,19 +97,19 @@ def test_copies_of_one_view_guide_nothing(walk: Room) -> None:
 
 
 @pytest.mark.parametrize("known", [{}, {1: 1, 2: 2}, {1: 1, 3: 3}])
-def test_without_poses_everything_is_searched(walk: Room, known: dict[int, int]) -> None:
+def test_without_poses_everything_is_searched(walk, known):
     poses = {row: walk[1][i] for row, i in known.items()}
     assert kinds(asked_of(walk, [1, 2, 3], poses)) == ["correspondences"] * 3
 
 
-def test_matches_that_disagree_guide_nothing(walk: Room) -> None:
+def test_matches_that_disagree_guide_nothing(walk):
     poses = dict(enumerate(walk[1]))
     poses[2] = poses[2].copy()
     poses[2][0, 3] += 1.0  # the map is wrong about it, so its match votes for another place
     assert kinds(asked_of(walk, [1, 2, 3], poses)) == ["correspondences"] * 3
 
 
-def test_a_prediction_that_the_frames_do_not_bear_out_is_searched_for(walk: Room) -> None:
+def test_a_prediction_that_the_frames_do_not_bear_out_is_searched_for(walk):
     geometries, poses = walk
     wrong = dict(enumerate(poses))
     wrong[3] = wrong[3].copy()
@@ -134,7 +127,7 @@ def test_a_prediction_that_the_frames_do_not_bear_out_is_searched_for(walk: Room
     assert validate_guided(geometries[0], geometries[3], near, p=strict) is None
 
 
-def test_guided_matches_can_be_searched_for_after_all(walk: Room) -> None:
+def test_guided_matches_can_be_searched_for_after_all(walk):
     geometries, poses = walk
     rows = [1, 2, 3]
     matches = asked_of(walk, rows, dict(enumerate(poses)))
@@ -152,4 +145,4 @@ def test_guided_matches_can_be_searched_for_after_all(walk: Room) -> None:
     assert unguided_validations(again) is None
     alone = associate(geometries[0], ranking, range(3), geometries.__getitem__, 3)
     of_alone = {match.index: match.validation.T_match_query for match in alone}
-    np.testing.assert_array_equal(by_row[3].T_match_query, of_alone[3])  # type: ignore[arg-type]
+    np.testing.assert_array_equal(by_row[3].T_match_query, of_alone[3])

@@ -1,11 +1,8 @@
 """Tests of the rendered Helm chart against the schemas of Kubernetes and our code."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import kubernetes_validate
 import pytest
@@ -50,7 +47,7 @@ ALL = REQUIRED | {
 }
 
 
-def run_helm(*arguments: str, values: dict[str, Any], folder: Path) -> tuple[int, str, str]:
+def run_helm(*arguments, values, folder):
     """Exit code, output and errors of Helm over the chart with these values."""
     helm = shutil.which("helm")
     if helm is None:
@@ -65,7 +62,7 @@ def run_helm(*arguments: str, values: dict[str, Any], folder: Path) -> tuple[int
     return done.returncode, done.stdout, done.stderr
 
 
-def rendered(values: dict[str, Any], folder: Path) -> dict[tuple[str, str], Any]:
+def rendered(values, folder):
     """The objects of a release `fleet`, by kind and name."""
     returned, text, error = run_helm("template", "fleet", values=values, folder=folder)
     assert returned == 0, error
@@ -75,12 +72,12 @@ def rendered(values: dict[str, Any], folder: Path) -> dict[tuple[str, str], Any]
     return found
 
 
-def environment(container: dict[str, Any]) -> dict[str, str]:
+def environment(container):
     return {one["name"]: one["value"] for one in container["env"]}
 
 
 @pytest.mark.parametrize("values", [REQUIRED, ALL], ids=["required", "all"])
-def test_helm_and_kubernetes_accept_it(values: dict[str, Any], tmp_path: Path) -> None:
+def test_helm_and_kubernetes_accept_it(values, tmp_path):
     returned, text, error = run_helm("lint", "--strict", values=values, folder=tmp_path)
     assert (returned, "0 chart(s) failed" in text) == (0, True), text + error
     objects = rendered(values, tmp_path)
@@ -109,9 +106,7 @@ def test_helm_and_kubernetes_accept_it(values: dict[str, Any], tmp_path: Path) -
         ({"ingress": {"enabled": True}}, "set ingress.host"),
     ],
 )
-def test_values_that_cannot_work_are_refused(
-    change: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_values_that_cannot_work_are_refused(change, message, tmp_path):
     returned, _, error = run_helm("template", "fleet", values=REQUIRED | change, folder=tmp_path)
     assert returned != 0
     assert message in error
@@ -128,7 +123,7 @@ def test_values_that_cannot_work_are_refused(
         "mysql://sceneprint:hush@db/x",
     ],
 )
-def test_a_password_in_a_url_is_refused_and_not_repeated(url: str, tmp_path: Path) -> None:
+def test_a_password_in_a_url_is_refused_and_not_repeated(url, tmp_path):
     values = REQUIRED | {"database": REQUIRED["database"] | {"url": url}}
     returned, said, error = run_helm("template", "fleet", values=values, folder=tmp_path)
     assert (returned, said) == (1, "")
@@ -146,13 +141,13 @@ def test_a_password_in_a_url_is_refused_and_not_repeated(url: str, tmp_path: Pat
         "postgresql://sceneprint@[2001:db8::1]:5432/x",
     ],
 )
-def test_urls_without_a_password_are_taken(url: str, tmp_path: Path) -> None:
+def test_urls_without_a_password_are_taken(url, tmp_path):
     objects = rendered(REQUIRED | {"database": {"url": url}}, tmp_path)
     pod = objects["Job", "fleet-migration"]["spec"]["template"]["spec"]
     assert environment(pod["containers"][0])["SCENEPRINT_DATABASE_URL"] == url
 
 
-def test_pods_run_our_commands_with_our_settings(tmp_path: Path) -> None:
+def test_pods_run_our_commands_with_our_settings(tmp_path):
     known = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields} | {"AWS_REGION"}
     objects = rendered(ALL, tmp_path)
     parts = {
@@ -168,7 +163,7 @@ def test_pods_run_our_commands_with_our_settings(tmp_path: Path) -> None:
         given = environment(container)
         assert given.keys() - known == set()
         own = {k.removeprefix("SCENEPRINT_").lower(): v for k, v in given.items() if k[:3] == "SCE"}
-        settings = Settings(**own)  # type: ignore[arg-type]  # texts, as in the environment
+        settings = Settings(**own)  # texts, as in the environment
         assert settings.database == REQUIRED["database"]["url"]
         assert container["image"] == f"sceneprint@sha256:{'a' * 64}"
         assert container["envFrom"] == [{"secretRef": {"name": "sceneprint"}}]
@@ -181,7 +176,7 @@ def test_pods_run_our_commands_with_our_settings(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
-def test_pods_take_the_kernels_that_the_image_compiled(tmp_path: Path) -> None:
+def test_pods_take_the_kernels_that_the_image_compiled(tmp_path):
     cache = "/var/cache/sceneprint"
     assert f"NUMBA_CACHE_DIR={cache}/numba" in (CHART.parents[2] / "Dockerfile").read_text()
     objects = rendered(REQUIRED, tmp_path)
@@ -194,7 +189,7 @@ def test_pods_take_the_kernels_that_the_image_compiled(tmp_path: Path) -> None:
         assert {"name": copied["name"], "mountPath": cache} in container["volumeMounts"]
 
 
-def test_others_reach_the_port_of_the_api_alone(tmp_path: Path) -> None:
+def test_others_reach_the_port_of_the_api_alone(tmp_path):
     own = {"podSelector": {}}
     proxy = {"namespaceSelector": {"matchLabels": {"name": "ingress"}}}
     for values, allowed in (({}, own), ({"networkPolicy": {"from": [proxy]}}, proxy)):
@@ -208,7 +203,7 @@ def test_others_reach_the_port_of_the_api_alone(tmp_path: Path) -> None:
             assert policy["podSelector"]["matchLabels"].items() <= labels.items()
 
 
-def test_traffic_goes_to_ready_api_pods_alone(tmp_path: Path) -> None:
+def test_traffic_goes_to_ready_api_pods_alone(tmp_path):
     objects = rendered(ALL, tmp_path)
     api, worker = (objects["Deployment", f"fleet-{part}"]["spec"] for part in ("api", "worker"))
     selector = objects["Service", "fleet-api"]["spec"]["selector"]
@@ -226,7 +221,7 @@ def test_traffic_goes_to_ready_api_pods_alone(tmp_path: Path) -> None:
     assert by_default["Deployment", "fleet-api"]["spec"]["replicas"] == 2
 
 
-def test_the_schema_is_migrated_before_pods_are_replaced(tmp_path: Path) -> None:
+def test_the_schema_is_migrated_before_pods_are_replaced(tmp_path):
     objects = rendered(REQUIRED, tmp_path)
     hooks = {
         name: one["metadata"].get("annotations", {}).get("helm.sh/hook")
@@ -238,7 +233,7 @@ def test_the_schema_is_migrated_before_pods_are_replaced(tmp_path: Path) -> None
     assert ("Job", "fleet-migration") not in without
 
 
-def exposed() -> set[str]:
+def exposed():
     """Names of all series that /metrics may have."""
     found = set()
     for family in Metrics().registry.collect():
@@ -249,7 +244,7 @@ def exposed() -> set[str]:
     return found
 
 
-def test_workers_are_added_by_the_age_of_the_oldest_job(tmp_path: Path) -> None:
+def test_workers_are_added_by_the_age_of_the_oldest_job(tmp_path):
     objects = rendered(ALL, tmp_path)
     scaled = objects["ScaledObject", "fleet-worker"]["spec"]
     (trigger,) = scaled["triggers"]
@@ -262,7 +257,7 @@ def test_workers_are_added_by_the_age_of_the_oldest_job(tmp_path: Path) -> None:
     assert reference == [{"parameter": "token", "name": "sceneprint", "key": "METRICS_KEY"}]
 
 
-def test_versions_and_dashboards_are_in_the_chart(tmp_path: Path) -> None:
+def test_versions_and_dashboards_are_in_the_chart(tmp_path):
     chart = yaml.safe_load((CHART / "Chart.yaml").read_text())
     assert chart["appVersion"] == __version__  # also the tag of the image
     # Helm wants a SemVer version, which writes a release candidate as 1.0.0-rc.1
@@ -274,7 +269,7 @@ def test_versions_and_dashboards_are_in_the_chart(tmp_path: Path) -> None:
 SINGLE = {"single": {"enabled": True, "workers": 2, "dataSize": "9Gi", "storageClass": "local"}}
 
 
-def test_one_pod_has_the_whole_service_on_a_volume(tmp_path: Path) -> None:
+def test_one_pod_has_the_whole_service_on_a_volume(tmp_path):
     returned, text, error = run_helm("lint", "--strict", values=SINGLE, folder=tmp_path)
     assert (returned, "0 chart(s) failed" in text) == (0, True), text + error
     objects = rendered(SINGLE, tmp_path)
@@ -304,7 +299,7 @@ def test_one_pod_has_the_whole_service_on_a_volume(tmp_path: Path) -> None:
     assert container["envFrom"] == [{"secretRef": {"name": "keys"}}]
 
 
-def test_chart_and_compose_agree() -> None:
+def test_chart_and_compose_agree():
     """Memory limits, and the health check of workers."""
     compose = yaml.safe_load((CHART.parents[2] / "docker-compose.yml").read_text())["services"]
     values = yaml.safe_load((CHART / "values.yaml").read_text())

@@ -1,11 +1,8 @@
 """Tests of the project's rules: names, lengths of functions and files, and import cycles."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from itertools import combinations
@@ -35,7 +32,7 @@ RETIRED = {
 
 
 @cache
-def modules() -> dict[str, ast.Module]:
+def modules():
     """Syntax trees of all product modules, by path; not of copies that builds leave behind."""
     built = {"build", "install", "log"}
     paths = (
@@ -45,15 +42,13 @@ def modules() -> dict[str, ast.Module]:
     return {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in paths}
 
 
-def definitions(
-    tree: ast.Module,
-) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef]:
+def definitions(tree):
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             yield node
 
 
-def test_no_file_and_no_definition_has_a_retired_name() -> None:
+def test_no_file_and_no_definition_has_a_retired_name():
     tests = (path.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py"))
     found = [
         path for path in (*modules(), *tests) if Path(path).stem.removeprefix("test_") in RETIRED
@@ -64,7 +59,7 @@ def test_no_file_and_no_definition_has_a_retired_name() -> None:
     assert [one for one in found if one != furniture] == []
 
 
-def distance(a: Path, b: Path) -> int:
+def distance(a, b):
     """Steps from folder to folder."""
     common = 0
     for x, y in zip(a.parts, b.parts, strict=False):
@@ -74,7 +69,7 @@ def distance(a: Path, b: Path) -> int:
     return len(a.parts) + len(b.parts) - 2 * common
 
 
-def test_no_two_files_near_each_other_have_one_name() -> None:
+def test_no_two_files_near_each_other_have_one_name():
     by_name = defaultdict(list)
     for path in modules():
         if not Path(path).stem.startswith("__"):
@@ -88,7 +83,7 @@ def test_no_two_files_near_each_other_have_one_name() -> None:
     assert near == []
 
 
-def test_no_class_name_is_there_twice() -> None:
+def test_no_class_name_is_there_twice():
     names = Counter(
         one.name
         for path, tree in modules().items()
@@ -98,7 +93,7 @@ def test_no_class_name_is_there_twice() -> None:
     assert [name for name, count in names.items() if count > 1] == []
 
 
-def code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+def code_lines(node):
     """Lines of a function but for its docstring, which may be as long as it is useful."""
     first = node.body[0]
     told = 0
@@ -107,7 +102,7 @@ def code_lines(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return (node.end_lineno or 0) - node.lineno + 1 - told
 
 
-def test_a_long_function_says_why() -> None:
+def test_a_long_function_says_why():
     functions = [
         (path, node)
         for path, tree in modules().items()
@@ -124,7 +119,7 @@ def test_a_long_function_says_why() -> None:
     assert found == []
 
 
-def imports(tree: ast.Module, known: Collection[str]) -> Iterator[str]:
+def imports(tree, known):
     """Which of the known modules a module imports when it is loaded.
 
     `from a import b` is a.b where that is a module, and else a.
@@ -137,7 +132,7 @@ def imports(tree: ast.Module, known: Collection[str]) -> Iterator[str]:
             yield from (one if one in known else node.module for one in whole)
 
 
-def test_no_modules_import_each_other_in_a_circle() -> None:
+def test_no_modules_import_each_other_in_a_circle():
     names = {
         path.removesuffix(".py").removesuffix("/__init__").replace("/", "."): tree
         for path, tree in modules().items()

@@ -1,7 +1,5 @@
 """Tests of the check of the dashboard's JavaScript, which is skipped without Node."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -14,7 +12,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "tools/javascript"
 
 
-def check(folder: Path, path: str) -> subprocess.CompletedProcess[str]:
+def check(folder, path):
     return subprocess.run(
         ["/bin/sh", str(folder / "check")],
         env={**os.environ, "PATH": path},
@@ -24,7 +22,7 @@ def check(folder: Path, path: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_its_tools_are_pinned_and_locked() -> None:
+def test_its_tools_are_pinned_and_locked():
     wanted = json.loads((FOLDER / "package.json").read_text())["devDependencies"]
     locked = json.loads((FOLDER / "package-lock.json").read_text())["packages"]
     assert {name: locked[f"node_modules/{name}"]["version"] for name in wanted} == wanted
@@ -41,7 +39,7 @@ def test_its_tools_are_pinned_and_locked() -> None:
         ("/** @param {number} n */ export const f = (n) => n;\nf('1');", "error TS2345"),
     ],
 )
-def test_a_mistake_is_found(tmp_path: Path, line: str, found: str) -> None:
+def test_a_mistake_is_found(tmp_path, line, found):
     # looked at now, and not when tests are collected: make test lints beside them
     if not (FOLDER / "node_modules/.installed").exists() or shutil.which("node") is None:
         pytest.skip("the tools are installed by make lint, where there is Node")

@@ -1,12 +1,8 @@
 """Tests of poses from matches: votes, competitors, parent frames, priors and sequences."""
 
-from __future__ import annotations
-
 import itertools
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,55 +28,52 @@ from sceneprint.geometry.validation.map_verification import (
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import (
     PosedFrame,
-    PoseEstimate,
     localize,
     mark_unconfirmed,
     rival_rows,
     views_of_rows,
 )
-from sceneprint.pipeline import PairMatch, Signer, associate, open_signer, prepare, retrieve
-from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame, ViewsOf
-from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics, Patches, Surface
-from sceneprint_lab.synth import KINECT, SynthRoom, render, symmetric_box
+from sceneprint.pipeline import PairMatch, associate, open_signer, prepare, retrieve
+from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame
+from sceneprint.types import DepthFrame, Geometry, Intrinsics, Patches, Surface
+from sceneprint_lab.synth import KINECT, render, symmetric_box
 
 
-def outcome(
-    status: str = "accepted", strength: str | None = "strong", T: Floats | None = None
-) -> PairValidation:
+def outcome(status="accepted", strength="strong", T=None):
     """What `validate` might have said."""
     T = np.eye(4) if T is None else T
     return PairValidation(
-        status,  # type: ignore[arg-type]
-        strength if status == "accepted" else None,  # type: ignore[arg-type]
+        status,
+        strength if status == "accepted" else None,
         "as given", T, 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.0,
         None, 0, hypotheses=T[None],
     )  # fmt: skip
 
 
-def shifted(x: float, y: float = 0.0) -> Floats:
+def shifted(x, y=0.0):
     T = np.eye(4)
     T[:2, 3] = x, y
     return T
 
 
-def about_up(degrees: float) -> Floats:
+def about_up(degrees):
     """A turn about z."""
     T, a = np.eye(4), math.radians(degrees)
     T[:2, :2] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
     return T
 
 
-def match(index: int, validation: PairValidation) -> PairMatch:
+def match(index, validation):
     return PairMatch(index, 10, 0.5, validation)
 
 
 @pytest.fixture(scope="module")
-def signer() -> Signer:
+def signer():
     return open_signer("depth")
 
 
 @pytest.fixture(scope="module")
-def blank(room_frames: tuple[DepthFrame, ...], signer: Signer) -> Geometry:
+def blank(room_frames, signer):
     """A query's artifact where the map is not asked: any."""
     return prepare(room_frames[0], signer)[1]
 
@@ -89,12 +82,12 @@ def blank(room_frames: tuple[DepthFrame, ...], signer: Signer) -> Geometry:
 ROWS = [shifted(float(i)) for i in range(12)]
 
 
-def seen_at(x: float, rows: Sequence[int], strength: str = "strong") -> list[PairMatch]:
+def seen_at(x, rows, strength="strong"):
     """Matches of some rows that all say that the query is at x."""
     return [match(i, outcome(T=inverse(ROWS[i]) @ shifted(x), strength=strength)) for i in rows]
 
 
-def by_pairs(blank: Geometry, matches: Sequence[PairMatch]) -> PoseEstimate | None:
+def by_pairs(blank, matches):
     """What the matches alone decide."""
     return localize([QueryFrame(blank, matches)], ROWS)
 
@@ -102,7 +95,7 @@ def by_pairs(blank: Geometry, matches: Sequence[PairMatch]) -> PoseEstimate | No
 # Votes by hand
 
 
-def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None:
+def test_the_pose_of_a_match_leads_to_that_of_the_query(blank):
     turn = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], float)
     frame = QueryFrame(blank, [match(1, outcome(T=shifted(2.0)))])
     found = localize([frame], [np.eye(4), turn], ["here", "there"])
@@ -116,7 +109,7 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank: Geometry) -> None
     assert (itself.T.tolist(), itself.support) == (found.average.T.tolist(), 1)
 
 
-def test_the_covariance_of_an_earlier_frame_refers_to_the_localized_frame(blank: Geometry) -> None:
+def test_the_covariance_of_an_earlier_frame_refers_to_the_localized_frame(blank):
     """Its sensor is 2 m ahead in x, so its errors of rotation move the pose in y and z."""
     certain = replace(outcome(T=shifted(3.0)), covariance=np.eye(6) * 1e-4)
     found = localize(
@@ -129,10 +122,10 @@ def test_the_covariance_of_an_earlier_frame_refers_to_the_localized_frame(blank:
     np.testing.assert_allclose(np.diag(found.covariance)[:3], [1e-4, 5e-4, 5e-4], rtol=1e-6)
 
 
-def test_near_views_and_certain_matches_count_more(blank: Geometry) -> None:
+def test_near_views_and_certain_matches_count_more(blank):
     """The query is at x = 0, and a camera in row 0 looks the same way as the query."""
 
-    def located(rows: Sequence[int], deviations: Sequence[float]) -> float:
+    def located(rows, deviations):
         matches = [
             match(
                 row,
@@ -163,9 +156,7 @@ def test_near_views_and_certain_matches_count_more(blank: Geometry) -> None:
         (5, 2, "found", 1),
     ],
 )
-def test_a_pose_is_found_where_it_outweighs_every_other(
-    blank: Geometry, here: int, there: int, status: str, alternatives: int
-) -> None:
+def test_a_pose_is_found_where_it_outweighs_every_other(blank, here, there, status, alternatives):
     matches = seen_at(0.0, range(here)) + seen_at(5.0, range(here, here + there))
     found = by_pairs(blank, matches)
     assert found is not None
@@ -181,7 +172,7 @@ def test_a_pose_is_found_where_it_outweighs_every_other(
         assert told == [(here, pytest.approx(0.0)), (there, pytest.approx(5.0))]
 
 
-def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank: Geometry) -> None:
+def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank):
     weak = by_pairs(blank, seen_at(0.0, [0, 1, 2], "weak"))
     assert weak is not None
     assert (weak.status, weak.strength) == ("ambiguous", None)
@@ -192,12 +183,12 @@ def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank: Geometry
     assert mixed is not None
     assert mixed.status == "ambiguous"
     unsure = match(3, outcome("ambiguous", T=inverse(ROWS[3]) @ shifted(5.0)))
-    assert by_pairs(blank, [*seen_at(0.0, [0]), unsure]).status == "found"  # type: ignore[union-attr]
+    assert by_pairs(blank, [*seen_at(0.0, [0]), unsure]).status == "found"
     two = [unsure, match(4, outcome("ambiguous", T=inverse(ROWS[4]) @ shifted(5.0)))]
-    assert by_pairs(blank, [*seen_at(0.0, [0]), *two]).status == "ambiguous"  # type: ignore[union-attr]
+    assert by_pairs(blank, [*seen_at(0.0, [0]), *two]).status == "ambiguous"
 
 
-def test_rejected_matches_do_not_vote(blank: Geometry) -> None:
+def test_rejected_matches_do_not_vote(blank):
     lost = replace(outcome("rejected"), T_match_query=None, hypotheses=np.empty((0, 4, 4)))
     found = by_pairs(blank, [*seen_at(0.0, [0]), match(1, outcome("rejected")), match(2, lost)])
     assert found is not None
@@ -206,7 +197,7 @@ def test_rejected_matches_do_not_vote(blank: Geometry) -> None:
     assert by_pairs(blank, []) is None
 
 
-def test_poses_of_one_parent_frame_are_compared(blank: Geometry) -> None:
+def test_poses_of_one_parent_frame_are_compared(blank):
     # three matches of a hall, two of a flat whose coordinates mean something else
     parents = ["flat", "hall", "flat", "hall", "hall", "attic"]
     poses = [shifted(0.0, y=float(i)) for i in range(6)]
@@ -222,7 +213,7 @@ def test_poses_of_one_parent_frame_are_compared(blank: Geometry) -> None:
     assert (found.parent, found.average.T[0, 3]) == ("flat", pytest.approx(0.01))
 
 
-def test_five_votes_are_averaged(blank: Geometry) -> None:
+def test_five_votes_are_averaged(blank):
     found = by_pairs(blank, [m for i in range(8) for m in seen_at(0.01 * i, [i])])
     assert found is not None
     assert found.average is not None
@@ -233,7 +224,7 @@ def test_five_votes_are_averaged(blank: Geometry) -> None:
 # Properties
 
 
-def test_a_copy_of_a_view_is_no_second_vote(blank: Geometry) -> None:
+def test_a_copy_of_a_view_is_no_second_vote(blank):
     """Whatever is uploaded twice, ambiguous never becomes found."""
     rows = [*ROWS, *(T @ shifted(0.01) for T in ROWS)]  # each viewpoint again, a centimetre off
     both = [*seen_at(0.0, [0]), *seen_at(5.0, [1])]
@@ -247,7 +238,7 @@ def test_a_copy_of_a_view_is_no_second_vote(blank: Geometry) -> None:
     assert other.status == "found"
 
 
-def test_the_order_of_candidates_changes_no_status(blank: Geometry) -> None:
+def test_the_order_of_candidates_changes_no_status(blank):
     matches = [
         *seen_at(0.0, [0, 1]), *seen_at(5.0, [2], "weak"), *seen_at(9.0, [3], "weak"),
         match(4, outcome("ambiguous", T=inverse(ROWS[4]) @ shifted(5.0))),
@@ -266,7 +257,7 @@ def test_the_order_of_candidates_changes_no_status(blank: Geometry) -> None:
 
 
 @pytest.fixture(scope="module")
-def box_views(signer: Signer) -> tuple[list[Floats], list[Geometry]]:
+def box_views(signer):
     """Views of a cube on a bare floor, from all around: every 30 degrees at two metres."""
     room, views, poses = symmetric_box(), [], []
     for degrees in range(0, 360, 30):
@@ -278,7 +269,7 @@ def box_views(signer: Signer) -> tuple[list[Floats], list[Geometry]]:
     return poses, views
 
 
-def looking_at_the_box(degrees: float) -> Floats:
+def looking_at_the_box(degrees):
     """A camera two metres from the origin, a metre up, its optical axis through the box."""
     eye = about_up(degrees)[:3, :3] @ np.array([2.0, 0.0, 1.0])
     z = np.array([0.0, 0.0, 0.3]) - eye
@@ -291,9 +282,7 @@ def looking_at_the_box(degrees: float) -> Floats:
     return T
 
 
-def test_a_room_bears_out_the_true_pose_alone(
-    signer: Signer, room_views: Callable[..., SynthRoom]
-) -> None:
+def test_a_room_bears_out_the_true_pose_alone(signer, room_views):
     p, overlap_p = MapParameters(), OverlapParameters()
     frames = room_views(21, 0, 4, along_path=True).frames[:3]
     geometries = [prepare(frame, signer)[1] for frame in frames]
@@ -326,9 +315,7 @@ def test_a_room_bears_out_the_true_pose_alone(
     np.testing.assert_allclose(drawn.T, poses[0] @ inverse(before), atol=0.02)
 
 
-def box_query(
-    box_views: tuple[list[Floats], list[Geometry]], signer: Signer, prior: PosePrior | None = None
-) -> tuple[PoseEstimate, Floats]:
+def box_query(box_views, signer, prior=None):
     """A view between two of the map, asked of all."""
     poses, views = box_views
     T = looking_at_the_box(45.0)
@@ -346,9 +333,7 @@ def box_query(
     return found, T
 
 
-def test_a_cube_is_ambiguous_by_quarter_turns_until_a_prior_decides(
-    box_views: tuple[list[Floats], list[Geometry]], signer: Signer
-) -> None:
+def test_a_cube_is_ambiguous_by_quarter_turns_until_a_prior_decides(box_views, signer):
     found, T = box_query(box_views, signer)
     assert (found.status, found.average, found.evidence.rival) == (
         "ambiguous", None, pytest.approx(1.0, abs=0.1),
@@ -374,7 +359,7 @@ def test_a_cube_is_ambiguous_by_quarter_turns_until_a_prior_decides(
     assert wrong.status == "ambiguous"  # of a prior that is wrong by metres nothing becomes found
 
 
-def test_a_pose_is_expected_within_the_mass_of_its_prior() -> None:
+def test_a_pose_is_expected_within_the_mass_of_its_prior():
     prior = PosePrior("", shifted(1.0), np.diag([0.01] * 3 + [0.0004] * 3))
     # chi-square of six degrees of freedom: 22.458 holds 99.9 %
     assert prior.expects(shifted(1.0 + 0.1 * math.sqrt(22.4)))
@@ -414,7 +399,7 @@ BY_HAND = LocalizationParameters(map=MapParameters(n_refining=0, n_noise=0), jud
 APART = 100.0
 
 
-def picture(*tiles: tuple[int, float]) -> Geometry:
+def picture(*tiles):
     """Runs of tiles, the first row first: how many, and how much farther off."""
     off = np.full(TILES, NOTHING)
     told = np.repeat([away for _, away in tiles], [count for count, _ in tiles])
@@ -441,29 +426,24 @@ def picture(*tiles: tuple[int, float]) -> Geometry:
 WHOLE = picture((TILES, SAME))
 
 
-def told_by(
-    *places: Sequence[Geometry], parent: str = "", rendered: Sequence[bool] | None = None
-) -> ViewsOf:
+def told_by(*places, parent="", rendered=None):
     """A map with these pictures at each place, in the parent frame of that name alone."""
     pictures = [one for place in places for one in place]
     poses = [shifted(APART * k) for k, place in enumerate(places) for _ in place]
 
-    def views_of(asked: str, at: Floats) -> MapViews:
+    def views_of(asked, at):
         opened = pictures.__getitem__ if asked == parent else lambda _: None
         return MapViews(np.stack(poses), opened, BY_HAND.map, FIXED, rendered=rendered)
 
     return views_of
 
 
-def suggested_at(x: float, row: int, status: str = "rejected") -> PairMatch:
+def suggested_at(x, row, status="rejected"):
     """A match that votes for nothing, or for little, and suggests a pose."""
     return match(row, outcome(status, T=inverse(ROWS[row]) @ shifted(x)))
 
 
-def judged(
-    matches: Sequence[PairMatch], *places: Sequence[Geometry], query: Geometry = WHOLE,
-    prior: PosePrior | None = None, p: LocalizationParameters = BY_HAND,
-) -> PoseEstimate:  # fmt: skip
+def judged(matches, *places, query=WHOLE, prior=None, p=BY_HAND):
     """What comes of matches of the whole picture where the map has these."""
     frames = [QueryFrame(query, matches)]
     found = localize(frames, ROWS, None, told_by(*places), prior, p, FIXED)
@@ -471,15 +451,15 @@ def judged(
     return found
 
 
-def at_place(k: int, found: PoseEstimate) -> bool:
+def at_place(k, found):
     return found.average is not None and np.allclose(found.average.T, shifted(APART * k))
 
 
-def near_place(k: int, deviation: float = 0.1) -> PosePrior:
+def near_place(k, deviation=0.1):
     return PosePrior("", shifted(APART * k), np.eye(6) * deviation**2)
 
 
-def test_a_score_by_hand() -> None:
+def test_a_score_by_hand():
     views = told_by([
         picture((40, SAME), (10, FARTHER)),
         picture((45, SAME), (5, NOTHING), (3, NEARER)),
@@ -498,7 +478,7 @@ def test_a_score_by_hand() -> None:
     assert told.score == pytest.approx(40 / 60 * (1 - 2 * (violations + hidden)))
 
 
-def test_frames_that_look_the_same_way_are_asked_first() -> None:
+def test_frames_that_look_the_same_way_are_asked_first():
     """Of a camera the middle of what it sees counts, 1.5 m ahead, and its direction."""
     back, aside = shifted(0.0), shifted(0.0)
     back[:3, :3] = aside[:3, :3] = np.diag([-1.0, 1.0, -1.0])
@@ -520,7 +500,7 @@ def test_frames_that_look_the_same_way_are_asked_first() -> None:
     assert mixed.near(shifted(-2.15), True) == [0, 4, 2]
 
 
-def test_evidence_by_hand() -> None:
+def test_evidence_by_hand():
     """Two strong votes and a weak one for a place of three frames; another has a vote as well."""
     matches = [
         *seen_at(0.0, [0, 1]), *seen_at(0.0, [2], "weak"), suggested_at(0.0, 3),
@@ -553,9 +533,7 @@ def test_evidence_by_hand() -> None:
         (40, 1 / (2 + math.exp(-2)), "ambiguous"),  # both odds are e^2
     ],
 )
-def test_a_pose_is_found_where_its_confidence_is_enough(
-    rival: int, confidence: float, status: str
-) -> None:
+def test_a_pose_is_found_where_its_confidence_is_enough(rival, confidence, status):
     matches = [*seen_at(0.0, [0, 1]), *(suggested_at(APART, row) for row in (5, 6))]
     found = judged(matches, [picture((40, SAME))], [picture((rival, SAME))])
     assert found.status == status
@@ -575,7 +553,7 @@ def test_a_pose_is_found_where_its_confidence_is_enough(
         assert again.status == ("found" if rival == 24 else "ambiguous")
 
 
-def test_alternatives_are_told_with_their_confidences_the_best_first() -> None:
+def test_alternatives_are_told_with_their_confidences_the_best_first():
     """Equal places share what is left; what is not worth a look is not told."""
     matches = [suggested_at(APART * k, row) for k in range(3) for row in (2 * k, 2 * k + 1)]
     places = [[picture((count, SAME))] for count in (36, 36, 12)]
@@ -585,10 +563,10 @@ def test_alternatives_are_told_with_their_confidences_the_best_first() -> None:
     assert [one.confidence for one in found.alternatives] == pytest.approx([1 / 2.2] * 3, abs=1)
     few = judged(matches, [picture((36, SAME))], [picture((30, SAME))], [picture((8, SAME))])
     assert [one.T[0, 3] for one in few.alternatives] == [0.0, APART]
-    assert few.alternatives[0].confidence > few.alternatives[1].confidence  # type: ignore[operator]
+    assert few.alternatives[0].confidence > few.alternatives[1].confidence
 
 
-def test_few_planes_and_violations_lower_a_confidence() -> None:
+def test_few_planes_and_violations_lower_a_confidence():
     """By the penalties: 3 of 6 planes; 1 of 5 %, on either side."""
     votes = seen_at(0.0, [0, 1])
     for there, logit, why in (
@@ -603,7 +581,7 @@ def test_few_planes_and_violations_lower_a_confidence() -> None:
         assert found.status == "found" or found.reason.startswith(why)
 
 
-def test_a_pose_that_one_view_alone_suggests_is_not_sure() -> None:
+def test_a_pose_that_one_view_alone_suggests_is_not_sure():
     alone, other = seen_at(0.0, [0]), suggested_at(0.0, 5)
     for matches, status in ((alone, "ambiguous"), ([*alone, other], "found")):
         found = judged(matches, [WHOLE] * 3)
@@ -620,9 +598,7 @@ def test_a_pose_that_one_view_alone_suggests_is_not_sure() -> None:
         (24, 12, 15, 12 / 36 - 0.2),  # of 15 / 51 but a fifth is believed
     ],
 )
-def test_violations_that_the_map_shows_of_itself_are_borne(
-    same: int, missing: int, unlike: int, excess: float
-) -> None:
+def test_violations_that_the_map_shows_of_itself_are_borne(same, missing, unlike, excess):
     """Its two frames see the same, but for so many tiles that the query does not show."""
     query = picture((same + missing, SAME))
     frames = [
@@ -637,9 +613,7 @@ def test_violations_that_the_map_shows_of_itself_are_borne(
 @pytest.mark.parametrize(
     ("rendered", "status"), [((False, True, False), "ambiguous"), ((False, True, True), "found")]
 )
-def test_most_of_the_frames_that_agree_decide_what_a_map_is_made_of(
-    rendered: Sequence[bool], status: str
-) -> None:
+def test_most_of_the_frames_that_agree_decide_what_a_map_is_made_of(rendered, status):
     """A tenth is missing, for which frames of a sensor pay and rendered views do not."""
     query = picture((40, SAME))
     frames = [picture((36, SAME), (4, FARTHER))] * 3
@@ -653,9 +627,7 @@ def test_most_of_the_frames_that_agree_decide_what_a_map_is_made_of(
     assert found.evidence.excess == pytest.approx(0.1)
 
 
-def test_a_pose_that_refines_to_another_is_no_rival(
-    signer: Signer, room_views: Callable[..., SynthRoom]
-) -> None:
+def test_a_pose_that_refines_to_another_is_no_rival(signer, room_views):
     """Beyond the distance between places, but in the basin of the right pose."""
     p, overlap_p = MapParameters(same_m=0.02, place_m=0.05), OverlapParameters()
     frames = room_views(21, 0, 4, along_path=True).frames[:3]
@@ -674,7 +646,7 @@ def test_a_pose_that_refines_to_another_is_no_rival(
     assert not ranked[0].is_of(away, p)
 
 
-def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank: Geometry) -> None:
+def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank):
     """A cloud without a viewpoint has no strong ones; here the map is not asked."""
     weak = seen_at(0.0, [0, 1, 2], "weak")
     lost = replace(blank, surface=replace(blank.surface, camera=None))
@@ -682,7 +654,7 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank: Geomet
         found = localize([QueryFrame(geometry, weak)], ROWS)
         assert found is not None
         assert found.status == status
-    assert (found.strength, found.verified_by) == ("weak", "matches")  # type: ignore[union-attr]
+    assert (found.strength, found.verified_by) == ("weak", "matches")
     unsure = [suggested_at(0.0, row, "ambiguous") for row in range(3)]
     none = localize([QueryFrame(lost, unsure)], ROWS)
     assert none is not None
@@ -692,7 +664,7 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank: Geomet
 # The map alone
 
 
-def test_the_map_alone_may_decide_where_no_match_votes() -> None:
+def test_the_map_alone_may_decide_where_no_match_votes():
     suggested = [suggested_at(0.0, 0), suggested_at(0.0, 2)]
     found = judged(suggested, [WHOLE] * 8, [picture((10, SAME))])
     assert (found.status, found.verified_by, found.strength) == ("found", "map", "weak")
@@ -707,12 +679,12 @@ def test_the_map_alone_may_decide_where_no_match_votes() -> None:
     assert voted.status == "found"
 
 
-def test_a_copy_of_a_view_suggests_nothing_new() -> None:
+def test_a_copy_of_a_view_suggests_nothing_new():
     for rows, status in (((0, 0), "ambiguous"), ((0, 2), "found")):
         assert judged([suggested_at(0.0, row) for row in rows], [WHOLE] * 8).status == status
 
 
-def test_a_pose_against_which_up_speaks_is_not_suggested() -> None:
+def test_a_pose_against_which_up_speaks_is_not_suggested():
     suggested = [suggested_at(0.0, row) for row in (0, 2)]
     assert judged(suggested, [WHOLE] * 8).status == "found"
     tilted = [match(m.index, replace(m.validation, contradicts_up=True)) for m in suggested]
@@ -720,7 +692,7 @@ def test_a_pose_against_which_up_speaks_is_not_suggested() -> None:
     assert localize(frames, ROWS, None, told_by([WHOLE] * 8), None, BY_HAND, FIXED) is None
 
 
-def test_where_no_match_is_accepted_the_pose_is_that_of_the_map() -> None:
+def test_where_no_match_is_accepted_the_pose_is_that_of_the_map():
     """What an ambiguous match says is but the first to be looked at."""
     aside = inverse(ROWS[0])
     aside[2, 3] = 0.2
@@ -744,9 +716,7 @@ def test_where_no_match_is_accepted_the_pose_is_that_of_the_map() -> None:
         (36, 4, 36, False),  # 10 %
     ],
 )
-def test_a_prior_decides_for_what_the_map_bears_out(
-    same: int, farther: int, elsewhere: int, confirmed: bool
-) -> None:
+def test_a_prior_decides_for_what_the_map_bears_out(same, farther, elsewhere, confirmed):
     matches = [suggested_at(APART * k, row) for k in range(2) for row in (k, 2 + k)]
     places = [picture((elsewhere, SAME))], [picture((same, SAME), (farther, FARTHER))]
     assert judged(matches, *places).status != "found"
@@ -757,9 +727,7 @@ def test_a_prior_decides_for_what_the_map_bears_out(
 
 
 @pytest.mark.parametrize(("second", "confirmed"), [(18, True), (25, False)])
-def test_a_prior_does_not_decide_between_poses_that_it_expects(
-    second: int, confirmed: bool
-) -> None:
+def test_a_prior_does_not_decide_between_poses_that_it_expects(second, confirmed):
     matches = [suggested_at(APART * k, row) for k in (0, 1, 5) for row in (k, 6 + k)]
     places = [[picture((36, SAME))], [picture((second, SAME))], [], [], [], [picture((36, SAME))]]
     found = judged(matches, *places, prior=near_place(0, deviation=30.0))
@@ -778,9 +746,7 @@ def test_a_prior_does_not_decide_between_poses_that_it_expects(
         (2, 37, ("ambiguous", None, None)),  # nothing is where the prior expects it
     ],
 )
-def test_a_prior_decides_where_another_pose_fits_as_well(
-    expected: int, other: int, decided: tuple[str, str | None, int | None]
-) -> None:
+def test_a_prior_decides_where_another_pose_fits_as_well(expected, other, decided):
     matches = [*seen_at(0.0, [0, 1]), suggested_at(APART, 8), suggested_at(APART, 9)]
     places = [picture((40, SAME))], [picture((other, SAME))]
     found = judged(matches, *places, prior=near_place(expected))
@@ -788,13 +754,11 @@ def test_a_prior_decides_where_another_pose_fits_as_well(
     assert (found.status, found.verified_by, at) == decided
 
 
-def test_a_prior_chooses_the_parent_frame_unless_matches_have() -> None:
+def test_a_prior_chooses_the_parent_frame_unless_matches_have():
     parents = ["here", "here", "here", "there", "there"]
     views_of = told_by([WHOLE] * 8, [picture((56, SAME))], parent="there")
 
-    def asked(
-        matches: Sequence[PairMatch], parent: str, x: float = 0.0
-    ) -> tuple[str, str, str | None]:
+    def asked(matches, parent, x=0.0):
         prior = PosePrior(parent, shifted(x), np.eye(6) * 0.01)
         frames = [QueryFrame(WHOLE, matches)]
         found = localize(frames, ROWS[:5], parents, views_of, prior, BY_HAND, FIXED)
@@ -813,7 +777,7 @@ def test_a_prior_chooses_the_parent_frame_unless_matches_have() -> None:
     assert asked(both, "there")[1] == "there"
 
 
-def test_the_parent_frame_is_that_of_the_strongest_matches(blank: Geometry) -> None:
+def test_the_parent_frame_is_that_of_the_strongest_matches(blank):
     parents = ["here", "here", "there"]
     weak, strong = seen_at(0.0, [0, 1], "weak"), seen_at(0.0, [2])
     tried = [suggested_at(0.0, 0), suggested_at(0.0, 1)]
@@ -823,9 +787,7 @@ def test_the_parent_frame_is_that_of_the_strongest_matches(blank: Geometry) -> N
         assert (found.parent, found.votes) == ("there", 1)
 
 
-def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(
-    box_views: tuple[list[Floats], list[Geometry]], signer: Signer
-) -> None:
+def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(box_views, signer):
     """Also where no candidate suggests any."""
     poses, views = box_views
     T = looking_at_the_box(45.0)
@@ -841,7 +803,7 @@ def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(
     np.testing.assert_allclose(found.average.T, T, atol=0.03)
 
 
-def test_starts_lie_a_deviation_about_a_prior() -> None:
+def test_starts_lie_a_deviation_about_a_prior():
     T = shifted(1.0, 2.0) @ about_up(30.0)
     starts = prior_starts(T, np.diag([0.04, 0.09, 4.0, 1.0, 1.0, 1.0]), MapParameters())
     np.testing.assert_array_equal(starts[:, :3, :3], np.tile(T[:3, :3], (7, 1, 1)))
@@ -854,7 +816,7 @@ def test_starts_lie_a_deviation_about_a_prior() -> None:
 # Several frames
 
 
-def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank: Geometry) -> None:
+def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank):
     """Each match places its own frame; odometry brings that to the last."""
     before = shifted(-1.0) @ about_up(20.0)  # T_query_sensor of the frame before
     truth = about_up(40.0) @ shifted(3.0)
@@ -871,7 +833,7 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank: Geometry) -> 
     np.testing.assert_allclose(found.average.T, truth, atol=1e-12)
 
 
-def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last() -> None:
+def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last():
     """Both frames are looked up where odometry puts them, and planes are those of one frame."""
     query = picture((30, SAME))
     suggested = [suggested_at(0.0, row) for row in (0, 2)]
@@ -888,7 +850,7 @@ def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last() -> None:
     assert (found.verified_by, at_place(1, found)) == ("map", True)
 
 
-def test_a_prior_reaches_frames_within_sight_and_three_deviations() -> None:
+def test_a_prior_reaches_frames_within_sight_and_three_deviations():
     T, covariance = np.eye(4), np.diag([0.01, 0.25, 0.04, 1.0, 1.0, 1.0])  # 0.5 m at most
     T[:3, 3] = (1.0, 2.0, 3.0)
     prior = PosePrior("room", T, covariance)
@@ -906,11 +868,8 @@ def test_a_prior_reaches_frames_within_sight_and_three_deviations() -> None:
 CORRIDOR = {row: shifted(5.0 * row) for row in range(8)}
 
 
-def corridor_rivals(
-    estimate: PoseEstimate | None, nearest: Sequence[int], tried: Sequence[int], *,
-    ahead: bool = True, distances: Sequence[int] = (1,) * 8, **numbers: Any,
-) -> list[int]:  # fmt: skip
-    def posed(rows: Sequence[int]) -> dict[int, PosedFrame]:
+def corridor_rivals(estimate, nearest, tried, *, ahead=True, distances=(1,) * 8, **numbers):
+    def posed(rows):
         parents = {**dict.fromkeys(CORRIDOR, ""), 6: "another floor"}
         return {row: PosedFrame(parents[row], CORRIDOR[row], ahead) for row in rows if row != 7}
 
@@ -919,7 +878,7 @@ def corridor_rivals(
     return rival_rows(estimate, ranking, set(tried), posed, ahead, p)
 
 
-def test_rivals_are_the_first_of_the_ranking_elsewhere(blank: Geometry) -> None:
+def test_rivals_are_the_first_of_the_ranking_elsewhere(blank):
     at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
     assert at_origin is not None
     assert at_origin.members == (0, 1)
@@ -933,7 +892,7 @@ def test_rivals_are_the_first_of_the_ranking_elsewhere(blank: Geometry) -> None:
     assert corridor_rivals(at_origin, ranking, [0, 1], ahead=False, rivals=9) == [4, 2, 3, 5]
 
 
-def test_rivals_are_about_as_near_as_the_farthest_vote(blank: Geometry) -> None:
+def test_rivals_are_about_as_near_as_the_farthest_vote(blank):
     at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
     nearest, distances = [0, 4, 1, 2, 3], (10, 11, 100, 120, 121)
     assert corridor_rivals(at_origin, nearest, [0, 1], distances=distances, rivals=9) == [4, 2]
@@ -946,7 +905,7 @@ def test_rivals_are_about_as_near_as_the_farthest_vote(blank: Geometry) -> None:
     assert without == [2]
 
 
-def test_rivals_are_asked_of_nothing_that_is_not_found(blank: Geometry) -> None:
+def test_rivals_are_asked_of_nothing_that_is_not_found(blank):
     assert corridor_rivals(None, [0, 1, 2, 3], []) == []
     unsure = by_pairs(blank, [*seen_at(0.0, [0]), *seen_at(9.0, [1])])
     assert unsure is not None
@@ -957,7 +916,7 @@ def test_rivals_are_asked_of_nothing_that_is_not_found(blank: Geometry) -> None:
     assert corridor_rivals(replace(sure, verified_by="prior"), [0, 1, 2, 3], [0, 1]) == []
 
 
-def test_what_was_not_compared_is_ambiguous(blank: Geometry) -> None:
+def test_what_was_not_compared_is_ambiguous(blank):
     sure = by_pairs(blank, seen_at(4.0, [0, 1]))
     assert sure is not None
     assert sure.average is not None

@@ -1,11 +1,7 @@
 """Tests that ambiguous pairs of frames are not accepted, on whole seeded images."""
 
-from __future__ import annotations
-
 from collections import Counter
-from collections.abc import Iterator
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,20 +9,20 @@ from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from benchmarks.pairs import pairs_among
-from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.rigid import inverse, pose_difference
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
-from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Geometry
-from sceneprint_lab.synth import KINECT, Room, corridor, symmetric_box, synthesise_survey, take
+from sceneprint.types import Cloud, DepthFrame
+from sceneprint_lab.synth import KINECT, corridor, symmetric_box, synthesise_survey, take
 from sceneprint_lab.synth.sensors import Spinning, scan
 
 #: A transform this near the truth is right: then the pair was told apart after all.
 RIGHT_M = 0.2
 
 
-def looking(eye: Floats, at: Floats) -> Floats:
+def looking(eye, at):
     """T_room_camera (4, 4) of an upright camera at `eye` that looks at `at`."""
     z = (at - eye) / np.linalg.norm(at - eye)
     x = np.cross(z, (0.0, 0.0, 1.0))
@@ -37,11 +33,11 @@ def looking(eye: Floats, at: Floats) -> Floats:
     return pose
 
 
-def _taken(room: Room, pose: Floats, rng: np.random.Generator) -> DepthFrame:
+def _taken(room, pose, rng):
     return DepthFrame(take(room, pose, KINECT, rng), KINECT, pose=pose)
 
 
-def box_pairs(n: int, seed: int) -> Iterator[tuple[DepthFrame, DepthFrame]]:
+def box_pairs(n, seed):
     """A cube from two of its sides: azimuths a multiple of 90 degrees apart, give or take 7."""
     rng, room = np.random.default_rng((seed, 0)), symmetric_box()
     for _ in range(n):
@@ -58,7 +54,7 @@ def box_pairs(n: int, seed: int) -> Iterator[tuple[DepthFrame, DepthFrame]]:
         yield frames[0], frames[1]
 
 
-def corridor_pairs(n: int, seed: int) -> Iterator[tuple[DepthFrame, DepthFrame]]:
+def corridor_pairs(n, seed):
     """A corridor from two places one or two doors apart, in any direction of view."""
     rng, room = np.random.default_rng((seed, 1)), corridor(12, 2.0)
     for _ in range(n):
@@ -74,7 +70,7 @@ def corridor_pairs(n: int, seed: int) -> Iterator[tuple[DepthFrame, DepthFrame]]
         yield frames[0], frames[1]
 
 
-def scan_pairs(room: Room, pitch: float, n: int, seed: int) -> Iterator[tuple[Cloud, Cloud]]:
+def scan_pairs(room, pitch, n, seed):
     """A corridor or a hall of equal bays, scanned from two places one to three pitches apart."""
     rng = np.random.default_rng((seed, 2))
     length, width = room.outline.max(axis=0)
@@ -89,41 +85,37 @@ def scan_pairs(room: Room, pitch: float, n: int, seed: int) -> Iterator[tuple[Cl
         yield scans[0], scans[1]
 
 
-def other_rooms(
-    sequences: list[list[FrameReference]], n: int, seed: int, model: Model
-) -> Counter[str]:
+def other_rooms(sequences, n, seed, model):
     """Outcomes of `n` pairs of frames drawn from two different recordings."""
     rng = np.random.default_rng(seed)
-    known: dict[tuple[int, int], Geometry] = {}
+    known = {}
 
-    def drawn(which: int) -> Geometry:
+    def drawn(which):
         index = int(rng.integers(len(sequences[which]) // 10 or 1)) * 10 % len(sequences[which])
         if (which, index) not in known:
             known[which, index] = geometry(sequences[which][index].read_depth(), model)
         return known[which, index]
 
-    outcomes: Counter[str] = Counter()
+    outcomes = Counter()
     for i in tqdm(range(n), desc="other rooms", unit="pair", disable=None):
         a, b = rng.choice(len(sequences), 2, replace=False).tolist()
         outcomes[outcome(drawn(a), drawn(b), None, i)] += 1
     return outcomes
 
 
-def overlapping(
-    recording: list[FrameReference], n: int, seed: int
-) -> list[tuple[DepthFrame, DepthFrame]]:
+def overlapping(recording, n, seed):
     """`n` pairs of every 20th frame of a recording that overlap by half, the smaller direction."""
     frames = [reference.read_depth() for reference in recording[::20]]
     found = [(p.query, p.match) for p in pairs_among(frames) if p.overlap >= 0.5]
     return [found[i] for i in np.random.default_rng(seed).permutation(len(found))[:n]]
 
 
-def geometry(frame: AnyFrame, model: Model) -> Geometry:
+def geometry(frame, model):
     """The geometry artifact of a frame."""
     return geometry_of(see(frame, model.parameters), model)
 
 
-def outcome(query: Geometry, match: Geometry, truth: Floats | None, seed: int) -> str:
+def outcome(query, match, truth, seed):
     """`status` of a pair, with strength, and `right` or `wrong` where it was accepted."""
     v = validate(query, match, seed)
     if v.status != "accepted" or v.T_match_query is None:
@@ -132,11 +124,9 @@ def outcome(query: Geometry, match: Geometry, truth: Floats | None, seed: int) -
     return f"accepted {v.strength}, {'right' if right else 'wrong'}"
 
 
-def outcomes_of(
-    pairs: Iterator[tuple[AnyFrame, AnyFrame]], n: int, name: str, model: Model
-) -> Counter[str]:
+def outcomes_of(pairs, n, name, model):
     """Outcomes of pairs with known poses."""
-    counted: Counter[str] = Counter()
+    counted = Counter()
     for i, (a, b) in enumerate(tqdm(pairs, total=n, desc=name, unit="pair", disable=None)):
         assert a.pose is not None
         assert b.pose is not None
@@ -145,25 +135,25 @@ def outcomes_of(
     return counted
 
 
-def not_believed(counted: Counter[str]) -> float:
+def not_believed(counted):
     """Share of pairs that were not accepted with a wrong transform."""
     wrong = sum(n for what, n in counted.items() if what.endswith("wrong"))
     return 1.0 - wrong / counted.total()
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
+def model():
     return read_model("paper")
 
 
 @pytest.fixture(scope="module")
-def recordings(data_root: Path) -> list[list[FrameReference]]:
+def recordings(data_root):
     scenes = ("7scenes/redkitchen", "tum/fr1_rpy", "sun3d/studyroom2")
     return [[f for s in find_sequences(data_root / name) for f in s.frames] for name in scenes]
 
 
 @pytest.mark.thorough
-def test_the_sides_of_a_lone_box_are_not_told_apart(model: Model) -> None:
+def test_the_sides_of_a_lone_box_are_not_told_apart(model):
     counted = outcomes_of(box_pairs(24, 31), 24, "box", model)
     assert counted.total() == 24
     assert not_believed(counted) >= 0.95
@@ -172,7 +162,7 @@ def test_the_sides_of_a_lone_box_are_not_told_apart(model: Model) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("n", [12, pytest.param(24, marks=pytest.mark.thorough)])
-def test_the_doors_of_a_corridor_are_not_told_apart(model: Model, n: int) -> None:
+def test_the_doors_of_a_corridor_are_not_told_apart(model, n):
     counted = outcomes_of(corridor_pairs(n, 31), n, "corridor", model)
     assert counted.total() == n
     assert not_believed(counted) >= 0.95
@@ -180,15 +170,13 @@ def test_the_doors_of_a_corridor_are_not_told_apart(model: Model, n: int) -> Non
 
 
 @pytest.fixture(scope="module")
-def scans_model() -> Model:
+def scans_model():
     return read_model("lidar")
 
 
 @pytest.mark.thorough  # tests/geometry/test_validation_clouds.py has a room of equal sides
 @pytest.mark.parametrize("doors", [24, 60])
-def test_scans_of_a_corridor_of_equal_doors_are_not_believed(
-    doors: int, scans_model: Model
-) -> None:
+def test_scans_of_a_corridor_of_equal_doors_are_not_believed(doors, scans_model):
     room = corridor(doors, 2.5, 2.2, 2.6)
     counted = outcomes_of(scan_pairs(room, 2.5, 12, 31), 12, "corridor", scans_model)
     assert counted.total() == 12
@@ -197,7 +185,7 @@ def test_scans_of_a_corridor_of_equal_doors_are_not_believed(
 
 
 @pytest.mark.thorough
-def test_scans_of_a_hall_of_equal_bays_are_seldom_believed(scans_model: Model) -> None:
+def test_scans_of_a_hall_of_equal_bays_are_seldom_believed(scans_model):
     """Half a turn maps an empty hall onto itself: what tells is no more than noise."""
     room = corridor(10, 6.0, 14.0, 6.0)
     counted = outcomes_of(scan_pairs(room, 6.0, 24, 31), 24, "bays", scans_model)
@@ -208,9 +196,9 @@ def test_scans_of_a_hall_of_equal_bays_are_seldom_believed(scans_model: Model) -
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("seed", "most"), [(7200, 1), (7300, 1)])
-def test_scans_of_synthetic_storeys(seed: int, most: int, scans_model: Model) -> None:
+def test_scans_of_synthetic_storeys(seed, most, scans_model):
     """Corridors with rooms: of what is accepted at most one in fifty is wrong."""
-    counted: Counter[str] = Counter()
+    counted = Counter()
     for index in range(8):
         survey = synthesise_survey(seed, index, 14, kind="storey")
         frames = [(cloud.pose, geometry(cloud, scans_model)) for cloud in survey.clouds]
@@ -224,9 +212,7 @@ def test_scans_of_synthetic_storeys(seed: int, most: int, scans_model: Model) ->
     assert wrong <= most
 
 
-def test_frames_that_overlap_by_half_are_accepted(
-    model: Model, recordings: list[list[FrameReference]]
-) -> None:
+def test_frames_that_overlap_by_half_are_accepted(model, recordings):
     pairs = overlapping(recordings[0], 40, 31)
     counted = outcomes_of(iter(pairs), 40, "half", model)
     assert counted.total() == 40
@@ -236,9 +222,7 @@ def test_frames_that_overlap_by_half_are_accepted(
 
 
 @pytest.mark.thorough
-def test_frames_of_other_rooms_are_not_accepted(
-    model: Model, recordings: list[list[FrameReference]]
-) -> None:
+def test_frames_of_other_rooms_are_not_accepted(model, recordings):
     counted = other_rooms(recordings, 150, 31, model)
     assert counted.total() == 150
     assert not_believed(counted) == 1.0

@@ -1,7 +1,5 @@
 """Tests on PostgreSQL that detect most in a second; `make test-postgres` runs all."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -26,7 +24,7 @@ GROUPS = {
 @pytest.mark.usefixtures("postgres")  # skips where there is no server
 @pytest.mark.thorough
 @pytest.mark.parametrize("group", ["engine", "service"])
-def test_what_holds_on_sqlite_holds_on_postgresql(group: str, tmp_path: Path) -> None:
+def test_what_holds_on_sqlite_holds_on_postgresql(group, tmp_path):
     outside = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-n", "0", "-q", "-p", "no:cacheprovider", "--tb=short",

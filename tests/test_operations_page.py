@@ -1,11 +1,8 @@
 """Tests that pages, alerts and the dashboards of Grafana match the tables of the code."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,24 +20,24 @@ FOLDER = DOCS.parent / "deploy/helm/sceneprint/dashboards"
 DASHBOARDS = {path.stem: json.loads(path.read_text()) for path in sorted(FOLDER.glob("*.json"))}
 
 
-def section(title: str) -> str:
+def section(title):
     """A section of the page, without those after it."""
     (found,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL)
     return str(found)
 
 
-def rows(text: str) -> dict[str, list[str]]:
+def rows(text):
     """Rows of its tables by the first cell's code, with the other cells."""
     found = re.findall(r"^\| `([^`]+)` \|(.*)\|$", text, re.MULTILINE)
     return {name: [cell.strip() for cell in rest.split("|")] for name, rest in found}
 
 
-def families() -> dict[str, set[str]]:
+def families():
     """Return the labels of each metric."""
     return {f"sceneprint_{name}": set(family.labels) for name, family in METRICS.items()}
 
 
-def queried(expression: str) -> list[tuple[str, set[str]]]:
+def queried(expression):
     """Names of metrics in an expression of Prometheus, with the labels that they are picked by."""
     return [
         (name, set(re.findall(r"(\w+)\s*(?:=~|!=|!~|=)", picked)))
@@ -48,7 +45,7 @@ def queried(expression: str) -> list[tuple[str, set[str]]]:
     ]
 
 
-def check(expression: str) -> None:
+def check(expression):
     known = families()
     found = queried(expression)
     by = set(re.findall(r"\w+", " ".join(re.findall(r"\bby \(([^)]*)\)", expression))))
@@ -65,11 +62,11 @@ def check(expression: str) -> None:
 
 
 @pytest.mark.parametrize("path", written_pages(), ids=lambda path: path.name)
-def test_tables_of_pages_are_those_of_the_code(path: Path) -> None:
+def test_tables_of_pages_are_those_of_the_code(path):
     assert path.read_text() == written_pages()[path], "run: make goldens"
 
 
-def test_tables_have_the_units_statuses_and_labels_of_the_code() -> None:
+def test_tables_have_the_units_statuses_and_labels_of_the_code():
     listed = rows((DOCS / "settings.md").read_text())
     assert list(listed) == [name.upper() for name in Settings.model_fields]
     assert all(len(cells) == 4 and all(cells) for cells in listed.values())
@@ -82,7 +79,7 @@ def test_tables_have_the_units_statuses_and_labels_of_the_code() -> None:
     assert set(KINDS) < rows(PAGE).keys()
 
 
-def test_every_public_error_is_in_one_row_with_its_status() -> None:
+def test_every_public_error_is_in_one_row_with_its_status():
     table = [row for row in problem_rows() if not row[0].startswith("5")]
     listed = {one.strip("`"): row[0] for row in table for one in row[1].split(", ")}
     assert sum(len(row[1].split(", ")) for row in table) == len(listed)
@@ -95,7 +92,7 @@ def test_every_public_error_is_in_one_row_with_its_status() -> None:
     assert all(len(row) == 4 and all(row) for row in table)
 
 
-def test_alerts_query_existing_metrics() -> None:
+def test_alerts_query_existing_metrics():
     alerts = re.findall(r"^\| `([^`]*sceneprint_[^`]*)` \|", section("What to watch"), re.M)
     alerts = [alert for alert in alerts if " " in alert]
     assert len(alerts) >= 9
@@ -103,7 +100,7 @@ def test_alerts_query_existing_metrics() -> None:
         check(alert)
 
 
-def expressions(dashboard: dict[str, Any]) -> list[str]:
+def expressions(dashboard):
     return [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
 
 
@@ -117,7 +114,7 @@ def test_dashboards_ask_for_what_there_is():
 
 
 @pytest.mark.parametrize("name", DASHBOARDS)
-def test_a_dashboard_can_be_imported_and_provisioned(name: str):
+def test_a_dashboard_can_be_imported_and_provisioned(name):
     """The data source is a variable: Grafana asks for inputs only where a person imports."""
     dashboard = DASHBOARDS[name]
     assert not dashboard.keys() & {"id", "__inputs"}  # of another Grafana: it would overwrite
@@ -152,4 +149,4 @@ def test_every_command_and_option_is_there():
     for name, rest in named:
         assert name in choices
         for option in re.findall(r"--[\w-]+", rest):
-            assert option in choices[name].format_help()  # type: ignore[call-overload]
+            assert option in choices[name].format_help()

@@ -1,13 +1,10 @@
 """Tests of the path from a frame to its stored signature."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +12,9 @@ import pytest
 import sceneprint
 from sceneprint.errors import ModelMismatch, UselessFrame
 from sceneprint.geometry.signature.fisher_vector import quantise
-from sceneprint.models import Model, save_model
+from sceneprint.models import save_model
 from sceneprint.pipeline import distance, sign
 from sceneprint.signing import (
-    Signer,
     describe,
     encode,
     exact_statistics,
@@ -31,13 +27,11 @@ from sceneprint.types import DepthFrame, Intrinsics
 CAMERA = Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)
 
 
-def flat(depth: float, camera: Intrinsics = CAMERA) -> DepthFrame:
+def flat(depth, camera=CAMERA):
     return DepthFrame(np.full((camera.height, camera.width), depth, np.float32), camera, "wall")
 
 
-def test_a_signature_has_the_size_of_its_model(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_a_signature_has_the_size_of_its_model(small_signer, room_frames):
     signature = sign(room_frames[0], small_signer)
     assert signature.vector.dtype == np.uint8
     assert signature.vector.shape == (25 * 8 * 2,)
@@ -49,9 +43,7 @@ def test_a_signature_has_the_size_of_its_model(
     assert all(0 < n <= p * (p - 1) for n, p in pairs)
 
 
-def test_same_bytes_in_any_thread_and_order(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_same_bytes_in_any_thread_and_order(small_signer, room_frames):
     alone = [sign(frame, small_signer).vector.tobytes() for frame in room_frames]
     with ThreadPoolExecutor(4) as pool:
         jobs = [pool.submit(sign, frame, small_signer) for frame in room_frames[::-1] * 2]
@@ -67,9 +59,7 @@ PLAIN_PROCESSOR = {
 }
 
 
-def signed_elsewhere(
-    frame: DepthFrame, model: Model, folder: Path, **environment: str
-) -> np.ndarray:
+def signed_elsewhere(frame, model, folder, **environment):
     """The stored signature of a frame, made by a fresh process."""
     save_model(model, folder / "model")
     np.save(folder / "depth.npy", frame.depth)
@@ -86,18 +76,14 @@ def signed_elsewhere(
     return np.frombuffer(done.stdout, np.uint8)
 
 
-def test_same_bytes_in_another_process(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...], tmp_path: Path
-) -> None:
+def test_same_bytes_in_another_process(small_signer, room_frames, tmp_path):
     assert room_frames[0].intrinsics == CAMERA
     elsewhere = signed_elsewhere(room_frames[0], small_signer.model, tmp_path)
     np.testing.assert_array_equal(elsewhere, sign(room_frames[0], small_signer).vector)
 
 
 @pytest.mark.thorough
-def test_nearly_the_same_on_another_processor(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...], tmp_path: Path
-) -> None:
+def test_nearly_the_same_on_another_processor(small_signer, room_frames, tmp_path):
     """Our kernels are exact everywhere; numpy's own powers and sines may round otherwise."""
     elsewhere = signed_elsewhere(room_frames[0], small_signer.model, tmp_path, **PLAIN_PROCESSOR)
     here = sign(room_frames[0], small_signer).vector
@@ -106,15 +92,13 @@ def test_nearly_the_same_on_another_processor(
     assert np.abs(here.astype(int) - elsewhere.astype(int)).sum() < 0.001 * d0
 
 
-def test_the_frame_is_left_as_it_was(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_the_frame_is_left_as_it_was(small_signer, room_frames):
     before = hashlib.sha256(room_frames[1].depth.tobytes()).hexdigest()
     sign(room_frames[1], small_signer)
     assert hashlib.sha256(room_frames[1].depth.tobytes()).hexdigest() == before
 
 
-def test_stages_add_up_to_sign(small_signer: Signer, room_frames: tuple[DepthFrame, ...]) -> None:
+def test_stages_add_up_to_sign(small_signer, room_frames):
     model = small_signer.model
     patches = describe(room_frames[2], model.parameters)
     psi = float_signature([table_statistics(x, small_signer) for x in patches.levels], model)
@@ -126,9 +110,7 @@ def test_stages_add_up_to_sign(small_signer: Signer, room_frames: tuple[DepthFra
     assert np.linalg.norm(psi[half:]) == pytest.approx(1.0, abs=1e-12)
 
 
-def test_distance_of_two_models_is_an_error_that_names_both(
-    small_model: Model, small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_distance_of_two_models_is_an_error_that_names_both(small_model, small_signer, room_frames):
     a = sign(room_frames[0], small_signer)
     other = open_signer(replace(small_model, quantiser_step=0.004), cached=False)
     b = sign(room_frames[0], other)
@@ -140,7 +122,7 @@ def test_distance_of_two_models_is_an_error_that_names_both(
     assert distance(a, sign(room_frames[1], small_signer)) > 0
 
 
-def test_a_lone_flat_wall_signs(small_signer: Signer) -> None:
+def test_a_lone_flat_wall_signs(small_signer):
     signature = sign(flat(2.0), small_signer)
     assert signature.n_patches[0] > 100
     exact = [
@@ -162,18 +144,18 @@ def test_a_lone_flat_wall_signs(small_signer: Signer) -> None:
         (flat(1.0, Intrinsics(2, 1, 500.0, 500.0, 0.5, 0.0)), "2 x 1 samples show no surface"),
     ],
 )
-def test_frames_with_nothing_to_sign(small_signer: Signer, frame: DepthFrame, message: str) -> None:
+def test_frames_with_nothing_to_sign(small_signer, frame, message):
     with pytest.raises(UselessFrame, match=message):
         sign(frame, small_signer)
 
 
-def test_noise_is_no_surface(small_signer: Signer) -> None:
+def test_noise_is_no_surface(small_signer):
     depth = np.random.default_rng(0).uniform(0.5, 8.0, (480, 640)).astype(np.float32)
     with pytest.raises(UselessFrame):
         sign(DepthFrame(depth, CAMERA, "noise"), small_signer)
 
 
-def test_one_patch_has_no_pair(small_model: Model) -> None:
+def test_one_patch_has_no_pair(small_model):
     few = replace(
         small_model.parameters,
         segmentation=replace(small_model.parameters.segmentation, n_patches=1),
@@ -183,7 +165,7 @@ def test_one_patch_has_no_pair(small_model: Model) -> None:
         sign(flat(2.0), signer)
 
 
-def test_any_depth_signs_or_says_why(small_signer: Signer) -> None:
+def test_any_depth_signs_or_says_why(small_signer):
     """Shapes, cameras and values nobody planned for: a signature or a UselessFrame."""
     rng = np.random.default_rng(3)
     outcomes = {"signed": 0, "useless": 0}
@@ -204,7 +186,7 @@ def test_any_depth_signs_or_says_why(small_signer: Signer) -> None:
     assert min(outcomes.values()) >= 10
 
 
-def test_the_package_says_what_it_offers() -> None:
+def test_the_package_says_what_it_offers():
     assert sceneprint.sign is sign
     assert sorted(sceneprint.__all__) == sceneprint.__all__
     assert all(getattr(sceneprint, name) is not None for name in sceneprint.__all__)
@@ -213,7 +195,7 @@ def test_the_package_says_what_it_offers() -> None:
         _ = sceneprint.nothing
 
 
-def test_importing_loads_nothing_heavy() -> None:
+def test_importing_loads_nothing_heavy():
     code = (
         "import sys, sceneprint\n"
         "heavy = {'numpy', 'numba', 'sklearn', 'open3d', 'PIL', 'pydantic'}\n"

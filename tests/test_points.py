@@ -1,9 +1,6 @@
 """Tests of encoded points against a decoder that follows docs/reference.md."""
 
-from __future__ import annotations
-
 import struct
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +8,7 @@ import pytest
 from sceneprint.formats.export import encode_points, thinned
 
 
-def decoded(data: bytes) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+def decoded(data):
     """Header and points, by the words of the documentation alone."""
     magic, version, flags, count, stride = struct.unpack_from("<4sHHII", data, 0)
     assert (magic, version, stride) == (b"SPPT", 1, 12)
@@ -34,7 +31,7 @@ def decoded(data: bytes) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     return head, points
 
 
-def test_points_are_read_back() -> None:
+def test_points_are_read_back():
     rng = np.random.default_rng(3)
     points = rng.uniform((-4, -1, 0.5), (3, 2, 9), (300, 3))
     normals = rng.normal(size=(300, 3))
@@ -55,7 +52,7 @@ def test_points_are_read_back() -> None:
     assert data == encode_points(points, normals, patches, residuals, total=777, scale=0.05)
 
 
-def test_what_is_not_told_says_so() -> None:
+def test_what_is_not_told_says_so():
     head, told = decoded(encode_points(np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 3.5]])))
     assert (head["flags"], head["total"], head["scale"]) == (0, 2, 0)
     assert head["extent"] == (0, 0, 0.5)  # flat in two directions
@@ -71,7 +68,7 @@ def test_what_is_not_told_says_so() -> None:
     assert [one["patch"] for one in told] == [0, 65535, 65535]
 
 
-def test_far_from_its_origin_a_cloud_keeps_its_shape() -> None:
+def test_far_from_its_origin_a_cloud_keeps_its_shape():
     points = 4e6 + np.array([[0.0, 0, 0], [1, 2, 0.25], [0.5, 1, 0.25]])
     _, told = decoded(encode_points(points))
     apart = np.array([one["at"] for one in told]) - told[0]["at"]
@@ -79,7 +76,7 @@ def test_far_from_its_origin_a_cloud_keeps_its_shape() -> None:
 
 
 @pytest.mark.parametrize(("count", "limit"), [(5, 5), (5, 9), (1000, 1), (19200, 7000), (0, 3)])
-def test_thinning_takes_some_of_everywhere(count: int, limit: int) -> None:
+def test_thinning_takes_some_of_everywhere(count, limit):
     kept = thinned(count, limit)
     assert len(kept) == len(set(kept.tolist())) == min(count, limit)
     assert (np.diff(kept) > 0).all()

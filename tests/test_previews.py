@@ -1,7 +1,5 @@
 """Tests of pictures of frames: pixels, and common properties."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np
@@ -19,10 +17,10 @@ from sceneprint.pictures import (
     patches_view,
     picture,
 )
-from sceneprint.types import Floats32, Intrinsics, Surface
+from sceneprint.types import Intrinsics, Surface
 
 
-def surface(z: list[list[float]], normals: Floats32 | None = None) -> Surface:
+def surface(z, normals=None):
     """Of these depths; 0 for none."""
     depth = np.array(z, np.float32)
     points = np.zeros((*depth.shape, 3), np.float32)
@@ -34,7 +32,7 @@ def surface(z: list[list[float]], normals: Floats32 | None = None) -> Surface:
     return Surface(points, normals, depth > 0, np.ones_like(depth), camera)
 
 
-def test_depth_by_hand() -> None:
+def test_depth_by_hand():
     colours, text = depth_view(surface([[1.0, 2.0, 3.0, 0.0, 1.5]]))
     # viridis of matplotlib at 1, 1/2, 0 and 3/4; percentiles 1 and 99 of 1, 1.5, 2, 3
     near, far = np.percentile([1.0, 1.5, 2.0, 3.0], (1, 99))
@@ -46,7 +44,7 @@ def test_depth_by_hand() -> None:
     assert two[0, 50].tolist() == [33, 145, 140]  # half way
 
 
-def test_nothing_seen_is_grey_throughout() -> None:
+def test_nothing_seen_is_grey_throughout():
     blank = surface([[0.0, 0.0]])
     colours, text = depth_view(blank)
     assert (colours == UNKNOWN).all()
@@ -57,13 +55,13 @@ def test_nothing_seen_is_grey_throughout() -> None:
     assert text["patches"] == "0"
 
 
-def test_normals_by_hand() -> None:
+def test_normals_by_hand():
     normals = np.array([[[0, 0, -1], [1, 0, 0], [0, -1, 0], [0, 0.6, -0.8]]], np.float32)
     colours, _ = normals_view(surface([[1.0, 1.0, 1.0, 0.0]], normals))
     assert colours[0].tolist() == [[128, 128, 0], [255, 128, 128], [128, 0, 128], [UNKNOWN] * 3]
 
 
-def test_patches_have_colours_of_their_own_unlike_their_neighbours() -> None:
+def test_patches_have_colours_of_their_own_unlike_their_neighbours():
     """900 patches in a grid of 30 x 30, some of them torn in two, with holes between."""
     rng = np.random.default_rng(3)
     labels = np.kron(np.arange(900).reshape(30, 30), np.ones((4, 4), int)).astype(np.int32)
@@ -81,21 +79,21 @@ def test_patches_have_colours_of_their_own_unlike_their_neighbours() -> None:
         assert beside.max(axis=2).min() >= 40  # of 255, in the channel that differs most
 
 
-def test_a_picture_repeats_pixels_and_keeps_its_text() -> None:
+def test_a_picture_repeats_pixels_and_keeps_its_text():
     colours = np.arange(2 * 64 * 3).reshape(2, 64, 3).astype(np.uint8)
     data = picture(colours, 128, {"near_m": "0.5", "Description": "é"})
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     assert data == picture(colours, 128, {"near_m": "0.5", "Description": "é"})
     with Image.open(io.BytesIO(data)) as image:
         assert (image.size, image.mode) == ((128, 4), "RGB")
-        assert image.text == {"near_m": "0.5", "Description": "é"}  # type: ignore[attr-defined]
+        assert image.text == {"near_m": "0.5", "Description": "é"}
         large = np.asarray(image)
     assert np.array_equal(large, colours.repeat(2, axis=0).repeat(2, axis=1))
     with Image.open(io.BytesIO(picture(large, 64, {}))) as image:
         assert np.array_equal(np.asarray(image), colours)
 
 
-def test_no_picture_is_larger_than_it_may_be() -> None:
+def test_no_picture_is_larger_than_it_may_be():
     for shape in ((200_000, 1), (5000, 40)):
         with Image.open(io.BytesIO(picture(np.zeros((*shape, 3), np.uint8), 1280, {}))) as image:
             assert image.size[1] == MOST_ROWS
@@ -106,7 +104,7 @@ def test_no_picture_is_larger_than_it_may_be() -> None:
             picture(np.zeros((2, 2, 3), np.uint8), width, {})
 
 
-def test_an_overlay_by_hand() -> None:
+def test_an_overlay_by_hand():
     """Two points 4 m apart in x and z, seen from 2 m to the right: 479 pixels stand for 6 m."""
     match = surface([[1.0] * 50, [1.0] * 50])
     match.points[:] = 0.0

@@ -1,7 +1,5 @@
 """Tests of the pages' language against CONTRIBUTING.md, by counts."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from statistics import median
@@ -61,7 +59,7 @@ STUMBLES = re.compile(
 )
 
 
-def sentences(page: str) -> list[str]:
+def sentences(page):
     """Sentences of the prose of a page: without code, tables, headings and what is generated."""
     page = re.sub(r"^ *```.*?^ *```$", "", page, flags=re.DOTALL | re.MULTILINE)
     page = re.sub(r"<!-- ([\w-]+):begin -->.*<!-- \1:end -->", "", page, flags=re.DOTALL)
@@ -77,17 +75,17 @@ def sentences(page: str) -> list[str]:
     return [one for one in found if re.search(r"\w", one)]
 
 
-def words(sentence: str) -> int:
+def words(sentence):
     return len([word for word in sentence.split() if re.search(r"\w", word)])
 
 
 @pytest.mark.parametrize("name", EDITED)
-def test_edited_pages_are_in_short_sentences(name: str) -> None:
+def test_edited_pages_are_in_short_sentences(name):
     found = sentences((ROOT / name).read_text())
     assert [one for one in found if words(one) > MOST_WORDS] == []
     assert median(map(words, found)) <= MEDIAN_WORDS
 
 
 @pytest.mark.parametrize("name", EDITED)
-def test_edited_pages_have_no_phrase_that_readers_stumble_over(name: str) -> None:
+def test_edited_pages_have_no_phrase_that_readers_stumble_over(name):
     assert STUMBLES.findall(" ".join(sentences((ROOT / name).read_text()))) == []

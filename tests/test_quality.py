@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.formats.dataset import find_sequences
 from sceneprint.geometry.retrieval.ranking import cross_distances
 from sceneprint.geometry.signature.fisher_vector import quantise
 from sceneprint.pipeline import distance, sign
 from sceneprint.signing import (
-    Signer,
     describe,
     exact_statistics,
     float_signature,
     open_signer,
     table_statistics,
 )
-from sceneprint.types import DepthFrame, Floats, Floats32, Intrinsics
+from sceneprint.types import DepthFrame, Floats, Intrinsics
 from sceneprint_lab.evaluation.protocol import overlaps, view_of
 from sceneprint_lab.synth import KINECT, Room, render, synthesise_room
 from sceneprint_lab.synth.dataset import room_and_rng
@@ -34,12 +30,12 @@ SPLITS = {
 }
 
 
-def ranks(rows: Floats) -> NDArray[np.intp]:
+def ranks(rows):
     """Database indices by rising distance, ties by index."""
     return np.argsort(rows, axis=1, kind="stable")
 
 
-def recall_at_10(stored: Floats, exact: Floats) -> float:
+def recall_at_10(stored, exact):
     """Share of the exact first ten that stored signatures keep among their first ten."""
     kept = [
         len(set(a[:10]) & set(b[:10])) / 10
@@ -65,19 +61,19 @@ class RolledView:
     pose: Floats
     _seen: dict[tuple[float, bool], DepthFrame] = field(default_factory=dict, repr=False)
 
-    def seen(self, degrees: float, round_lens: bool) -> DepthFrame:
+    def seen(self, degrees, round_lens):
         """The depth image after a roll about the optical axis, noise-free; rendered once."""
         asked = (degrees, round_lens)
         if asked not in self._seen:
             self._seen[asked] = self._render(degrees, round_lens)
         return self._seen[asked]
 
-    def _render(self, degrees: float, round_lens: bool) -> DepthFrame:
+    def _render(self, degrees, round_lens):
         a = math.radians(degrees)
         roll = np.eye(4)
         roll[:2, :2] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
         camera = SQUARE if round_lens else KINECT
-        depth: Floats32 = render(self.room, self.pose @ roll, camera)
+        depth = render(self.room, self.pose @ roll, camera)
         if round_lens:
             y, x = np.mgrid[: camera.height, : camera.width]
             inside = (x - camera.cx) ** 2 + (y - camera.cy) ** 2 < 239.0**2
@@ -85,16 +81,14 @@ class RolledView:
         return DepthFrame(depth, camera, f"rolled by {degrees:g}")
 
 
-def view(number: int) -> RolledView:
+def view(number):
     """View `number` of rooms kept for this measurement."""
     pose = synthesise_room(SEED, number, 1).frames[0].pose
     assert pose is not None
     return RolledView(room_and_rng(SEED, number)[0], pose)
 
 
-def shares_of_d0(
-    one: RolledView, signer: Signer, round_lens: bool, angles: Iterable[float] = ANGLES
-) -> list[float]:
+def shares_of_d0(one, signer, round_lens, angles=ANGLES):
     """Distance to the unrolled view, for each angle, as a share of d0."""
     d0 = signer.model.unrelated_distance
     still = sign(one.seen(0, round_lens), signer)
@@ -102,31 +96,31 @@ def shares_of_d0(
 
 
 @pytest.fixture(scope="module", params=[pytest.param("paper", marks=pytest.mark.thorough), "depth"])
-def signer(request: pytest.FixtureRequest) -> Signer:
+def signer(request):
     return open_signer(request.param)
 
 
 @pytest.fixture(scope="module")
-def paper() -> Signer:
+def paper():
     return open_signer("paper")
 
 
 @pytest.fixture(scope="module")
-def views() -> list[RolledView]:
+def views():
     """Rendered once for both models."""
     return [view(i) for i in range(12)]
 
 
-def every(path: Path, step: int) -> list[FrameReference]:
+def every(path, step):
     return [f for s in find_sequences(path) for f in s.frames][::step]
 
 
-def pairwise(rows: list[Floats]) -> Floats:
+def pairwise(rows):
     upper = np.triu_indices(len(rows), 1)
     return np.array([[np.abs(a - b).sum() for b in rows] for a in rows])[upper]
 
 
-def test_the_table_keeps_the_distances_of_the_exact_path(data_root: Path, signer: Signer) -> None:
+def test_the_table_keeps_the_distances_of_the_exact_path(data_root, signer):
     """Twelve real frames of three sensors; fewer patches only so that the oracle ends soon."""
     p = signer.model.parameters
     p = replace(p, segmentation=replace(p.segmentation, n_patches=200))
@@ -157,9 +151,7 @@ def test_the_table_keeps_the_distances_of_the_exact_path(data_root: Path, signer
         pytest.param("reverse", 0.628, 0.59, 0.70, marks=pytest.mark.thorough),
     ],
 )
-def test_retrieval(
-    data_root: Path, paper: Signer, split: str, oracle: float, mean_overlap: float, top1: float
-) -> None:
+def test_retrieval(data_root, paper, split, oracle, mean_overlap, top1):
     """Every fourth frame of the splits of docs/model.md: .604 and .603, .84 and .73."""
     (sequence,) = find_sequences(data_root / "7scenes/redkitchen")
     database, queries = (
@@ -178,7 +170,7 @@ def test_retrieval(
     assert recall_at_10(stored, exact) >= 0.99
 
 
-def psi_of(frames: list[DepthFrame], signer: Signer) -> Floats:
+def psi_of(frames, signer):
     """(N, D) psi before any rounding."""
     found = []
     for frame in frames:
@@ -188,7 +180,7 @@ def psi_of(frames: list[DepthFrame], signer: Signer) -> Floats:
     return np.stack(found)
 
 
-def test_recall_by_hand() -> None:
+def test_recall_by_hand():
     exact = np.arange(20.0)[None]
     assert recall_at_10(exact, exact) == 1.0
     # the nearest four move behind all others: six of the first ten remain
@@ -196,16 +188,14 @@ def test_recall_by_hand() -> None:
     assert recall_at_10(moved, exact) == pytest.approx(0.6)
 
 
-def test_another_rooms_frame_is_farther(
-    signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_another_rooms_frame_is_farther(signer, room_frames):
     signed = [sign(frame, signer) for frame in room_frames]
     across = [distance(a, b) for a in signed[:3] for b in signed[3:]]
     assert np.median(across) / signer.model.unrelated_distance == pytest.approx(1.0, abs=0.25)
 
 
 @pytest.mark.thorough
-def test_a_roll_of_the_camera_changes_little(signer: Signer, views: list[RolledView]) -> None:
+def test_a_roll_of_the_camera_changes_little(signer, views):
     """The same content at every angle: what is left is the segmentation's own noise.
 
     A third of d0 is what we want; one of the 84 measurements misses it, as docs/limits.md
@@ -218,6 +208,6 @@ def test_a_roll_of_the_camera_changes_little(signer: Signer, views: list[RolledV
 
 
 @pytest.mark.thorough
-def test_a_rectangular_sensor_turned_upside_down_sees_the_same(signer: Signer) -> None:
+def test_a_rectangular_sensor_turned_upside_down_sees_the_same(signer):
     shares = [shares_of_d0(view(i), signer, False, angles=(180,))[0] for i in range(4)]
     assert max(shares) <= 1 / 3

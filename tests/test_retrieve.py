@@ -1,7 +1,5 @@
 """Tests of the paper's Fig. 1 as functions: retrieve, diversify, associate, locate."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -14,11 +12,10 @@ from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.retrieval.ranking import diversify as select
 from sceneprint.geometry.signature.segmentation import extract_patches, segment
 from sceneprint.geometry.validation.validation import PairValidation, expected_error, rank_accepted
-from sceneprint.models import Model, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import (
     PairMatch,
     Signature,
-    Signer,
     associate,
     diversify,
     geometry_of,
@@ -28,45 +25,43 @@ from sceneprint.pipeline import (
     validate,
 )
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Floats, Geometry, Intrinsics
+from sceneprint.types import DepthFrame, Geometry, Intrinsics
 from sceneprint_lab.synth import KINECT, take, trajectory
 from sceneprint_lab.synth.dataset import room_and_rng
 
 
-def signature(*values: int, model_id: str = "a" * 64) -> Signature:
+def signature(*values, model_id="a" * 64):
     return Signature(np.array(values, np.uint8), model_id, (5,), (20,), "l1")
 
 
-def outcome(
-    status: str = "accepted", strength: str | None = "strong", T: Floats | None = None
-) -> PairValidation:
+def outcome(status="accepted", strength="strong", T=None):
     """What `validate` might have said."""
     return PairValidation(
-        status,  # type: ignore[arg-type]
-        strength if status == "accepted" else None,  # type: ignore[arg-type]
+        status,
+        strength if status == "accepted" else None,
         "as given", np.eye(4) if T is None else T, 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.0,
         None, 0,
     )  # fmt: skip
 
 
-def shifted(x: float) -> Floats:
+def shifted(x):
     T = np.eye(4)
     T[0, 3] = x
     return T
 
 
-def match(index: int, validation: PairValidation) -> PairMatch:
+def match(index, validation):
     return PairMatch(index, 10, 0.5, validation)
 
 
-def ranked(model: Model, *indices: int) -> Ranking:
+def ranked(model, *indices):
     """A ranking of these rows, 10, 20 and so on away."""
     far = 10 * np.arange(1, len(indices) + 1)
     return Ranking(np.array(indices, np.intp), far, 1 - far / model.unrelated_distance)
 
 
 @pytest.fixture
-def model_a(small_model: Model) -> Model:
+def model_a(small_model):
     """The small model by the id that signatures have here."""
     named = replace(small_model)
     vars(named)["id"] = "a" * 64
@@ -76,7 +71,7 @@ def model_a(small_model: Model) -> Model:
 # retrieve
 
 
-def test_retrieve_by_hand(model_a: Model) -> None:
+def test_retrieve_by_hand(model_a):
     query = signature(10, 10, 10)
     database = [
         signature(10, 10, 13),
@@ -93,14 +88,14 @@ def test_retrieve_by_hand(model_a: Model) -> None:
     assert retrieve(query, database, model_a, 0).indices.tolist() == []
 
 
-def test_how_many_are_retrieved(model_a: Model) -> None:
+def test_how_many_are_retrieved(model_a):
     rng = np.random.default_rng(0)
     database = [signature(*rng.integers(0, 256, 4).tolist()) for _ in range(600)]
     for n, size in ((49, 49), (51, 50), (200, 80), (600, 200)):
         assert len(retrieve(database[0], database[:n], model_a)) == size
 
 
-def test_an_empty_database(model_a: Model) -> None:
+def test_an_empty_database(model_a):
     for size in (None, 0, 5):
         found = retrieve(signature(1, 2, 3), [], model_a, size)
         assert len(found) == 0
@@ -110,7 +105,7 @@ def test_an_empty_database(model_a: Model) -> None:
         assert associate(never(), found, [], unopened) == []
 
 
-def test_a_database_of_one_frame(model_a: Model) -> None:
+def test_a_database_of_one_frame(model_a):
     database = [signature(1, 2, 3)]
     found = retrieve(signature(1, 2, 5), database, model_a)
     assert (found.indices.tolist(), found.distances.tolist()) == ([0], [2])
@@ -118,7 +113,7 @@ def test_a_database_of_one_frame(model_a: Model) -> None:
     assert (chosen.indices.tolist(), chosen.gains.tolist()) == ([0], [1.0])
 
 
-def test_signatures_of_two_models_are_not_compared(model_a: Model) -> None:
+def test_signatures_of_two_models_are_not_compared(model_a):
     mixed = [signature(1, 2), signature(1, 2, model_id="b" * 64)]
     other = replace(model_a)
     vars(other)["id"] = "b" * 64
@@ -131,9 +126,7 @@ def test_signatures_of_two_models_are_not_compared(model_a: Model) -> None:
         retrieve(mixed[1], mixed[1:], model_a)
 
 
-def test_a_frame_of_the_database_finds_itself(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_a_frame_of_the_database_finds_itself(small_signer, room_frames):
     signed = [sign(frame, small_signer) for frame in room_frames]
     for i, one in enumerate(signed):
         found = retrieve(one, signed, small_signer.model)
@@ -144,7 +137,7 @@ def test_a_frame_of_the_database_finds_itself(
 # diversify
 
 
-def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a: Model) -> None:
+def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a):
     rng = np.random.default_rng(1)
     database = [signature(*rng.integers(0, 256, 30).tolist()) for _ in range(25)]
     database += database[:5]  # and duplicates, which add nothing
@@ -163,9 +156,7 @@ def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a: Mo
 # prepare and geometry_of
 
 
-def test_prepare_is_sign_and_geometry_of_one_look(
-    small_signer: Signer, room_frames: tuple[DepthFrame, ...]
-) -> None:
+def test_prepare_is_sign_and_geometry_of_one_look(small_signer, room_frames):
     model = small_signer.model
     made, geometry = prepare(room_frames[0], small_signer)
     np.testing.assert_array_equal(made.vector, sign(room_frames[0], small_signer).vector)
@@ -188,7 +179,7 @@ def test_prepare_is_sign_and_geometry_of_one_look(
     assert 250 < len(patches) < 450  # 400 cells
 
 
-def test_prepare_of_nothing(small_signer: Signer) -> None:
+def test_prepare_of_nothing(small_signer):
     k = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
     with pytest.raises(UselessFrame):
         prepare(DepthFrame(np.zeros((48, 64), np.float32), k), small_signer)
@@ -197,16 +188,16 @@ def test_prepare_of_nothing(small_signer: Signer) -> None:
 # validate, associate
 
 
-def never() -> Geometry:
+def never():
     """An artifact that is not looked into."""
-    return Geometry(None, None, None, "a" * 64)  # type: ignore[arg-type]
+    return Geometry(None, None, None, "a" * 64)
 
 
-def unopened(index: int) -> Geometry:
+def unopened(index):
     raise AssertionError(f"row {index} was opened")
 
 
-def test_artifacts_of_two_models_are_not_compared(small_model: Model) -> None:
+def test_artifacts_of_two_models_are_not_compared(small_model):
     other = replace(never(), model_id="b" * 64)
     with pytest.raises(ModelMismatch, match="aaaaaaaaaaaa and bbbbbbbbbbbb"):
         validate(never(), other)
@@ -215,7 +206,7 @@ def test_artifacts_of_two_models_are_not_compared(small_model: Model) -> None:
 
 
 @pytest.fixture(scope="module")
-def walk() -> list[Geometry]:
+def walk():
     """Three views along a path in one room, and a view of another room."""
     model = read_model("paper")
     frames = []
@@ -226,15 +217,13 @@ def walk() -> list[Geometry]:
     return [geometry_of(see(frame, model.parameters), model) for frame in frames]
 
 
-def test_candidates_are_tried_in_order_until_enough(
-    small_model: Model, walk: list[Geometry]
-) -> None:
+def test_candidates_are_tried_in_order_until_enough(small_model, walk):
     query, near, far, elsewhere = walk
     rows = {40: elsewhere, 10: far, 30: near, 20: query}
     ranking = ranked(small_model, 40, 10, 30, 20)
-    opened: list[int] = []
+    opened = []
 
-    def row(index: int) -> Geometry:
+    def row(index):
         opened.append(index)
         return rows[index]
 
@@ -258,7 +247,7 @@ def test_candidates_are_tried_in_order_until_enough(
     assert (only.validation.status, only.validation.strength) == ("accepted", "strong")
 
 
-def test_preferred() -> None:
+def test_preferred():
     strong, weak = outcome(), outcome(strength="weak")
     no, unsure = outcome("rejected"), outcome("ambiguous")
     assert rank_accepted([]) == []
@@ -267,7 +256,7 @@ def test_preferred() -> None:
     assert rank_accepted([strong, strong]) == [0, 1]  # equals: the order of R
 
 
-def test_of_cameras_the_least_expected_error_goes_first() -> None:
+def test_of_cameras_the_least_expected_error_goes_first():
     turned = np.eye(4)
     turned[:2, :2] = [[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]]
     # deviations of 1 and 3 cm, and 4 cm for each radian between the views
@@ -282,7 +271,7 @@ def test_of_cameras_the_least_expected_error_goes_first() -> None:
     assert expected_error(outcome()) == math.inf  # nothing is known of its precision
 
 
-def test_of_scans_all_around_the_nearest_goes_first() -> None:
+def test_of_scans_all_around_the_nearest_goes_first():
     far, near, nearest = (outcome(T=shifted(x)) for x in (3.0, -2.0, 1.0))
     weak = outcome(strength="weak", T=shifted(0.5))
     said = [far, weak, near, nearest]
@@ -293,9 +282,7 @@ def test_of_scans_all_around_the_nearest_goes_first() -> None:
     assert rank_accepted([replace(far, around=True)]) == [0]
 
 
-def test_frames_are_judged_by_the_numbers_of_their_model(
-    room_frames: tuple[DepthFrame, ...], small_model: Model, small_signer: Signer
-) -> None:
+def test_frames_are_judged_by_the_numbers_of_their_model(room_frames, small_model, small_signer):
     """Of a preset, whoever made the artifacts; of a model of one's own, once it was used."""
     query, match = (prepare(frame, small_signer)[1] for frame in room_frames[:2])
     lidar = read_model("lidar")

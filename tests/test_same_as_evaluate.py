@@ -1,36 +1,30 @@
 """Tests that answers over HTTP equal those of `sceneprint evaluate`."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import statistics
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from sceneprint.formats.dataset import FrameReference, find_sequences
+from sceneprint.formats.dataset import find_sequences
 from sceneprint_client import Client, meta_of
-from sceneprint_client.api import Answer
-from sceneprint_lab.cli.demo import DemoQuery, choose_frames, fill, place_of, run_queries, serving
+from sceneprint_lab.cli.demo import choose_frames, fill, place_of, run_queries, serving
 from sceneprint_lab.evaluation.report import answer_rows, judge_answers
 
 
-def evaluate(folder: Path, *arguments: str) -> dict[str, Any]:
+def evaluate(folder, *arguments):
     out = folder / "figures.json"
     subprocess.run(
         [sys.executable, "-m", "sceneprint", "evaluate", *arguments, "--json", str(out)],
         check=True,
         stdout=subprocess.DEVNULL,
     )
-    figures: dict[str, Any] = json.loads(out.read_text())
-    return figures
+    return json.loads(out.read_text())
 
 
-def told(answer: Answer, names: dict[str, str]) -> list[dict[str, Any]]:
+def told(answer, names):
     """The matches of an answer as `per_query` of an evaluation tells them."""
     return [
         {
@@ -44,10 +38,7 @@ def told(answer: Answer, names: dict[str, str]) -> list[dict[str, Any]]:
     ]
 
 
-def check(
-    folder: Path, expected: dict[str, Any], database: dict[str, FrameReference],
-    queries: dict[str, FrameReference],
-) -> None:  # fmt: skip
+def check(folder, expected, database, queries):
     """Ask a service of the same frames, and compare to the last bit."""
     data = folder / "data"
     data.mkdir()
@@ -76,7 +67,7 @@ def check(
 
 
 @pytest.mark.thorough
-def test_redkitchen_over_http_is_redkitchen_evaluated(data_root: Path, tmp_path: Path) -> None:
+def test_redkitchen_over_http_is_redkitchen_evaluated(data_root, tmp_path):
     recording = data_root / "7scenes" / "redkitchen"
     figures = evaluate(
         tmp_path, str(recording), "--db", "0:600:15", "--queries", "650:1000:44", "--jobs", "1"
@@ -84,14 +75,14 @@ def test_redkitchen_over_http_is_redkitchen_evaluated(data_root: Path, tmp_path:
     frames = [frame for sequence in find_sequences(recording) for frame in sequence.frames]
     assert figures["counts"] == {"queries": 8, "database": 40, "left_out": 0}
 
-    def named(some: list[FrameReference]) -> dict[str, FrameReference]:
+    def named(some):
         return {f"redkitchen/{frame.name}": frame for frame in some}
 
     check(tmp_path, figures, named(frames[0:600:15]), named(frames[650:1000:44]))
 
 
 @pytest.mark.thorough
-def test_the_demo_prints_the_figures_of_evaluate(building: Path, tmp_path: Path) -> None:
+def test_the_demo_prints_the_figures_of_evaluate(building, tmp_path):
     """The first half of a walk, signed with the smaller preset."""
     half = tmp_path / "half"
     shutil.copytree(building, half, ignore=shutil.ignore_patterns("frame-0000[5-9]*"))
@@ -102,7 +93,7 @@ def test_the_demo_prints_the_figures_of_evaluate(building: Path, tmp_path: Path)
     data.mkdir()
     with serving(data, workers=1) as url, Client(url) as client:
         known = fill(client, "depth", choice)
-        asked: list[DemoQuery] = run_queries(client, choice)
+        asked = run_queries(client, choice)
     places = {key: place for key, one in known.items() if (place := place_of(one)) is not None}
     rows = answer_rows(
         [

@@ -1,11 +1,8 @@
 """Tests of secrets in files instead of environment variables."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +11,7 @@ from sceneprint.errors import InvalidRequest
 from sceneprint.process import SECRETS, read_secret_files
 
 
-def test_a_file_holds_what_its_variable_would(tmp_path: Path) -> None:
+def test_a_file_holds_what_its_variable_would(tmp_path):
     password, other = tmp_path / "password", tmp_path / "other"
     password.write_bytes(b" pass word\r\n")
     other.write_text("s3cret")
@@ -30,7 +27,7 @@ def test_a_file_holds_what_its_variable_would(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SECRETS)
-def test_what_is_no_secret_is_refused_and_never_shown(name: str, tmp_path: Path) -> None:
+def test_what_is_no_secret_is_refused_and_never_shown(name, tmp_path):
     path = tmp_path / "secret"
     for content, said in (
         (None, "No such file"), (b"", "does not contain a secret"), (b"a\nhunter2", "one line"),
@@ -46,7 +43,7 @@ def test_what_is_no_secret_is_refused_and_never_shown(name: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("command", [["sceneprint", "keys", "--list"], ["service"]])
-def test_every_command_reads_them(command: list[str], tmp_path: Path) -> None:
+def test_every_command_reads_them(command, tmp_path):
     path = tmp_path / "url"
     path.write_text("nothing://robot:hunter2@host/name\n")
     given = {**os.environ, "SCENEPRINT_DATABASE_URL_FILE": str(path), "SCENEPRINT_PORT": "0"}

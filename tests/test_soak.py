@@ -1,13 +1,10 @@
 """Tests of `python -m benchmarks.soak` at reduced size, and of its detection of losses."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,14 +20,13 @@ from benchmarks.soak.faults import CUT_OFF, FROZEN, FULL, PRIMARY, Promotion
 from benchmarks.soak.lock_samples import LockShares
 from benchmarks.soak.operations import OperationFigures, call_as_everybody
 from benchmarks.soak.plan import FAULTS, PLANS, Plan
-from benchmarks.soak.recordings import Shot, walks
+from benchmarks.soak.recordings import walks
 from benchmarks.soak.robots import Acknowledged, Ledger, Listener, Search
 from benchmarks.soak.run import SoakFigures, drive
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.store import open_store
 from sceneprint.store.tables import audit as audit_table
-from sceneprint.types import DepthFrame
 from sceneprint_client import Client
 
 #: At reduced size, on either store.
@@ -47,9 +43,7 @@ HARD = replace(
 
 
 @pytest.fixture(scope="module")
-def recording(
-    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def recording(room_frames, tmp_path_factory):
     """Six frames of two rooms as one sequence, which is enough for walks of many grids."""
     folder = tmp_path_factory.mktemp("recording") / "seq-01"
     folder.mkdir()
@@ -62,12 +56,12 @@ def recording(
 
 
 @pytest.fixture(scope="module")
-def shots(recording: Path) -> list[Shot]:
+def shots(recording):
     return [shot for walk in walks(recording, 4, 6) for shot in walk]
 
 
 @pytest.fixture
-def soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def soon(monkeypatch):
     """Restart killed parts at once, and compare few frames."""
     monkeypatch.setattr(faults, "AWAY_S", (0.0, 0.0))
     monkeypatch.setattr(faults, "UNNOTICED_S", 0.2)
@@ -75,14 +69,14 @@ def soon(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def servers() -> None:
+def servers():
     try:
         binaries()
     except NoServer as error:
         pytest.skip(str(error))
 
 
-def assert_sound(figures: SoakFigures) -> None:
+def assert_sound(figures):
     """What is counted is what a run without a loss has."""
     n = figures.found.acknowledged
     looked_up = figures.found.looked_up
@@ -99,9 +93,7 @@ def assert_sound(figures: SoakFigures) -> None:
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("soon")
-def test_kills_and_a_full_disk_lose_nothing(
-    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kills_and_a_full_disk_lose_nothing(tmp_path, recording, monkeypatch):
     monkeypatch.setattr(faults, "FULL_S", 2.0)
     full = int(os.geteuid() == 0)  # who may mount a disk
     found = drive(tmp_path, replace(SMALL, data=recording, faults={"kill": 3, "full-disk": full}))
@@ -112,7 +104,7 @@ def test_kills_and_a_full_disk_lose_nothing(
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("soon", "servers")
-def test_a_promoted_standby_loses_nothing(tmp_path: Path, recording: Path) -> None:
+def test_a_promoted_standby_loses_nothing(tmp_path, recording):
     found = drive(tmp_path, replace(ON_SERVERS, data=recording))
     assert_sound(found)
     assert (found.kills[PRIMARY], found.kills.total(), found.window) == (1, 3, 0)
@@ -124,9 +116,7 @@ def test_a_promoted_standby_loses_nothing(tmp_path: Path, recording: Path) -> No
 
 @pytest.mark.thorough
 @pytest.mark.usefixtures("soon", "servers")
-def test_a_fleet_loses_nothing_whatever_becomes_of_it(
-    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fleet_loses_nothing_whatever_becomes_of_it(tmp_path, recording, monkeypatch):
     monkeypatch.setattr(faults, "CUT_OFF_S", 6.0)
     found = drive(tmp_path, replace(HARD, data=recording))
     assert_sound(found)
@@ -135,9 +125,7 @@ def test_a_fleet_loses_nothing_whatever_becomes_of_it(
 
 
 @pytest.mark.thorough
-def test_a_siege_breaks_nothing(
-    tmp_path: Path, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_siege_breaks_nothing(tmp_path, recording, monkeypatch):
     monkeypatch.setattr("benchmarks.soak.run.ROWS", 50)
     few = ("event streams", "queries", "edits, each audited")
     monkeypatch.setattr(attacks, "ATTACKS", {name: ATTACKS[name] for name in few})
@@ -158,16 +146,14 @@ def test_a_siege_breaks_nothing(
 
 
 @pytest.mark.thorough
-def test_every_operation_answers_as_declared(tmp_path: Path, shots: list[Shot]) -> None:
+def test_every_operation_answers_as_declared(tmp_path, shots):
     found = call_as_everybody(tmp_path, shots[:2], examples=2, phases="fuzzing")
     assert [one.report[-2000:] for one in found if not one.sound] == []
     assert len(found) == 5
     assert all(one.requests > one.operations >= 40 for one in found[:4])
 
 
-def test_what_is_lost_is_seen(
-    tmp_path: Path, shots: list[Shot], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_lost_is_seen(tmp_path, shots, monkeypatch):
     monkeypatch.setattr(audit, "EVENTS_S", 0.0)
     with Client.embedded(tmp_path) as client:
         client.create_map("fleet", model="depth")
@@ -207,7 +193,7 @@ def test_what_is_lost_is_seen(
         assert (before, count_separated(connection, ["fleet"])) == (0, 1)
 
 
-def search(*matches: tuple[str, int], begun: float = 5.0) -> Search:
+def search(*matches, begun=5.0):
     return Search("s0", matches, begun, begun + 0.5)
 
 
@@ -229,17 +215,17 @@ OUT_OF_ORDER = "the matches are not in order, or one is repeated"
         (search(("s1", 16), ("w", 32), begun=6.5), []),  # it was being deleted
     ],
 )
-def test_a_wrong_answer_is_seen(answer: Search, wrong: list[str]) -> None:
+def test_a_wrong_answer_is_seen(answer, wrong):
     vectors = {"s0": np.array([0, 0]), "s1": np.array([4, 0]), "w": np.array([4, 4])}
     assert wrong_matches(answer, {"w": (6.0, 7.0)}, ["s0", "s1"], vectors) == wrong
 
 
-NOTHING: dict[str, Any] = {"acknowledged": 9, "indexed": 9, "looked_up": 9, "found": 9}
-LESS: dict[str, Any] = NOTHING | {"indexed": 8, "looked_up": 8, "found": 8}
+NOTHING = {"acknowledged": 9, "indexed": 9, "looked_up": 9, "found": 9}
+LESS = NOTHING | {"indexed": 8, "looked_up": 8, "found": 8}
 
 
-def figures(found: dict[str, Any], **changed: Any) -> SoakFigures:
-    same: dict[str, Any] = {
+def figures(found, **changed):
+    same = {
         "plan": Plan(), "kills": Counter(service=2, primary=1),
         "outages": {"service": [1.25, 0.0], PRIMARY: [3.0]},
         "promotions": [Promotion(10.0, 11.5, {"a": 0.5, "b": 2.0}, frozenset())],
@@ -249,8 +235,8 @@ def figures(found: dict[str, Any], **changed: Any) -> SoakFigures:
     return SoakFigures(found=AuditCounts(**NOTHING | found), **same | changed)
 
 
-def broken(**changed: Any) -> BrokenFigures:
-    same: dict[str, Any] = {"failed": [], "crashed": 0}
+def broken(**changed):
+    same = {"failed": [], "crashed": 0}
     return BrokenFigures({"png": 2}, {422: 2}, peak_bytes=1, seconds=1.0, **same | changed)
 
 
@@ -299,11 +285,11 @@ def broken(**changed: Any) -> BrokenFigures:
         ({}, {"operations": [OperationFigures("nobody", 9, 5, 4, "")]}, False),
     ],
 )
-def test_what_is_wrong_fails(found: dict[str, Any], changed: dict[str, Any], sound: bool) -> None:
+def test_what_is_wrong_fails(found, changed, sound):
     assert figures(found, **changed).sound is sound
 
 
-def test_every_plan_has_known_faults_and_marks_in_the_page() -> None:
+def test_every_plan_has_known_faults_and_marks_in_the_page():
     text = (Path(__file__).parent.parent / "docs" / "fault_injection.md").read_text()
     for name, plan in PLANS.items():
         assert set(plan.faults) <= set(FAULTS)

@@ -1,7 +1,5 @@
 """Tests of the commands of docs/api.md, run in order."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -9,7 +7,6 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,11 +16,11 @@ TOUR = (ROOT / "docs/api.md").read_text()
 PATIENCE_S = 600.0
 
 
-def blocks(language: str) -> list[str]:
+def blocks(language):
     return re.findall(rf"```{language}\n(.*?)```", TOUR, re.DOTALL)
 
 
-def named_blocks() -> list[tuple[str, str]]:
+def named_blocks():
     """Blocks of commands, each with the heading it stands under."""
     found, heading = [], ""
     for part in re.findall(r"^##+ [^\n]*$|^```sh\n.*?^```", TOUR, re.DOTALL | re.MULTILINE):
@@ -35,7 +32,7 @@ def named_blocks() -> list[tuple[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def outputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
+def outputs(tmp_path_factory):
     """What the blocks under each heading printed; a command that fails fails the tour."""
     folder = tmp_path_factory.mktemp("tour")
     with socket.socket() as free:
@@ -61,14 +58,14 @@ def outputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout[-1500:] + done.stderr[-1500:]
-    said: dict[str, list[str]] = {}
+    said = {}
     texts = done.stdout.split(f"{mark}\n")[1:]
     for (heading, _), text in zip(named, texts, strict=True):
         said.setdefault(heading, []).append(text)
     return said
 
 
-def documents(output: str) -> list[dict[str, Any]]:
+def documents(output):
     """The JSON documents of an output, which curl prints one after the other."""
     decoder, found = json.JSONDecoder(), []
     position = output.find("{")
@@ -79,12 +76,12 @@ def documents(output: str) -> list[dict[str, Any]]:
     return found
 
 
-def one(outputs: dict[str, list[str]], heading: str, place: int = 0) -> list[dict[str, Any]]:
+def one(outputs, heading, place=0):
     return documents(outputs[heading][place].partition("# HELP")[0])
 
 
 @pytest.mark.thorough
-def test_frames_go_into_a_map(outputs: dict[str, list[str]]) -> None:
+def test_frames_go_into_a_map(outputs):
     assert one(outputs, "Start", 1)[0]["status"] == "ok"
     assert [m["title"] for m in one(outputs, "A map")] == ["Two rooms"] * 2
     first, six, recording = outputs["Frames into the map"]
@@ -96,7 +93,7 @@ def test_frames_go_into_a_map(outputs: dict[str, list[str]]) -> None:
 
 
 @pytest.mark.thorough
-def test_there_are_other_ways_in(outputs: dict[str, list[str]]) -> None:
+def test_there_are_other_ways_in(outputs):
     raw, put, cloud, once, batch, archive = outputs["More ways in"]
     assert documents(raw)[1]["state"] == "received"
     added, frame = documents(put)
@@ -115,7 +112,7 @@ def test_there_are_other_ways_in(outputs: dict[str, list[str]]) -> None:
 
 
 @pytest.mark.thorough
-def test_frames_can_be_looked_at_and_edited(outputs: dict[str, list[str]]) -> None:
+def test_frames_can_be_looked_at_and_edited(outputs):
     page, monday, posed, named = one(outputs, "Look around")
     assert len(page["items"]) == 2
     assert [f["session"] for f in monday["items"]] == ["monday"]
@@ -130,7 +127,7 @@ def test_frames_can_be_looked_at_and_edited(outputs: dict[str, list[str]]) -> No
 
 
 @pytest.mark.thorough
-def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
+def test_queries_answer_as_the_page_says(outputs):
     asked, of_map, less, listed = outputs["Where was this taken?"]
     answer = documents(asked)[0]
     assert answer["status"] == "found"
@@ -171,14 +168,14 @@ def test_queries_answer_as_the_page_says(outputs: dict[str, list[str]]) -> None:
 
 
 @pytest.mark.thorough
-def test_places_are_rebuilt(outputs: dict[str, list[str]], with_open3d: None) -> None:
+def test_places_are_rebuilt(outputs, with_open3d):
     rebuilt = one(outputs, "What does the place look like?")[-1]
     assert rebuilt["state"] == "succeeded"
     assert len(rebuilt["result"]["views"]) > 1
 
 
 @pytest.mark.thorough
-def test_robots_maps_are_joined(outputs: dict[str, list[str]]) -> None:
+def test_robots_maps_are_joined(outputs):
     joined = one(outputs, "Join two robots' maps")
     (join,) = joined[-2]["result"]["joins"]
     assert (join["from_session"], join["to_session"]) == ("ann", "bob")
@@ -187,7 +184,7 @@ def test_robots_maps_are_joined(outputs: dict[str, list[str]]) -> None:
 
 
 @pytest.mark.thorough
-def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
+def test_operators_see_what_goes_on(outputs):
     jobs = one(outputs, "Jobs")[0]
     assert [job["state"] for job in jobs["items"]] == ["succeeded"] * 3
     assert jobs["next_cursor"] is not None
@@ -213,7 +210,7 @@ def test_operators_see_what_goes_on(outputs: dict[str, list[str]]) -> None:
 
 
 @pytest.mark.thorough
-def test_the_page_shows_the_fields_that_there_are(outputs: dict[str, list[str]]) -> None:
+def test_the_page_shows_the_fields_that_there_are(outputs):
     """The examples are JSON, and have the keys of the records they stand for."""
     from sceneprint_client.api import Answer, Match, Validation
 

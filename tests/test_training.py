@@ -1,10 +1,6 @@
 """Tests of training: reproducibility, and errors for too little data."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,11 +16,10 @@ from sceneprint.geometry.signature.segmentation import (
     extract_patches,
     segment,
 )
-from sceneprint.models import Model, ModelParameters
+from sceneprint.models import ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
 from sceneprint.signing import see
-from sceneprint.types import DepthFrame
-from sceneprint_lab.synth import SynthRoom, synthesise_room
+from sceneprint_lab.synth import synthesise_room
 from sceneprint_lab.training import TrainingParameters, preset_parameters, preset_whitening, train
 
 MODEL = ModelParameters(
@@ -37,14 +32,14 @@ TRAINING = TrainingParameters(rooms=4, views=2, seed=3, pairs=4000)
 
 
 @pytest.fixture(scope="module")
-def trained() -> tuple[Model, list[tuple[str, int, int]]]:
-    steps: list[tuple[str, int, int]] = []
+def trained():
+    steps = []
     model = train("tiny", MODEL, MIXTURE, TRAINING, report=lambda *step: steps.append(step))
     return model, steps
 
 
 @pytest.mark.thorough
-def test_processes_do_not_matter(trained: tuple[Model, object]) -> None:
+def test_processes_do_not_matter(trained):
     helped = train("tiny", MODEL, MIXTURE, TRAINING, jobs=2)
     assert helped.id == trained[0].id
     other = train("tiny", MODEL, MIXTURE, replace(TRAINING, seed=4), jobs=1)
@@ -52,22 +47,20 @@ def test_processes_do_not_matter(trained: tuple[Model, object]) -> None:
 
 
 @pytest.mark.thorough
-def test_progress_is_told_to_the_end(trained: tuple[Model, list[tuple[str, int, int]]]) -> None:
+def test_progress_is_told_to_the_end(trained):
     steps = trained[1]
     assert [s for s in steps if s[0] == "rooms"] == [("rooms", i, 4) for i in range(1, 5)]
     assert [s for s in steps if s[0] == "mixture"] == [("mixture", i, 3) for i in range(1, 4)]
 
 
 @pytest.fixture(scope="module")
-def unseen(room_views: Callable[..., SynthRoom]) -> list[DepthFrame]:
+def unseen(room_views):
     """A view of each of eight rooms that no model was trained on."""
     return [room_views(99, i, 1).frames[0] for i in range(8)]
 
 
 @pytest.mark.thorough
-def test_quantiser_and_d0_fit_new_rooms(
-    trained: tuple[Model, object], unseen: list[DepthFrame]
-) -> None:
+def test_quantiser_and_d0_fit_new_rooms(trained, unseen):
     """d0 is near the median distance of rooms it never saw; few bytes are clipped."""
     signer = open_signer(trained[0], cached=False)
     signed = [sign(frame, signer) for frame in unseen]
@@ -80,9 +73,7 @@ def test_quantiser_and_d0_fit_new_rooms(
 
 
 @pytest.mark.thorough
-def test_descriptors_are_learnt_from_the_rooms(
-    trained: tuple[Model, object], unseen: list[DepthFrame]
-) -> None:
+def test_descriptors_are_learnt_from_the_rooms(trained, unseen):
     model = trained[0]
     axes = model.compression.matrix.astype(float)
     assert axes.shape == (128, model.parameters.surroundings.dimension)
@@ -99,7 +90,7 @@ def test_descriptors_are_learnt_from_the_rooms(
 
 
 @pytest.mark.thorough
-def test_provenance_says_what_it_saw(trained: tuple[Model, object]) -> None:
+def test_provenance_says_what_it_saw(trained):
     seen = trained[0].provenance
     assert (seen["frames_used"], seen["own_frames"]) == (8, 0)
     assert seen["training"]["seed"] == 3
@@ -118,13 +109,13 @@ def test_provenance_says_what_it_saw(trained: tuple[Model, object]) -> None:
         ),
     ],
 )
-def test_too_little_data(parameters: TrainingParameters, message: str) -> None:
+def test_too_little_data(parameters, message):
     with pytest.raises(TrainingError, match=message):
         train("tiny", MODEL, MIXTURE, parameters)
 
 
 @pytest.fixture(scope="module")
-def whitened_model() -> Model:
+def whitened_model():
     p = replace(
         TRAINING, whitening_rooms=12, levels=(1,), whitening=WhiteningParameters(dimension=12)
     )
@@ -132,9 +123,7 @@ def whitened_model() -> Model:
 
 
 @pytest.mark.thorough
-def test_a_whitening_is_learnt_from_more_rooms(
-    trained: tuple[Model, object], whitened_model: Model
-) -> None:
+def test_a_whitening_is_learnt_from_more_rooms(trained, whitened_model):
     """The rest of the model is as without; signatures are short, and unrelated rooms d0 apart."""
     plain = trained[0]
     assert whitened_model.mixture.means.tolist() == plain.mixture.means.tolist()
@@ -158,7 +147,7 @@ def test_a_whitening_is_learnt_from_more_rooms(
         ({"levels": (2,)}, "There is no level 2: the hierarchy has 2"),
     ],
 )
-def test_too_little_for_a_whitening(changes: dict[str, Any], message: str) -> None:
+def test_too_little_for_a_whitening(changes, message):
     p = replace(
         TRAINING, whitening_rooms=4, levels=(0,), whitening=WhiteningParameters(dimension=12)
     )
@@ -166,7 +155,7 @@ def test_too_little_for_a_whitening(changes: dict[str, Any], message: str) -> No
         train("tiny", MODEL, MIXTURE, replace(p, rooms=2, **changes))
 
 
-def test_presets() -> None:
+def test_presets():
     model, mixture = preset_parameters("paper")
     assert (mixture.n_components, model.hierarchy.n_levels) == (1250, 4)
     model, mixture = preset_parameters("depth")

@@ -1,7 +1,5 @@
 """Tests of the training of the LiDAR preset: lengths and retrieval."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +7,7 @@ import pytest
 
 from sceneprint.geometry.signature.mixture import MixtureParameters
 from sceneprint.geometry.signature.pair_features import TableLayout
-from sceneprint.models import Model, ModelParameters, read_model
+from sceneprint.models import ModelParameters, read_model
 from sceneprint.pipeline import distance, open_signer, sign
 from sceneprint_lab.synth import Spinning, synthesise_survey
 from sceneprint_lab.training import TrainingParameters, preset_parameters, preset_scenes, train
@@ -20,20 +18,20 @@ TRAINING = TrainingParameters(
 
 
 @pytest.fixture(scope="module")
-def trained() -> Model:
+def trained():
     model_p, _ = preset_parameters("lidar")
     small = replace(model_p, table=TableLayout(8, 9, 8))
     return train("tiny", small, MixtureParameters(n_components=16, iterations=3), TRAINING)
 
 
 @pytest.mark.thorough
-def test_provenance_says_sites(trained: Model) -> None:
+def test_provenance_says_sites(trained):
     seen = trained.provenance
     assert seen["training"]["scenes"] == "sites"
     assert (seen["training"]["rooms"], seen["frames_used"], seen["own_frames"]) == (2, 4, 0)
 
 
-def test_scenes_and_lengths_are_the_presets_own() -> None:
+def test_scenes_and_lengths_are_the_presets_own():
     assert [preset_scenes(name) for name in ("paper", "depth", "lidar")] == [
         ("rooms", 6), ("rooms", 6), ("sites", 3),
     ]  # fmt: skip
@@ -45,7 +43,7 @@ def test_scenes_and_lengths_are_the_presets_own() -> None:
     assert preset_parameters("paper")[0] == ModelParameters()
 
 
-def test_scans_of_one_part_of_a_hall_are_nearer_than_others(trained: Model) -> None:
+def test_scans_of_one_part_of_a_hall_are_nearer_than_others(trained):
     """Along a walk of 30 m, signatures of scans within 5 m differ less than those further off."""
     sensor = Spinning(rings=32, azimuth_step=0.01)
     walk = synthesise_survey(4, 3, 21, along_path=True, kind="hall", sensor=sensor).clouds
@@ -60,7 +58,7 @@ def test_scans_of_one_part_of_a_hall_are_nearer_than_others(trained: Model) -> N
     assert np.mean(ratios) < 0.75  # 0.665 to 0.68 on four targets of `make test-portable`
 
 
-def test_the_preset_ships_as_its_recipe_says() -> None:
+def test_the_preset_ships_as_its_recipe_says():
     model = read_model("lidar")
     assert model.name == "lidar"
     assert (model.signature_bytes, model.levels) == (448, (1, 2, 3))

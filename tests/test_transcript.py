@@ -3,14 +3,11 @@
 The output of the former must match the page; SCENEPRINT_UPDATE_GOLDEN=1 updates it.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -27,11 +24,11 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 SPEED = re.compile(r"\d+\.\d frames/s")
 
 
-def transcripts(text: str) -> list[list[tuple[str, list[str]]]]:
+def transcripts(text):
     """Of each block its commands, each with the lines that it prints."""
     found = []
     for block in BLOCK.findall(text):
-        commands: list[tuple[str, list[str]]] = []
+        commands = []
         for line in block.splitlines():
             if line.startswith("$ "):
                 commands.append((line[2:], []))
@@ -41,14 +38,14 @@ def transcripts(text: str) -> list[list[tuple[str, list[str]]]]:
     return found
 
 
-def alike(line: str, other: str) -> bool:
+def alike(line, other):
     """Whether two lines say the same: numbers with decimals may differ a little, others not."""
     ours, theirs = (SPEED.sub("N frames/s", one) for one in (line, other))
     if NUMBER.sub("#", ours).split() != NUMBER.sub("#", theirs).split():
         return False
     is_pose = "off by" in line  # another processor rounds poses otherwise
 
-    def near(a: str, b: str) -> bool:
+    def near(a, b):
         """Equal, or of a fraction to ten of the last digit; deviations in whole cm to one."""
         apart = 10.0 ** (1 - len(a.partition(".")[2])) if "." in a else float(is_pose)
         return a == b or abs(float(a) - float(b)) <= apart
@@ -58,7 +55,7 @@ def alike(line: str, other: str) -> bool:
 
 
 @pytest.fixture
-def said(tmp_path: Path) -> Iterator[Callable[[str, int], list[str]]]:
+def said(tmp_path):
     """Runs a command as the page's reader does; with a number of lines it is left running."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -71,12 +68,12 @@ def said(tmp_path: Path) -> Iterator[Callable[[str, int], list[str]]]:
         "SCENEPRINT_DATA_DIR": str(tmp_path / "data"),
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
     }  # fmt: skip
-    running: list[subprocess.Popen[str]] = []
+    running = []
 
-    def shown(text: str) -> str:
+    def shown(text):
         return text.replace(str(tmp_path / "here"), HERE).replace(f"127.0.0.1:{port}", URL[7:])
 
-    def run(command: str, lines: int) -> list[str]:
+    def run(command, lines):
         # `exec`: what is left running is the command itself, and no shell around it
         process = subprocess.Popen(
             ["bash", "-c", f"exec {command}"], cwd=tmp_path / "here", env=environment,
@@ -97,7 +94,7 @@ def said(tmp_path: Path) -> Iterator[Callable[[str, int], list[str]]]:
 
 
 @pytest.mark.thorough
-def test_the_page_says_what_happens(said: Callable[[str, int], list[str]]) -> None:
+def test_the_page_says_what_happens(said):
     text = PAGE.read_text(encoding="utf-8")
     blocks = transcripts(text)
     assert sum(len(block) for block in blocks[:3]) == 5
@@ -122,7 +119,7 @@ def test_the_page_says_what_happens(said: Callable[[str, int], list[str]]) -> No
 
 
 @pytest.mark.thorough
-def test_a_map_in_one_file_leads_to_a_pose(said: Callable[[str, int], list[str]]) -> None:
+def test_a_map_in_one_file_leads_to_a_pose(said):
     (commands,) = transcripts(WHOLE_MAPS.read_text(encoding="utf-8"))
     assert len(commands) == 5
     for command, expected in commands:

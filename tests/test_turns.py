@@ -1,10 +1,7 @@
 """Tests of threads that take turns: fairness among tenants, timeouts and shutdown."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Callable
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.turns import ACTIVE_S, PRESENT_S, ThreadTurns, TurnOrder
@@ -13,18 +10,18 @@ from sceneprint.turns import ACTIVE_S, PRESENT_S, ThreadTurns, TurnOrder
 class Clock:
     """Seconds that pass when told to."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 0.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
-def queue(turns: ThreadTurns, tenants: str, order: list[str]) -> list[threading.Thread]:
+def queue(turns, tenants, order):
     """Threads that wait for a turn in that order, and note when they have had it."""
     found = []
 
-    def take(tenant: str) -> None:
+    def take(tenant):
         assert turns.acquire(tenant, 60)
         order.append(tenant)
         turns.release(tenant)
@@ -37,14 +34,14 @@ def queue(turns: ThreadTurns, tenants: str, order: list[str]) -> list[threading.
     return found
 
 
-def await_waiting(turns: ThreadTurns, count: int) -> None:
+def await_waiting(turns, count):
     until = time.monotonic() + PATIENCE_S
     while len(turns._order.waiters()) != count:
         assert time.monotonic() < until
         time.sleep(0.001)
 
 
-def test_a_turn_goes_to_who_was_served_the_longest_ago() -> None:
+def test_a_turn_goes_to_who_was_served_the_longest_ago():
     turns, order = ThreadTurns(1), list[str]()
     assert turns.acquire("a", 60)
     threads = queue(turns, "aaaaabbc", order)
@@ -54,7 +51,7 @@ def test_a_turn_goes_to_who_was_served_the_longest_ago() -> None:
     assert "".join(order) == "bcabaaaa"
 
 
-def test_who_waits_for_too_long_gets_none_and_holds_nobody_up() -> None:
+def test_who_waits_for_too_long_gets_none_and_holds_nobody_up():
     turns, order = ThreadTurns(1), list[str]()
     assert turns.acquire("a", 60)
     assert not turns.acquire("b", 0.01)
@@ -65,7 +62,7 @@ def test_who_waits_for_too_long_gets_none_and_holds_nobody_up() -> None:
     assert turns.acquire("b", 0)
 
 
-def test_after_the_end_there_are_no_turns() -> None:
+def test_after_the_end_there_are_no_turns():
     turns, told = ThreadTurns(1), list[bool]()
     assert turns.acquire("a", 60)
     waiting = threading.Thread(target=lambda: told.append(turns.acquire("b", 600)))
@@ -77,11 +74,11 @@ def test_after_the_end_there_are_no_turns() -> None:
     assert not turns.acquire("c", 600)
 
 
-def test_beside_another_a_tenant_holds_so_many_and_alone_all() -> None:
+def test_beside_another_a_tenant_holds_so_many_and_alone_all():
     clock = Clock()
-    order: TurnOrder[str] = TurnOrder(4, 1, clock)
+    order = TurnOrder(4, 1, clock)
 
-    def ask(*waiters: str) -> list[str]:
+    def ask(*waiters):
         for one in waiters:
             order.enter(one[0], one)
         return order.admit()
@@ -98,8 +95,8 @@ def test_beside_another_a_tenant_holds_so_many_and_alone_all() -> None:
     assert ask("a4", "a5", "a6", "a7") == ["a4", "a5", "a6"]
 
 
-def test_who_asks_for_several_gets_them_beside_another_too_where_it_holds_none() -> None:
-    order: TurnOrder[str] = TurnOrder(8, 1)
+def test_who_asks_for_several_gets_them_beside_another_too_where_it_holds_none():
+    order = TurnOrder(8, 1)
     assert order.enter("b", "b1") == 1
     assert order.enter("a", "heavy", 20) == 4  # half of all at most
     assert order.admit() == ["heavy", "b1"]
@@ -109,9 +106,9 @@ def test_who_asks_for_several_gets_them_beside_another_too_where_it_holds_none()
     assert order.admit() == ["light"]
 
 
-def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns() -> None:
+def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns():
     clock = Clock()
-    order: TurnOrder[str] = TurnOrder(4, 1, clock, rests=True)
+    order = TurnOrder(4, 1, clock, rests=True)
     order.enter("b", "b1")
     order.enter("a", "a1")
     assert order.admit() == ["a1", "b1"]
@@ -133,9 +130,9 @@ def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns() -> None:
     assert order.rest_s() is None
 
 
-def test_one_rests_for_its_latest_turn_and_a_second_at_most() -> None:
+def test_one_rests_for_its_latest_turn_and_a_second_at_most():
     clock = Clock()
-    order: TurnOrder[str] = TurnOrder(4, 2, clock, rests=True)
+    order = TurnOrder(4, 2, clock, rests=True)
     order.enter("a", "a1")
     order.admit()
     clock.now = 100.0
@@ -158,9 +155,9 @@ def test_one_rests_for_its_latest_turn_and_a_second_at_most() -> None:
     assert (order.admit(), order.rest_s()) == (["b3"], ACTIVE_S)
 
 
-def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once() -> None:
+def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once():
     clock = Clock()
-    order: TurnOrder[str] = TurnOrder(4, 1, clock, rests=True)
+    order = TurnOrder(4, 1, clock, rests=True)
     order.enter("b", "b1")
     order.enter("a", "a1")
     order.admit()
@@ -174,9 +171,9 @@ def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once() -> None:
     assert order.rest_s() is None
 
 
-def test_nobody_rests_for_a_tenant_that_asked_long_ago() -> None:
+def test_nobody_rests_for_a_tenant_that_asked_long_ago():
     clock = Clock()
-    order: TurnOrder[str] = TurnOrder(4, 1, clock, rests=True)
+    order = TurnOrder(4, 1, clock, rests=True)
     order.enter("b", "b1")
     order.enter("a", "a1")
     order.admit()
@@ -194,12 +191,12 @@ def test_nobody_rests_for_a_tenant_that_asked_long_ago() -> None:
     assert order.admit() == ["a3"]
 
 
-def test_many_threads_never_hold_more_than_there_are() -> None:
+def test_many_threads_never_hold_more_than_there_are():
     turns, lock = ThreadTurns(3), threading.Lock()
     held, most, done = 0, 0, 0
 
-    def work(tenant: str) -> Callable[[], None]:
-        def run() -> None:
+    def work(tenant):
+        def run():
             nonlocal held, most, done
             for _ in range(50):
                 assert turns.acquire(tenant, 60)

@@ -1,17 +1,15 @@
 """Tests of pictures of surfaces: pixels of points, and rotation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 
 from sceneprint.pictures import vista_of
-from sceneprint.types import Floats, Intrinsics, Sphere, Surface
+from sceneprint.types import Intrinsics, Sphere, Surface
 
 
-def surface(points: Floats, camera: Intrinsics | Sphere | None) -> Surface:
+def surface(points, camera):
     """Of points (h, w, 3), all of them valid but those at the origin."""
     valid = points.any(axis=-1)
     normals = np.where(valid[..., None], -points, 0).astype(np.float32)
@@ -19,7 +17,7 @@ def surface(points: Floats, camera: Intrinsics | Sphere | None) -> Surface:
     return Surface(points.astype(np.float32), normals, valid, valid.astype(np.float32), camera)
 
 
-def around(pole: int) -> Surface:
+def around(pole):
     """Four by three pixels about the axis ahead of a pole, ranges 1, 2, ... in their order."""
     camera = Sphere(4, 3, math.radians(10), math.radians(-15), math.radians(10), pole)
     azimuth = camera.left + camera.step * np.arange(4)
@@ -33,7 +31,7 @@ def around(pole: int) -> Surface:
     return surface(np.roll(rays, pole - 2, axis=-1) * ranges, camera)
 
 
-def test_an_image_is_as_its_camera_saw_it() -> None:
+def test_an_image_is_as_its_camera_saw_it():
     seen = surface(np.dstack([np.zeros((2, 2, 2)), [[1.0, 2.0], [0.0, 4.0]]]),
                    Intrinsics(2, 2, 1, 1, 0, 0))  # fmt: skip
     vista = vista_of(seen)
@@ -42,7 +40,7 @@ def test_an_image_is_as_its_camera_saw_it() -> None:
 
 
 @pytest.mark.parametrize("pole", [0, 1, 2])
-def test_a_range_image_is_no_mirror_image(pole: int) -> None:
+def test_a_range_image_is_no_mirror_image(pole):
     seen = around(pole)
     vista = vista_of(seen)
     assert vista.what == "range"
@@ -58,7 +56,7 @@ def test_a_range_image_is_no_mirror_image(pole: int) -> None:
         assert down[pole] < 0  # the pole is above
 
 
-def test_points_in_no_order_are_seen_from_above() -> None:
+def test_points_in_no_order_are_seen_from_above():
     """A floor of 4 m x 2 m with a step on it, laid along other axes than the grid's."""
     x, y = np.meshgrid(np.linspace(0, 4, 41), np.linspace(0, 2, 21))
     z = np.where((x > 3) & (y > 1), 0.3, 0.0)

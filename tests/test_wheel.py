@@ -1,7 +1,5 @@
 """Tests of a wheel with compiled kernels, which need no compilation after installation."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -80,7 +78,7 @@ print(hashlib.sha256(prepare(_corner(), signer)[0].vector.tobytes()).hexdigest()
 """
 
 
-def environment_without_us(folder: Path) -> Path:
+def environment_without_us(folder):
     """The Python of an environment with all libraries of this one, and no sceneprint yet."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     (there,) = folder.glob("lib/python*/site-packages")
@@ -92,7 +90,7 @@ def environment_without_us(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     """Built from what git knows of this checkout, as on a node where nothing of it is installed."""
     folder = tmp_path_factory.mktemp("wheel")
     python = environment_without_us(folder / "environment")
@@ -119,7 +117,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(wheel, tmp_path_factory):
     """Its files, in a folder that nobody may write to but root."""
     folder = tmp_path_factory.mktemp("installed")
     with zipfile.ZipFile(wheel) as archive:
@@ -130,7 +128,7 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(program: str, installed: Path, folder: Path, *arguments: str, **env: str) -> str:
+def run(program, installed, folder, *arguments, **env):
     """What a program of an installation prints, with cache folders of its own."""
     given = {
         **os.environ, "PYTHONPATH": os.pathsep.join((str(installed), str(ROOT / "client"))),
@@ -145,7 +143,7 @@ def run(program: str, installed: Path, folder: Path, *arguments: str, **env: str
     return done.stdout.splitlines()[-1]
 
 
-def test_it_says_for_whom_it_is_and_brings_code_for_every_kernel(wheel: Path) -> None:
+def test_it_says_for_whom_it_is_and_brings_code_for_every_kernel(wheel):
     python = f"cp{sys.version_info.major}{sys.version_info.minor}"
     system = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     assert wheel.stem.endswith(f"-{python}-{python}-{system}")
@@ -162,14 +160,14 @@ def test_it_says_for_whom_it_is_and_brings_code_for_every_kernel(wheel: Path) ->
 
 
 @pytest.mark.parametrize("what", ["depth", "clouds"])
-def test_a_first_use_compiles_nothing(installed: Path, tmp_path: Path, what: str) -> None:
+def test_a_first_use_compiles_nothing(installed, tmp_path, what):
     compiled, loaded = map(int, run(COUNT, installed, tmp_path, what).split())
     assert compiled == 0
     assert loaded > 25
     assert [*(tmp_path / "numba").rglob("*.nb?")] == []
 
 
-def test_a_first_upload_and_query_compile_nothing(installed: Path, tmp_path: Path) -> None:
+def test_a_first_upload_and_query_compile_nothing(installed, tmp_path):
     told = json.loads(run(USE, installed, tmp_path))
     assert Path(told["from"]).is_relative_to(installed)
     assert told["matches"] == [told["frame"]]
@@ -177,12 +175,12 @@ def test_a_first_upload_and_query_compile_nothing(installed: Path, tmp_path: Pat
     assert told["loaded"] > 25
 
 
-def test_signatures_are_those_of_code_for_this_processor(installed: Path, tmp_path: Path) -> None:
+def test_signatures_are_those_of_code_for_this_processor(installed, tmp_path):
     brought = run(BYTES, installed, tmp_path)
     assert run(BYTES, ROOT, tmp_path, NUMBA_CACHE_DIR="") == brought
 
 
-def test_another_processor_gets_code_of_its_own(installed: Path, tmp_path: Path) -> None:
+def test_another_processor_gets_code_of_its_own(installed, tmp_path):
     program = (
         "import sys; from sceneprint.geometry.session_join import *; import sceneprint;"
         "from sceneprint.geometry.signature.pair_features import machine_code_folder;"
@@ -201,9 +199,7 @@ def test_another_processor_gets_code_of_its_own(installed: Path, tmp_path: Path)
         ("viewers", ("sceneprint_viewers",)),
     ],
 )
-def test_a_source_distribution_builds_the_whole_wheel(
-    folder: str, packages: tuple[str, ...], tmp_path: Path
-) -> None:
+def test_a_source_distribution_builds_the_whole_wheel(folder, packages, tmp_path):
     build = "import sys; from setuptools.build_meta import build_sdist; build_sdist(sys.argv[1])"
     subprocess.run(
         [sys.executable, "-c", build, str(tmp_path)], cwd=ROOT / folder, check=True,

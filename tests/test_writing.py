@@ -1,13 +1,9 @@
 """Tests of atomic file writes: order of operations, and remains after a failure."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -15,18 +11,18 @@ from sceneprint.atomic_files import sync_folder, whole_file, write_durable, writ
 
 
 @pytest.fixture
-def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, bytes]]:
+def calls(monkeypatch):
     """What is synced and renamed, in order, with what the file held at that moment."""
-    seen: list[tuple[str, str, bytes]] = []
+    seen = []
     fsync, replace = os.fsync, os.replace
 
-    def recording_fsync(number: int) -> None:
+    def recording_fsync(number):
         name = Path(f"/proc/self/fd/{number}").readlink()
         folder = stat.S_ISDIR(os.fstat(number).st_mode)
         seen.append(("fsync", str(name), b"" if folder else name.read_bytes()))
         fsync(number)
 
-    def recording_replace(source: Path, target: Path) -> None:
+    def recording_replace(source, target):
         seen.append(("replace", str(target), Path(source).read_bytes()))
         replace(source, target)
 
@@ -35,9 +31,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, bytes]]:
     return seen
 
 
-def test_a_durable_file_is_synced_before_its_name_and_the_name_after(
-    tmp_path: Path, calls: list[tuple[str, str, bytes]]
-) -> None:
+def test_a_durable_file_is_synced_before_its_name_and_the_name_after(tmp_path, calls):
     folder = tmp_path / "new"
     folder.mkdir()
     write_durable(folder / "a", b"content" * 9000)
@@ -54,9 +48,7 @@ def test_a_durable_file_is_synced_before_its_name_and_the_name_after(
     ]
 
 
-def test_a_folder_is_synced_through_a_descriptor_that_is_closed(
-    tmp_path: Path, calls: list[tuple[str, str, bytes]]
-) -> None:
+def test_a_folder_is_synced_through_a_descriptor_that_is_closed(tmp_path, calls):
     before = len(list(Path("/proc/self/fd").iterdir()))
     sync_folder(tmp_path)
     with pytest.raises(FileNotFoundError):
@@ -66,13 +58,11 @@ def test_a_folder_is_synced_through_a_descriptor_that_is_closed(
 
 
 @pytest.mark.parametrize("write", [write_whole, write_durable])
-def test_the_old_file_stays_until_the_new_one_is_whole(
-    tmp_path: Path, write: Callable[[Path, bytes], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path, write, monkeypatch):
     path = tmp_path / "a"
     write(path, b"old")
 
-    def fail(*_: Any) -> None:
+    def fail(*_):
         assert path.read_bytes() == b"old"
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -85,15 +75,13 @@ def test_the_old_file_stays_until_the_new_one_is_whole(
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_a_name_that_cannot_be_made_durable_is_an_error(
-    tmp_path: Path, which: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_that_cannot_be_made_durable_is_an_error(tmp_path, which, monkeypatch):
     folder = tmp_path / "new"
     folder.mkdir()
     fsync = os.fsync
     left = [which]
 
-    def fail(number: int) -> None:
+    def fail(number):
         if stat.S_ISDIR(os.fstat(number).st_mode):
             if left[0] == 0:
                 raise OSError(errno.EIO, "Input/output error")
@@ -109,10 +97,8 @@ def test_a_name_that_cannot_be_made_durable_is_an_error(
 
 
 @pytest.mark.parametrize("write", [write_whole, write_durable])
-def test_an_interruption_leaves_nothing(
-    tmp_path: Path, write: Callable[[Path, bytes], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupt(*_: Any) -> None:
+def test_an_interruption_leaves_nothing(tmp_path, write, monkeypatch):
+    def interrupt(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(os, "replace", interrupt)
@@ -122,9 +108,7 @@ def test_an_interruption_leaves_nothing(
 
 
 @pytest.mark.parametrize("write", [write_whole, write_durable])
-def test_a_folder_that_is_not_there_is_named(
-    tmp_path: Path, write: Callable[[Path, bytes], None]
-) -> None:
+def test_a_folder_that_is_not_there_is_named(tmp_path, write):
     with pytest.raises(FileNotFoundError) as caught:
         write(tmp_path / "none" / "a", b"content")
     assert caught.value.filename == str(tmp_path / "none" / "a")
@@ -133,7 +117,7 @@ def test_a_folder_that_is_not_there_is_named(
     assert long.read_bytes() == b"content"
 
 
-def test_a_library_writes_beside_the_file(tmp_path: Path) -> None:
+def test_a_library_writes_beside_the_file(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"old")
     with whole_file(path) as part:
@@ -144,7 +128,7 @@ def test_a_library_writes_beside_the_file(tmp_path: Path) -> None:
     with whole_file(path):
         pass  # nothing was written, so nothing changes
 
-    def interrupted() -> None:
+    def interrupted():
         with whole_file(path) as part:
             part.write_bytes(b"half")
             raise KeyboardInterrupt

@@ -1,7 +1,5 @@
 """Tests of the content of a bundle, and of the cost of the next one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -441,7 +439,7 @@ def test_interrupted_it_leaves_no_bundle(master, tmp_path, settings):
 
 @pytest.mark.parametrize("kind", ["snapshot", "verify"])
 def test_progress_goes_from_nothing_to_all(kind, master, place, tmp_path, settings):
-    seen: list[tuple[int, int]] = []
+    seen = []
     if kind == "snapshot":
         take_backup(settings(master), str(tmp_path / "place"), lambda *one: seen.append(one))
     else:
@@ -496,7 +494,7 @@ def test_it_is_one_state(postgres_url, tmp_path):
         for frame in ("a", "b"):
             with late.write(map_number=1) as connection:
                 record_event(connection, "frame.received", "hall", frame)
-        done: list[int] = []
+        done = []
 
         def go_on(count, _total):
             if not done:

@@ -1,7 +1,5 @@
 """Tests that damaged or manipulated bundles are detected and rejected."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import random

@@ -1,7 +1,5 @@
 """Tests of deletions during a backup, which is complete and can be restored."""
 
-from __future__ import annotations
-
 import threading
 import time
 

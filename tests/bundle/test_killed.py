@@ -1,7 +1,5 @@
 """Tests of backups and restores that are killed: bundles are complete, and restores continue."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

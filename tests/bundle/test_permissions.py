@@ -1,7 +1,5 @@
 """Tests that other users of the machine cannot read a data folder, whatever the umask."""
 
-from __future__ import annotations
-
 import os
 from contextlib import suppress
 

@@ -1,7 +1,5 @@
 """Tests that restored folders and servers have the same rows and answers."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -215,7 +213,7 @@ def test_a_restore_killed_between_two_names_goes_on(place, tmp_path, content):
 
 
 def test_two_at_once(place, tmp_path):
-    inner: list[Exception] = []
+    inner = []
 
     def come(_done, _total):
         try:

@@ -1,34 +1,25 @@
 """Fixtures of commands that use a service: a real service and a data set."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
-from sceneprint.types import DepthFrame
 from tests.conftest import halved
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture
-def sceneprint(service_url: str, run_command: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
+def sceneprint(service_url, run_command, monkeypatch):
     """Runs a command in this process against the service and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_URL", service_url)
     return run_command
 
 
 @pytest.fixture(scope="session")
-def room_frames(room_frames: tuple[DepthFrame, ...]) -> tuple[DepthFrame, ...]:
+def room_frames(room_frames):
     """The frames of `tests/conftest.py` with a quarter of their samples, which are fast to sign."""
     return tuple(map(halved, room_frames))
 
 
-def write_rooms(root: Path, frames: Sequence[DepthFrame]) -> Path:
+def write_rooms(root, frames):
     """Write three views of each of two rooms, with poses, in 7-Scenes layout; return the folder."""
     for number, frame in enumerate(frames):
         folder = root / f"room-{number // 3}" / "seq-01"
@@ -41,6 +32,6 @@ def write_rooms(root: Path, frames: Sequence[DepthFrame]) -> Path:
 
 
 @pytest.fixture(scope="session")
-def rooms(room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rooms(room_frames, tmp_path_factory):
     """Three views of each of two rooms; see `write_rooms`."""
     return write_rooms(tmp_path_factory.mktemp("rooms"), room_frames)

@@ -1,7 +1,5 @@
 """Tests of the options of `query`, `localize` and `similarity`."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -28,7 +26,7 @@ def maps(service_url, rooms):
     """`near` has two views of the first room, `far` one of each."""
     from sceneprint.formats.dataset import find_sequences
 
-    found: dict[str, list[str]] = {}
+    found = {}
     frames = [one for sequence in find_sequences(rooms) for one in sequence.frames]
     with Client(service_url) as client:
         for name, which in (("near", (0, 1)), ("far", (0, 3))):
@@ -159,7 +157,7 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(sceneprint, sides):
     )
 
 
-def floored(confidence: float) -> float:
+def floored(confidence):
     """Per cent, as printed: rounded down to a tenth."""
     return math.floor(1000 * min(confidence, 0.999)) / 10
 

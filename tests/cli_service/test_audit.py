@@ -2,31 +2,25 @@
 messages.
 """
 
-from __future__ import annotations
-
 import json
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from sceneprint.cli import main
 
-Run = Callable[..., Any]
 MESSAGE = re.compile(r"<109>1 \d{4}-\d\d-\d\dT[\d:.]{12}Z \S+ sceneprint - audit - (\{.*\})")
 
 
 @pytest.fixture
-def data(sceneprint: Run, tmp_path: Path) -> Path:
+def data(sceneprint, tmp_path):
     for arguments in (("--create", "robot"), ("--create", "screen"), ("--revoke", "robot")):
         sceneprint("keys", *arguments, "--data", tmp_path)
     sceneprint("keys", "--create-tenant", "fleet", "--data", tmp_path)
     return tmp_path
 
 
-def test_the_newest_entries_are_printed(sceneprint: Run, data: Path) -> None:
+def test_the_newest_entries_are_printed(sceneprint, data):
     lines = sceneprint("audit", "--data", data).stdout.splitlines()
     assert [line[22:] for line in lines] == [
         "command  tenant.created fleet", "command  key.revoked robot",
@@ -39,7 +33,7 @@ def test_the_newest_entries_are_printed(sceneprint: Run, data: Path) -> None:
         assert sceneprint("audit", *given, "--data", data).stdout.splitlines() == wanted
 
 
-def test_all_entries_are_exported(sceneprint: Run, data: Path) -> None:
+def test_all_entries_are_exported(sceneprint, data):
     export = ("audit", "--data", data, "--format")
     lines = sceneprint(*export, "jsonl").stdout.splitlines()
     found = [json.loads(line) for line in lines]
@@ -57,7 +51,7 @@ def test_all_entries_are_exported(sceneprint: Run, data: Path) -> None:
     assert file.read_text().splitlines()[4:] == lines  # behind what was there
 
 
-def test_a_file_needs_a_format(sceneprint: Run, data: Path) -> None:
+def test_a_file_needs_a_format(sceneprint, data):
     done = sceneprint("audit", "--output", data / "x", "--data", data, expect=2)
     assert "--output requires --format" in done.stderr
     with pytest.raises(SystemExit):

@@ -1,7 +1,5 @@
 """Tests of point clouds on the command line, in a map that also has depth images."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of `sceneprint demo`, which removes its data however it ends."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
@@ -9,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -25,24 +22,23 @@ from sceneprint_client import Client
 from sceneprint_client.api import JobState
 from sceneprint_lab.cli import demo as served
 from sceneprint_lab.cli.demo import choose_frames, fill, serving
-from sceneprint_lab.synth import SynthRoom
 from tests.cli_service.conftest import write_rooms
 
 
 @pytest.fixture(scope="module")
-def rooms(room_views: Callable[..., SynthRoom], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rooms(room_views, tmp_path_factory):
     """The rooms with all samples: their third frames have no accepted match."""
     frames = [frame for i in range(2) for frame in room_views(21, i, 3).frames]
     return write_rooms(tmp_path_factory.mktemp("whole"), frames)
 
 
 @pytest.fixture
-def demo(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+def demo(tmp_path):
     """Starts the demo with a temporary folder of its own, its signals as a terminal leaves them."""
     (tmp_path / "tmp").mkdir()
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # these tests may run under `nohup`
 
-    def start(*arguments: object) -> subprocess.Popen[str]:
+    def start(*arguments):
         return subprocess.Popen(
             [sys.executable, "-m", "sceneprint", "demo", "--workers", "1",
              "--out", str(tmp_path / "out"), *map(str, arguments)],
@@ -54,20 +50,20 @@ def demo(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     signal.signal(signal.SIGHUP, before)
 
 
-def environment_of(process: Path) -> bytes:
+def environment_of(process):
     try:
         return (process / "environ").read_bytes()
     except OSError:  # gone, or another user's
         return b""
 
 
-def processes_with(temporary: Path) -> list[Path]:
+def processes_with(temporary):
     """Processes that were started with that temporary folder."""
     mark = f"TMPDIR={temporary}".encode()
     return [p for p in Path("/proc").glob("[0-9]*") if mark in environment_of(p)]
 
 
-def leaves_nothing(temporary: Path) -> None:
+def leaves_nothing(temporary):
     deadline = time.monotonic() + PATIENCE_S  # a resource tracker ends after its parent
     while (left := processes_with(temporary)) and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -75,9 +71,7 @@ def leaves_nothing(temporary: Path) -> None:
     assert list(temporary.iterdir()) == []
 
 
-def test_demo_goes_the_whole_way_and_leaves_nothing(
-    demo: Callable[..., subprocess.Popen[str]], tmp_path: Path, rooms: Path
-) -> None:
+def test_demo_goes_the_whole_way_and_leaves_nothing(demo, tmp_path, rooms):
     process = demo("--dataset", rooms)
     out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, err
@@ -95,9 +89,7 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(
 
 
 @pytest.mark.thorough
-def test_demo_draws_a_match_of_its_building(
-    demo: Callable[..., subprocess.Popen[str]], tmp_path: Path
-) -> None:
+def test_demo_draws_a_match_of_its_building(demo, tmp_path):
     process = demo("--rooms", 1)
     out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, err
@@ -114,10 +106,7 @@ def test_demo_draws_a_match_of_its_building(
         ("serving", signal.SIGTERM),
     ],
 )
-def test_demo_that_is_stopped_leaves_nothing(
-    demo: Callable[..., subprocess.Popen[str]], tmp_path: Path, rooms: Path, stage: str,
-    number: signal.Signals,
-) -> None:  # fmt: skip
+def test_demo_that_is_stopped_leaves_nothing(demo, tmp_path, rooms, stage, number):
     temporary = tmp_path / "tmp"
     process = demo(*(("--dataset", rooms) if stage == "serving" else ("--rooms", 2)))
     assert process.stdout is not None
@@ -135,9 +124,7 @@ def test_demo_that_is_stopped_leaves_nothing(
     leaves_nothing(temporary)
 
 
-def test_demo_needs_frames_for_the_map_and_to_look_up(
-    demo: Callable[..., subprocess.Popen[str]], rooms: Path
-) -> None:
+def test_demo_needs_frames_for_the_map_and_to_look_up(demo, rooms):
     process = demo("--dataset", rooms / "room-0/seq-01/frame-000000.depth.png")
     _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
@@ -146,7 +133,7 @@ def test_demo_needs_frames_for_the_map_and_to_look_up(
 
 
 @pytest.fixture
-def twice(rooms: Path, tmp_path: Path) -> Path:
+def twice(rooms, tmp_path):
     """A sequence whose first depth frame comes twice, with two poses; 5 frames, 3 of the map."""
     folder = tmp_path / "twice"
     shutil.copytree(rooms / "room-0" / "seq-01", folder)
@@ -160,9 +147,7 @@ def twice(rooms: Path, tmp_path: Path) -> Path:
     return folder
 
 
-def test_what_comes_twice_is_left_out_once(
-    twice: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_comes_twice_is_left_out_once(twice, tmp_path, capsys):
     choice = choose_frames(twice)
     assert len(choice.database) == 3
     with Client.embedded(tmp_path / "data") as client:
@@ -173,9 +158,7 @@ def test_what_comes_twice_is_left_out_once(
     assert "map: 2 of 3 frames uploaded" in said.out
 
 
-def test_frames_that_are_not_signed_in_time_end_it(
-    rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_that_are_not_signed_in_time_end_it(rooms, tmp_path, monkeypatch):
     waited = [SimpleNamespace(state=one) for one in (JobState.SUCCEEDED, JobState.RUNNING)]
     monkeypatch.setattr(Client, "wait", lambda *_, **__: waited)
     with (
@@ -185,7 +168,7 @@ def test_frames_that_are_not_signed_in_time_end_it(
         fill(client, "depth", choose_frames(rooms))
 
 
-def test_signals_that_are_ignored_stay_so_and_others_are_given_back() -> None:
+def test_signals_that_are_ignored_stay_so_and_others_are_given_back():
     before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGHUP)]
     try:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -201,9 +184,7 @@ def test_signals_that_are_ignored_stay_so_and_others_are_given_back() -> None:
             signal.signal(number, handler)
 
 
-def test_a_service_that_says_nothing_is_not_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_service_that_says_nothing_is_not_waited_for(tmp_path, monkeypatch):
     """In place of Python, something that never says that it serves, nor ends."""
     silent = tmp_path / "silent"
     silent.write_text(f"#!/bin/sh\necho $$ >{tmp_path}/pid\nprintf 'sceneprint: '\nexec sleep 99\n")

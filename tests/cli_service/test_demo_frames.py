@@ -1,9 +1,6 @@
 """Tests of the selection of map and query frames for the demo."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +10,7 @@ from sceneprint.formats.dataset import write_depth_png
 from sceneprint_lab.cli.demo import choose_frames
 
 
-def sequence(folder: Path, frames: int) -> None:
+def sequence(folder, frames):
     """Frames that are named and never read."""
     folder.mkdir(parents=True)
     write_depth_png(folder / "frame-000000.depth.png", np.ones((2, 2), np.float32), 1000.0)
@@ -23,7 +20,7 @@ def sequence(folder: Path, frames: int) -> None:
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
+def scene(tmp_path):
     scene = tmp_path / "scene"
     scene.mkdir()
     camera = {"width": 2, "height": 2, "fx": 1, "fy": 1, "cx": 0, "cy": 0}
@@ -31,13 +28,11 @@ def scene(tmp_path: Path) -> Path:
     return scene
 
 
-def numbers(chosen: list) -> list[int]:
+def numbers(chosen):
     return [int(one.reference.name[-6:]) for one in chosen]
 
 
-def test_without_split_files_the_first_60_percent_are_the_map_and_5_are_left_out(
-    scene: Path,
-) -> None:
+def test_without_split_files_the_first_60_percent_are_the_map_and_5_are_left_out(scene):
     sequence(scene / "seq-01", 100)
     choice = choose_frames(scene)
     assert numbers(choice.database) == list(range(60))
@@ -45,14 +40,14 @@ def test_without_split_files_the_first_60_percent_are_the_map_and_5_are_left_out
     assert {(one.parent, one.session) for one in choice.queries} == {("scene", "seq-01")}
 
 
-def test_long_sequences_are_thinned_evenly(scene: Path) -> None:
+def test_long_sequences_are_thinned_evenly(scene):
     sequence(scene / "seq-01", 1000)
     choice = choose_frames(scene)
     assert numbers(choice.database) == list(range(0, 600, 2))  # 300 at most
     assert numbers(choice.queries) == list(range(650, 1000, 2))  # 180 at most
 
 
-def test_split_files_decide_where_they_are(scene: Path) -> None:
+def test_split_files_decide_where_they_are(scene):
     sequence(scene / "seq-01", 3)
     sequence(scene / "seq-02", 2)
     (scene / "TrainSplit.txt").write_text("sequence2\n")

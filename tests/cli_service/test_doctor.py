@@ -1,11 +1,8 @@
 """Tests of `sceneprint doctor` on machines with and without problems."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sqlite3
-from pathlib import Path
 
 import pytest
 from pydantic import SecretStr
@@ -14,7 +11,6 @@ from benchmarks.waiting import until
 from sceneprint import __version__
 from sceneprint.cli import checks, doctor
 from sceneprint.cli.checks import (
-    Check,
     clock_check,
     model_check,
     queue_check,
@@ -39,7 +35,7 @@ SERVICE = [
 ]  # fmt: skip
 
 
-def verdicts(text: str) -> dict[str, str]:
+def verdicts(text):
     """The first word of each line by its subject."""
     lines = text.splitlines()[:-1]
     return {line[7:23].strip(): line[:5].strip() for line in lines}
@@ -78,7 +74,7 @@ def test_a_running_service(sceneprint, working, monkeypatch):
         model = client.map("looked-at").model
     monkeypatch.delenv("SCENEPRINT_URL")
 
-    def ask() -> str:  # until jobs that other tests left, or that begin by themselves, are over
+    def ask():  # until jobs that other tests left, or that begin by themselves, are over
         said = str(sceneprint("doctor", "--url", working).stdout)
         return said if "0 jobs waiting, 0 running" in said else ""
 
@@ -94,7 +90,7 @@ def test_a_running_service(sceneprint, working, monkeypatch):
 
 
 def test_a_key_that_may_not_see_all(sceneprint, service_url, monkeypatch):
-    def asked(key: str | None) -> list[Check]:
+    def asked(key):
         with Client(service_url, key) as client:
             client._http.headers["X-Forwarded-For"] = "192.0.2.7"  # as behind a proxy
             return list(service_checks(client, service_url))
@@ -157,7 +153,7 @@ def test_what_is_wrong_says_what_to_do(sceneprint, tmp_path):
     assert verdicts(done.stdout)["data folder"] == "WRONG"
 
 
-def found_in(settings: Settings) -> dict[str, Check]:
+def found_in(settings):
     return {one.subject: one for one in doctor.machine(settings)}
 
 
@@ -196,7 +192,7 @@ def test_a_decoder_is_tried(tmp_path):
     assert (finding.verdict, "SCENEPRINT_DECODERS is 0" in finding.text) == ("note", True)
 
 
-def content(folder: Path) -> dict[str, bytes]:
+def content(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.glob("sceneprint.db*"))}
 
 
@@ -207,7 +203,7 @@ def test_looking_at_a_database_changes_nothing(tmp_path):
     Client.embedded(path.parent).close()
     settings = Settings(data_dir=path.parent, database_url=None)
 
-    def look(where: Path = path) -> str:
+    def look(where=path):
         before, used = content(where.parent), where is path and path.with_suffix(".db-wal").exists()
         url = None if where is path else SecretStr(f"sqlite:///{where}")
         verdict = found_in(settings.model_copy(update={"database_url": url}))["database"].verdict
@@ -346,12 +342,12 @@ def test_what_a_service_may_tell(waiting):
 
 
 def test_the_first_use_says_what_it_waits_for(tmp_path, monkeypatch):
-    said: list[str] = []
+    said = []
     prepare_presets(Settings(data_dir=tmp_path), said.append)
     said.clear()  # of a checkout in which nothing was compiled
     prepare_presets(Settings(data_dir=tmp_path), said.append)
     assert said == []
-    waits: list[bool] = []
+    waits = []
     monkeypatch.setattr(compilation, "missing", lambda _: ("signing", "validation"))
     monkeypatch.setattr(compilation, "_run", lambda *_: waits.append(True))  # not told to stop
     prepare_presets(Settings(data_dir=tmp_path), said.append)

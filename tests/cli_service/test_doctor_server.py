@@ -1,13 +1,10 @@
 """Tests of `sceneprint doctor` with PostgreSQL and object stores."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 from pydantic import SecretStr
 
-from benchmarks.postgres import Server
 from sceneprint.cli.checks import Check, store_check
 from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.settings import Settings
@@ -15,14 +12,14 @@ from sceneprint.store import open_database
 from tests.whole_engine import Engine
 
 
-def found_in(url: str, **other: object) -> dict[str, Check]:
+def found_in(url, **other):
     settings = Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url), **other)
     found = [database(settings), *server(settings), *object_stores(settings)]
     return {one.subject: one for one in found}
 
 
 @pytest.mark.thorough
-def test_a_server_and_its_standby(postgres: Server, tmp_path: Path) -> None:
+def test_a_server_and_its_standby(postgres, tmp_path):
     url = postgres.create("looked_at")
     open_database(url).close()
     standby = postgres.standby(tmp_path / "standby", synchronous=False)
@@ -39,13 +36,13 @@ def test_a_server_and_its_standby(postgres: Server, tmp_path: Path) -> None:
         standby.kill()
 
 
-def test_more_connections_than_the_server_allows(postgres: Server) -> None:
+def test_more_connections_than_the_server_allows(postgres):
     found = found_in(postgres.create("modest"), workers=250)
     assert found["connections"].verdict == "note"
     assert "Raise max_connections, or run fewer" in found["connections"].text
 
 
-def test_a_service_does_not_take_the_server_for_a_file(postgres_url: str, tmp_path: Path) -> None:
+def test_a_service_does_not_take_the_server_for_a_file(postgres_url, tmp_path):
     settings = Settings(data_dir=tmp_path, database_url=SecretStr(postgres_url))
     with Engine(settings) as engine:
         stats = engine.statistics.collect(1)
@@ -62,14 +59,14 @@ def test_a_service_does_not_take_the_server_for_a_file(postgres_url: str, tmp_pa
         ("mysql://me:hidden@host/maps", "'mysql' is not a supported database"),
     ],
 )
-def test_a_server_that_cannot_be_asked(url: str, said: str) -> None:
+def test_a_server_that_cannot_be_asked(url, said):
     found = database(Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url)))
     assert (found.verdict, found.subject) == ("WRONG", "database")
     assert said in found.text
     assert "hidden" not in found.text
 
 
-def test_object_stores(bucket: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_object_stores(bucket, tmp_path, monkeypatch):
     settings = Settings(
         data_dir=tmp_path, database_url=None, blob_url=SecretStr(f"{bucket}/blobs"),
         index_url=f"file://{tmp_path}/kept",

@@ -1,7 +1,5 @@
 """Tests of uploads of files from other systems on the command line."""
 
-from __future__ import annotations
-
 import sqlite3
 import struct
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Tests of filters and `--if-novel` on the command line."""
 
-from __future__ import annotations
-
 import pytest
 
 from sceneprint.cli.options import add_filter_options, filter_of

@@ -1,7 +1,5 @@
 """Tests of `sceneprint frames` with a service."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,12 +1,7 @@
 """Tests of `sceneprint keys`: creation, list and revocation in a data folder."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -14,11 +9,9 @@ from sceneprint.settings import Settings
 from sceneprint.store.keys import KeyUses
 from tests.whole_engine import Engine
 
-Run = Callable[..., Any]
 
-
-def test_keys_are_made_listed_and_revoked(sceneprint: Run, tmp_path: Path) -> None:
-    def keys(*arguments: str, expect: int = 0) -> Any:
+def test_keys_are_made_listed_and_revoked(sceneprint, tmp_path):
+    def keys(*arguments, expect=0):
         return sceneprint("keys", *arguments, "--data", tmp_path, expect=expect)
 
     assert keys("--list").stdout == ""
@@ -38,11 +31,11 @@ def test_keys_are_made_listed_and_revoked(sceneprint: Run, tmp_path: Path) -> No
     assert [one and (one.name, one.grants) for one in found] == [None, ("robot 2", {"*": "admin"})]
 
 
-def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_path: Path) -> None:
-    def keys(*arguments: str, expect: int = 0) -> Any:
+def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint, tmp_path):
+    def keys(*arguments, expect=0):
         return sceneprint("keys", *arguments, "--data", tmp_path, expect=expect)
 
-    def named(secret: str) -> str | None:
+    def named(secret):
         with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
             found, uses = engine.find_key(secret), KeyUses()
             if found is not None:
@@ -77,12 +70,12 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint: Run, tmp_pa
 @pytest.mark.parametrize(
     "arguments", [(), ("--list", "--revoke", "x"), ("--create", "x", "--list")]
 )
-def test_one_thing_at_a_time(sceneprint: Run, arguments: tuple[str, ...]) -> None:
+def test_one_thing_at_a_time(sceneprint, arguments):
     with pytest.raises(SystemExit):
         sceneprint("keys", *arguments)
 
 
-def test_a_key_may_do_what_it_was_made_for(sceneprint: Run, tmp_path: Path) -> None:
+def test_a_key_may_do_what_it_was_made_for(sceneprint, tmp_path):
     given = ("--scope", "write", "--map", "hall", "--map", "yard", "--expires", "30d")
     sceneprint("keys", "--create", "robot", *given, "--data", tmp_path)
     sceneprint("keys", "--create", "screen", "--scope", "read", "--data", tmp_path)
@@ -102,8 +95,8 @@ def test_a_key_may_do_what_it_was_made_for(sceneprint: Run, tmp_path: Path) -> N
     assert ", expired " in late
 
 
-def test_tenants_are_made_listed_and_deleted(sceneprint: Run, tmp_path: Path) -> None:
-    def run(*arguments: str, expect: int = 0) -> Any:
+def test_tenants_are_made_listed_and_deleted(sceneprint, tmp_path):
+    def run(*arguments, expect=0):
         return sceneprint(*arguments, "--data", tmp_path, expect=expect)
 
     assert run("keys", "--create-tenant", "acme").stdout == "tenant acme is created\n"
@@ -126,12 +119,12 @@ def test_tenants_are_made_listed_and_deleted(sceneprint: Run, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("time", ["30", "d", "0d", "-1d", "1y", "999999w", "1 d"])
-def test_a_time_is_written_as_it_is_read(sceneprint: Run, time: str) -> None:
+def test_a_time_is_written_as_it_is_read(sceneprint, time):
     with pytest.raises(SystemExit):
         sceneprint("keys", "--create", "x", "--expires", time)
 
 
-def test_what_a_key_may_is_said_when_it_is_made(sceneprint: Run, tmp_path: Path) -> None:
+def test_what_a_key_may_is_said_when_it_is_made(sceneprint, tmp_path):
     done = sceneprint("keys", "--list", "--scope", "read", "--data", tmp_path, expect=2)
     assert "Use it with --create" in done.stderr
     done = sceneprint("keys", "--create", "x", "--map", "No Map", "--data", tmp_path, expect=2)

@@ -1,20 +1,12 @@
 """Tests of `sceneprint pull`, which copies maps of a running service to a robot's folder."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from sceneprint_client import Client
 
 
 @pytest.mark.sqlite_only("a copy of a map is in a folder with SQLite")
-def test_a_map_is_pulled_and_renewed(
-    sceneprint: Callable[..., Any], service_url: str, rooms: Path, tmp_path: Path
-) -> None:
+def test_a_map_is_pulled_and_renewed(sceneprint, service_url, rooms, tmp_path):
     copy = tmp_path / "copy"
     with Client(service_url) as client:
         client.create_map("pulled", model="depth")

@@ -1,11 +1,6 @@
 """Tests of `sceneprint make mesh` with a service."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,11 +8,9 @@ from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
 from sceneprint_client import Client
 from sceneprint_lab.synth import synthesise_room
 
-Run = Callable[..., Any]
-
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def walk(tmp_path_factory):
     """Six views of one room that overlap."""
     folder = tmp_path_factory.mktemp("walk") / "room" / "seq-01"
     folder.mkdir(parents=True)
@@ -27,9 +20,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_mesh_and_its_figures(
-    sceneprint: Run, service_url: str, walk: Path, tmp_path: Path, with_open3d: None
-) -> None:
+def test_a_mesh_and_its_figures(sceneprint, service_url, walk, tmp_path, with_open3d):
     with Client(service_url) as client:
         client.create_map("walk", model="depth")
     first, *rest = sorted(walk.glob("*.png"))
@@ -55,7 +46,7 @@ def test_a_mesh_and_its_figures(
     assert b"element face" not in mesh.read_bytes()[:1000]
 
 
-def test_what_cannot_be_reconstructed(sceneprint: Run, service_url: str, walk: Path) -> None:
+def test_what_cannot_be_reconstructed(sceneprint, service_url, walk):
     with Client(service_url) as client:
         client.create_map("nothing", model="depth")
     first = min(walk.glob("*.png"))

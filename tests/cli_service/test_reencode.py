@@ -1,9 +1,6 @@
 """Tests of `sceneprint reencode`: start, progress, cancellation, and answers after the switch."""
 
-from __future__ import annotations
-
 import re
-from typing import Any
 
 from sqlalchemy import update
 
@@ -17,7 +14,7 @@ from tests.whole_engine import Engine
 
 
 def test_a_map_is_signed_anew_while_its_service_runs(sceneprint, service_url, data_folder, rooms):
-    def reencode(*arguments: object, expect: int = 0) -> Any:
+    def reencode(*arguments, expect=0):
         return sceneprint("reencode", "anew", *arguments, "--data", data_folder, expect=expect)
 
     sceneprint("upload", "anew", rooms / "room-0", "--model", "depth")
@@ -39,7 +36,7 @@ def test_a_map_is_signed_anew_while_its_service_runs(sceneprint, service_url, da
 def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint, tmp_path):
     """In a folder on which no worker runs."""
 
-    def reencode(*arguments: object, expect: int = 0) -> Any:
+    def reencode(*arguments, expect=0):
         return sceneprint("reencode", "hall", *arguments, "--data", tmp_path, expect=expect)
 
     Client.embedded(tmp_path).close()
@@ -69,7 +66,7 @@ def test_waiting_ends_where_it_is_no_use(sceneprint, tmp_path, rooms, monkeypatc
         client.wait([added.job_id])
         assert client.map("hall").frames == {"indexed": 1}
 
-    def wait() -> Any:
+    def wait():
         return sceneprint(
             "reencode", "hall", "--model", "paper", "--wait", "--data", tmp_path, expect=2
         )

@@ -1,7 +1,5 @@
 """Tests of URLs and body sizes in settings; errors never repeat a rejected URL."""
 
-from __future__ import annotations
-
 import argparse
 import traceback
 
@@ -29,9 +27,7 @@ SERVER = "postgresql+psycopg://u:hunter2@host/db"
         ("BLOB_URL", "s3:///hunter2", "contains no bucket"),
     ],
 )
-def test_a_url_that_is_none_is_refused_and_not_repeated(
-    monkeypatch: pytest.MonkeyPatch, name: str, value: str, said: str
-) -> None:
+def test_a_url_that_is_none_is_refused_and_not_repeated(monkeypatch, name, value, said):
     monkeypatch.delenv("SCENEPRINT_DATABASE_URL", raising=False)
     monkeypatch.setenv(f"SCENEPRINT_{name}", value)
     with pytest.raises(InvalidRequest, match=rf"SCENEPRINT_{name}\.$") as caught:
@@ -43,7 +39,7 @@ def test_a_url_that_is_none_is_refused_and_not_repeated(
     assert "hunter2" not in str(refused.value)
 
 
-def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch):
     for name, value in (
         ("DATABASE_URL", SERVER), ("BLOB_URL", "s3://bucket/prefix"),
         ("INDEX_URL", "file:///srv/indexes"),
@@ -57,7 +53,7 @@ def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch: pytest.MonkeyPatch
     assert "hunter2" not in repr(found)
 
 
-def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch):
     monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(SHARED_BYTES))
     assert settings_of(argparse.Namespace()).max_upload_bytes == 536870912  # as the docs say
     monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(SHARED_BYTES + 1))

@@ -1,7 +1,5 @@
 """Tests of `sceneprint spool`, and of the example of an offline robot."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import sqlite3
@@ -72,7 +70,7 @@ def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_pat
 
 @pytest.fixture
 def run_example(rooms, tmp_path, monkeypatch, capsys):
-    def example(url: str, *more: object) -> list[str]:
+    def example(url, *more):
         given = [rooms, "offline-example", "--spool", tmp_path / "spool", "--url", url, *more]
         monkeypatch.setattr(sys, "argv", ["offline_robot.py", *map(str, given)])
         capsys.readouterr()

@@ -1,7 +1,5 @@
 """Tests of upload, query and map commands as processes with a real service."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -12,7 +10,6 @@ import subprocess
 import sys
 import time
 from contextlib import redirect_stderr, redirect_stdout
-from typing import Any
 
 import numpy as np
 import pytest
@@ -337,7 +334,7 @@ def test_a_query_goes_on_after_a_file_that_is_not_taken(
 ):
     ask = Client.query
 
-    def query(client: Client, name: Any, frame: Any, *more: Any, **how: Any) -> Any:
+    def query(client, name, frame, *more, **how):
         if frame.name.endswith("1"):
             raise error
         return ask(client, name, frame, *more, **how)

@@ -3,67 +3,60 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from threading import Thread
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import (
     Camera,
-    FrameReference,
     find_sequences,
     write_depth_png,
     write_intrinsics,
     write_pose,
 )
-from sceneprint.types import DepthFrame
 from sceneprint_client import Client, http
 from sceneprint_client.api import FrameMeta, JobState
-from sceneprint_lab.synth import SynthRoom
 from tests.conftest import halved
 
 
 @pytest.fixture
-def remote(service_url: str) -> Iterator[Client]:
+def remote(service_url):
     with Client(service_url) as client:
         yield client
 
 
 @pytest.fixture
-def embedded(tmp_path: Path) -> Iterator[Client]:
+def embedded(tmp_path):
     with Client.embedded(tmp_path / "embedded") as client:
         yield client
 
 
 @pytest.fixture(scope="session")
-def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Client]:
+def client(tmp_path_factory):
     """A service in this process for all tests, each of which uses its own maps."""
     with Client.embedded(tmp_path_factory.mktemp("client")) as client:
         yield client
 
 
 @pytest.fixture
-def map_name(request: pytest.FixtureRequest) -> str:
+def map_name(request):
     """A name that no other test uses."""
     return "m" + f"{abs(hash(request.node.nodeid)):x}"[:20]
 
 
 @pytest.fixture(scope="session")
-def room_frames(room_frames: tuple[DepthFrame, ...]) -> tuple[DepthFrame, ...]:
+def room_frames(room_frames):
     """The frames of `tests/conftest.py` with a quarter of their samples, which are fast to sign."""
     return tuple(map(halved, room_frames))
 
 
 @pytest.fixture(scope="session")
-def references(
-    room_frames: tuple[DepthFrame, ...], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[FrameReference, ...]:
+def references(room_frames, tmp_path_factory):
     """Three views of each of two rooms, with poses, as files in 7-Scenes layout."""
     root = tmp_path_factory.mktemp("rooms")
     for number, frame in enumerate(room_frames):
@@ -77,15 +70,11 @@ def references(
 
 
 @pytest.fixture(scope="session")
-def walk(
-    room_views: Callable[..., SynthRoom], tmp_path_factory: pytest.TempPathFactory
-) -> Callable[..., list[tuple[bytes, FrameMeta]]]:
+def walk(room_views, tmp_path_factory):
     """A function that creates frames along a path, a second apart, of one or two sessions."""
     path = tmp_path_factory.mktemp("walk") / "depth.png"
 
-    def make(
-        count: int = 4, sessions: str = "a", parent: str | None = None, **options: Any
-    ) -> list[tuple[bytes, FrameMeta]]:
+    def make(count=4, sessions="a", parent=None, **options):
         found = []
         frames = map(halved, room_views(21, 0, count, along_path=True, **options).frames)
         for i, frame in enumerate(frames):
@@ -107,9 +96,7 @@ def walk(
 
 
 @pytest.fixture(scope="session")
-def produced(
-    service_url: str, walk: Callable[..., list[tuple[bytes, FrameMeta]]]
-) -> Iterator[Client]:
+def produced(service_url, walk):
     """A client of the map `produced`: sessions a and b of two frames each in one parent frame."""
     with Client(service_url) as client:
         client.create_map("produced", model="depth")
@@ -120,9 +107,7 @@ def produced(
 
 
 @pytest.fixture(scope="session")
-def bare_wall(
-    tmp_path_factory: pytest.TempPathFactory, references: tuple[FrameReference, ...]
-) -> Path:
+def bare_wall(tmp_path_factory, references):
     """A frame that decodes but has no surface to sign: 30 samples of a wall."""
     folder = tmp_path_factory.mktemp("bare")
     lens = references[0].camera.intrinsics
@@ -134,7 +119,7 @@ def bare_wall(
 
 
 @pytest.fixture
-def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
+def hasty(monkeypatch):
     """Remove the delay between retries."""
     monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(http, "LONGEST_PAUSE_S", 0.02)
@@ -150,18 +135,14 @@ class Scripted:
     stop: Callable[[], None] = lambda: None
 
 
-#: Status, headers and JSON of an answer; status 0 breaks the connection.
-Reply = tuple[int, dict[str, str], object]
-
-
 @pytest.fixture
-def scripted() -> Iterator[Callable[[list[Reply]], Scripted]]:
+def scripted():
     """A function that starts a server with replies in order; the last one repeats."""
-    servers: list[ThreadingHTTPServer] = []
+    servers = []
 
-    def make(replies: list[Reply]) -> Scripted:
+    def make(replies):
         class Handler(BaseHTTPRequestHandler):
-            def answer(self) -> None:
+            def answer(self):
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
                 told.asked.append((self.command, self.path, body))
                 told.headers.append(dict(self.headers.items()))
@@ -178,15 +159,15 @@ def scripted() -> Iterator[Callable[[list[Reply]], Scripted]]:
 
             do_GET = do_POST = do_DELETE = answer  # noqa: N815
 
-            def log_message(self, *_: object) -> None:
+            def log_message(self, *_):
                 pass
 
         server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        server.handle_error = lambda *_: None  # type: ignore[method-assign, assignment]
+        server.handle_error = lambda *_: None
         servers.append(server)
         told = Scripted(f"http://127.0.0.1:{server.server_address[1]}")
 
-        def stop() -> None:
+        def stop():
             server.shutdown()
             server.server_close()
 

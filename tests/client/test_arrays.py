@@ -1,9 +1,6 @@
 """Tests of frames as arrays with a camera, of path strings, and of poses in ROS notation."""
 
-from __future__ import annotations
-
 import io
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ QUARTER = 0.5**0.5
 CAMERA = CameraIntrinsics(width=4, height=3, fx=5, fy=6, cx=1.5, cy=1)
 
 
-def loaded(data: bytes) -> np.ndarray:
+def loaded(data):
     return np.load(io.BytesIO(data), allow_pickle=False)
 
 
@@ -92,12 +89,12 @@ def test_other_arrays_are_refused(array, camera, error, message):
 
 
 def test_what_is_no_frame_is_refused(references):
-    wrong: Any = [[1, 2], [3, 4]]
+    wrong = [[1, 2], [3, 4]]
     with pytest.raises(TypeError, match="not list"):
         sendable(wrong, CAMERA, with_pose=False)
     with pytest.raises(TypeError, match="lacks the image size"):
         sendable(references[0].path, (5, 6, 1.5, 1), with_pose=False)
-    known: Any = {"robot": "a"}
+    known = {"robot": "a"}
     for frame in (references[0].path, references[0], b"P5"):
         with pytest.raises(TypeError) as caught:
             sendable(frame, known, with_pose=False)

@@ -1,15 +1,10 @@
 """Tests of AsyncClient: its methods against a service, concurrency, retries, cancellation."""
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 import shutil
-from asyncio import StreamReader, StreamWriter
-from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,12 +13,11 @@ from sceneprint_client import AsyncClient, Client
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.coverage import MapCoverage
 from sceneprint_client.errors import Busy, UnknownMap, Unreachable
-from tests.client.conftest import Reply
 
-BUSY: Reply = (503, {}, {"type": "/problems/busy", "title": "", "status": 503, "detail": "later"})
+BUSY = (503, {}, {"type": "/problems/busy", "title": "", "status": 503, "detail": "later"})
 
 
-def public_methods(kind: type) -> dict[str, Any]:
+def public_methods(kind):
     found = inspect.getmembers(kind, inspect.isfunction)
     return {name: one for name, one in found if not name.startswith("_")}
 
@@ -46,7 +40,7 @@ def test_a_map_from_upload_to_deletion(service_url, map_name, tmp_path, referenc
     folder = references[0].path.parents[1]
     archive = Path(shutil.make_archive(str(tmp_path / "scene"), "zip", folder))
 
-    async def session() -> None:
+    async def session():
         async with AsyncClient(service_url) as client:
             created = await client.create_map(map_name, model="depth")
             job = await client.import_archive(map_name, archive)
@@ -78,11 +72,11 @@ def test_a_map_from_upload_to_deletion(service_url, map_name, tmp_path, referenc
 
 @asynccontextmanager
 async def answering(
-    respond: Callable[[StreamReader], Awaitable[bytes]],
-) -> AsyncIterator[str]:
+    respond,
+):
     """Run a server in this event loop, and yield its address."""
 
-    async def answer(reader: StreamReader, writer: StreamWriter) -> None:
+    async def answer(reader, writer):
         await reader.readuntil(b"\r\n\r\n")
         body = await respond(reader)
         writer.write(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n%b" % (len(body), body))
@@ -93,10 +87,10 @@ async def answering(
 
 
 def test_ten_requests_are_in_progress_at_once():
-    async def session() -> list[bool]:
+    async def session():
         together = asyncio.Barrier(10)
 
-        async def respond(_: StreamReader) -> bytes:
+        async def respond(_):
             await together.wait()
             return b'{"status": "ok"}'
 
@@ -107,10 +101,10 @@ def test_ten_requests_are_in_progress_at_once():
 
 
 def test_a_cancelled_call_closes_its_connection():
-    async def session() -> list[bytes]:
+    async def session():
         begun, rest = asyncio.Event(), list[bytes]()
 
-        async def respond(reader: StreamReader) -> bytes:
+        async def respond(reader):
             begun.set()
             rest.append(await reader.read())  # until the client closes the connection
             return b""
@@ -131,10 +125,10 @@ def test_a_cancelled_call_closes_its_connection():
 
 def test_requests_are_repeated(hasty, scripted):
     page = {"items": [], "next_cursor": None}
-    lost: Reply = (0, {}, None)
+    lost = (0, {}, None)
     server = scripted([BUSY, lost, (200, {}, page), lost, (404, {}, None), BUSY])
 
-    async def session() -> None:
+    async def session():
         async with AsyncClient(server.url) as client:
             assert await client.maps() == []
             await client.delete_map("hall")  # the answer to the first deletion was lost
@@ -146,7 +140,7 @@ def test_requests_are_repeated(hasty, scripted):
 
 
 def test_where_no_service_is():
-    async def session() -> None:
+    async def session():
         async with AsyncClient("http://127.0.0.1:9") as client:
             assert not await client.healthy()
             with pytest.raises(Unreachable):

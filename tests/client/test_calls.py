@@ -1,7 +1,5 @@
 """Tests of the client's methods for maps, frames and jobs."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -69,7 +67,7 @@ def test_a_frame_from_upload_to_deletion(client, map_name, references):
 def test_jobs_are_waited_for(client, map_name, references, bare_wall):
     client.create_map(map_name)
     added = [client.upload(map_name, one) for one in (*references[:2], bare_wall)]
-    seen: list[tuple[int, int]] = []
+    seen = []
     ids = [one.job_id for one in added]
     jobs = client.wait([*ids, ids[0]], timeout_s=PATIENCE_S, progress=lambda *n: seen.append(n))
     assert [job.job_id for job in jobs] == [*ids, ids[0]]

@@ -1,7 +1,5 @@
 """Tests of point clouds through the client."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

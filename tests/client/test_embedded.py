@@ -1,12 +1,9 @@
 """Tests of the service in the client's process: streaming, waiting and shutdown."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
 
 import httpx
 import pytest
@@ -31,7 +28,7 @@ def test_a_body_is_read_in_parts_by_who_asks(local):
     local.post("/v1/maps", json={"name": "m"}).raise_for_status()
     threads = set()
 
-    def archive() -> Iterator[bytes]:
+    def archive():
         for _ in range(3):
             threads.add(threading.current_thread())
             yield bytes(1 << 20)
@@ -40,7 +37,7 @@ def test_a_body_is_read_in_parts_by_who_asks(local):
     assert (answer.status_code, answer.json()["type"]) == (422, "/problems/unreadable-archive")
     assert threads == {threading.current_thread()}
 
-    def broken() -> Iterator[bytes]:
+    def broken():
         yield b"PK"
         raise OSError("the disk is gone")
 
@@ -81,9 +78,9 @@ def test_closing_ends_streams_and_threads(tmp_path):
     client.create_map("m")
     stream = client.events(after="0")
     assert next(stream).kind == "map.created"
-    ended: list[Exception] = []
+    ended = []
 
-    def listen() -> None:
+    def listen():
         try:
             next(stream)
         except RuntimeError as error:

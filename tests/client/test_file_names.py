@@ -1,9 +1,6 @@
 """Tests of the file names and sequence numbers that the client sends with frames."""
 
-from __future__ import annotations
-
 import os
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +38,7 @@ def test_a_frame_is_sent_with_its_name_and_a_query_without(references, tmp_path)
     meta, camera = meta_of(one), (5.0, 5.0, 2.0, 2.0)
     assert (meta.name, meta.sequence) == ("frame-000001.depth.png", 1)
 
-    def labels(frame: Any, known: Any = None, *, with_pose: bool = True) -> tuple[Any, Any]:
+    def labels(frame, known=None, *, with_pose=True):
         sent = sendable(frame, known, with_pose=with_pose)[1]
         return sent.name, sent.sequence
 

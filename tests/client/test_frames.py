@@ -1,7 +1,5 @@
 """Tests of the bytes and metadata of frames to send, and of interrupted jobs."""
 
-from __future__ import annotations
-
 import json
 import shutil
 
@@ -86,7 +84,7 @@ def test_a_query_needs_no_pose(embedded, references, tmp_path):
 
 
 def test_a_stopped_job_waits_for_the_next_worker(embedded, references, monkeypatch):
-    def stopped(*_: object) -> None:
+    def stopped(*_):
         raise KeyboardInterrupt
 
     embedded.create_map("m")

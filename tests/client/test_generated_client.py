@@ -1,7 +1,5 @@
 """Test that a client generated from the OpenAPI document works, without any code of ours."""
 
-from __future__ import annotations
-
 import importlib
 import io
 import json
@@ -40,7 +38,7 @@ def test_a_generated_client_maps_and_localizes(
             "frames.list_frames", "maps.get_map")}  # fmt: skip
     reference = references[0]
 
-    def form() -> dict[str, object]:
+    def form():
         meta = models.FrameMeta.from_dict(meta_of(reference).model_dump(mode="json"))
         return {"frame": types.File(io.BytesIO(reference.path.read_bytes()), "a"), "meta": meta}
 

@@ -1,11 +1,7 @@
 """Tests of uploads under an id, of batches and of archives through the client."""
 
-from __future__ import annotations
-
 import io
 import tarfile
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +13,7 @@ from sceneprint.errors import (
     UnknownMap,
     UnreadableCloud,
 )
-from sceneprint_client import Client, meta_of
+from sceneprint_client import meta_of
 from sceneprint_client.api import JobState
 from sceneprint_client.api.base import GivenBase
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
@@ -37,7 +33,7 @@ def rooms(references):
     return references[0].path.parent.parent.parent
 
 
-def packed(rooms: Path, **more: bytes) -> io.BytesIO:
+def packed(rooms, **more):
     """A compressed tar of the folder, with more members of these names."""
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w:gz") as archive:
@@ -50,7 +46,7 @@ def packed(rooms: Path, **more: bytes) -> io.BytesIO:
     return made
 
 
-def done(client: Client, map_name: str, archive: Any, options: ImportOptions | None = None) -> Any:
+def done(client, map_name, archive, options=None):
     """What came of an import, when it and all its frames are done."""
     job = client.import_archive(map_name, archive, options)
     assert (job.kind, job.map, job.state.over) == ("import", map_name, False)
@@ -83,7 +79,7 @@ def test_a_frame_put_under_an_id(client, map_name, references):
 def test_a_batch(client, map_name, references):
     client.create_map(map_name, model="depth")
     known = [meta_of(one) for one in references]
-    sent: list[Any] = [references[0], b"none", references[1].path, references[0]]
+    sent = [references[0], b"none", references[1].path, references[0]]
     items = client.upload_batch(map_name, sent, [known[0], known[0], known[1], known[0]])
     assert [one.status for one in items] == [202, 422, 202, 200]
     assert items[1].problem.type == "/problems/unreadable-frame"

@@ -1,31 +1,28 @@
 """Tests of joined scans: motion within a scan, windows, and what is left out."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 import pytest
 
 from sceneprint_client.joiner import MOST_SCANS, Joiner, window_start
-from sceneprint_client.poses import Floats, SensorTrajectory, interpolate, rotation_of
+from sceneprint_client.poses import SensorTrajectory, interpolate, rotation_of
 from sceneprint_client.transforms import TransformTree
 
 SECOND = 1_000_000_000
 
 
-def pose(x: float, y: float = 0.0, yaw: float = 0.0) -> Floats:
+def pose(x, y=0.0, yaw=0.0):
     T = np.eye(4)
     T[:3, :3] = rotation_of(np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]))
     T[:3, 3] = x, y, 0
     return T
 
 
-def along_x(metres_per_second: float, *, yaw: float = 0.0) -> Joiner:
+def along_x(metres_per_second, *, yaw=0.0):
     """A joiner for a sensor that moves along x and turns at constant rates."""
 
-    def odometry(stamps_ns: Sequence[int]) -> list[Floats | None]:
+    def odometry(stamps_ns):
         return [pose(metres_per_second * ns / SECOND, 0.0, yaw * ns / SECOND) for ns in stamps_ns]
 
     return Joiner(odometry, 2.0)
@@ -133,7 +130,7 @@ def test_times_that_are_not_seconds_of_one_scan_are_refused(last):
 
 
 def test_a_jump_within_a_scan_of_other_odometry_is_found():
-    def odometry(stamps_ns: Sequence[int]) -> list[Floats | None]:
+    def odometry(stamps_ns):
         return [pose(0.0 if ns < SECOND // 20 else 1.0) for ns in stamps_ns]
 
     joiner = Joiner(odometry)

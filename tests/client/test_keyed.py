@@ -1,11 +1,8 @@
 """Tests that every client method requires a key, and of the methods that manage keys."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
-from typing import Any
 
 import pytest
 
@@ -15,7 +12,7 @@ from sceneprint_client.api.coverage import MapCoverage
 
 ID = "0" * 32
 #: Arguments of every call by their names in its signature.
-GIVEN: dict[str, Any] = {
+GIVEN = {
     "map_name": "hall", "name": "hall", "frame_id": ID, "job_id": ID, "query_id": ID,
     "before": "s", "after": "t", "kind": MapCoverage,
     "since": ID, "session": "s",
@@ -51,7 +48,7 @@ def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
         if name in ("query", "localize"):
             needed = {"map_name": "hall", "frame_id": ID}
 
-        def call(name: str = name, needed: dict[str, Any] = needed) -> None:
+        def call(name=name, needed=needed):
             found = getattr(remote, name)(**needed)
             if isinstance(found, Iterator):
                 next(found)

@@ -1,10 +1,7 @@
 """Tests of the HTML that notebooks show for records."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from datetime import UTC, datetime
-from typing import Any
 
 from sceneprint_client.api import Answer, Frame, Map, Match
 from sceneprint_client.api.base import CameraIntrinsics, Transform
@@ -13,7 +10,7 @@ from sceneprint_client.api.query import Alternative, Location, Validation
 EVIL = "<script>alert('&\"')</script>"
 
 
-def pose(x: float, y: float, child: str = "query.optical") -> Transform:
+def pose(x, y, child="query.optical"):
     """A sensor that looks along y with z up, or along x if it is no camera."""
     axes = [[1, 0, 0, x], [0, 0, 1, y], [0, -1, 0, 1.5], [0, 0, 0, 1]]
     if not child.endswith("optical"):
@@ -24,18 +21,18 @@ def pose(x: float, y: float, child: str = "query.optical") -> Transform:
     )  # fmt: skip
 
 
-def match(rank: int, frame_id: str) -> Match:
+def match(rank, frame_id):
     validation = Validation.model_construct(status="accepted", overlap=0.8125, reason="")
     return Match.model_construct(
         rank=rank, frame_id=frame_id, map="hall", similarity=0.75, validation=validation
     )
 
 
-def elements(record: Any) -> ElementTree.Element:
+def elements(record):
     return ElementTree.fromstring(f"<div>{record._repr_html_()}</div>")
 
 
-def cells(table: ElementTree.Element) -> list[list[str | None]]:
+def cells(table):
     return [[cell.text for cell in row] for row in table]
 
 

@@ -52,7 +52,7 @@ def test_events_as_they_happen(client, map_name):
     (made,) = client.events(map_name, follow=False)
     names = [f"{map_name[:18]}{i}" for i in range(3)]
 
-    def write() -> None:
+    def write():
         for name in names:
             client.create_map(name, model="depth")
 
@@ -138,10 +138,10 @@ STREAMS = [
 class Stream:
     """A network whose answers are those of a stream."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.after: list[str | None] = []
 
-    def __call__(self, request: httpx.Request) -> httpx.Response:
+    def __call__(self, request):
         self.after.append(request.headers.get("Last-Event-ID"))
         body = STREAMS[len(self.after) - 1]
         if body is None:

@@ -1,7 +1,5 @@
 """Tests of downloads and edits of frames through the client."""
 
-from __future__ import annotations
-
 import base64
 import io
 from datetime import UTC, datetime, timedelta
@@ -12,7 +10,7 @@ from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, NotIndexed, PreconditionFailed, UnknownFrame
-from sceneprint_client import Client, meta_of
+from sceneprint_client import meta_of
 
 START = datetime(2026, 11, 16, 9, 30, tzinfo=UTC)
 
@@ -38,7 +36,7 @@ def ids(client, references):
     return found
 
 
-def listed(client: Client, map_name: str, **wanted: object) -> list[str]:
+def listed(client, map_name, **wanted):
     return [one.frame_id for one in client.frames(map_name, **wanted)]
 
 

@@ -1,7 +1,5 @@
 """Tests of the client's package: its imports, its shared code with the service, and its wheel."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -90,7 +88,7 @@ def test_the_distributions_have_one_version():
     }  # fmt: skip
 
 
-def oldest_python() -> str:
+def oldest_python():
     """A Python 3.10 that starts (a shim of pyenv may not), or the Python of the tests."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     for found in (shutil.which("python3.10"), *pyenv.glob("versions/3.10.*/bin/python3.10")):

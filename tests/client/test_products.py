@@ -1,7 +1,5 @@
 """Tests of operations that all products of maps share, by client and HTTP."""
 
-from __future__ import annotations
-
 import httpx
 import numpy as np
 import pytest
@@ -35,7 +33,7 @@ def test_a_product_from_request_to_deletion(
     with httpx.Client(base_url=service_url, trust_env=False, timeout=PATIENCE_S) as http:
         first, second = (http.post(root, json=request_) for _ in range(2))
         assert (first.status_code, first.json()["progress"]["total"]) == (202, steps)
-        seen: list[tuple[int, int]] = []
+        seen = []
         done = client.wait_for_product(
             kind.model_validate(first.json()), progress=lambda *step: seen.append(step)
         )

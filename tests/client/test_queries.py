@@ -1,17 +1,12 @@
 """Tests of queries, with equal answers over the network and in process."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownMap, UnknownQuery
-from sceneprint_client import Client
 from sceneprint_client.api import Answer, NamedFrame, ValidationOptions
 
-STAGES: tuple[Any, ...] = (("retrieve",), ("retrieve", "diversify", "validate"))
+STAGES = (("retrieve",), ("retrieve", "diversify", "validate"))
 
 
 @pytest.fixture
@@ -26,7 +21,7 @@ def filled(remote, embedded, map_name, references):
     return numbers[0], numbers[1]
 
 
-def comparable(told: Any, numbers: dict[str, int]) -> Any:
+def comparable(told, numbers):
     """What is told, with frames by number, and without what differs from call to call."""
     drop = {"query_id", "milliseconds", "job_id", "received_at", "indexed_at", "created_at"}
     if isinstance(told, dict):
@@ -40,7 +35,7 @@ def comparable(told: Any, numbers: dict[str, int]) -> Any:
 
 
 def test_answers_are_equal(remote, embedded, map_name, references, filled):
-    def ask(client: Client, numbers: dict[str, int], **how: Any) -> tuple[Answer, Any]:
+    def ask(client, numbers, **how):
         answer = client.query(map_name, **how)
         return answer, comparable(answer.model_dump(mode="json"), numbers)
 
@@ -74,7 +69,7 @@ def test_all_ways_of_asking(client, map_name, references):
     ids = [client.upload(map_name, one, wait_s=PATIENCE_S).frame_id for one in references]
     client.create_map(other)
     added = client.upload(other, references[1], wait_s=PATIENCE_S).frame_id
-    options: dict[str, Any] = {
+    options = {
         "k": 2, "seed": 3, "candidates": 4, "diversity": {"omega": 8.0},
         "validation": ValidationOptions(strong=1.0), "explain": True, "keep": False,
         "filter": {"exclude_frames": [ids[4]]}, "stages": "retrieve,diversify,validate",

@@ -1,9 +1,5 @@
 """Tests of reconstructions through the client: files, results and errors."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -48,12 +44,12 @@ def answered(client, views, with_open3d):
     return answer
 
 
-def files(folder: Path) -> set[Path]:
+def files(folder):
     """Blobs of a data folder."""
     return {path for path in (folder / "blobs").rglob("*") if path.is_file()}
 
 
-def ply(data: bytes) -> tuple[int, int, str]:
+def ply(data):
     """Points, triangles and comment of a PLY file, whose size must fit its header."""
     head, _, body = data.partition(b"end_header\n")
     lines = head.decode().splitlines()

@@ -1,7 +1,5 @@
 """Tests of network effects: retries, rejected requests and addresses."""
 
-from __future__ import annotations
-
 import logging
 import socket
 import time
@@ -26,7 +24,7 @@ MAP = {
 ADDED = {"frame_id": "f", "job_id": "j", "state": "received", "reason": None}
 
 
-def problem(kind: str, status: int, **more: object) -> tuple[int, dict[str, str], object]:
+def problem(kind, status, **more):
     document = {"type": f"https://x/problems/{kind}", "title": kind, "status": status}
     return status, {}, {**document, "detail": f"it is {kind}", **more}
 
@@ -191,8 +189,8 @@ def test_nobody_there():
 
 
 def test_who_answered_before_is_waited_for(scripted, monkeypatch):
-    def tries_on(client: Client) -> int:
-        pauses: list[float] = []
+    def tries_on(client):
+        pauses = []
         with monkeypatch.context() as patch:
             patch.setattr("sceneprint_client.http.time.sleep", pauses.append)
             with pytest.raises(errors.Unreachable):
@@ -290,9 +288,9 @@ def test_no_proxy_stands_before_this_machine(monkeypatch, host, proxied):
     monkeypatch.delenv("NO_PROXY", raising=False)
     monkeypatch.delenv("no_proxy", raising=False)
     monkeypatch.setenv("http_proxy", "http://192.0.2.7:3128")
-    asked: list[str] = []
+    asked = []
 
-    def noted(given: str) -> bool:
+    def noted(given):
         asked.append(given)
         return is_loopback(given)
 

@@ -1,7 +1,5 @@
 """Tests of client methods for many frames, for deletions and for kept answers."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.waiting import PATIENCE_S

@@ -1,7 +1,5 @@
 """Tests of the spool of an offline robot, which never loses or duplicates frames after a kill."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -13,11 +11,9 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +39,7 @@ CAMERA = CameraIntrinsics(width=16, height=12, fx=14, fy=14, cx=7.5, cy=5.5)
 CHARGE = 2 * 4096
 
 
-def meta(x: float | None = None, seconds: float = 0.0, **more: Any) -> FrameMeta:
+def meta(x=None, seconds=0.0, **more):
     """A frame at x metres along a line, or without a pose."""
     pose = None
     if x is not None:
@@ -56,42 +52,42 @@ def meta(x: float | None = None, seconds: float = 0.0, **more: Any) -> FrameMeta
     )  # fmt: skip
 
 
-def depth(number: int) -> np.ndarray[Any, Any]:
+def depth(number):
     """A small depth image that no other number has, millimetres."""
     image = np.full((12, 16), 2000, np.uint16)
     image[0, :2] = 1000 + number % 1000, 1000 + number // 1000
     return image
 
 
-def large(number: int, known: FrameMeta) -> tuple[np.ndarray[Any, Any], FrameMeta]:
+def large(number, known):
     """A depth image of 6 kB, and what is known of it."""
     lens = CAMERA.model_copy(update={"width": 64, "height": 48})
     return np.tile(depth(number), (4, 4)), known.model_copy(update={"intrinsics": lens})
 
 
-def wide(number: int, known: FrameMeta) -> tuple[np.ndarray[Any, Any], FrameMeta]:
+def wide(number, known):
     """One of 150 kB."""
     lens = CAMERA.model_copy(update={"width": 320, "height": 240})
     return np.tile(depth(number), (20, 20)), known.model_copy(update={"intrinsics": lens})
 
 
-def broken(number: int, known: FrameMeta) -> tuple[bytes, FrameMeta]:
+def broken(number, known):
     """None, of 150 kB, which a service refuses."""
     return f"none, {number}".encode().ljust(150_000), known
 
 
-KINDS: dict[str, Callable[[int, FrameMeta], Any]] = {
+KINDS = {
     "large": large, "wide": wide, "broken": broken,
 }  # fmt: skip
 
 
-def png_of(image: np.ndarray[Any, Any]) -> bytes:
+def png_of(image):
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG")
     return buffer.getvalue()
 
 
-def names(path: Path) -> list[str]:
+def names(path):
     """Names of the frames that wait, oldest first."""
     with closing(sqlite3.connect(path)) as database, database:
         rows = database.execute("SELECT meta FROM frames WHERE reason IS NULL ORDER BY id")
@@ -223,7 +219,7 @@ def test_what_a_spool_cannot_take_is_refused(tmp_path):
 
 
 @contextmanager
-def longest_file(size: int) -> Iterator[None]:
+def longest_file(size):
     """No file of this process grows beyond so many bytes, as on a disk that is full."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -235,7 +231,7 @@ def longest_file(size: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, handler)
 
 
-def fill(spool: Spool) -> None:
+def fill(spool):
     """More frames than there is room for."""
     for number in range(1000):
         spool.add(*large(number, meta(name=f"{number}")))
@@ -368,7 +364,7 @@ def test_nothing_is_sent_from_a_spool_that_cannot_be_written(remote, map_name, t
 def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, references, tmp_path):
     remote.create_map(map_name, model="depth")
     there = remote.upload(map_name, references[0], meta_of(references[0]))
-    told: list[tuple[int, int]] = []
+    told = []
     with Spool(tmp_path / "spool") as spool:
         for one in references[:3]:
             spool.add(one, meta_of(one))
@@ -439,7 +435,7 @@ def test_a_service_that_asks_to_come_back_is_waited_for(scripted, monkeypatch, t
     done = {"items": [{"status": 202, "frame": frame, "problem": None}]}
     busy = (429, {"Retry-After": "45"}, problem)  # longer than the client waits by itself
     server = scripted([busy, busy, (200, {}, done)])
-    pauses: list[float] = []
+    pauses = []
     monkeypatch.setattr(time, "sleep", pauses.append)
     with Client(server.url) as client, Spool(tmp_path / "spool") as spool:
         spool.add(depth(1), meta())
@@ -488,13 +484,13 @@ with Spool(path) as spool:
 """
 
 
-def drive_meta(number: int) -> FrameMeta:
+def drive_meta(number):
     """A drive at 0.3 m/s, a frame a second."""
     return meta(0.3 * number, number, name=f"{number}")
 
 
 @contextmanager
-def child(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
+def child(*arguments):
     """A process that works with the spool; killed in the end."""
     code = [sys.executable, "-c", CHILD, str(Path(__file__).parent), *map(str, arguments)]
     process = subprocess.Popen(code, stdout=subprocess.PIPE)
@@ -505,7 +501,7 @@ def child(*arguments: object) -> Iterator[subprocess.Popen[bytes]]:
         process.communicate()
 
 
-def add_until(path: Path, first: int, count: int, acknowledged: int, room: int = 0) -> list[str]:
+def add_until(path, first, count, acknowledged, room=0):
     """What a child said that is killed once it has said so many lines."""
     with child("add", path, first, count, room) as process:
         assert process.stdout is not None

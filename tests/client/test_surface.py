@@ -1,7 +1,5 @@
 """Tests of the surface of a map by client and HTTP."""
 
-from __future__ import annotations
-
 import io
 
 import httpx

@@ -1,7 +1,5 @@
 """Tests of the decoder of points from the service."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -5,7 +5,6 @@ buildings with kidnapped robots and ambiguous places.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from threading import Event
@@ -16,12 +15,12 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint.types import Floats
 from sceneprint_client import AsyncTracker, Client, Tracker, errors
 from sceneprint_client.api import Alternative, FrameMeta, GivenPose, Localization
 from sceneprint_client.api.base import GivenDirection
 from sceneprint_client.frame_files import camera_of
-from sceneprint_client.tracker import State, TrackerParameters, replay
+from sceneprint_client.tracker import TrackerParameters, replay
 from sceneprint_client.tracker_core import (
     difference,
     inverse,
@@ -35,7 +34,7 @@ DEPTH = np.ones((3, 4), np.float32)
 K = (5.0, 5.0, 1.5, 1.0)
 
 
-def answer(status: str, x: float = 0.0, **fields: Any) -> Localization:
+def answer(status, x=0.0, **fields):
     """An answer of the service; `found` at (x, 0, 0)."""
     matrix = np.eye(4)
     matrix[0, 3] = x
@@ -68,17 +67,17 @@ class FakeClient:
     begun: Event = field(default_factory=Event)
     may_answer: Event = field(default_factory=Event)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         self.may_answer.set()
 
-    def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
+    def localize(self, map_name, frame, meta=None, **how):
         return self.answer({"map": map_name, "frames": [depth_of(frame)], "metas": [meta], **how})
 
-    def localize_sequence(self, map_name: str, frames: Any, metas: Any, **how: Any) -> Localization:
+    def localize_sequence(self, map_name, frames, metas, **how):
         seen = [depth_of(one) for one in frames]
         return self.answer({"map": map_name, "frames": seen, "metas": metas, **how})
 
-    def answer(self, asked: dict[str, Any]) -> Localization:
+    def answer(self, asked):
         self.asked.append(asked)
         self.begun.set()
         assert self.may_answer.wait(PATIENCE_S)
@@ -88,28 +87,28 @@ class FakeClient:
         return told
 
 
-def depth(metres: float) -> np.ndarray:
+def depth(metres):
     return np.full((3, 4), metres, np.float32)
 
 
-def depth_of(data: bytes) -> float:
+def depth_of(data):
     """The depth of a frame of `depth`, as it was sent."""
     sent = np.load(io.BytesIO(data))
     assert (sent.shape, sent.min()) == ((3, 4), sent.max())
     return float(sent[0, 0])
 
 
-def ahead(x: float) -> np.ndarray:
+def ahead(x):
     T = np.eye(4)
     T[0, 3] = x
     return T
 
 
-def fake(*answers: Localization | Exception) -> Any:
+def fake(*answers):
     return FakeClient(list(answers))
 
 
-def equal(a: State, b: State) -> bool:
+def equal(a, b):
     names = ("T_map_odom", "T_map_sensor", "covariance")
     same = all(np.array_equal(getattr(a, n), getattr(b, n)) for n in names)
     plain = [(s.status, s.stamp, s.parent_frame, s.age, s.reason) for s in (a, b)]
@@ -235,7 +234,7 @@ def test_alternatives_weigh_by_their_confidence():
 # Several frames in one question, while no place is tracked.
 
 
-def asked_with(tracker: Tracker, xs: Sequence[float], client: FakeClient) -> list[list[float]]:
+def asked_with(tracker, xs, client):
     """Depths of the frames of each question; the depth of a frame is its place on the way."""
     for i, x in enumerate(xs):
         tracker.update(depth(x), ahead(x), stamp=float(i))
@@ -330,7 +329,7 @@ class Seen:
     T_map_sensor: Floats
 
 
-def drifted(poses: list[Floats], seed: int, share: float = 0.01) -> list[Floats]:
+def drifted(poses, seed, share=0.01):
     """Odometry that begins at the origin: too long by a share, turning by 0.1 deg/m, and noisy."""
     rng = np.random.default_rng(seed)
     odometry = [np.eye(4)]
@@ -343,7 +342,7 @@ def drifted(poses: list[Floats], seed: int, share: float = 0.01) -> list[Floats]
     return odometry
 
 
-def shifted(frame: DepthFrame, x: float) -> Seen:
+def shifted(frame, x):
     T = frame.pose.copy()
     T[0, 3] += x
     return Seen(frame.depth, T)
@@ -357,7 +356,7 @@ class Building:
     name: str
     camera: Any
 
-    def fill(self, views: list[Seen]) -> None:
+    def fill(self, views):
         self.client.create_map(self.name, "a building", model="depth")
         jobs = []
         for view in views:
@@ -366,7 +365,7 @@ class Building:
             jobs.append(self.client.upload(self.name, view.depth, meta).job_id)
         self.client.wait(jobs)
 
-    def drive(self, views: list[Seen], odometry: list[Floats]) -> Iterator[tuple[State, float]]:
+    def drive(self, views, odometry):
         """Each state at 2.5 Hz, and how far off it is, metres; infinite where nothing is told."""
         tracker = Tracker(self.client, self.name, camera=self.camera)
         for i, (view, T) in enumerate(zip(views, odometry, strict=True)):
@@ -379,7 +378,7 @@ class Building:
 
 @pytest.fixture
 def building(client, map_name):
-    def make(k: Intrinsics) -> Building:
+    def make(k):
         return Building(client, map_name, camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height)))
 
     return make
@@ -389,7 +388,7 @@ def building(client, map_name):
 def walked(room_views):
     """Of a walk in a room every third frame for the map, and the others."""
 
-    def walk(seed: int, index: int, views: int) -> tuple[list[Seen], list[Seen]]:
+    def walk(seed, index, views):
         room = room_views(seed, index, views, along_path=True)
         frames = [shifted(one, 20.0 * index) for one in room.frames]
         return frames[::3], [one for i, one in enumerate(frames) if i % 3]
@@ -397,9 +396,9 @@ def walked(room_views):
     return walk
 
 
-def check_kidnapping(site: Building, runs: list[list[Seen]]) -> None:
+def check_kidnapping(site, runs):
     """Drive each run after the other, as if the robot had not moved in between."""
-    odometry: list[Floats] = []
+    odometry = []
     for seed, run in enumerate(runs):
         start = odometry[-1] if odometry else np.eye(4)
         odometry += [start @ T for T in drifted([one.T_map_sensor for one in run], seed)]
@@ -469,7 +468,7 @@ def test_beside_what_looks_alike_it_never_tracks_wrongly(building, kind, index):
 def test_in_a_corridor_of_equal_doors_it_never_tracks_wrongly(building):
     hall = corridor(8)
 
-    def looking(x: float, yaw: float) -> Seen:
+    def looking(x, yaw):
         T = camera_pose(np.array([x, 0.9, 1.4, yaw, -0.05, 0.0]))
         return Seen(render(hall, T, KINECT), T)
 

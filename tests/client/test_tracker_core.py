@@ -1,9 +1,6 @@
 """Tests of the tracker's arithmetic: first fix, gate, kidnapping, ambiguity and drift."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -12,7 +9,6 @@ from sceneprint_client.errors import InvalidPose, InvalidRequest
 from sceneprint_client.tracker_core import (
     Observation,
     PoseEvidence,
-    State,
     TrackerCore,
     TrackerParameters,
     difference,
@@ -26,7 +22,7 @@ from sceneprint_client.tracker_core import (
 COVARIANCE = np.diag([0.0016] * 3 + [0.0] * 3)
 
 
-def at(x: float, y: float = 0.0, z: float = 0.0, yaw_deg: float = 0.0) -> np.ndarray:
+def at(x, y=0.0, z=0.0, yaw_deg=0.0):
     T = np.eye(4)
     T[:3, :3] = rotation_matrix(np.array([0, 0, math.radians(yaw_deg)]))
     T[:3, 3] = x, y, z
@@ -37,17 +33,15 @@ def at(x: float, y: float = 0.0, z: float = 0.0, yaw_deg: float = 0.0) -> np.nda
 T_MAP_ODOM = at(10, 20, 0, 90)
 
 
-def pose(T: np.ndarray, weight: float = 1.0, parent: str = "map") -> PoseEvidence:
+def pose(T, weight=1.0, parent="map"):
     return PoseEvidence(parent, T, weight, COVARIANCE)
 
 
-def found(
-    T: np.ndarray, *, strong: bool = True, by_prior: bool = False, parent: str = "map"
-) -> Observation:
+def found(T, *, strong=True, by_prior=False, parent="map"):
     return Observation("found", (pose(T, parent=parent),), strong, by_prior, "an answer")
 
 
-def several(*poses: np.ndarray, weights: Sequence[float] | None = None) -> Observation:
+def several(*poses, weights=None):
     evidence = tuple(map(pose, poses, weights or [1.0] * len(poses)))
     return Observation("ambiguous", evidence, reason="an answer")
 
@@ -55,14 +49,14 @@ def several(*poses: np.ndarray, weights: Sequence[float] | None = None) -> Obser
 NOTHING = Observation("not_found", reason="nothing alike")
 
 
-def tracking(parameters: TrackerParameters | None = None) -> TrackerCore:
+def tracking(parameters=None):
     """One that was fixed at the origin of the odometry, at 0 s."""
     core = TrackerCore(parameters)
     assert core.update(0.0, at(0), found(T_MAP_ODOM)).status == "tracking"
     return core
 
 
-def step(core: TrackerCore, stamp: float, x: float, observation: Observation) -> State:
+def step(core, stamp, x, observation):
     return core.update(stamp, at(x), observation)
 
 
@@ -282,7 +276,7 @@ def test_stamps_that_do_not_rise_are_refused():
     assert core.update(0.5, at(7), found(at(10, 27, 0, 90))).status == "tracking"
 
 
-def walk() -> list[tuple[float, np.ndarray, Observation]]:
+def walk():
     rng = np.random.default_rng(3)
     calls = []
     for i in range(40):

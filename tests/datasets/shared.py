@@ -1,20 +1,16 @@
 """Helpers of the data set tests: poses, modified images and their results."""
 
-from collections.abc import Callable, Iterator
-
 import numpy as np
 
 from sceneprint.errors import FrameError
 from sceneprint.formats.dataset import Camera, make_frame
-from sceneprint.types import DepthFrame, Intrinsics
+from sceneprint.types import Intrinsics
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
 DEPTH = np.arange(12, dtype=np.float32).reshape(3, 4) / 8
 
 
-def frame_or_error(
-    decode: Callable[[bytes], np.ndarray], data: bytes, camera: Intrinsics
-) -> DepthFrame | None:
+def frame_or_error(decode, data, camera):
     """Return a valid frame, or a FrameError with a message of one line."""
     try:
         frame = make_frame(decode(data), camera)
@@ -28,7 +24,7 @@ def frame_or_error(
     return frame
 
 
-def mutations(data: bytes, number: int) -> Iterator[bytes]:
+def mutations(data, number):
     """Yield the file with random changes: bytes, flipped bits, removed or inserted parts."""
     random = np.random.default_rng(7)
     for _ in range(number):
@@ -47,7 +43,7 @@ def mutations(data: bytes, number: int) -> Iterator[bytes]:
         yield bytes(mutated)
 
 
-def pose_at(x: float) -> np.ndarray:
+def pose_at(x):
     pose = np.eye(4)
     pose[0, 3] = x
     return pose

@@ -1,7 +1,5 @@
 """Tests that archives give the same frames as folders, and that faults affect single members."""
 
-from __future__ import annotations
-
 import bz2
 import gzip
 import io
@@ -15,9 +13,7 @@ import sys
 import tarfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,11 +21,9 @@ import pytest
 from sceneprint.errors import SceneprintError, UnreadableArchive
 from sceneprint.formats import archive as archives
 from sceneprint.formats import archive as inflating
-from sceneprint.formats.archive import Archive, Inflater, is_archive, open_archive
+from sceneprint.formats.archive import Inflater, is_archive, open_archive
 from sceneprint.formats.dataset import (
     Camera,
-    FrameReference,
-    FrameSequence,
     find_sequences,
     write_depth_png,
     write_intrinsics,
@@ -37,7 +31,7 @@ from sceneprint.formats.dataset import (
 )
 from tests.datasets.shared import CAMERA, DEPTH, pose_at
 
-PACKERS: dict[str, Callable[[bytes], bytes]] = {
+PACKERS = {
     "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress,
 }  # fmt: skip
 
@@ -59,7 +53,7 @@ print(list(folder.iterdir()))
 
 
 @pytest.fixture(scope="module")
-def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kitchen(tmp_path_factory):
     """A scene of 7-Scenes with two sequences and colour."""
     scene = tmp_path_factory.mktemp("scenes") / "kitchen"
     for number in (1, 2):
@@ -76,7 +70,7 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def desk(tmp_path_factory):
     """A folder of TUM, whose name has `rgb` in it, with colour and a trajectory."""
     folder = tmp_path_factory.mktemp("tum") / "rgbd_dataset_freiburg1_desk"
     (folder / "depth").mkdir(parents=True)
@@ -93,7 +87,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def zipped(folder: Path, **options: int) -> bytes:
+def zipped(folder, **options):
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w", options.get("method", zipfile.ZIP_DEFLATED)) as packed:
         for path in sorted(folder.rglob("*")):
@@ -101,14 +95,14 @@ def zipped(folder: Path, **options: int) -> bytes:
     return made.getvalue()
 
 
-def tarred(folder: Path, form: int = tarfile.GNU_FORMAT) -> bytes:
+def tarred(folder, form=tarfile.GNU_FORMAT):
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w", format=form) as packed:
         packed.add(folder, folder.name)
     return made.getvalue()
 
 
-def tar_of(*members: tuple[str, bytes] | tarfile.TarInfo) -> bytes:
+def tar_of(*members):
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w", format=tarfile.GNU_FORMAT) as packed:
         for one in members:
@@ -129,9 +123,7 @@ def tar_of(*members: tuple[str, bytes] | tarfile.TarInfo) -> bytes:
         ("scene/1.png", "scene/1.pose.txt"),
     ],
 )
-def test_an_archive_has_the_poses_that_its_folder_has(
-    image: str, pose: str, tmp_path: Path
-) -> None:
+def test_an_archive_has_the_poses_that_its_folder_has(image, pose, tmp_path):
     folder = tmp_path / "packed"
     for one in (image, pose):
         (folder / one).parent.mkdir(parents=True, exist_ok=True)
@@ -147,38 +139,36 @@ def test_an_archive_has_the_poses_that_its_folder_has(
     np.testing.assert_array_equal(pose, of_folder.frames[0].pose)
 
 
-def inflated(data: bytes, most: int = 1 << 30, step: int = 1 << 16) -> bytes:
+def inflated(data, most=1 << 30, step=1 << 16):
     inflater = Inflater(most)
     parts = [p for i in range(0, len(data), step) for p in inflater.pieces(data[i : i + step])]
     return b"".join([*parts, *inflater.end()])
 
 
 @contextmanager
-def looked_into(data: bytes, folder: Path, name: str = "import") -> Iterator[Archive]:
+def looked_into(data, folder, name="import"):
     with open_archive(io.BytesIO(inflated(data)), folder, name) as archive:
         yield archive
 
 
-def said(sequence: FrameSequence, frame: FrameReference, data: bytes) -> tuple[object, ...]:
+def said(sequence, frame, data):
     """All that is known of a frame."""
     pose = None if frame.pose is None else frame.pose.tolist()
     of_all = (sequence.name, sequence.parent_frame, sequence.layout, sequence.split)
     return (*of_all, frame.name, frame.camera, frame.timestamp, pose, data)
 
 
-def told(archive: Archive) -> list[object]:
+def told(archive):
     return [said(s, f, archive.data_of(f)) for s in archive.sequences for f in s.frames]
 
 
-def oracle(folder: Path) -> list[object]:
+def oracle(folder):
     return [said(s, f, f.path.read_bytes()) for s in find_sequences(folder) for f in s.frames]
 
 
 @pytest.mark.parametrize("kind", ["zip", "stored", "tar", "pax", "ustar", "gz", "bz2", "xz"])
 @pytest.mark.parametrize("which", ["kitchen", "desk"])
-def test_it_is_read_as_the_folder_is(
-    kind: str, which: str, kitchen: Path, desk: Path, tmp_path: Path
-) -> None:
+def test_it_is_read_as_the_folder_is(kind, which, kitchen, desk, tmp_path):
     folder = {"kitchen": kitchen, "desk": desk}[which]
     forms = {"pax": tarfile.PAX_FORMAT, "ustar": tarfile.USTAR_FORMAT}
     if kind in ("zip", "stored"):
@@ -195,7 +185,7 @@ def test_it_is_read_as_the_folder_is(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folders_that_are_left_out_are_named(tmp_path: Path) -> None:
+def test_folders_that_are_left_out_are_named(tmp_path):
     scene = tmp_path / "scene"
     for place in ("depth", "ir/deep", "__MACOSX/ir"):
         (scene / place).mkdir(parents=True)
@@ -208,7 +198,7 @@ def test_folders_that_are_left_out_are_named(tmp_path: Path) -> None:
         assert archive.ignored == 2
 
 
-def test_several_streams_and_any_chunks_are_one_tar(kitchen: Path) -> None:
+def test_several_streams_and_any_chunks_are_one_tar(kitchen):
     plain = tarred(kitchen)
     for pack in PACKERS.values():
         data = pack(plain[:5000]) + pack(plain[5000:]) + bytes(8)
@@ -216,7 +206,7 @@ def test_several_streams_and_any_chunks_are_one_tar(kitchen: Path) -> None:
             assert inflated(data, step=step) == plain
 
 
-def test_what_has_no_folder_is_named_by_the_caller(kitchen: Path, tmp_path: Path) -> None:
+def test_what_has_no_folder_is_named_by_the_caller(kitchen, tmp_path):
     members = [(p.name, p.read_bytes()) for p in sorted((kitchen / "seq-01").glob("*.depth.png"))]
     camera = ("intrinsics.json", (kitchen / "intrinsics.json").read_bytes())
     with looked_into(tar_of(camera, *members), tmp_path, "hall") as archive:
@@ -226,7 +216,7 @@ def test_what_has_no_folder_is_named_by_the_caller(kitchen: Path, tmp_path: Path
         assert [(s.name, s.parent_frame) for s in a.sequences] == [("seq-01", "hall")]
 
 
-def test_a_camera_is_not_looked_for_outside_the_archive(kitchen: Path, tmp_path: Path) -> None:
+def test_a_camera_is_not_looked_for_outside_the_archive(kitchen, tmp_path):
     write_intrinsics(tmp_path, CAMERA)  # beside the private folder
     image = (kitchen / "seq-01" / "frame-000000.depth.png").read_bytes()
     with looked_into(tar_of(("a.png", image)), tmp_path) as archive:
@@ -237,9 +227,7 @@ def test_a_camera_is_not_looked_for_outside_the_archive(kitchen: Path, tmp_path:
     assert str(tmp_path) not in reason
 
 
-def test_names_that_lead_elsewhere_are_refused_and_the_rest_is_taken(
-    kitchen: Path, tmp_path: Path
-) -> None:
+def test_names_that_lead_elsewhere_are_refused_and_the_rest_is_taken(kitchen, tmp_path):
     image = (kitchen / "seq-01" / "frame-000000.depth.png").read_bytes()
     camera = (kitchen / "intrinsics.json").read_bytes()
     link, device = tarfile.TarInfo("s/link.png"), tarfile.TarInfo("s/tty.png")
@@ -274,7 +262,7 @@ def test_names_that_lead_elsewhere_are_refused_and_the_rest_is_taken(
     assert {p.name for p in tmp_path.iterdir()} == set()
 
 
-def test_a_full_disk_is_no_fault_of_the_members(kitchen: Path, tmp_path: Path) -> None:
+def test_a_full_disk_is_no_fault_of_the_members(kitchen, tmp_path):
     if subprocess.run(["unshare", "-rm", "true"], capture_output=True).returncode != 0:
         pytest.skip("this machine lets nobody mount anything")
     (tmp_path / "kitchen.zip").write_bytes(zipped(kitchen))
@@ -287,7 +275,7 @@ def test_a_full_disk_is_no_fault_of_the_members(kitchen: Path, tmp_path: Path) -
     assert said == ["No space left on device", "[]"]
 
 
-def test_a_damaged_member_costs_itself_alone(kitchen: Path, tmp_path: Path) -> None:
+def test_a_damaged_member_costs_itself_alone(kitchen, tmp_path):
     data = bytearray(zipped(kitchen, method=zipfile.ZIP_STORED))
     with zipfile.ZipFile(io.BytesIO(data)) as packed:
         places = {i.filename: i.header_offset for i in packed.infolist()}
@@ -306,7 +294,7 @@ def test_a_damaged_member_costs_itself_alone(kitchen: Path, tmp_path: Path) -> N
         assert frames["seq-02/frame-000001"].pose is not None
 
 
-def test_a_sequence_without_a_camera_costs_itself_alone(kitchen: Path, tmp_path: Path) -> None:
+def test_a_sequence_without_a_camera_costs_itself_alone(kitchen, tmp_path):
     scene = tmp_path / "two"
     shutil.copytree(kitchen / "seq-01", scene / "a")
     shutil.copytree(kitchen / "seq-02", scene / "b")
@@ -317,7 +305,7 @@ def test_a_sequence_without_a_camera_costs_itself_alone(kitchen: Path, tmp_path:
         assert [name for name, _ in archive.refused] == ["a"]
 
 
-def test_a_tar_that_ends_early_gives_what_it_has(kitchen: Path, tmp_path: Path) -> None:
+def test_a_tar_that_ends_early_gives_what_it_has(kitchen, tmp_path):
     plain = tarred(kitchen)
     with tarfile.open(fileobj=io.BytesIO(plain)) as packed:
         last = max(i.offset_data for i in packed.getmembers() if i.name.endswith("depth.png"))
@@ -332,7 +320,7 @@ def test_a_tar_that_ends_early_gives_what_it_has(kitchen: Path, tmp_path: Path) 
         assert "the rest cannot be read" in archive.refused[-1][1]
 
 
-def test_encrypted_and_strangely_packed_members_are_told(kitchen: Path, tmp_path: Path) -> None:
+def test_encrypted_and_strangely_packed_members_are_told(kitchen, tmp_path):
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w") as packed:
         packed.write(kitchen / "intrinsics.json", "s/intrinsics.json")
@@ -350,7 +338,7 @@ def test_encrypted_and_strangely_packed_members_are_told(kitchen: Path, tmp_path
             archive.data_of(strange)
 
 
-def test_a_zip_of_64_bits_is_read(kitchen: Path, tmp_path: Path) -> None:
+def test_a_zip_of_64_bits_is_read(kitchen, tmp_path):
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w") as packed:
         for path in sorted(kitchen.rglob("*.*")):
@@ -362,9 +350,7 @@ def test_a_zip_of_64_bits_is_read(kitchen: Path, tmp_path: Path) -> None:
         assert [archive.data_of(f) for s in archive.sequences for f in s.frames] == expected
 
 
-def test_bombs_are_refused_while_they_burst(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bombs_are_refused_while_they_burst(tmp_path, monkeypatch):
     for module in (inflating, archives):  # the same with less to write
         monkeypatch.setattr(module, "FREE", 1 << 20)
     info = tarfile.TarInfo("s/a.npy")
@@ -398,14 +384,14 @@ def test_bombs_are_refused_while_they_burst(
         pass
 
 
-def extended(kind: bytes, content: bytes) -> bytes:
+def extended(kind, content):
     """A header of a tar that tells more of what follows it."""
     info = tarfile.TarInfo("more")
     info.type, info.size = kind, len(content)
     return info.tobuf(tarfile.GNU_FORMAT) + content + bytes(-len(content) % 512)
 
 
-def sparse(blocks: int) -> bytes:
+def sparse(blocks):
     """A member with holes, whose list of them goes on for some blocks."""
     info = tarfile.TarInfo("s/holes.npy")
     info.type = b"S"
@@ -428,15 +414,13 @@ def sparse(blocks: int) -> bytes:
     ],
     ids=["pax", "global", "long name", "chain", "backwards", "holes"],
 )
-def test_headers_of_a_tar_are_bounded(head: bytes, tmp_path: Path) -> None:
+def test_headers_of_a_tar_are_bounded(head, tmp_path):
     sound = tar_of(("s/a.png", b"x"))[:1024]
     with looked_into(sound + head + tar_of(("s/b.png", b"y")), tmp_path) as archive:
         assert archive.refused[0] == ("s/a.png", f"s/a.png: {inflating._DAMAGED}.")
 
 
-def test_a_zip_of_too_many_members_is_refused_before_they_are_read(
-    kitchen: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_zip_of_too_many_members_is_refused_before_they_are_read(kitchen, tmp_path, monkeypatch):
     monkeypatch.setattr(inflating, "MOST_MEMBERS", 14)  # of 16
     with (
         pytest.raises(UnreadableArchive, match="more than 14"),
@@ -445,7 +429,7 @@ def test_a_zip_of_too_many_members_is_refused_before_they_are_read(
         pass
 
 
-def test_names_of_a_zip_that_are_no_utf8_are_read(kitchen: Path, tmp_path: Path) -> None:
+def test_names_of_a_zip_that_are_no_utf8_are_read(kitchen, tmp_path):
     data = zipped(kitchen, method=zipfile.ZIP_STORED).replace(b"kitchen/", b"k\x81tchen/")
     with looked_into(data, tmp_path) as archive:
         assert [s.name for s in archive.sequences] == ["seq-01", "seq-02"]
@@ -470,12 +454,12 @@ def test_names_of_a_zip_that_are_no_utf8_are_read(kitchen: Path, tmp_path: Path)
     ],
     ids=range(10),  # gzip writes the time of the day: not every process would call them alike
 )
-def test_what_is_no_archive_of_frames_says_so(data: bytes, reason: str, tmp_path: Path) -> None:
+def test_what_is_no_archive_of_frames_says_so(data, reason, tmp_path):
     with pytest.raises(UnreadableArchive, match=reason), looked_into(data, tmp_path):
         pass
 
 
-def test_no_mutation_surprises(kitchen: Path, desk: Path, tmp_path: Path) -> None:
+def test_no_mutation_surprises(kitchen, desk, tmp_path):
     seeds = [zipped(kitchen), zipped(desk), tarred(kitchen), tarred(desk, tarfile.PAX_FORMAT)]
     seeds += [gzip.compress(seeds[2]), lzma.compress(seeds[3])]
     draw, refused = random.Random(6), 0

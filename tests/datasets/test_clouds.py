@@ -3,7 +3,6 @@
 import io
 import json
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,11 +26,11 @@ from tests.datasets.shared import pose_at
 POINTS = np.arange(36, dtype=np.float32).reshape(12, 3) / 8
 
 
-def kitti(points: np.ndarray) -> bytes:
+def kitti(points):
     return np.concatenate([points, np.zeros((len(points), 1))], axis=1).astype("<f4").tobytes()
 
 
-def points_of(frame: FrameReference) -> np.ndarray:
+def points_of(frame):
     cloud = frame.read()
     assert isinstance(cloud, Cloud)
     assert cloud.name == frame.name
@@ -39,7 +38,7 @@ def points_of(frame: FrameReference) -> np.ndarray:
 
 
 @pytest.fixture
-def hall(tmp_path: Path) -> Path:
+def hall(tmp_path):
     """Nine scans of two formats and a pose."""
     folder = tmp_path / "hall"
     folder.mkdir()
@@ -51,7 +50,7 @@ def hall(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_folder_of_clouds(hall: Path) -> None:
+def test_a_folder_of_clouds(hall):
     (sequence,) = find_sequences(hall)
     assert (sequence.layout, sequence.name, sequence.parent_frame) == (
         Layout.CLOUDS,
@@ -69,7 +68,7 @@ def test_a_folder_of_clouds(hall: Path) -> None:
         sequence.frames[0].read_depth()
 
 
-def test_one_cloud(hall: Path) -> None:
+def test_one_cloud(hall):
     (sequence,) = find_sequences(hall / "scan-2.ply")
     assert [frame.name for frame in sequence.frames] == ["hall/scan-2"]
     np.testing.assert_array_equal(sequence.frames[0].pose, pose_at(2.0))
@@ -81,7 +80,7 @@ def test_one_cloud(hall: Path) -> None:
         find_sequences(hall / "image.npy")
 
 
-def test_what_clouds_json_says(hall: Path) -> None:
+def test_what_clouds_json_says(hall):
     said = {"viewpoint": {"x": 1, "y": 0, "z": -2.5}, "units_per_metre": 1000}
     (hall / "clouds.json").write_text(json.dumps(said))
     np.save(hall / "scan-4.npy", POINTS)  # of points, beside clouds.json
@@ -102,7 +101,7 @@ def test_what_clouds_json_says(hall: Path) -> None:
         find_sequences(hall)[0].frames[0].read()
 
 
-def test_rows_that_clouds_json_names(tmp_path: Path) -> None:
+def test_rows_that_clouds_json_names(tmp_path):
     rows = np.c_[np.arange(12), POINTS[:, ::-1], np.ones(12)].astype("<f4")
     folder = tmp_path / "drive"
     folder.mkdir()
@@ -148,13 +147,13 @@ def test_rows_that_clouds_json_names(tmp_path: Path) -> None:
         ('{"viewpoint": {"x": 0, "y": 0, "z": 1e999}}', "z is inf"),
     ],
 )
-def test_clouds_json_that_is_none(hall: Path, text: str, message: str) -> None:
+def test_clouds_json_that_is_none(hall, text, message):
     (hall / "clouds.json").write_text(text)
     with pytest.raises(DatasetError, match=rf"clouds\.json: .*{message}"):
         find_sequences(hall)
 
 
-def test_depth_and_clouds_together(hall: Path, tmp_path: Path) -> None:
+def test_depth_and_clouds_together(hall, tmp_path):
     """Images win, as a mesh often lies beside them, unless clouds.json is there."""
     write_depth_png(hall / "scan-1.png", np.ones((3, 4), np.float32), 1000.0)
     with pytest.raises(DatasetError, match=r"no intrinsics\.json"):
@@ -169,7 +168,7 @@ def test_depth_and_clouds_together(hall: Path, tmp_path: Path) -> None:
     assert [s.name for s in find_sequences(scene)] == ["depth"]
 
 
-def test_a_mesh_does_not_hide_the_images_below_it(hall: Path) -> None:
+def test_a_mesh_does_not_hide_the_images_below_it(hall):
     for run, deeper in (("a", ""), ("b", "night")):
         folder = hall / run / deeper
         folder.mkdir(parents=True)
@@ -184,7 +183,7 @@ def test_a_mesh_does_not_hide_the_images_below_it(hall: Path) -> None:
     assert [s.layout for s in find_sequences(hall)] == [Layout.CLOUDS]
 
 
-def test_damaged_clouds_and_names(hall: Path) -> None:
+def test_damaged_clouds_and_names(hall):
     (hall / "scan-1.ply").write_bytes(b"ply\n")
     with pytest.raises(UnreadableCloud, match=r"scan-1\.ply: The PLY header has no end_header"):
         find_sequences(hall)[0].frames[0].read()
@@ -194,7 +193,7 @@ def test_damaged_clouds_and_names(hall: Path) -> None:
         find_sequences(hall)
 
 
-def test_in_an_archive(hall: Path, tmp_path: Path) -> None:
+def test_in_an_archive(hall, tmp_path):
     (hall / "clouds.json").write_text('{"viewpoint": null}')
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -212,12 +211,12 @@ def test_in_an_archive(hall: Path, tmp_path: Path) -> None:
         assert opened.ignored == 1  # the notes
 
 
-def test_a_frame_is_one_or_the_other(hall: Path) -> None:
+def test_a_frame_is_one_or_the_other(hall):
     with pytest.raises(ValueError, match="either a depth image with `camera`"):
         FrameReference("a", hall / "scan-1.ply", None)
 
 
-def test_a_real_hall(data_root: Path) -> None:
+def test_a_real_hall(data_root):
     (sequence,) = find_sequences(data_root / "lidar" / "hall")
     assert len(sequence.frames) == 59
     last = sequence.frames[-1]

@@ -2,7 +2,6 @@
 
 import json
 import tracemalloc
-from pathlib import Path
 
 import pytest
 
@@ -14,18 +13,18 @@ from sceneprint.types import Intrinsics
 GOOD = {"width": 640, "height": 480, "fx": 525, "fy": 526.5, "cx": 319.5, "cy": 239}
 
 
-def write(path: Path, fields: object) -> Path:
+def write(path, fields):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(fields))
     return path
 
 
-def test_the_least_that_is_needed(tmp_path: Path) -> None:
+def test_the_least_that_is_needed(tmp_path):
     camera = read_camera(write(tmp_path / "intrinsics.json", GOOD))
     assert camera == Camera(Intrinsics(640, 480, 525.0, 526.5, 319.5, 239.0), 1000.0, False)
 
 
-def test_a_short_file_takes_no_more_memory_than_it_needs(tmp_path: Path) -> None:
+def test_a_short_file_takes_no_more_memory_than_it_needs(tmp_path):
     """Not the 64 MiB that a trajectory may have."""
     path = tmp_path / "groundtruth.txt"
     path.write_text("1.0 0 0 0 0 0 0 1\n")
@@ -37,7 +36,7 @@ def test_a_short_file_takes_no_more_memory_than_it_needs(tmp_path: Path) -> None
         tracemalloc.stop()
 
 
-def test_all_that_may_be_said(tmp_path: Path) -> None:
+def test_all_that_may_be_said(tmp_path):
     fields = GOOD | {
         "depth_scale": 5000, "distortion": [0.1, -0.2, 0, 1e-3, 4], "depth_along_ray": True,
         "up": [0, -1, 0.001],
@@ -49,7 +48,7 @@ def test_all_that_may_be_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("up", [[0, 0, 9.81], [0, -1], {"x": 0}, [0, "a", 1], 1, [0, 0, True]])
-def test_an_up_that_is_no_direction(up: object, tmp_path: Path) -> None:
+def test_an_up_that_is_no_direction(up, tmp_path):
     path = write(tmp_path / "intrinsics.json", GOOD | {"up": up})
     with pytest.raises(InvalidIntrinsics, match="up is") as caught:
         read_camera(path)
@@ -58,14 +57,14 @@ def test_an_up_that_is_no_direction(up: object, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("k", [(), (0.1, -0.2, 0.3, 1 / 3)])
 @pytest.mark.parametrize("along_ray", [True, False])
-def test_written_is_read(k: tuple[float, ...], along_ray: bool, tmp_path: Path) -> None:
+def test_written_is_read(k, along_ray, tmp_path):
     up = (0.6, -0.8, 0.0) if along_ray else None
     camera = Camera(Intrinsics(64, 48, 52.1, 1 / 3, 0.1, -7.0, k), 1234.5, along_ray, up)
     assert read_camera(write_intrinsics(tmp_path, camera)) == camera
     assert [file.name for file in tmp_path.iterdir()] == ["intrinsics.json"]
 
 
-def test_the_nearest_wins_up_to_four_folders_above(tmp_path: Path) -> None:
+def test_the_nearest_wins_up_to_four_folders_above(tmp_path):
     deep = tmp_path / "a/b/c/d"
     deep.mkdir(parents=True)
     write(tmp_path / "intrinsics.json", GOOD | {"width": 1})
@@ -77,7 +76,7 @@ def test_the_nearest_wins_up_to_four_folders_above(tmp_path: Path) -> None:
     assert find_camera(deep / "..").intrinsics.width == 2
 
 
-def test_none_is_found(tmp_path: Path, monkeypatch) -> None:
+def test_none_is_found(tmp_path, monkeypatch):
     deep = tmp_path / "a/b/c/d/e"
     deep.mkdir(parents=True)
     write(tmp_path / "intrinsics.json", GOOD)  # five above
@@ -125,7 +124,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_files(case: str, tmp_path: Path) -> None:
+def test_bad_files(case, tmp_path):
     content, message = BAD[case]
     path = tmp_path / "intrinsics.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
@@ -135,7 +134,7 @@ def test_bad_files(case: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_no_text_and_too_much(tmp_path: Path) -> None:
+def test_no_text_and_too_much(tmp_path):
     path = tmp_path / "intrinsics.json"
     path.write_bytes(b"\xff\xfe{")
     with pytest.raises(InvalidIntrinsics, match="not UTF-8 text"):

@@ -1,7 +1,5 @@
 """Tests of each layout: frames, order and poses."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ from sceneprint.formats.dataset.sequences import natural
 from tests.datasets.shared import CAMERA, DEPTH, pose_at
 
 
-def tum(folder: Path) -> Path:
+def tum(folder):
     (folder / "depth").mkdir(parents=True)
     (folder / "rgb").mkdir()
     (folder / "rgb/9.0.png").write_bytes(b"colour")
@@ -35,7 +33,7 @@ def tum(folder: Path) -> Path:
     return folder
 
 
-def test_tum(tmp_path: Path) -> None:
+def test_tum(tmp_path):
     (sequence,) = find_sequences(tum(tmp_path / "desk"))
     assert (sequence.layout, sequence.parent_frame) == (Layout.TUM, "desk")
     assert [f.timestamp for f in sequence.frames] == [9.5, 10.02, 10.5]
@@ -47,7 +45,7 @@ def test_tum(tmp_path: Path) -> None:
     np.testing.assert_array_equal(between.read().depth, DEPTH)  # at 5000 units a metre
 
 
-def test_tum_stamps_that_differ_by_rounding_or_a_millisecond(tmp_path: Path) -> None:
+def test_tum_stamps_that_differ_by_rounding_or_a_millisecond(tmp_path):
     folder = tum(tmp_path / "desk")
     rows = "9.501 1 0 0 0 0 0 1\n10.019999 2 0 0 0 0 0 1\n10.9 3 0 0 0 0 0 1\n"
     (folder / "groundtruth.txt").write_text(rows)
@@ -58,7 +56,7 @@ def test_tum_stamps_that_differ_by_rounding_or_a_millisecond(tmp_path: Path) -> 
     )
 
 
-def test_tum_without_poses(tmp_path: Path) -> None:
+def test_tum_without_poses(tmp_path):
     (tum(tmp_path / "desk") / "groundtruth.txt").unlink()
     (sequence,) = find_sequences(tmp_path)
     assert [f.pose for f in sequence.frames] == [None] * 3
@@ -76,7 +74,7 @@ def test_tum_without_poses(tmp_path: Path) -> None:
         ("20.npy", "poses/20.txt"),
     ],
 )
-def test_poses_beside_plain_images(image: str, pose: str, tmp_path: Path) -> None:
+def test_poses_beside_plain_images(image, pose, tmp_path):
     file = tmp_path / "scene" / image
     for name in (image, pose):
         (tmp_path / "scene" / name).parent.mkdir(parents=True, exist_ok=True)
@@ -109,11 +107,11 @@ def test_poses_beside_plain_images(image: str, pose: str, tmp_path: Path) -> Non
         ("color_aligned_depth", False), ("depth_registered", False), ("unmasked", False),
     ],
 )  # fmt: skip
-def test_names_of_what_lies_beside_depth(name: str, *, is_beside: bool) -> None:
+def test_names_of_what_lies_beside_depth(name, *, is_beside):
     assert is_beside_depth(name) is is_beside
 
 
-def test_what_is_left_out_is_named(tmp_path: Path) -> None:
+def test_what_is_left_out_is_named(tmp_path):
     scene = tmp_path / "scene"
     for folder in ("depth", "ir", "aligned_depth_to_color"):
         (scene / folder).mkdir(parents=True)
@@ -133,7 +131,7 @@ def test_what_is_left_out_is_named(tmp_path: Path) -> None:
         find_sequences(scene)
 
 
-def test_folders_below_frames_are_named(tmp_path: Path) -> None:
+def test_folders_below_frames_are_named(tmp_path):
     scene = tmp_path / "scene"
     for place in ("", "more", "ir", "pose"):
         (scene / place).mkdir(exist_ok=True, parents=True)
@@ -161,7 +159,7 @@ def test_folders_below_frames_are_named(tmp_path: Path) -> None:
         ("1 depth/9.5.png\n2 depth/9.5.png", "same name"),
     ],
 )
-def test_bad_lists(line: str, message: str, tmp_path: Path) -> None:
+def test_bad_lists(line, message, tmp_path):
     folder = tum(tmp_path / "desk")
     (tmp_path / "secret.png").write_bytes(b"secret")
     (folder / "depth.txt").write_text(line + "\n")
@@ -169,7 +167,7 @@ def test_bad_lists(line: str, message: str, tmp_path: Path) -> None:
         find_sequences(folder)
 
 
-def test_a_plain_folder_in_natural_order(tmp_path: Path) -> None:
+def test_a_plain_folder_in_natural_order(tmp_path):
     for name in ("d10.png", "d9.png", "d1.PNG"):
         write_depth_png(tmp_path / name, DEPTH, 1000.0)
     np.save(tmp_path / "d2.npy", DEPTH)
@@ -185,13 +183,13 @@ def test_a_plain_folder_in_natural_order(tmp_path: Path) -> None:
         assert reference.pose is None
 
 
-def test_natural_order() -> None:
+def test_natural_order():
     names = ["a10", "a9", "a", "10", "9", "a01", "a1", "b²", "b", "a1b2", "a1b10", "9" * 5000]
     expected = ["9", "10", "9" * 5000, "a", "a01", "a1", "a1b2", "a1b10", "a9", "a10", "b", "b²"]
     assert sorted(names, key=natural) == expected
 
 
-def test_a_file_of_two_kinds_has_one_name(tmp_path: Path) -> None:
+def test_a_file_of_two_kinds_has_one_name(tmp_path):
     write_intrinsics(tmp_path, CAMERA)
     np.save(tmp_path / "a.npy", DEPTH)
     write_depth_png(tmp_path / "a.png", DEPTH, 1000.0)

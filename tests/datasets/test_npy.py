@@ -17,13 +17,13 @@ CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
 METRES = np.array([[0, 0.001, 1, 0], [1.234, 65.534, 0.002, 0.003], [0.5, 0.501, 0.502, 0.503]])
 
 
-def npy(array: np.ndarray, **options) -> bytes:
+def npy(array, **options):
     buffer = io.BytesIO()
     np.save(buffer, array, **options)
     return buffer.getvalue()
 
 
-def npy_with(header: str, data: bytes = b"", version: int = 1) -> bytes:
+def npy_with(header, data=b"", version=1):
     text = header.encode()
     size = struct.pack("<H" if version == 1 else "<I", len(text))
     return b"\x93NUMPY" + bytes([version, 0]) + size + text + data
@@ -34,7 +34,7 @@ GOOD_NPY = npy(METRES.astype(np.float32))
 
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("dtype", ["<f4", ">f4", "<f8", "<f2"])
-def test_npy(order: str, dtype: str) -> None:
+def test_npy(order, dtype):
     array = np.asarray(np.array([[1.5, np.nan, 2], [0.25, np.inf, 4]]), dtype=dtype, order=order)
     decoded = decode_npy(npy(array))
     np.testing.assert_array_equal(decoded, [[1.5, np.nan, 2], [0.25, np.inf, 4]])
@@ -44,7 +44,7 @@ def test_npy(order: str, dtype: str) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["<u2", ">u2"])
-def test_npy_of_stored_units_is_read_as_a_png(dtype: str) -> None:
+def test_npy_of_stored_units_is_read_as_a_png(dtype):
     array = np.array([[0, 1500, 65535], [2000, 1, 4]], dtype)
     decoded = decode_npy(npy(array))
     assert decoded.dtype == np.uint16
@@ -54,7 +54,7 @@ def test_npy_of_stored_units_is_read_as_a_png(dtype: str) -> None:
     np.testing.assert_allclose(depth, [[0, 1.5, 0], [2, 0.001, 0.004]], rtol=1e-6)
 
 
-def test_npy_of_later_versions() -> None:
+def test_npy_of_later_versions():
     data = np.array([[1, 2]], "<f4").tobytes()
     header = "{'descr': '<f4', 'fortran_order': False, 'shape': (1, 2), }\n"
     for version in (1, 2, 3):
@@ -119,13 +119,13 @@ BAD_NPY = {
 
 
 @pytest.mark.parametrize("case", BAD_NPY)
-def test_bad_npy(case: str) -> None:
+def test_bad_npy(case):
     data, message = BAD_NPY[case]
     with pytest.raises(UnreadableFrame, match=message):
         decode_npy(data)
 
 
-def test_mutations() -> None:
+def test_mutations():
     frames = errors = 0
     for data in (GOOD_NPY, npy(METRES), npy(np.asfortranarray(METRES))):
         for mutated in mutations(data, 700):
@@ -137,5 +137,5 @@ def test_mutations() -> None:
 
 @settings(max_examples=100)
 @given(st.binary(max_size=300), st.sampled_from([b"", GOOD_NPY[:8], GOOD_NPY[:10], GOOD_NPY[:128]]))
-def test_any_bytes(data: bytes, start: bytes) -> None:
+def test_any_bytes(data, start):
     frame_or_error(decode_npy, start + data, CAMERA)

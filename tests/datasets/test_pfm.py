@@ -1,7 +1,5 @@
 """Tests of depth images in PFM against the description of the format."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -14,19 +12,19 @@ from sceneprint.types import Intrinsics
 METRES = np.array([[1, 2, 0], [3.5, np.inf, np.nan]], np.float32)
 
 
-def pfm(order: str = "<", header: str = "Pf\n3 2\n{}1.000000\n") -> bytes:
+def pfm(order="<", header="Pf\n3 2\n{}1.000000\n"):
     head = header.format("-" if order == "<" else "").encode()
     return head + METRES[::-1].astype(order + "f4").tobytes()
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_pfm(order: str) -> None:
+def test_pfm(order):
     assert size_of(pfm(order)[:20]) == (3, 2)
     frame = decode_frame(pfm(order), Intrinsics(3, 2, 5.0, 5.0, 1.0, 0.5))
     np.testing.assert_array_equal(frame.depth, [[1, 2, 0], [3.5, 0, 0]])
 
 
-def test_its_scale_makes_metres() -> None:
+def test_its_scale_makes_metres():
     data = pfm(header="Pf 3 2\r\n{}.5e-1\n")
     frame = decode_frame(data, Intrinsics(3, 2, 5.0, 5.0, 1.0, 0.5))
     np.testing.assert_allclose(frame.depth, [[0.05, 0.1, 0], [0.175, 0, 0]], rtol=1e-6)
@@ -45,12 +43,12 @@ def test_its_scale_makes_metres() -> None:
         (pfm(header="PF\n3 2\n-1\n"), "none of PNG"),
     ],
 )
-def test_lies(data: bytes, message: str) -> None:
+def test_lies(data, message):
     with pytest.raises(UnreadableFrame, match=message):
         decode_frame(data, Intrinsics(3, 2, 5.0, 5.0, 1.0, 0.5))
 
 
-def test_a_folder_of_them_is_a_sequence(tmp_path: Path) -> None:
+def test_a_folder_of_them_is_a_sequence(tmp_path):
     (tmp_path / "a.pfm").write_bytes(pfm())
     (tmp_path / "intrinsics.json").write_text(
         '{"width": 3, "height": 2, "fx": 5, "fy": 5, "cx": 1, "cy": 0.5}'

@@ -11,7 +11,7 @@ from sceneprint.types import Intrinsics
 RANDOM = np.random.default_rng(11)
 
 
-def room(noise: float = 0.002, width: int = 320, height: int = 240) -> np.ndarray:
+def room(noise=0.002, width=320, height=240):
     """A slanted wall behind a ball, with holes: (H, W) millimetres."""
     v, u = np.mgrid[:height, :width] / height
     depth = 1500.0 + 900.0 * u + 400.0 * v
@@ -23,11 +23,11 @@ def room(noise: float = 0.002, width: int = 320, height: int = 240) -> np.ndarra
     return depth.astype(np.uint16)
 
 
-def rotated_left(samples: np.ndarray, bits: int) -> np.ndarray:
+def rotated_left(samples, bits):
     return (samples << bits) | (samples >> (16 - bits))
 
 
-def decode(samples: np.ndarray, depth_scale: float = 1000.0) -> np.ndarray:
+def decode(samples, depth_scale=1000.0):
     height, width = samples.shape
     data = encode_png(samples) if samples.dtype == np.uint16 else encode_npy(samples)
     camera = Intrinsics(width, height, 300.0, 300.0, width / 2, height / 2)
@@ -47,24 +47,24 @@ DEPTH = {
 
 
 @pytest.mark.parametrize("kind", DEPTH)
-def test_depth_is_taken(kind: str) -> None:
+def test_depth_is_taken(kind):
     assert (decode(DEPTH[kind]) > 0).mean() > 0.08
 
 
 @pytest.mark.parametrize("kind", ["clean", "of a Kinect", "of 80 x 60"])
-def test_swapped_bytes_are_refused(kind: str) -> None:
+def test_swapped_bytes_are_refused(kind):
     with pytest.raises(UnreadableFrame, match=r"wrong byte order.*samples\.byteswap\(\)"):
         decode(DEPTH[kind].byteswap())
     np.testing.assert_array_equal(decode(DEPTH[kind].byteswap().byteswap()), decode(DEPTH[kind]))
 
 
 @pytest.mark.parametrize("bits", [3, 5])
-def test_bits_rotated_right_are_refused(bits: int) -> None:
+def test_bits_rotated_right_are_refused(bits):
     with pytest.raises(UnreadableFrame, match=rf"Write d << {bits} \| d >> {16 - bits} for"):
         decode(rotated_left(room(), 16 - bits))
 
 
-def test_bits_rotated_left_are_refused_unless_the_scale_is_of_them() -> None:
+def test_bits_rotated_left_are_refused_unless_the_scale_is_of_them():
     samples = room()
     with pytest.raises(UnreadableFrame, match=r"d >> 3 \| d << 13 .* set depth_scale to 8000"):
         decode(rotated_left(samples, 3))
@@ -73,7 +73,7 @@ def test_bits_rotated_left_are_refused_unless_the_scale_is_of_them() -> None:
     np.testing.assert_allclose(eighths[seen], decode(samples)[seen], rtol=1e-6)
 
 
-def test_infrared_is_refused() -> None:
+def test_infrared_is_refused():
     speckle = 2000.0 * RANDOM.gamma(60.0, 1 / 60.0, (240, 320))  # 13 % of noise
     for samples in (speckle.astype(np.uint16), (speckle / 1000).astype(np.float32)):
         with pytest.raises(

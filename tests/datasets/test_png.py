@@ -20,21 +20,18 @@ CAMERA = Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0)
 SAMPLES = np.array([[0, 1, 1000, 65535], [1234, 65534, 2, 3], [500, 501, 502, 503]], np.uint16)
 
 
-def pillow_png(samples: np.ndarray, **options) -> bytes:
+def pillow_png(samples, **options):
     buffer = io.BytesIO()
     Image.fromarray(samples).save(buffer, "PNG", **options)
     return buffer.getvalue()
 
 
-def chunk(kind: bytes, content: bytes = b"") -> bytes:
+def chunk(kind, content=b""):
     crc = zlib.crc32(kind + content)
     return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
 
 
-def raw_png(
-    width: int, height: int, rows: bytes, *, bits: int = 16, colour: int = 0, interlace: int = 0,
-    before: bytes = b"", after: bytes = b"",
-) -> bytes:  # fmt: skip
+def raw_png(width, height, rows, *, bits=16, colour=0, interlace=0, before=b"", after=b""):
     header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, interlace)
     return b"".join([
         PNG_SIGNATURE, chunk(b"IHDR", header), before, chunk(b"IDAT", zlib.compress(rows)), after,
@@ -42,14 +39,14 @@ def raw_png(
     ])  # fmt: skip
 
 
-def rows_of(samples: np.ndarray) -> bytes:
+def rows_of(samples):
     return b"".join(b"\0" + row.astype(">u2").tobytes() for row in samples)
 
 
 GOOD_PNG = pillow_png(SAMPLES)
 
 
-def test_png_by_pillow_and_by_hand() -> None:
+def test_png_by_pillow_and_by_hand():
     np.testing.assert_array_equal(decode_png(GOOD_PNG), SAMPLES)
     np.testing.assert_array_equal(decode_png(raw_png(4, 3, rows_of(SAMPLES))), SAMPLES)
     assert decode_png(GOOD_PNG).dtype == np.uint16
@@ -59,7 +56,7 @@ def test_png_by_pillow_and_by_hand() -> None:
     np.testing.assert_array_equal(decode_png(pillow_png(smooth)), smooth)  # filters at work
 
 
-def test_png_of_many_data_chunks_and_trailing_bytes() -> None:
+def test_png_of_many_data_chunks_and_trailing_bytes():
     data = zlib.compress(rows_of(SAMPLES))
     header = struct.pack(">IIBBBBB", 4, 3, 16, 0, 0, 0, 0)
     pieces = b"".join(chunk(b"IDAT", data[i : i + 1]) for i in range(len(data)))
@@ -68,7 +65,7 @@ def test_png_of_many_data_chunks_and_trailing_bytes() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 4), (5, 2), (8, 8), (13, 21)])
-def test_interlaced_png(shape: tuple[int, int]) -> None:
+def test_interlaced_png(shape):
     samples = np.random.default_rng(1).integers(0, 65536, shape, dtype=np.uint16)
     rows = b""
     for column, row, across, down in ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4),
@@ -79,7 +76,7 @@ def test_interlaced_png(shape: tuple[int, int]) -> None:
     np.testing.assert_array_equal(decoded, samples)
 
 
-def test_text_and_profiles_are_not_even_unpacked() -> None:
+def test_text_and_profiles_are_not_even_unpacked():
     bomb = zlib.compress(b"\0" * 50_000_000, 9)
     before = (
         chunk(b"zTXt", b"Comment\0\0" + bomb)
@@ -93,7 +90,7 @@ def test_text_and_profiles_are_not_even_unpacked() -> None:
     np.testing.assert_array_equal(decode_png(data), SAMPLES)
 
 
-def test_the_largest_image_is_read() -> None:
+def test_the_largest_image_is_read():
     side = int(MAXIMUM_SAMPLES**0.5)
     rows = (b"\0" + b"\x03\xe8" * side) * side
     assert (decode_png(raw_png(side, side, rows)) == 1000).all()
@@ -149,13 +146,13 @@ BAD_PNG = {
 
 
 @pytest.mark.parametrize("case", BAD_PNG)
-def test_bad_png(case: str) -> None:
+def test_bad_png(case):
     data, message = BAD_PNG[case]
     with pytest.raises(UnreadableFrame, match=message):
         decode_png(data)
 
 
-def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
+def test_truncated_png_whatever_the_program_told_pillow(monkeypatch):
     monkeypatch.setattr(ImageFile, "LOAD_TRUNCATED_IMAGES", True)
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100_000)
     for case in ("fewer rows than declared", "truncated in the data", "bomb by its header"):
@@ -165,7 +162,7 @@ def test_truncated_png_whatever_the_program_told_pillow(monkeypatch) -> None:
     np.testing.assert_array_equal(decode_png(GOOD_PNG), SAMPLES)
 
 
-def repaired(data: bytes) -> bytes:
+def repaired(data):
     """The same PNG with right checksums, so that damage reaches what lies behind them."""
     out, position = data[:8], 8
     while position + 12 <= len(data):
@@ -176,7 +173,7 @@ def repaired(data: bytes) -> bytes:
     return out
 
 
-def test_mutations() -> None:
+def test_mutations():
     frames = errors = 0
     text = raw_png(4, 3, rows_of(SAMPLES), before=chunk(b"tEXt", b"a\0b"))
     for data in (GOOD_PNG, text):
@@ -192,7 +189,7 @@ def test_mutations() -> None:
 
 @settings(max_examples=100)
 @given(st.binary(max_size=300), st.sampled_from([b"", PNG_SIGNATURE, GOOD_PNG[:33]]))
-def test_any_bytes(data: bytes, start: bytes) -> None:
+def test_any_bytes(data, start):
     frame_or_error(decode_png, start + data, CAMERA)
     frame_or_error(decode_png, repaired(start + data), CAMERA)
 
@@ -205,23 +202,21 @@ def test_any_bytes(data: bytes, start: bytes) -> None:
     st.sampled_from([0, 0, 0, 2, 3, 4, 6]),
     st.integers(0, 1),
 )
-def test_any_pixels(
-    size: tuple[int, int], rows: bytes, bits: int, colour: int, interlace: int
-) -> None:
+def test_any_pixels(size, rows, bits, colour, interlace):
     frame_or_error(
         decode_png, raw_png(*size, rows, bits=bits, colour=colour, interlace=interlace), CAMERA
     )
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (7, 1), (60, 80)])
-def test_what_is_encoded_is_a_png_for_everybody(shape: tuple[int, int]) -> None:
+def test_what_is_encoded_is_a_png_for_everybody(shape):
     samples = np.random.default_rng(0).integers(0, 65_536, shape).astype(np.uint16)
     data = encode_png(samples)
     np.testing.assert_array_equal(decode_png(data), samples)
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), samples)
 
 
-def test_a_compressed_depth_message_of_ros() -> None:
+def test_a_compressed_depth_message_of_ros():
     """A header of 12 bytes before the PNG: its size is told, and its samples are read."""
     samples = np.arange(1, 49, dtype=np.uint16).reshape(6, 8)
     camera = Intrinsics(8, 6, 10, 10, 4, 3)

@@ -1,7 +1,6 @@
 """Tests of poses: values, round trips, and invalid files."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from sceneprint.formats.dataset import (
 HALF = math.sqrt(0.5)
 
 
-def pose_of(rotation: Rotation, position: tuple[float, float, float]) -> np.ndarray:
+def pose_of(rotation, position):
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.as_matrix(), position
     return pose
@@ -29,20 +28,20 @@ def pose_of(rotation: Rotation, position: tuple[float, float, float]) -> np.ndar
 POSE = pose_of(Rotation.from_rotvec([0.3, -1.1, 0.7]), (1 / 3, -2e5, 1e-9))
 
 
-def test_written_is_read(tmp_path: Path) -> None:
+def test_written_is_read(tmp_path):
     write_pose(tmp_path / "a.txt", POSE)
     np.testing.assert_allclose(read_pose(tmp_path / "a.txt"), POSE, rtol=0, atol=2e-15)
     np.testing.assert_array_equal(read_pose(tmp_path / "a.txt")[:3, 3], POSE[:3, 3])
 
 
-def test_seven_scenes_text_by_hand(tmp_path: Path) -> None:
+def test_seven_scenes_text_by_hand(tmp_path):
     path = tmp_path / "frame-000000.pose.txt"
     path.write_text(" 0 -1 0\t1.5 \n1 0 0 2\n 0.000e+00 0 1 -3\r\n0 0 0 1\n\n")
     expected = [[0, -1, 0, 1.5], [1, 0, 0, 2], [0, 0, 1, -3], [0, 0, 0, 1]]
     np.testing.assert_allclose(read_pose(path), expected, atol=1e-13)
 
 
-def test_a_rounded_rotation_becomes_the_nearest_true_one() -> None:
+def test_a_rounded_rotation_becomes_the_nearest_true_one():
     rough = np.round(POSE, 3)
     exact = rigid_transform(rough)
     rotation = exact[:3, :3]
@@ -74,7 +73,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("text", BAD)
-def test_bad_pose_files(text: str, tmp_path: Path) -> None:
+def test_bad_pose_files(text, tmp_path):
     path = tmp_path / "frame-000007.pose.txt"
     path.write_text(text)
     with pytest.raises(InvalidPose, match=r"frame-000007\.pose\.txt: .*" + BAD[text]) as caught:
@@ -82,7 +81,7 @@ def test_bad_pose_files(text: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_no_pose_file(tmp_path: Path) -> None:
+def test_no_pose_file(tmp_path):
     with pytest.raises(InvalidPose, match=r"a\.txt: .*No such file"):
         read_pose(tmp_path / "a.txt")
     (tmp_path / "b.txt").write_bytes(b"\x00\xff\x89")
@@ -91,12 +90,12 @@ def test_no_pose_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("matrix", [np.eye(3), np.ones(16), [["a"] * 4] * 4, [[1], [2, 3]], None])
-def test_bad_matrices(matrix) -> None:
+def test_bad_matrices(matrix):
     with pytest.raises(InvalidPose):
         rigid_transform(matrix)
 
 
-def test_only_whole_poses_are_written(tmp_path: Path) -> None:
+def test_only_whole_poses_are_written(tmp_path):
     with pytest.raises(InvalidPose):
         write_pose(tmp_path / "a.txt", np.zeros((4, 4)))
     assert list(tmp_path.iterdir()) == []
@@ -105,7 +104,7 @@ def test_only_whole_poses_are_written(tmp_path: Path) -> None:
 # ---- trajectories
 
 
-def test_slerp_by_hand() -> None:
+def test_slerp_by_hand():
     # 90 deg about z within 1 s; a third of the way is 30 deg
     trajectory = SensorTrajectory(
         np.array([10.0, 11.0]),
@@ -123,7 +122,7 @@ def test_slerp_by_hand() -> None:
     )
 
 
-def test_quaternion_order_by_hand(tmp_path: Path) -> None:
+def test_quaternion_order_by_hand(tmp_path):
     path = tmp_path / "groundtruth.txt"
     path.write_text("# t tx ty tz qx qy qz qw\n1.0 1 2 3 1 0 0 0\n")  # half a turn about x
     (pose,) = interpolate(read_trajectory(path), [1.0])
@@ -132,7 +131,7 @@ def test_quaternion_order_by_hand(tmp_path: Path) -> None:
     )
 
 
-def test_interpolation_equals_scipy() -> None:
+def test_interpolation_equals_scipy():
     random = np.random.default_rng(5)
     stamps = np.cumsum(random.uniform(0.01, 0.09, 40)) + 1.3e9
     rotations = Rotation.random(40, random)
@@ -147,7 +146,7 @@ def test_interpolation_equals_scipy() -> None:
         np.testing.assert_allclose(rigid_transform(pose), pose, atol=1e-14)
 
 
-def test_nothing_is_made_up() -> None:
+def test_nothing_is_made_up():
     one = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
     trajectory = SensorTrajectory(np.array([1.0, 1.05, 2.0, 2.05]), np.eye(4)[:, :3], one)
     stamps = [0.99, 1.0, 1.02, 1.05, 1.06, 1.99, 2.0, 2.05, 2.06, math.nan]
@@ -158,7 +157,7 @@ def test_nothing_is_made_up() -> None:
     assert interpolate(trajectory, []) == []
 
 
-def test_a_near_pose_stands_where_nothing_is_interpolated() -> None:
+def test_a_near_pose_stands_where_nothing_is_interpolated():
     one = np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
     positions = np.array([[1.0, 0, 0], [2.0, 0, 0], [4.0, 0, 0]])
     trajectory = SensorTrajectory(np.array([1.0, 1.03, 2.0]), positions, one)
@@ -168,7 +167,7 @@ def test_a_near_pose_stands_where_nothing_is_interpolated() -> None:
     assert found == [None, 1.0, 1.5, 2.0, None, 4.0, 4.0, 4.0, None, None]
 
 
-def test_trajectory_files(tmp_path: Path) -> None:
+def test_trajectory_files(tmp_path):
     path = tmp_path / "groundtruth.txt"
     path.write_text("# a\n\n2.5 4 5 6 0 0 0.7071 0.7071\n1.5 1 2 3 0 0 0 1\n1.5 9 9 9 0 0 0 1\n")
     trajectory = read_trajectory(path)
@@ -189,7 +188,7 @@ def test_trajectory_files(tmp_path: Path) -> None:
         ("# only comments", "has no pose"),
     ],
 )
-def test_bad_trajectories(line: str, message: str, tmp_path: Path) -> None:
+def test_bad_trajectories(line, message, tmp_path):
     path = tmp_path / "groundtruth.txt"
     good = "" if line.startswith("#") else "2 1 2 3 0 0 0 1\n"
     path.write_text(f"# comment\n{line}\n{good}")

@@ -8,7 +8,7 @@ from sceneprint.formats.dataset import Layout, find_sequences
 from sceneprint.types import DepthFrame
 
 
-def agreement(a: DepthFrame, b: DepthFrame) -> float:
+def agreement(a, b):
     """Share of the samples of a that land in b within 5 cm + 3 % of its depth."""
     c, v, u = a.intrinsics, *np.indices(a.depth.shape)[:, ::10, ::10]
     z = a.depth[v, u].astype(np.float64)
@@ -21,7 +21,7 @@ def agreement(a: DepthFrame, b: DepthFrame) -> float:
     return float(near.sum() / max((seen > 0).sum(), 1))
 
 
-def test_all_are_found_from_above(data_root: Path) -> None:
+def test_all_are_found_from_above(data_root):
     found = {s.name: s for s in find_sequences(data_root)}
     kitchen = found["7scenes/redkitchen/seq-01"]
     assert (kitchen.layout, kitchen.parent_frame) == (Layout.SEVEN_SCENES, "redkitchen")
@@ -32,13 +32,13 @@ def test_all_are_found_from_above(data_root: Path) -> None:
     assert found["sun3d/studyroom2"].parent_frame == "sun3d/studyroom2"
 
 
-def test_listing_reads_no_frame_and_no_pose(data_root: Path) -> None:
+def test_listing_reads_no_frame_and_no_pose(data_root):
     (sequence,) = find_sequences(data_root / "7scenes/redkitchen/seq-01")
     assert len(sequence.frames) == 1000
     assert all(isinstance(frame.pose_source, Path) for frame in sequence.frames)
 
 
-def test_poses_and_depth_agree(data_root: Path) -> None:
+def test_poses_and_depth_agree(data_root):
     """Frames a moment apart see the same surfaces where depth, camera and pose are right."""
     for path, i, j in (
         ("7scenes/redkitchen", 100, 110),
@@ -54,7 +54,7 @@ def test_poses_and_depth_agree(data_root: Path) -> None:
         assert agreement(*turned) < 0.7, path
 
 
-def test_depth_is_in_metres(data_root: Path) -> None:
+def test_depth_is_in_metres(data_root):
     for path, least, most in (("7scenes", 0.4, 6.0), ("sun3d", 0.4, 9.0), ("tum", 0.3, 8.0)):
         (sequence,) = find_sequences(data_root / path)
         frame = sequence.frames[50].read()
@@ -64,7 +64,7 @@ def test_depth_is_in_metres(data_root: Path) -> None:
         assert np.percentile(valid, 99) < most
 
 
-def test_nearly_every_frame_of_tum_has_a_pose(data_root: Path) -> None:
+def test_nearly_every_frame_of_tum_has_a_pose(data_root):
     (sequence,) = find_sequences(data_root / "tum/fr1_rpy")
     assert sum(frame.pose is None for frame in sequence.frames) <= 5
     for frame in sequence.frames[100:110]:

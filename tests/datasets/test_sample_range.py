@@ -1,7 +1,5 @@
 """Tests of the range of samples in uploads."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -13,11 +11,11 @@ from sceneprint_client.api.frames import SampleRange, pooled_range, upload_summa
 REAL = [(0.95, 1.82, 2.79), (0.8, 1.05, 3.01), (1.6, 2.8, 4.09), (0.65, 1.18, 6.45)]
 
 
-def of(near: float, median: float, far: float, valid: float | None = 0.875) -> SampleRange:
+def of(near, median, far, valid=0.875):
     return SampleRange(near=near, median=median, far=far, count=100, valid=valid)
 
 
-def test_the_range_of_depth_leaves_missing_pixels_out() -> None:
+def test_the_range_of_depth_leaves_missing_pixels_out():
     depth = np.zeros((25, 8), np.float32)
     depth.flat[:101] = np.arange(0, 101) / 10  # the first is missing: 0.1 to 10 m
     found = sample_range(DepthFrame(depth, Intrinsics(8, 25, 9, 9, 4, 12)))
@@ -25,7 +23,7 @@ def test_the_range_of_depth_leaves_missing_pixels_out() -> None:
     assert [found.near, found.median, found.far] == pytest.approx([0.595, 5.05, 9.505])
 
 
-def test_the_range_of_large_images_is_of_some_of_their_samples() -> None:
+def test_the_range_of_large_images_is_of_some_of_their_samples():
     depth = np.full((480, 640), 2.0, np.float32)
     depth[:, :64] = 0.0
     lens = Intrinsics(640, 480, 500, 500, 320, 240)
@@ -36,7 +34,7 @@ def test_the_range_of_large_images_is_of_some_of_their_samples() -> None:
     assert sample_range(DepthFrame(alone, lens)).median == 3.0
 
 
-def test_the_range_of_points_is_their_distance_from_the_sensor() -> None:
+def test_the_range_of_points_is_their_distance_from_the_sensor():
     points = np.zeros((101, 3), np.float32)
     points[:, 1] = -np.arange(101)
     found = sample_range(Cloud(points))
@@ -44,14 +42,14 @@ def test_the_range_of_points_is_their_distance_from_the_sensor() -> None:
 
 
 @pytest.mark.parametrize(("near", "median", "far"), REAL)
-def test_a_range_is_doubted_where_the_unit_is_wrong(near: float, median: float, far: float) -> None:
+def test_a_range_is_doubted_where_the_unit_is_wrong(near, median, far):
     assert not of(near, median, far).is_doubtful
     for scale in (4.0, 5.0, 10.0, 0.1):  # 0.25 mm, TUM's, 0.1 mm, and centimetres for millimetres
         assert of(scale * near, scale * median, scale * far).is_doubtful
     assert not of(10 * near, 10 * median, 10 * far, valid=None).is_doubtful  # of a scanner
 
 
-def test_a_summary_is_one_line() -> None:
+def test_a_summary_is_one_line():
     ranges = [of(0.6, 1.5, 4.0), of(0.7, 1.6, 4.2), of(0.8, 1.9, 9.0), of(1.0, 5.0, 30.0, None)]
     why = "no sample within 20 ms (nearest 1.2 s)"
     summary = upload_summary(50, {why: 9}, ranges, ["skipped: run/ir (infrared)"])

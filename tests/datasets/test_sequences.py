@@ -1,7 +1,6 @@
 """Tests that written folders are recognised, and that invalid folders raise errors."""
 
 import os
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from sceneprint.errors import DatasetError, InvalidIntrinsics, InvalidPose, UnreadableFrame
 from sceneprint.formats.dataset import (
     Camera,
-    FrameSequence,
     Layout,
     find_sequences,
     sequences,
@@ -23,7 +21,7 @@ from sceneprint.types import Intrinsics
 from tests.datasets.shared import CAMERA, DEPTH, pose_at
 
 
-def seven_scenes(folder: Path, frames: int = 2) -> Path:
+def seven_scenes(folder, frames=2):
     folder.mkdir(parents=True)
     for i in range(frames):
         write_depth_png(folder / f"frame-{i:06d}.depth.png", DEPTH + np.float32(i), 1000.0)
@@ -33,7 +31,7 @@ def seven_scenes(folder: Path, frames: int = 2) -> Path:
 
 
 @pytest.fixture
-def kitchen(tmp_path: Path) -> Path:
+def kitchen(tmp_path):
     scene = tmp_path / "kitchen"
     for number in (1, 2, 10):
         seven_scenes(scene / f"seq-{number:02d}")
@@ -44,7 +42,7 @@ def kitchen(tmp_path: Path) -> Path:
     return scene
 
 
-def test_a_scene(kitchen: Path) -> None:
+def test_a_scene(kitchen):
     found = find_sequences(kitchen)
     assert [s.name for s in found] == ["seq-01", "seq-02", "seq-10"]
     assert [s.split for s in found] == ["train", "test", "train"]
@@ -59,7 +57,7 @@ def test_a_scene(kitchen: Path) -> None:
     assert found[1].frames[1].timestamp is None
 
 
-def test_a_camera_that_is_given_stands_in_for_a_missing_one_alone(kitchen: Path) -> None:
+def test_a_camera_that_is_given_stands_in_for_a_missing_one_alone(kitchen):
     given = Camera(Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0))
     assert {f.camera for s in find_sequences(kitchen, camera=given) for f in s.frames} == {CAMERA}
     (kitchen / "intrinsics.json").unlink()
@@ -69,7 +67,7 @@ def test_a_camera_that_is_given_stands_in_for_a_missing_one_alone(kitchen: Path)
         find_sequences(kitchen, camera=given)
 
 
-def test_a_folder_of_scenes(kitchen: Path) -> None:
+def test_a_folder_of_scenes(kitchen):
     root = kitchen.parent
     write_intrinsics(seven_scenes(root / "desk"), CAMERA)
     (root / "empty/rgb").mkdir(parents=True)
@@ -81,7 +79,7 @@ def test_a_folder_of_scenes(kitchen: Path) -> None:
     assert find_sequences(root)[2].frames[0].name == "kitchen/seq-02/frame-000000"
 
 
-def test_one_sequence_of_a_scene(kitchen: Path, monkeypatch) -> None:
+def test_one_sequence_of_a_scene(kitchen, monkeypatch):
     monkeypatch.chdir(kitchen / "seq-02")
     for path in (kitchen / "seq-02", Path(), Path("../seq-02")):
         (sequence,) = find_sequences(path)
@@ -90,7 +88,7 @@ def test_one_sequence_of_a_scene(kitchen: Path, monkeypatch) -> None:
         )  # fmt: skip
 
 
-def test_frames_in_the_folder_of_the_scene(tmp_path: Path) -> None:
+def test_frames_in_the_folder_of_the_scene(tmp_path):
     folder = seven_scenes(tmp_path / "studyroom")
     write_intrinsics(folder, CAMERA)
     (sequence,) = find_sequences(folder)
@@ -99,7 +97,7 @@ def test_frames_in_the_folder_of_the_scene(tmp_path: Path) -> None:
     )  # fmt: skip
 
 
-def test_a_pose_is_read_when_asked_for(kitchen: Path) -> None:
+def test_a_pose_is_read_when_asked_for(kitchen):
     (kitchen / "seq-01/frame-000000.pose.txt").unlink()
     (kitchen / "seq-01/frame-000001.pose.txt").write_text("nan " * 16)
     first, second = find_sequences(kitchen / "seq-01")[0].frames
@@ -110,7 +108,7 @@ def test_a_pose_is_read_when_asked_for(kitchen: Path) -> None:
             read()
 
 
-def test_a_single_file(kitchen: Path) -> None:
+def test_a_single_file(kitchen):
     (sequence,) = find_sequences(kitchen / "seq-02/frame-000001.depth.png")
     assert (sequence.name, sequence.parent_frame, sequence.split) == ("seq-02", "kitchen", "test")
     (reference,) = sequence.frames
@@ -126,27 +124,27 @@ def test_a_single_file(kitchen: Path) -> None:
         sequence.frames[0].read()
 
 
-def test_nothing_there(tmp_path: Path) -> None:
+def test_nothing_there(tmp_path):
     with pytest.raises(DatasetError, match=r"absent: The file or folder does not exist"):
         find_sequences(tmp_path / "absent")
     with pytest.raises(DatasetError, match=r"no depth image .*7-Scenes .*TUM .*NPY"):
         find_sequences(tmp_path)
 
 
-def test_depth_without_a_camera(tmp_path: Path) -> None:
+def test_depth_without_a_camera(tmp_path):
     folder = seven_scenes(tmp_path / "a/b/c/d/e/room")
     with pytest.raises(DatasetError, match=r"room: There is no intrinsics\.json"):
         find_sequences(folder)
 
 
-def test_four_folders_down_and_no_further(tmp_path: Path) -> None:
+def test_four_folders_down_and_no_further(tmp_path):
     write_intrinsics(tmp_path, CAMERA)
     seven_scenes(tmp_path / "1/2/3/4")
     seven_scenes(tmp_path / "1/2/3/x/5")
     assert [s.name for s in find_sequences(tmp_path)] == ["1/2/3/4"]
 
 
-def test_symlinks_do_not_go_in_circles(kitchen: Path) -> None:
+def test_symlinks_do_not_go_in_circles(kitchen):
     (kitchen / "again").symlink_to(kitchen, target_is_directory=True)
     (kitchen / "self").symlink_to(kitchen / "self")
     (kitchen / "seq-01/up").symlink_to(kitchen.parent, target_is_directory=True)
@@ -166,21 +164,21 @@ def test_symlinks_do_not_go_in_circles(kitchen: Path) -> None:
         ("sequence1\n\nsequence3", "line 3: The folder seq-03 does not exist"),
     ],
 )
-def test_bad_splits(train: str, message: str, kitchen: Path) -> None:
+def test_bad_splits(train, message, kitchen):
     (kitchen / "TrainSplit.txt").write_text(train)
     with pytest.raises(DatasetError, match=message):
         find_sequences(kitchen)
 
 
-def test_two_scenes_of_one_name(kitchen: Path) -> None:
+def test_two_scenes_of_one_name(kitchen):
     seven_scenes(kitchen.parent / "old/kitchen/seq-01")
     write_intrinsics(kitchen.parent, CAMERA)
     with pytest.raises(DatasetError, match=r"has the same name kitchen"):
         find_sequences(kitchen.parent)
 
 
-def test_a_folder_that_may_not_be_read(kitchen: Path, monkeypatch) -> None:
-    def refuse(folder: Path) -> None:  # root, as in a container, may read every folder
+def test_a_folder_that_may_not_be_read(kitchen, monkeypatch):
+    def refuse(folder):  # root, as in a container, may read every folder
         raise PermissionError(13, "Permission denied", str(folder))
 
     monkeypatch.setattr(os, "scandir", refuse)
@@ -188,7 +186,7 @@ def test_a_folder_that_may_not_be_read(kitchen: Path, monkeypatch) -> None:
         find_sequences(kitchen)
 
 
-def test_a_whole_disk_is_not_searched(tmp_path: Path, monkeypatch) -> None:
+def test_a_whole_disk_is_not_searched(tmp_path, monkeypatch):
     for i in range(7):
         (tmp_path / str(i)).mkdir()
     monkeypatch.setattr(sequences, "_MAXIMUM_FOLDERS", 5)
@@ -196,7 +194,7 @@ def test_a_whole_disk_is_not_searched(tmp_path: Path, monkeypatch) -> None:
         find_sequences(tmp_path)
 
 
-def test_frames_have_the_numbers_and_names_of_their_files(kitchen: Path, tmp_path: Path) -> None:
+def test_frames_have_the_numbers_and_names_of_their_files(kitchen, tmp_path):
     (kitchen / "seq-01" / "frame-000000.depth.png").unlink()  # a part has the numbers of the whole
     first, second, _ = find_sequences(kitchen)
     assert [(f.original, f.sequence) for f in first.frames] == [("frame-000001.depth.png", 1)]
@@ -215,8 +213,8 @@ def test_frames_have_the_numbers_and_names_of_their_files(kitchen: Path, tmp_pat
     assert alone.frames[0].sequence is None  # its place is not known
 
 
-def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen: Path) -> None:
-    def places(found: Iterable[FrameSequence], session: str | None) -> list[list[int | None]]:
+def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen):
+    def places(found, session):
         told = numbered_sequences(found, session)
         return [[frame.sequence for frame in one.frames] for one in told]
 
@@ -232,7 +230,7 @@ def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen: Path
     assert places(in_turns, "all") == [[0], [2], [1], [3]]
 
 
-def test_files_without_a_number_are_numbered_as_they_were_named(tmp_path: Path) -> None:
+def test_files_without_a_number_are_numbered_as_they_were_named(tmp_path):
     write_intrinsics(tmp_path, CAMERA)
     for name in ("b.png", "a.png"):
         write_depth_png(tmp_path / name, DEPTH, 1000.0)

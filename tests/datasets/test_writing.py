@@ -1,7 +1,6 @@
 """Tests that written data can be read, and that files are complete or absent."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from sceneprint.formats.dataset import (
 from sceneprint_client.poses import rotation_of
 
 
-def test_depth_by_hand(tmp_path: Path) -> None:
+def test_depth_by_hand(tmp_path):
     depth = np.array(
         [[0, 1, 0.0004, 0.0006], [65.534, 65.5346, 66, 1e30], [np.nan, np.inf, -1, 2.5]], np.float32
     )
@@ -31,18 +30,18 @@ def test_depth_by_hand(tmp_path: Path) -> None:
     assert decode_png((tmp_path / "a.png").read_bytes())[2, 3] == 12500
 
 
-def test_depth_round_trip_is_within_half_a_unit(tmp_path: Path) -> None:
+def test_depth_round_trip_is_within_half_a_unit(tmp_path):
     depth = np.random.default_rng(3).uniform(0.3, 8.0, (48, 64)).astype(np.float32)
     write_depth_png(tmp_path / "a.png", depth, 1000.0)
     read = decode_png((tmp_path / "a.png").read_bytes()) / 1000
     assert np.abs(read - depth).max() <= 0.0005 + 1e-6
 
 
-def test_a_killed_writer_leaves_the_old_file(tmp_path: Path, monkeypatch) -> None:
+def test_a_killed_writer_leaves_the_old_file(tmp_path, monkeypatch):
     write_pose(tmp_path / "a.txt", np.eye(4))
     before = (tmp_path / "a.txt").read_bytes()
 
-    def killed(*args: object) -> None:
+    def killed(*args):
         raise KeyboardInterrupt
 
     moved = np.eye(4)
@@ -59,7 +58,7 @@ def test_a_killed_writer_leaves_the_old_file(tmp_path: Path, monkeypatch) -> Non
     assert (tmp_path / "a.txt").read_text().split()[3] == "1"
 
 
-def test_others_may_read_what_is_written(tmp_path: Path) -> None:
+def test_others_may_read_what_is_written(tmp_path):
     mask = os.umask(0o022)
     try:
         write_pose(tmp_path / "a.txt", np.eye(4))
@@ -68,7 +67,7 @@ def test_others_may_read_what_is_written(tmp_path: Path) -> None:
     assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o644
 
 
-def test_a_trajectory_is_read_again_without_loss(tmp_path: Path) -> None:
+def test_a_trajectory_is_read_again_without_loss(tmp_path):
     rng = np.random.default_rng(8)
     poses = []
     for i in range(20):

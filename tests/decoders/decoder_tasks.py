@@ -1,22 +1,18 @@
 """Misbehaving tasks for a decoder's process; see test_decoders.py."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sceneprint.decoders.child_process import TASKS, serve
 
 
-def _errno_of(do: Callable[[], object]) -> int:
+def _errno_of(do):
     """Number of the error that it ends with; 0 if it works."""
     try:
         do()
@@ -25,7 +21,7 @@ def _errno_of(do: Callable[[], object]) -> int:
     return 0
 
 
-def _escape(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _escape(_data, request):
     """Try to get out; the errors of each way."""
     tried = {
         "socket": lambda: socket.socket(socket.AF_INET),
@@ -39,36 +35,36 @@ def _escape(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None
     return {name: _errno_of(do) for name, do in tried.items()}, None
 
 
-def _crash(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _crash(_data, _request):
     ctypes.string_at(0)
     return {}, None
 
 
-def _hang(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _hang(_data, _request):
     while True:
         pass
 
 
-def _sleep(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _sleep(_data, _request):
     time.sleep(3600)
     return {}, None
 
 
-def _hoard(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _hoard(_data, request):
     return {"sum": float(np.ones(request["numbers"]).sum())}, None
 
 
-def _leave(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _leave(_data, request):
     """Free an array of one value."""
     return {"sum": int(np.full(request["numbers"], 77, np.uint8).sum())}, None
 
 
-def _look(_data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _look(_data, request):
     """Count the bytes of that value in new memory of the same size."""
     return {"seen": int((np.empty(request["numbers"], np.uint8) == 77).sum())}, None
 
 
-def _fail(_data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], None]:
+def _fail(_data, _request):
     raise ZeroDivisionError("a bug of ours")
 
 

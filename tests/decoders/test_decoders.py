@@ -1,7 +1,5 @@
 """Tests of decoder processes: equal arrays, isolation, limits, replacement and fairness."""
 
-from __future__ import annotations
-
 import errno
 import os
 import select
@@ -9,10 +7,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +27,7 @@ MORE_BYTES, SECONDS = 256 << 20, 0.5
 
 
 @pytest.fixture(scope="module")
-def pool() -> Iterator[DecoderPool]:
+def pool():
     """One process, which also has the tasks of decoder_tasks.py."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("PYTHONPATH", str(HERE))
@@ -40,14 +36,13 @@ def pool() -> Iterator[DecoderPool]:
         pool.close()
 
 
-def do(pool: DecoderPool, task: str, **request: Any) -> dict[str, Any]:
+def do(pool, task, **request):
     """Have a task done; its reply."""
     with pool.place() as slot:
-        reply: dict[str, Any] = slot.run({"task": task, **request}, b"", lambda _, said: said)
-        return reply
+        return slot.run({"task": task, **request}, b"", lambda _, said: said)
 
 
-def await_end(pid: int) -> None:
+def await_end(pid):
     """Wait until a process is gone."""
     try:
         handle = os.pidfd_open(pid)
@@ -59,7 +54,7 @@ def await_end(pid: int) -> None:
         os.close(handle)
 
 
-def test_arrays_are_the_same_as_in_this_process(pool: DecoderPool) -> None:
+def test_arrays_are_the_same_as_in_this_process(pool):
     local = LocalDecoders(1)
     with pool.place() as slot:
         for data in _image_samples():
@@ -72,7 +67,7 @@ def test_arrays_are_the_same_as_in_this_process(pool: DecoderPool) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"no image", b"\x89PNG\r\n\x1a\n" + bytes(40)])
-def test_errors_are_the_same_as_in_this_process(pool: DecoderPool, data: bytes) -> None:
+def test_errors_are_the_same_as_in_this_process(pool, data):
     with pytest.raises(errors.UnreadableFrame) as here:
         LocalDecoders(1).samples(data)
     with pool.place() as slot, pytest.raises(errors.UnreadableFrame) as there:
@@ -80,7 +75,7 @@ def test_errors_are_the_same_as_in_this_process(pool: DecoderPool, data: bytes) 
     assert str(there.value) == str(here.value)
 
 
-def test_a_decoder_reaches_nothing(pool: DecoderPool, tmp_path: Path) -> None:
+def test_a_decoder_reaches_nothing(pool, tmp_path):
     found = do(pool, "escape", path=str(tmp_path / "escaped"))
     walls = pool.protections
     assert walls is not None
@@ -94,7 +89,7 @@ def test_a_decoder_reaches_nothing(pool: DecoderPool, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_crash_is_an_error_of_the_upload_and_the_process_is_replaced(pool: DecoderPool) -> None:
+def test_a_crash_is_an_error_of_the_upload_and_the_process_is_replaced(pool):
     do(pool, "hoard", numbers=1)
     (before,) = pool.pids()
     with pytest.raises(errors.DecoderFailure, match=r"crashes the decoder \(signal 11"):
@@ -104,7 +99,7 @@ def test_a_crash_is_an_error_of_the_upload_and_the_process_is_replaced(pool: Dec
     await_end(before)
 
 
-def test_memory_is_limited(pool: DecoderPool) -> None:
+def test_memory_is_limited(pool):
     assert do(pool, "hoard", numbers=MORE_BYTES // 16) == {"sum": float(MORE_BYTES // 16)}
     with pytest.raises(errors.DecoderFailure, match="more than 256 MiB of memory"):
         do(pool, "hoard", numbers=MORE_BYTES // 4)
@@ -114,13 +109,13 @@ def test_memory_is_limited(pool: DecoderPool) -> None:
 @pytest.mark.parametrize(
     ("task", "reason"), [("hang", r"longer than 0\.5 s"), ("sleep", r"idle for 0\.5 s")]
 )
-def test_time_is_limited_of_work_and_of_sleep(pool: DecoderPool, task: str, reason: str) -> None:
+def test_time_is_limited_of_work_and_of_sleep(pool, task, reason):
     with pytest.raises(errors.DecoderFailure, match=reason):
         do(pool, task)
     assert do(pool, "hoard", numbers=3) == {"sum": 3.0}
 
 
-def test_nothing_of_an_upload_stays_in_the_shared_memory(pool: DecoderPool) -> None:
+def test_nothing_of_an_upload_stays_in_the_shared_memory(pool):
     points = np.full((500, 3), 2.0, np.float32).tobytes()  # of 16-byte rows, a part of one is left
     with pool.place() as slot:
         for data in (_image_samples()[0], b"no image"):
@@ -132,13 +127,13 @@ def test_nothing_of_an_upload_stays_in_the_shared_memory(pool: DecoderPool) -> N
         assert not np.frombuffer(slot.process._shared, np.uint8, 1 << 20).any()
 
 
-def test_freed_memory_holds_nothing_of_an_upload(pool: DecoderPool) -> None:
+def test_freed_memory_holds_nothing_of_an_upload(pool):
     size = 1 << 20  # which the process keeps
     assert do(pool, "leave", numbers=size)["sum"] == 77 * size
     assert do(pool, "look", numbers=size)["seen"] < 1000
 
 
-def test_a_bug_is_not_an_error_of_the_upload(pool: DecoderPool) -> None:
+def test_a_bug_is_not_an_error_of_the_upload(pool):
     with pytest.raises(RuntimeError, match="ZeroDivisionError: a bug of ours"):
         do(pool, "fail")
 
@@ -150,9 +145,7 @@ def test_a_bug_is_not_an_error_of_the_upload(pool: DecoderPool) -> None:
         {"type": "<u2", "shape": [-1, 2]}, {"type": "<u2", "shape": "22"}, {},
     ],
 )  # fmt: skip
-def test_a_reply_that_lies_is_no_result(
-    pool: DecoderPool, reply: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reply_that_lies_is_no_result(pool, reply, monkeypatch):
     do(pool, "hoard", numbers=1)
     with pool.place() as slot:
         process = slot.process
@@ -162,7 +155,7 @@ def test_a_reply_that_lies_is_no_result(
             slot.samples(_image_samples()[0])
 
 
-def test_processes_end_with_the_pool_and_with_a_killed_parent() -> None:
+def test_processes_end_with_the_pool_and_with_a_killed_parent():
     pool = DecoderPool(2, 0, 10.0)
     pool.start()
     (pid,) = pool.pids()
@@ -183,7 +176,7 @@ def test_processes_end_with_the_pool_and_with_a_killed_parent() -> None:
     await_end(child)
 
 
-def test_a_tenant_alone_has_all_places_and_beside_another_half() -> None:
+def test_a_tenant_alone_has_all_places_and_beside_another_half():
     who = threading.local()
     pool = DecoderPool(4, 0, 10.0, lambda: str(who.name))
     who.name = "a"
@@ -192,7 +185,7 @@ def test_a_tenant_alone_has_all_places_and_beside_another_half() -> None:
         one.__enter__()
     asked, served, release = threading.Event(), threading.Event(), threading.Event()
 
-    def other() -> None:
+    def other():
         who.name = "b"
         asked.set()
         with pool.place():
@@ -208,7 +201,7 @@ def test_a_tenant_alone_has_all_places_and_beside_another_half() -> None:
     # a holds three of four, more than half: a place that b gives back is not for a
     done = threading.Event()
 
-    def again() -> None:
+    def again():
         who.name = "a"
         with pool.place():
             done.set()
@@ -227,7 +220,7 @@ def test_a_tenant_alone_has_all_places_and_beside_another_half() -> None:
 
 
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
-def test_the_filter_decides_as_its_list_says(machine: str) -> None:
+def test_the_filter_decides_as_its_list_says(machine):
     architecture = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}[machine]
     run = interpreter(filter_program(machine))
     allow, refuse, kill = 0x7FFF0000, 0x00050001, 0x80000000
@@ -242,10 +235,10 @@ def test_the_filter_decides_as_its_list_says(machine: str) -> None:
     assert run(read | 0x40000000, architecture, 0) == kill
 
 
-def interpreter(program: list[tuple[int, int, int, int]]) -> Callable[[int, int, int], int]:
+def interpreter(program):
     """What a program of classic BPF returns for (number, architecture, third argument)."""
 
-    def run(number: int, architecture: int, third: int) -> int:
+    def run(number, architecture, third):
         words, at, value = {0: number, 4: architecture, 32: third}, 0, 0
         while True:
             code, true, false, k = program[at]
@@ -261,7 +254,7 @@ def interpreter(program: list[tuple[int, int, int, int]]) -> Callable[[int, int,
     return run
 
 
-def test_samples_come_back_in_the_size_of_a_large_image(pool: DecoderPool) -> None:
+def test_samples_come_back_in_the_size_of_a_large_image(pool):
     from sceneprint.formats.depth_file import encode_png
 
     depth = np.arange(4_000_000, dtype=np.uint16).reshape(2000, 2000)

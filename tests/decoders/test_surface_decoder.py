@@ -1,13 +1,9 @@
 """Tests of the decoder of whole maps: equal arrays, isolation, limits and false headers."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
 import struct
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,24 +13,24 @@ from sceneprint.decoders.pool import DecoderProcess
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
 from sceneprint.decoders.surface_process import mesh_samples
 from sceneprint.errors import DecoderFailure, UnreadableCloud
-from sceneprint.formats.surface_file.reading import ReadSurface, SurfaceOptions, read_surface
+from sceneprint.formats.surface_file.reading import SurfaceOptions, read_surface
 
 STATED = SurfaceOptions(units_per_metre=2.0, up="-y")
 
 
-def ball(form: str) -> bytes:
+def ball(form):
     data = trimesh.creation.icosphere(subdivisions=2).export(file_type=form)
     return data.encode() if isinstance(data, str) else bytes(data)
 
 
-def rows(n: int = 5000) -> bytes:
+def rows(n=5000):
     file = io.BytesIO()
     points = np.random.default_rng(2).uniform((-8, -6, 0), (8, 6, 3), (n, 3))
     np.save(file, points + np.array([500_000.0, 4_000_000.0, 100.0]))
     return file.getvalue()
 
 
-def assert_equal(here: ReadSurface, there: ReadSurface) -> None:
+def assert_equal(here, there):
     for a, b in (
         (here.surface.points, there.surface.points),
         (here.surface.triangles, there.surface.triangles),
@@ -51,7 +47,7 @@ def assert_equal(here: ReadSurface, there: ReadSurface) -> None:
 
 
 @pytest.mark.parametrize("name", ["ball.ply", "ball.obj", "map.npy"])
-def test_surfaces_are_the_same_as_in_this_process(tmp_path: Path, name: str) -> None:
+def test_surfaces_are_the_same_as_in_this_process(tmp_path, name):
     data = rows() if name == "map.npy" else ball(name[-3:])
     path, options = tmp_path / "upload", STATED if name == "ball.ply" else None
     path.write_bytes(data)
@@ -61,7 +57,7 @@ def test_surfaces_are_the_same_as_in_this_process(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("form", ["gltf", "stl"])
-def test_what_meshes_need_is_loaded_before_the_walls(tmp_path: Path, form: str) -> None:
+def test_what_meshes_need_is_loaded_before_the_walls(tmp_path, form):
     """A glTF file with lines and points beside triangles: trimesh imports more for them."""
     data = next(data for data, one in mesh_samples() if one == form)
     path = tmp_path / "upload"
@@ -69,7 +65,7 @@ def test_what_meshes_need_is_loaded_before_the_walls(tmp_path: Path, form: str) 
     assert_equal(read_surface(data, f"a.{form}"), read_surface_confined(path, f"a.{form}"))
 
 
-def test_errors_are_the_same_as_in_this_process(tmp_path: Path) -> None:
+def test_errors_are_the_same_as_in_this_process(tmp_path):
     path, data = tmp_path / "upload", ball("ply")[:-100]
     path.write_bytes(data)
     with pytest.raises(UnreadableCloud) as here:
@@ -79,7 +75,7 @@ def test_errors_are_the_same_as_in_this_process(tmp_path: Path) -> None:
     assert str(here.value) == str(there.value)
 
 
-def test_what_is_no_file_of_a_map_starts_no_process(tmp_path: Path) -> None:
+def test_what_is_no_file_of_a_map_starts_no_process(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UnreadableCloud, match=r"a\.ply: This is not a regular file"):
         read_surface_confined(tmp_path / "pipe", "a.ply")
@@ -88,7 +84,7 @@ def test_what_is_no_file_of_a_map_starts_no_process(tmp_path: Path) -> None:
         read_surface_confined(tmp_path / "text", "a.txt")
 
 
-def many(tree: dict[str, Any], copies: int) -> bytes:
+def many(tree, copies):
     """A scene that places one part so often, just not too often to be refused."""
     mesh = next(node["mesh"] for node in tree["nodes"] if "mesh" in node)
     tree["nodes"] = [{"mesh": mesh} for _ in range(copies)]
@@ -97,7 +93,7 @@ def many(tree: dict[str, Any], copies: int) -> bytes:
     return text + b" " * (-len(text) % 4)
 
 
-def test_memory_and_time_are_limited(tmp_path: Path) -> None:
+def test_memory_and_time_are_limited(tmp_path):
     data = trimesh.creation.icosphere(subdivisions=6).export(file_type="glb")
     length = struct.unpack_from("<I", data, 12)[0]
     text = many(json.loads(data[20 : 20 + length]), 200)
@@ -120,9 +116,7 @@ def test_memory_and_time_are_limited(tmp_path: Path) -> None:
         {"units": "guessed"}, {"units_per_metre": -1}, {"notes": "x" * 30}, {"voxel": -1.0},
     ],
 )  # fmt: skip
-def test_a_reply_that_lies_is_no_result(
-    tmp_path: Path, lie: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reply_that_lies_is_no_result(tmp_path, lie, monkeypatch):
     truth = {
         "points": 12, "triangles": None, "file_points": 12, "offset": [0, 0, 0], "up": [0, 0, 1],
         "units": "file", "up_from": "file", "notes": [], "units_per_metre": 1.0, "voxel": None,
@@ -130,7 +124,7 @@ def test_a_reply_that_lies_is_no_result(
     path = tmp_path / "upload"
     path.write_bytes(rows(20))
 
-    def run(self: DecoderProcess, *_: object) -> dict[str, Any]:
+    def run(self, *_):
         block = np.full(400 * 3, 7, np.int32)  # of no triangle: index 7 is fine, 12 is none
         block[40:] = 12
         self._shared[: block.nbytes] = block.tobytes()

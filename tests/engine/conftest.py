@@ -98,7 +98,7 @@ def prepared(uploads, signer):
 @pytest.fixture
 def make_engine(tmp_path):
     """A function that opens engines on a data folder; all are closed after the test."""
-    opened: list[Engine] = []
+    opened = []
 
     def make(folder=tmp_path / "data", **more):
         opened.append(Engine(Settings.model_validate({"data_dir": folder} | more)))

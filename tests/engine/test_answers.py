@@ -1,7 +1,5 @@
 """Tests of queries: room, pose, and equality with the library."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import asdict
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Tests of associations of two runs with separate origins, including lost slices."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace
@@ -211,8 +209,8 @@ def concluded(here, there, off, scale=1.0):
     """Edges of the frames of two runs at some metres along a line, in their order; `off` by so
     many metres.
     """
-    stops: dict[int, PathFrame] = {}
-    runs: tuple[list[int], list[int]] = [], []
+    stops = {}
+    runs = [], []
     for run, places in enumerate((here, there)):
         for x in places:
             pose = np.eye(4)
@@ -411,7 +409,7 @@ def test_a_map_that_is_deleted_meanwhile_ends_the_job_quietly(engine):
     assert isinstance(task, LongJob)
     engine.delete_map("hall")
     engine.create_map(NewMap(name="hall", model="depth"))
-    broke: list[bool] = []
+    broke = []
     assert engine.run(task, lambda: broke.append(True)) is None
     assert broke == []
     assert engine.associations.list_all("hall").items == []

@@ -1,7 +1,5 @@
 """Tests of an association of two parts of a recording; see docs/associations.md."""
 
-from __future__ import annotations
-
 import math
 from datetime import UTC, datetime, timedelta
 

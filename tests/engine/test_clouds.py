@@ -1,7 +1,5 @@
 """Tests of point clouds in a store: decoding, answers, and mismatched models."""
 
-from __future__ import annotations
-
 import io
 import sys
 

@@ -1,7 +1,5 @@
 """Tests of kernels that separate processes compile ahead of the first frame."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -28,7 +26,7 @@ SLOW, FAILING = "import time; time.sleep(60)", "raise SystemExit(3)"
 @pytest.fixture
 def told_to(monkeypatch):
     """Has every part missing, and the first argument run in place of what compiles it."""
-    started: list[subprocess.Popen[bytes]] = []
+    started = []
     begin = subprocess.Popen
 
     def instead(command, **given):
@@ -50,7 +48,7 @@ def test_who_is_told_to_stop_leaves_no_process(told_to):
 
 
 def test_a_process_that_fails_is_told_of_and_costs_no_more(told_to):
-    said: list[str] = []
+    said = []
     compile_kernels(Path("failing"), ALL, said.append)
     assert len(told_to) == 3
     failed = [one for one in said if "not compiled (exit code 3); they are" in one]

@@ -66,7 +66,7 @@ def rooms(tmp_path_factory, uploads, make_upload, work_off, room_views):
     """
     folder = tmp_path_factory.mktemp("rooms") / "data"
     path = room_views(21, 0, 12, along_path=True)
-    positions: list[Floats] = []
+    positions = []
     with Engine(Settings(data_dir=folder)) as engine:
         for name in ("hall", "pair"):
             engine.create_map(NewMap(name=name, model="depth"))

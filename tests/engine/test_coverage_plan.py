@@ -1,7 +1,5 @@
 """Tests of coverage plans: axes, cell widths, counts, changes and colours."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of metadata edits: changed and unchanged fields, and their visibility."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 

@@ -1,7 +1,5 @@
 """Tests that rows of deleted and redundant frames are removed after some days."""
 
-from __future__ import annotations
-
 import time
 
 import pytest
@@ -181,7 +179,7 @@ def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(data, make_engine, 
 
 
 def test_rows_that_are_due_are_found_by_an_index(full, ids):
-    asked: list[str] = []
+    asked = []
     database = full.store.database
     with database.read() as connection:
         event.listen(connection, "before_cursor_execute", lambda *given: asked.append(given[2]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
-from typing import Any
 
 import numpy as np
 import pytest
@@ -128,7 +127,7 @@ def draw(rng, frames):
     """A filter of one to three conditions."""
     seconds = [int(one) for one in sorted(rng.integers(0, 60, 2))]
     corners = np.sort(rng.integers(-2, 3, (2, 3)), axis=0).tolist()
-    given: dict[str, Any] = {
+    given = {
         "robot": "r1" if rng.random() < 0.5 else ["r2", "r3"],
         "session": rng.choice(["s1", "s2"]),
         "captured_after": START + timedelta(seconds=seconds[0]),
@@ -189,7 +188,7 @@ def test_each_condition_alone(make_engine):
     nameless = next(one for one in frames if one.session and one.at and one.robot is None)
     later = own.at + timedelta(hours=2)
     box = {"min": {"x": -1, "y": -1, "z": -1}, "max": {"x": 1, "y": 1, "z": 1}}
-    cases: list[tuple[dict[str, Any], Known]] = [
+    cases = [
         ({"robot": own.robot}, own),
         ({"robot": ["r1", "r2", "r3"]}, own),
         ({"session": "s2"}, own),
@@ -211,7 +210,7 @@ def test_each_condition_alone(make_engine):
         wanted = Filter.model_validate(given)
         passed = hold(ask(engine, asker, wanted), frames, asker, wanted)
         assert 0 < passed < 99, given
-    nothing: list[dict[str, Any]] = [
+    nothing = [
         {"robot": "nobody"},
         {"tags": ["door", "window"]},
         {"captured_after": later},

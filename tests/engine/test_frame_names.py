@@ -1,7 +1,5 @@
 """Tests of original names of frames, and of their order in a session."""
 
-from __future__ import annotations
-
 import json
 from datetime import UTC, datetime
 

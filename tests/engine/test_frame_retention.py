@@ -1,7 +1,5 @@
 """Tests of retention: expired frames are deleted in blocks, and no others."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """Tests that an import continues after its last stored slice."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Tests of correct answers from an empty index to a damaged and rebuilt one."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests of stored answers: points, ranking, and details of a match."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

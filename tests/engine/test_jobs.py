@@ -1,7 +1,5 @@
 """Tests of jobs that are cancelled, retried, or taken over from dead workers."""
 
-from __future__ import annotations
-
 import time
 from functools import partial
 
@@ -217,7 +215,7 @@ def test_a_death_over_what_is_gone_changes_nothing(empty, uploads, told):
 
 
 def test_only_what_nobody_raised_on_purpose_makes_a_process_unsound(empty, uploads, monkeypatch):
-    unsound: list[str] = []
+    unsound = []
     empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     empty.store.blobs.remove(empty.store.blobs.put(uploads[0].data))
     assert empty.run(claimed(empty), lambda: unsound.append("damaged")) == JobState.QUEUED

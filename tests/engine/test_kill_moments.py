@@ -3,8 +3,6 @@
 A frame exists once its upload is acknowledged, and not after its deletion is acknowledged.
 """
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Tests of killed workers, whose jobs take effect once."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Tests of localization, and of the comparison of two frames."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

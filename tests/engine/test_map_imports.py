@@ -1,7 +1,5 @@
 """Tests of maps from a mesh: each view becomes a frame once, even after interruptions."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 

@@ -1,9 +1,5 @@
 """Tests of the disk use of a map, and of its trajectories."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 from sqlalchemy import func, select
 
@@ -59,7 +55,7 @@ def test_a_long_trajectory_is_thinned(full, ids, tmp_path, monkeypatch):
     names = ids(full)
     for i, name in enumerate(names[:7]):
         at = None if i == 6 else f"2026-11-16T09:30:0{i}Z"
-        pose: dict[str, Any] = {"parent_frame": "hall"}
+        pose = {"parent_frame": "hall"}
         edit_frame(full.store, "hall", name, {"session": "s", "captured_at": at, "pose": pose})
     whole = trajectory(full.store, "hall", Run(session="s"))
     monkeypatch.setattr(map_frames, "MOST_POSES", 3)  # a part of a run may be one of any length

@@ -1,7 +1,5 @@
 """Tests of answers while frames are added, deleted and damaged."""
 
-from __future__ import annotations
-
 import threading
 import time
 

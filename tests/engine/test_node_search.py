@@ -1,7 +1,5 @@
 """Tests of a node without an index, which compares all signatures."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 
 import numpy as np
@@ -22,7 +20,7 @@ SIZES, LENGTH = {"hall": 300, "yard": 200}, 64
 def node(store_url, tmp_path, monkeypatch):
     """Nodes with indexes of their own on one database; they always look for a newer index."""
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-    opened: list[Engine] = []
+    opened = []
 
     def engine(name):
         values = {
@@ -74,7 +72,7 @@ def nearest(places, frame, metric="l2"):
 @contextmanager
 def rows_read(engine):
     """Count the signatures that are read for a map, by statement."""
-    read: list[int] = []
+    read = []
 
     def changes(connection, row, revision, limit=256):
         for block in real(connection, row, revision, limit):

@@ -1,7 +1,5 @@
 """Tests of `if_novel`, which keeps only frames of new places."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import replace
@@ -173,7 +171,7 @@ def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkey
 
     monkeypatch.setattr(working, "find_nearest", together)
     claims = [engine.claim(f"w{i}") for i, engine in enumerate(engines)]
-    states: list[JobState | None] = []
+    states = []
     threads = [
         threading.Thread(target=lambda e=engine, c=work: states.append(e.run(c)))
         for engine, work in zip(engines, claims, strict=True)

@@ -1,7 +1,5 @@
 """Tests of engines that share only PostgreSQL and an object store."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile

@@ -1,7 +1,5 @@
 """Tests of statistics, models, event retention, and remains of deleted maps."""
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import os

@@ -1,10 +1,7 @@
 """Tests of downloads from a map against the library's results."""
 
-from __future__ import annotations
-
 import base64
 import io
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +24,6 @@ from sceneprint.signing import describe
 from sceneprint.store.maps import find_frame, find_map
 from sceneprint_client.api import FrameMeta, NewMap
 from sceneprint_client.api.listing import Run
-from sceneprint_client.api.results import View
 from sceneprint_client.poses import rotation_of
 
 
@@ -58,7 +54,7 @@ def test_a_cloud_is_the_surface_of_the_artifact(full, ids, uploads, prepared):
 
 def test_a_preview_is_that_of_the_artifact(full, ids, uploads, prepared, signer):
     name, surface = ids(full)[0], prepared[0][1].surface
-    views: dict[View, Any] = {"depth": depth_view, "normals": normals_view}
+    views = {"depth": depth_view, "normals": normals_view}
     for view, make in views.items():
         data = full.outputs.preview("hall", name, view, 160).make()
         colours, _ = make(surface)

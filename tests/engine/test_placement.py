@@ -1,10 +1,7 @@
 """Tests of poses of queries: priors, sequences, causes, and reads from the store."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +16,6 @@ from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
 from sceneprint.localization import (
     AlternativePose,
-    LocalizationStatus,
     PoseEstimate,
     localize,
     views_of_rows,
@@ -111,7 +107,7 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
     by_library = localize(frames, poses, rooms, views_of, p=own_p)
     assert by_library.verified_by in (None, "map")
 
-    how: dict[str, Any] = {"candidates": candidates, "validation": {"ambiguous": 0.0}}
+    how = {"candidates": candidates, "validation": {"ambiguous": 0.0}}
     if without:
         how["filter"] = {"exclude_frames": [names[i] for i in without]}
     answer = full.query_frame("hall", names[asked], Query.model_validate(how))
@@ -348,7 +344,7 @@ def came_of(geometry, *statuses, estimate=None, late=False, others=()):
 def supported(*confidences):
     """Poses of the map that no match votes for, with these confidences."""
     told = tuple(AlternativePose(np.eye(4), 0, one, None) for one in confidences)
-    status: LocalizationStatus = "ambiguous" if told else "not_found"
+    status = "ambiguous" if told else "not_found"
     return PoseEstimate(status, "the map's say", "hall", None, None, None, None, told)
 
 

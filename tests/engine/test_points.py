@@ -1,7 +1,5 @@
 """Tests of points for pages, with residuals like those of an overlay."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -3,8 +3,6 @@
 A test first finds the bytes in each possible place, and then none after the deletion.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 import time

@@ -1,7 +1,5 @@
 """Tests of the query log: records, pages, kept answers, and deletion in blocks."""
 
-from __future__ import annotations
-
 import logging
 import os
 import time

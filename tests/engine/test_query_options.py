@@ -1,13 +1,10 @@
 """Tests of the effect and the explanation of each option of a query."""
 
-from __future__ import annotations
-
 import json
 import math
 import time
 from dataclasses import replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pytest
@@ -153,7 +150,7 @@ def test_a_deadline_stops_validation_and_says_so(full, ids, monkeypatch):
 def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(full, ids, monkeypatch):
     names, strict = ids(full), {"evidence": 1.0}
     ranked = ask(full, names[0], k=50, stages=["retrieve"]).matches
-    how: dict[str, Any] = {"candidates": 3, "stages": VR, "deadline_ms": 600_000}
+    how = {"candidates": 3, "stages": VR, "deadline_ms": 600_000}
     allows, asked = Deadline.allows, list[bool]()
 
     def so_often(self):
@@ -203,7 +200,7 @@ def test_every_frame_of_the_ranking_is_explained(full, prepared, ids):
     ranked = [one.frame_id for one in ask(full, names[0], k=50, stages=["retrieve"]).matches]
     outcomes = set()
     for candidates in (5, 11):  # some of the ranking, and all of it
-        how: dict[str, Any] = {"k": 2, "candidates": candidates}
+        how = {"k": 2, "candidates": candidates}
         plain, answer = ask(full, names[0], **how), ask(full, names[0], **how, explain=True)
         assert told(answer, "explanations") == told(plain, "explanations")
         assert set(answer.milliseconds) - set(plain.milliseconds) == {"explain"}
@@ -344,7 +341,7 @@ def test_a_frame_that_is_not_searched_is_explained(full, ids):
 
 
 def test_options_as_text_are_those_of_json():
-    given: dict[str, Any] = {
+    given = {
         "candidates": 7, "diversity": {"sigma": 2.0}, "validation": {"mode": "paper"},
         "deadline_ms": 50, "explain": True, "explain_frame": "f", "keep": False,
     }  # fmt: skip

@@ -1,7 +1,5 @@
 """Tests that quotas are exact for concurrent uploads and all changes of frames."""
 
-from __future__ import annotations
-
 import io
 import threading
 

@@ -1,10 +1,7 @@
 """Tests of queries while maps grow, are indexed, shrink and are recreated."""
 
-from __future__ import annotations
-
 import shutil
 import threading
-from collections.abc import Iterator
 
 import pytest
 
@@ -18,7 +15,7 @@ pytestmark = pytest.mark.usefixtures("_always_look")
 @pytest.fixture
 def more(uploads, work_off):
     """Index that many frames more, by cameras that differ by half a pixel."""
-    shifts: Iterator[int] = iter(range(1, 100))
+    shifts = iter(range(1, 100))
 
     def add(engine, count):
         added = []

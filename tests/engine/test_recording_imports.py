@@ -1,7 +1,5 @@
 """Tests of the import of recordings: the same frames as those of an upload, once each."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Tests of re-encoding in the background, with the same result as a new map."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Tests of queries, workers and indexes at the switch to another model."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys

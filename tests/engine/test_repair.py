@@ -1,7 +1,5 @@
 """Tests that damaged derived data is rebuilt from uploads during service."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import select, update
 
@@ -52,7 +50,7 @@ def damage(path):
 
 def damage_signature(engine, frame_id):
     """Change a byte of the vector, and return the sound one."""
-    sound: bytes = column(engine, frame_id, "vector")
+    sound = column(engine, frame_id, "vector")
     data = bytearray(sound)
     data[100] ^= 8
     own = signatures.c.frame_number == number_of(engine, frame_id)

@@ -1,9 +1,6 @@
 """Tests that an evaluation and a service give the same status, confidence and pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +55,7 @@ def both(empty, work_off, signer):
 def see_same(served, evaluated, truth):
     """See that a service and an evaluation answer alike."""
     assert served.status == evaluated.status
-    poses: list[Any] = list(served.alternatives)
+    poses = list(served.alternatives)
     if served.location is not None:
         poses = [served.location]
         assert served.location.strength == evaluated.strength

@@ -1,14 +1,11 @@
 """Tests of valid and invalid requests, and of the conversion of poses."""
 
-from __future__ import annotations
-
 import json
 import math
-from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from sceneprint.engine.ingest.frame_decoder import pose_matrix
@@ -16,7 +13,7 @@ from sceneprint.engine.serializers import transform
 from sceneprint.errors import InvalidPose
 from sceneprint_client.api import FrameMeta, GivenPose, NewMap, Query
 
-CAMERA: dict[str, Any] = {"width": 4, "height": 3, "fx": 2, "fy": 2, "cx": 2, "cy": 1}
+CAMERA = {"width": 4, "height": 3, "fx": 2, "fy": 2, "cx": 2, "cy": 1}
 EYE = np.eye(4).tolist()
 ORIGIN = {"x": 0, "y": 0, "z": 0}
 LEVEL = {"x": 0, "y": 0, "z": 0, "w": 1}
@@ -26,7 +23,7 @@ def meta(**more):
     return {"intrinsics": CAMERA} | more
 
 
-REFUSED: list[tuple[type[BaseModel], dict[str, Any], str]] = [
+REFUSED = [
     (Query, {"K": 5}, "K"),
     (Query, {"k": 0}, "k"),
     (Query, {"k": 51}, "k"),

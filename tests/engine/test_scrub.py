@@ -1,7 +1,5 @@
 """Tests of the scrub, which reads all stored bytes in slices and has damage repaired."""
 
-from __future__ import annotations
-
 import signal
 import time
 from contextlib import closing

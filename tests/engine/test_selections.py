@@ -1,9 +1,5 @@
 """Tests of deletions and edits of selected frames, and of undo."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import pytest
 from pydantic import ValidationError
 
@@ -98,7 +94,7 @@ def changed(session, robot, tags, changes):
 
 def test_an_edit_is_undone_by_its_inverse(empty, ids):
     before = known(empty)
-    every: list[dict[str, Any]] = [
+    every = [
         {"session": "b"}, {"session": None}, {"robot": "r9", "session": "z"},
         {"add_tags": ["y", "n"]}, {"remove_tags": ["x"], "add_tags": ["n"]}, {"robot": None},
     ]  # fmt: skip

@@ -1,7 +1,5 @@
 """Tests of the comparison of two sessions: a new box, lost slices, and a deleted frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of sessions that are renamed, tagged and deleted in blocks."""
 
-from __future__ import annotations
-
 import pytest
 
 from sceneprint.engine.maps import selections

@@ -1,9 +1,5 @@
 """Tests of a query over several maps with a common ranking."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -34,7 +30,7 @@ def ask(engine, maps, upload, **how):
 
 
 def test_the_ranking_is_that_of_both_maps_together(two, uploads):
-    how: dict[str, Any] = {"stages": ["retrieve"], "k": 50}
+    how = {"stages": ["retrieve"], "k": 50}
     alone = {name: ask(two, [name], uploads[1], **how) for name in MAPS}
     both = ask(two, MAPS, uploads[1], **how)
     listed = [(one.distance, one.map, one.frame_id, one.similarity)

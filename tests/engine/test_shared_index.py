@@ -1,13 +1,10 @@
 """Tests of shared indexes: built once, fetched completely, and deleted everywhere."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -316,7 +313,7 @@ def test_a_restored_database_is_not_given_what_came_after(
     make_engine, tmp_path, fill, uploads, put_back
 ):
     """Put back to two frames, the database gives the numbers of the next three out again."""
-    given: dict[str, Any] = {"index_url": f"file://{tmp_path}/shared", "unindexed_frames": 2}
+    given = {"index_url": f"file://{tmp_path}/shared", "unindexed_frames": 2}
     data, kept = tmp_path / "data", tmp_path / "kept"
     engine = make_engine(data, **given)
     engine.create_map(NewMap(name="hall", model="depth"))
@@ -466,7 +463,7 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
     make_engine, postgres_url, bucket, object_server, fill, uploads, tmp_path, monkeypatch, caplog
 ):
     (tmp_path / "common" / "blobs").mkdir(parents=True)
-    given: dict[str, Any] = {
+    given = {
         "database_url": postgres_url, "blob_url": f"file://{tmp_path}/common",
         "unindexed_frames": 2,
     }  # fmt: skip

@@ -1,11 +1,8 @@
 """Tests of map surfaces against a simple fusion after all kinds of changes."""
 
-from __future__ import annotations
-
 import io
 import shutil
 from datetime import UTC, datetime
-from typing import Any
 
 import numpy as np
 import pytest
@@ -99,7 +96,7 @@ def cells_of(engine, parent, level=0):
 
 def oracle(engine, cell_m):
     """What each frame saw of each cell: its mean, its session and its time, by parent frame."""
-    found: dict[str, dict[Any, list[Any]]] = {}
+    found = {}
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
         numbers = numbers_of_runs(connection, row.number, None, None)
@@ -176,7 +173,7 @@ def test_coarser_levels_are_those_of_the_finest(engine):
     for level in (1, 2):
         found, cell_m = cells_of(engine, parent, level)
         assert cell_m == pytest.approx(0.05 * 4**level)
-        within: dict[Any, list[int]] = {}
+        within = {}
         for i, key in enumerate(np.floor(fine.points / cell_m).astype(int).tolist()):
             within.setdefault(tuple(key), []).append(i)
         keys = [tuple(one) for one in np.floor(found.points / cell_m + 1e-9).astype(int).tolist()]

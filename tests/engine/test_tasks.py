@@ -1,7 +1,5 @@
 """Tests of long jobs, each of whose slices is stored once."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import select, update
 
@@ -186,7 +184,7 @@ def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(engi
 
     engine.handle("count", handle)
     engine.begin_task("count", "hall", {})
-    broke: list[bool] = []
+    broke = []
     claimed = engine.claim("w")
     assert claimed is not None
     assert engine.run(claimed, lambda: broke.append(True)) is None
@@ -195,7 +193,7 @@ def test_a_job_that_is_removed_while_a_slice_runs_is_no_fault_of_its_worker(engi
 
 
 def test_a_file_that_a_deletion_swept_is_made_again(engine, work_off):
-    swept: list[str] = []
+    swept = []
 
     def handle(task, is_over):
         outcome = count_to(engine, 1)(task, is_over)

@@ -1,7 +1,5 @@
 """Tests of deleted frames: hidden, restored in time, and finally removed."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -24,7 +22,7 @@ from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import MapUsage, counted_usage, find_frame, find_map
 from sceneprint.store.tables import frames as frames_table
-from sceneprint_client.api import Frame, FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
 from sceneprint_client.api.listing import FrameListing, FrameSelection
 
 #: What a restored frame has anew.
@@ -289,7 +287,7 @@ def test_deletions_are_listed_a_page_at_a_time(full):
 
 def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
     """A redundant frame has no upload any more, and is deleted for good."""
-    made: list[Frame] = []
+    made = []
     for one, state in zip(uploads, (FrameState.REJECTED, FrameState.REDUNDANT), strict=False):
         name = empty.add_frame("hall", one.data, one.meta)[0].frame_id
         with empty.store.database.write() as connection:

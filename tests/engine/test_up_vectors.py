@@ -1,7 +1,5 @@
 """Tests of up vectors of frames and maps: storage, estimation, use, and wrong vectors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tests that indexes are caches, tied to one database history and its maps."""
 
-from __future__ import annotations
-
 import shutil
 
 import numpy as np

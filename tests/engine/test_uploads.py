@@ -1,7 +1,5 @@
 """Tests of uploads: repetition, conflicts and deletion."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

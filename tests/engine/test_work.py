@@ -1,7 +1,5 @@
 """Tests of frames that cannot be signed, and of workers that finish too late."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,11 +1,6 @@
 """Fixtures of the evaluation tests: rooms, and outcomes with known figures."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,33 +11,33 @@ from sceneprint_lab.evaluation.protocol import Error, QueryOutcome, ValidatedPai
 
 
 @pytest.fixture(scope="session")
-def building(once: Callable[[str, Callable[[Path], object]], Path]) -> Path:
+def building(once):
     """Two read-only rooms with twelve views each along a path."""
 
-    def make(folder: Path) -> None:
+    def make(folder):
         of = ("--rooms", "2", "--views", "12", "--seed", "9", "--path", "--jobs", "1")
         assert main(["synth", str(folder), *of]) == 0
 
     return once("evaluated", make)
 
 
-def error(cm: float, degrees: float = 0.0) -> Error:
+def error(cm, degrees=0.0):
     return Error(cm / 100, math.radians(degrees))
 
 
 def pair(
-    match: int,
-    status: str = "accepted",
-    strength: str | None = "strong",
-    off: Error | None = None,
+    match,
+    status="accepted",
+    strength="strong",
+    off=None,
     *,
-    scene: str = "here",
-    mean: float = 0.5,
-    least: float = 0.4,
-    bound: Error | None = None,
-) -> ValidatedPair:
+    scene="here",
+    mean=0.5,
+    least=0.4,
+    bound=None,
+):
     T = np.eye(4)
-    known: Any = {"status": status, "strength": strength if status == "accepted" else None}
+    known = {"status": status, "strength": strength if status == "accepted" else None}
     v = PairValidation(
         **known,
         reason="as given",
@@ -62,15 +57,7 @@ def pair(
     return ValidatedPair(match, scene, v, same, off, bound, mean, least, 10.0)
 
 
-def outcome(
-    ranking: list[int],
-    selection: list[int],
-    pairs: list[ValidatedPair],
-    *,
-    least: list[float] | None = None,
-    present: bool = True,
-    **rest: Any,
-) -> QueryOutcome:
+def outcome(ranking, selection, pairs, *, least=None, present=True, **rest):
     """Return an outcome for a query at the origin of "here", with a database like `least`."""
     overlap = np.array(least if least is not None else [0.4] * (max(ranking) + 1))
     return QueryOutcome(
@@ -92,17 +79,17 @@ def outcome(
 
 
 @pytest.fixture
-def make_pair() -> Callable[..., ValidatedPair]:
+def make_pair():
     return pair
 
 
 @pytest.fixture
-def make_outcome() -> Callable[..., QueryOutcome]:
+def make_outcome():
     return outcome
 
 
 @pytest.fixture
-def three() -> list[QueryOutcome]:
+def three():
     """A successful query, a failed one, and one whose scene is not in the database.
 
     First query: rank 1 is weak and off by 7 cm, rank 2 strong and off by 2 cm, rank 3 strong and

@@ -1,9 +1,6 @@
 """Tests of the comparison of answers with true poses."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +9,13 @@ from sceneprint_client.api import Answer, Quaternion, Transform, Vector
 from sceneprint_lab.evaluation.report import FramePlace, answer_rows, judge_answers
 
 
-def at(x: float, y: float = 0.0) -> np.ndarray:
+def at(x, y=0.0):
     pose = np.eye(4)
     pose[:2, 3] = x, y
     return pose
 
 
-def told(T: np.ndarray, parent: str = "match") -> Transform:
+def told(T, parent="match"):
     x, y, z = T[:3, 3].tolist()
     return Transform(
         parent_frame=parent, child_frame="query", translation=Vector(x=x, y=y, z=z),
@@ -26,7 +23,7 @@ def told(T: np.ndarray, parent: str = "match") -> Transform:
     )  # fmt: skip
 
 
-def match(frame_id: str, rank: int, status: str, T: np.ndarray | None) -> dict[str, Any]:
+def match(frame_id, rank, status, T):
     return {
         "frame_id": frame_id, "map": "m", "robot": None, "session": None, "rank": rank,
         "distance": rank, "similarity": 0.5, "selected": None, "diversity_gain": None,
@@ -35,7 +32,7 @@ def match(frame_id: str, rank: int, status: str, T: np.ndarray | None) -> dict[s
     }  # fmt: skip
 
 
-def answer(matches: list[dict[str, Any]], pose: Transform | None = None) -> Answer:
+def answer(matches, pose=None):
     names = ("map", "passed", "compared", "ranked", "selected", "validated", "accepted")
     counts = dict.fromkeys(names, 0)
     location = pose and {"pose": pose, "support": 1, "votes": 1, "spread_m": 0, "spread_deg": 0}
@@ -53,7 +50,7 @@ KNOWN = {
 TRUTH = FramePlace("hall", at(0))
 
 
-def test_rows_take_the_nearest_the_first_accepted_and_the_average() -> None:
+def test_rows_take_the_nearest_the_first_accepted_and_the_average():
     # accepted ones come first; b is accepted and 0.5 m off, a ranks first and is 0.1 m off
     ranked = answer([match("b", 2, "accepted", at(-2.5)), match("a", 1, "rejected", at(-0.9))])
     diverse = answer(
@@ -71,7 +68,7 @@ def test_rows_take_the_nearest_the_first_accepted_and_the_average() -> None:
     assert [rows[row]["within_5cm_5deg"] for row in rows] == [0.0, 0.0, 1.0, 1.0, 1.0]
 
 
-def test_another_place_and_no_answer_are_infinitely_far_off() -> None:
+def test_another_place_and_no_answer_are_infinitely_far_off():
     elsewhere = answer([match("c", 1, "accepted", at(0))], told(at(0), "cellar"))
     nothing = answer([])
     for one in (elsewhere, nothing):

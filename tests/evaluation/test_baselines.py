@@ -1,19 +1,14 @@
 """Tests of the baselines: descriptors, and the command."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.cli import main
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.models import Model, save_model
-from sceneprint.types import Floats
+from sceneprint.models import save_model
 from sceneprint_lab.evaluation.baselines import (
     FpfhVlad,
     features,
@@ -22,15 +17,14 @@ from sceneprint_lab.evaluation.baselines import (
 from sceneprint_lab.evaluation.measures import points_of
 
 
-def turned(points: Floats, sectors: int) -> Floats:
+def turned(points, sectors):
     """Turned about z by so many of sixty sectors."""
     angle = 2 * np.pi * sectors / 60
     c, s = np.cos(angle), np.sin(angle)
-    result: Floats = points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
-    return result
+    return points @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
 
 
-def test_vlad_by_hand() -> None:
+def test_vlad_by_hand():
     words = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
     local = np.array([[3.0, 0.0], [0.0, 4.0], [10.0, 2.0]], np.float32)
     # the first word is left (3, 4): 0.6, 0.8; the second (0, 2): 0, 1; the third nothing
@@ -40,7 +34,7 @@ def test_vlad_by_hand() -> None:
 
 
 @pytest.mark.thorough
-def test_fpfh_knows_a_cloud_that_was_turned(with_open3d: None) -> None:
+def test_fpfh_knows_a_cloud_that_was_turned(with_open3d):
     rng = np.random.default_rng(6)
     flat = rng.uniform(0, 2, (6000, 2))
     floor = np.column_stack([flat[:3000], np.zeros(3000)])
@@ -66,7 +60,7 @@ def test_fpfh_knows_a_cloud_that_was_turned(with_open3d: None) -> None:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def room(tmp_path_factory):
     """Twelve views along a path through a synthetic room."""
     out = tmp_path_factory.mktemp("baselines") / "rooms"
     arguments = ["synth", out, "--rooms", 1, "--views", 12, "--seed", 9, "--path", "--jobs", 1]
@@ -75,23 +69,20 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def model_file(small_model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model_file(small_model, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "small.safetensors"
     save_model(small_model, path)
     return path
 
 
-def evaluated(folder: Path, *arguments: object) -> dict[str, Any]:
+def evaluated(folder, *arguments):
     path = folder / "figures.json"
     assert main(["evaluate", *map(str, arguments), "--jobs", "1", "--json", str(path)]) == 0
-    found: dict[str, Any] = json.loads(path.read_text(), parse_constant=pytest.fail)
-    return found
+    return json.loads(path.read_text(), parse_constant=pytest.fail)
 
 
 @pytest.mark.thorough
-def test_baselines_are_rows_of_the_same_table(
-    room: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_baselines_are_rows_of_the_same_table(room, model_file, tmp_path, capsys):
     asked = (room, "--db", "0:12:2", "--queries", "1:12:4", "--model", model_file)
     found = evaluated(tmp_path, *asked, "--baselines", "rings", "thumbnail_l1")
     assert list(found["baselines"]) == ["thumbnail_l1", "rings"]
@@ -116,7 +107,7 @@ def test_baselines_are_rows_of_the_same_table(
 
 
 @pytest.mark.thorough
-def test_frames_that_come_back(room: Path, model_file: Path, tmp_path: Path) -> None:
+def test_frames_that_come_back(room, model_file, tmp_path):
     """Every frame asks those before it by more than 20 cm of travel."""
     poses = [np.loadtxt(room / "seq-01" / f"frame-{i:06d}.pose.txt") for i in range(12)]
     steps = [np.linalg.norm(b[:3, 3] - a[:3, 3]) for a, b in pairwise(poses)]
@@ -152,9 +143,7 @@ def test_frames_that_come_back(room: Path, model_file: Path, tmp_path: Path) -> 
         (["--within", "inf"], "--within"),
     ],
 )
-def test_wrong_options(
-    room: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_options(room, arguments, message, capsys):
     try:
         code = main(["evaluate", str(room), "--db", "0:4", "--queries", "5:6", *arguments])
     except SystemExit as stopped:
@@ -164,9 +153,7 @@ def test_wrong_options(
 
 
 @pytest.mark.thorough
-def test_clouds_are_evaluated_as_depth_images_are(
-    room: Path, model_file: Path, tmp_path: Path
-) -> None:
+def test_clouds_are_evaluated_as_depth_images_are(room, model_file, tmp_path):
     """Views of the room as files of points: ranked, validated, and beside the ring descriptor."""
     folder = tmp_path / "scans"
     folder.mkdir()

@@ -1,7 +1,5 @@
 """Tests of the confidence fit: steps, calibration and known penalties."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, fields
 
@@ -28,15 +26,15 @@ TRUTH = ConfidenceParameters(
 )
 
 
-def drawn(rng: np.random.Generator) -> PlaceEvidence:
+def drawn(rng):
     """Evidence of every kind, anywhere between its knots."""
     values = {name: float(rng.uniform(min(knots), max(knots))) for name, knots in KNOTS.items()}
     values |= {"frames": 5.0 + values["frames"], "accepted": 5.0 * values.pop("acceptance")}
     names = [one.name for one in fields(PlaceEvidence)]
-    return PlaceEvidence(**{name: values.get(name, 0.0) for name in names})  # type: ignore[arg-type]
+    return PlaceEvidence(**{name: values.get(name, 0.0) for name in names})
 
 
-def test_the_penalty_is_the_sum_of_its_steps() -> None:
+def test_the_penalty_is_the_sum_of_its_steps():
     rng = np.random.default_rng(0)
     evidence = [drawn(rng) for _ in range(50)]
     steps = steps_of(evidence)
@@ -53,7 +51,7 @@ def test_the_penalty_is_the_sum_of_its_steps() -> None:
     np.testing.assert_allclose(steps @ np.array(increments), by_hand, atol=1e-9)
 
 
-def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
+def test_what_was_drawn_from_a_model_is_learnt_again():
     """Of 4,000 queries of two candidates: confidences within a few hundredths."""
     rng = np.random.default_rng(1)
     samples = []
@@ -81,7 +79,7 @@ def test_what_was_drawn_from_a_model_is_learnt_again() -> None:
         assert p["worst"] >= p["poor"] >= p["fair"] >= 0.0
 
 
-def test_a_calibration_by_hand() -> None:
+def test_a_calibration_by_hand():
     found = calibration(
         [0.95, 0.95, 0.91, 0.15, 0.05, 0.05], [True, True, False, False, True, False]
     )

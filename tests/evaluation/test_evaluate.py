@@ -1,12 +1,8 @@
 """Tests of `sceneprint evaluate` on a small synthetic building."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
-from pathlib import Path
-from typing import Any
 
 import pytest
 from PIL import Image
@@ -14,45 +10,44 @@ from PIL import Image
 import sceneprint as sp
 from sceneprint.cli import main
 from sceneprint.geometry.rigid import pose_difference
-from sceneprint.models import Model, save_model
+from sceneprint.models import save_model
 
 ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}
 RETRIEVAL = {"top1_overlap_50", "top5_overlap_50", "top1_overlap_30", "mean_overlap"}
 
 
 @pytest.fixture(scope="module")
-def model_file(small_model: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model_file(small_model, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "small.safetensors"
     save_model(small_model, path)
     return path
 
 
-def evaluated(folder: Path, *arguments: object) -> dict[str, Any]:
+def evaluated(folder, *arguments):
     path = folder / "figures.json"
     assert main(["evaluate", *map(str, arguments), "--json", str(path)]) == 0
-    found: dict[str, Any] = json.loads(path.read_text(), parse_constant=pytest.fail)
-    return found
+    return json.loads(path.read_text(), parse_constant=pytest.fail)
 
 
-def copied(room: Path, to: Path) -> Path:
+def copied(room, to):
     """A room of which frames may be spoilt."""
     shutil.copytree(room, to)
     return to
 
 
 @pytest.fixture(scope="module")
-def ranges(building: Path) -> list[str]:
+def ranges(building):
     room = building / "room-000"
     return [f"{room}@db=0:12:3,queries=1:9:3", "--distractors", str(building / "room-001")]
 
 
 @pytest.fixture(scope="module")
-def figures(ranges: list[str], model_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def figures(ranges, model_file, tmp_path_factory):
     folder = tmp_path_factory.mktemp("figures")
     return evaluated(folder, *ranges, "--model", model_file, "--jobs", 1), folder
 
 
-def test_the_json_has_every_key(figures: Any) -> None:
+def test_the_json_has_every_key(figures):
     found, _ = figures
     for row in ("R", "VR", "DR", "VDR", "pose_average"):
         more = RETRIEVAL | {"right_scene"} if row in ("R", "DR") else set()
@@ -73,25 +68,21 @@ def test_the_json_has_every_key(figures: Any) -> None:
     assert found["oracle"]["mean_overlap"] > 0.5  # frames of a path, centimetres apart
 
 
-def test_neighbouring_frames_of_a_room_are_found(figures: Any) -> None:
+def test_neighbouring_frames_of_a_room_are_found(figures):
     found, _ = figures
     assert found["VDR"]["within_10cm_10deg"] == 1.0
     assert found["validation"]["accepted_strong_of_other_scenes"] == 0
 
 
 @pytest.mark.thorough
-def test_the_number_of_processes_changes_nothing(
-    figures: Any, ranges: list[str], model_file: Path, tmp_path: Path
-) -> None:
+def test_the_number_of_processes_changes_nothing(figures, ranges, model_file, tmp_path):
     alone, _ = figures
     several = evaluated(tmp_path, *ranges, "--model", model_file, "--jobs", 2)
     assert several["milliseconds"].keys() == alone["milliseconds"].keys()
     assert several | {"milliseconds": None} == alone | {"milliseconds": None}
 
 
-def test_the_answers_are_those_of_the_library(
-    building: Path, small_model: Model, model_file: Path, tmp_path: Path
-) -> None:
+def test_the_answers_are_those_of_the_library(building, small_model, model_file, tmp_path):
     """What a service gives for the same frames, with the seed it is given, and no other."""
     room, seed = building / "room-000", 3
     found = evaluated(
@@ -139,9 +130,7 @@ def test_the_answers_are_those_of_the_library(
         ]  # fmt: skip
 
 
-def answer_by_library(
-    room: Path, i: int, stored: list[bytes], ranking: Any, chosen: Any, seed: int
-) -> dict[str, Any]:
+def answer_by_library(room, i, stored, ranking, chosen, seed):
     """The whole answer to frame `i`, of every second frame: stopped at five accepted matches."""
     (sequence,) = sp.find_sequences(room)
     poses = [reference.read().pose for reference in sequence.frames]
@@ -162,9 +151,7 @@ def answer_by_library(
     }
 
 
-def test_a_scene_that_is_absent(
-    ranges: list[str], model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_scene_that_is_absent(ranges, model_file, tmp_path, capsys):
     options = ("--absent", "--levels", 1, "--metric", "l2", "--jobs", 1)
     found = evaluated(tmp_path, *ranges, "--model", model_file, *options)
     assert found["absent"]["queries"] == 3
@@ -173,9 +160,7 @@ def test_a_scene_that_is_absent(
     assert "3 queries whose scene is not in the database" in capsys.readouterr().out
 
 
-def test_frames_that_cannot_be_used_are_named(
-    building: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_frames_that_cannot_be_used_are_named(building, model_file, tmp_path, capsys):
     copy = copied(building / "room-000", tmp_path / "room")
     (copy / "seq-01" / "frame-000001.pose.txt").unlink()
     (copy / "seq-01" / "frame-000002.depth.png").write_bytes(b"no picture")
@@ -189,7 +174,7 @@ def test_frames_that_cannot_be_used_are_named(
     assert "left out" in capsys.readouterr().out
 
 
-def test_distractors_need_no_poses(building: Path, model_file: Path, tmp_path: Path) -> None:
+def test_distractors_need_no_poses(building, model_file, tmp_path):
     plain = tmp_path / "elsewhere"
     plain.mkdir()
     room = building / "room-001"
@@ -203,7 +188,7 @@ def test_distractors_need_no_poses(building: Path, model_file: Path, tmp_path: P
     assert found["absent"]["queries"] == 1
 
 
-def test_only_frames_that_overlap_little(building: Path, model_file: Path, tmp_path: Path) -> None:
+def test_only_frames_that_overlap_little(building, model_file, tmp_path):
     asked = (building / "room-000", "--db", "0:12:3", "--queries", "1:9:3", "--max-overlap", 0.7)
     found = evaluated(tmp_path, *asked, "--model", model_file, "--jobs", 1)
     assert found["oracle"]["mean_overlap"] is None or found["oracle"]["mean_overlap"] < 0.9
@@ -211,7 +196,7 @@ def test_only_frames_that_overlap_little(building: Path, model_file: Path, tmp_p
 
 
 @pytest.fixture(scope="module")
-def seven_scenes(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def seven_scenes(building, tmp_path_factory):
     """Two scenes laid out as in the official download: splits, a picture, no intrinsics.json."""
     folder = tmp_path_factory.mktemp("7scenes")
     for room, scene in (("room-000", "chess"), ("room-001", "redkitchen")):
@@ -238,16 +223,12 @@ def seven_scenes(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         (["--distractors", "elsewhere"], "Omit --distractors"),
     ],
 )
-def test_seven_scenes_have_splits_of_their_own(
-    more: list[str], message: str, seven_scenes: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_seven_scenes_have_splits_of_their_own(more, message, seven_scenes, capsys):
     assert main(["evaluate", *more, "--7scenes", str(seven_scenes)]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_seven_scenes_that_are_not_there(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_seven_scenes_that_are_not_there(tmp_path, capsys):
     assert main(["evaluate", "--7scenes", str(tmp_path)]) == 2
     assert "There is no folder chess, fire, heads" in capsys.readouterr().err
     (tmp_path / "chess").mkdir()
@@ -259,13 +240,9 @@ def test_seven_scenes_that_are_not_there(
 
 
 def test_what_cannot_be_written_is_said_before_the_work(
-    building: Path,
-    model_file: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def work(*_: object) -> None:
+    building, model_file, tmp_path, capsys, monkeypatch
+):
+    def work(*_):
         raise AssertionError("hours of it")
 
     monkeypatch.setattr("sceneprint_lab.evaluation.run.evaluate", work)
@@ -282,7 +259,7 @@ def test_what_cannot_be_written_is_said_before_the_work(
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_path: Path) -> None:
+def test_wrong_options_leave_no_folder(building, model_file, tmp_path):
     asked = [building / "room-000", "--db", "0:4", "--queries", "5:6", "--model", model_file]
     asked += ["--levels", "99", "--json", tmp_path / "a" / "b.json"]
     assert main(["evaluate", *map(str, asked)]) == 2
@@ -306,12 +283,8 @@ def test_wrong_options_leave_no_folder(building: Path, model_file: Path, tmp_pat
     ],
 )
 def test_wrong_options_are_one_line_and_exit_code_2(
-    arguments: list[str],
-    message: str,
-    building: Path,
-    model_file: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    arguments, message, building, model_file, capsys
+):
     filled = [a.format(room=building / "room-000") for a in arguments]
     try:
         code = main(["evaluate", *filled, "--model", str(model_file), "--jobs", "1"])

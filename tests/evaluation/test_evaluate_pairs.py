@@ -1,11 +1,7 @@
 """Tests of `sceneprint evaluate-pairs` on a small synthetic building."""
 
-from __future__ import annotations
-
 import json
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,16 +10,13 @@ from sceneprint.cli import main
 from sceneprint.formats.export import write_ply
 from sceneprint.fusion import open3d
 from sceneprint.geometry.rigid import pose_difference
-from sceneprint.models import Model, save_model
-from sceneprint.types import Floats
+from sceneprint.models import save_model
 from sceneprint_lab.evaluation.pair_run import BINS, METHODS, points_of, register
 from sceneprint_lab.evaluation.protocol import every_frame
 
 
 @pytest.fixture(scope="module")
-def asked(
-    building: Path, small_model: Model, tmp_path_factory: pytest.TempPathFactory
-) -> list[str]:
+def asked(building, small_model, tmp_path_factory):
     model = tmp_path_factory.mktemp("model") / "small.safetensors"
     save_model(small_model, model)
     rooms = [str(building / room) for room in ("room-000", "room-001")]
@@ -31,24 +24,19 @@ def asked(
     return ["evaluate-pairs", *rooms, "--model", str(model), *few]
 
 
-def figures(folder: Path, *arguments: str) -> dict[str, Any]:
+def figures(folder, *arguments):
     path = folder / "figures.json"
     assert main([*arguments, "--json", str(path)]) == 0
-    found: dict[str, Any] = json.loads(path.read_text(), parse_constant=pytest.fail)
-    return found
+    return json.loads(path.read_text(), parse_constant=pytest.fail)
 
 
 @pytest.fixture(scope="module")
-def alone(
-    asked: list[str], tmp_path_factory: pytest.TempPathFactory
-) -> tuple[dict[str, Any], Path]:
+def alone(asked, tmp_path_factory):
     folder = tmp_path_factory.mktemp("alone")
     return figures(folder, *asked, "--jobs", "1"), folder
 
 
-def test_pairs_of_rooms_are_registered_and_others_refused(
-    alone: tuple[dict[str, Any], Path],
-) -> None:
+def test_pairs_of_rooms_are_registered_and_others_refused(alone):
     found, _ = alone
     assert found["counts"]["frames"] == {"room-000": 8, "room-001": 8}
     assert found["bins"]["70-100"]["pairs"] > 0
@@ -64,15 +52,13 @@ def test_pairs_of_rooms_are_registered_and_others_refused(
 
 
 @pytest.mark.thorough
-def test_the_number_of_processes_changes_nothing(
-    alone: tuple[dict[str, Any], Path], asked: list[str], tmp_path: Path
-) -> None:
+def test_the_number_of_processes_changes_nothing(alone, asked, tmp_path):
     several = figures(tmp_path, *asked, "--jobs", "2")
     assert several | {"milliseconds": None} == alone[0] | {"milliseconds": None}
 
 
 @pytest.mark.thorough
-def test_clouds_are_registered_as_well(building: Path, asked: list[str], tmp_path: Path) -> None:
+def test_clouds_are_registered_as_well(building, asked, tmp_path):
     room = tmp_path / "scans"
     room.mkdir()
     for i, one in enumerate(every_frame([building / "room-001"])[:4]):
@@ -95,7 +81,7 @@ def test_clouds_are_registered_as_well(building: Path, asked: list[str], tmp_pat
 
 @pytest.mark.usefixtures("with_open3d")
 @pytest.mark.thorough
-def test_baselines_find_a_cloud_again() -> None:
+def test_baselines_find_a_cloud_again():
     """Three walls and a box, turned and moved."""
     rng = np.random.default_rng(0)
     sheet = rng.uniform(0, 1, (6, 700, 3)) * [2.0, 1.5, 1.0]
@@ -103,8 +89,8 @@ def test_baselines_find_a_cloud_again() -> None:
         sheet[i, :, i] = 0.0
         sheet[3 + i] = sheet[i] * 0.3 + [0.9, 0.4, 0.2]
         sheet[3 + i, :, i] = 0.5
-    points: Floats = sheet.reshape(-1, 3)
-    truth: Floats = np.eye(4)
+    points = sheet.reshape(-1, 3)
+    truth = np.eye(4)
     truth[:2, :2] = [[0.8, -0.6], [0.6, 0.8]]
     truth[:3, 3] = 0.5, -1.0, 0.2
     moved = points @ truth[:3, :3].T + truth[:3, 3]
@@ -121,18 +107,14 @@ def test_baselines_find_a_cloud_again() -> None:
     assert register(points[:5], moved, open3d("A test")) == {}
 
 
-def test_baselines_without_open3d_are_refused(
-    asked: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_baselines_without_open3d_are_refused(asked, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "open3d", None)
     assert main([*asked, "--baselines"]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "apt-get install libgl1" in line
 
 
-def test_what_cannot_be_done_is_one_line(
-    building: Path, asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_what_cannot_be_done_is_one_line(building, asked, capsys, tmp_path):
     room, model = str(building / "room-000"), asked[asked.index("--model") + 1]
     single = tmp_path / "single"
     single.mkdir()

@@ -1,16 +1,13 @@
 """Tests of rows, acceptance, lost queries and diversity against manual results."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint.types import DepthFrame, Intrinsics
 from sceneprint_lab.evaluation.judgement import views_to_average
 from sceneprint_lab.evaluation.measures import (
     PLACES,
@@ -27,8 +24,6 @@ from sceneprint_lab.evaluation.measures import (
 from sceneprint_lab.evaluation.protocol import (
     Error,
     JudgedAnswer,
-    QueryOutcome,
-    ValidatedPair,
     pose_error,
 )
 from sceneprint_lab.evaluation.report import (
@@ -37,11 +32,8 @@ from sceneprint_lab.evaluation.report import (
     without_infinities,
 )
 
-MakePair = Callable[..., ValidatedPair]
-MakeOutcome = Callable[..., QueryOutcome]
 
-
-def test_rows_of_three_queries(three: list[QueryOutcome]) -> None:
+def test_rows_of_three_queries(three):
     found = rows(three)  # the third has no scene to be found in
     assert found["R"] == {
         "within_5cm_5deg": 0.0,
@@ -68,7 +60,7 @@ def test_rows_of_three_queries(three: list[QueryOutcome]) -> None:
     assert bound(three)["pose_average"]["within_5cm_5deg"] == 0.5
 
 
-def test_acceptance_of_three_queries(three: list[QueryOutcome]) -> None:
+def test_acceptance_of_three_queries(three):
     found = validation(three)
     assert (found["pairs"], found["accepted"], found["accepted_strong"]) == (7, 5, 2)
     assert found["precision"] == pytest.approx(3 / 5)  # 15 cm, and another scene
@@ -88,7 +80,7 @@ def test_acceptance_of_three_queries(three: list[QueryOutcome]) -> None:
     }
 
 
-def test_whole_answers_by_hand() -> None:
+def test_whole_answers_by_hand():
     """Two are right, one is off a little, one faces elsewhere, one is in another room."""
     told = [
         JudgedAnswer("found", "strong", Error(0.02, 0.01)),
@@ -119,7 +111,7 @@ def test_whole_answers_by_hand() -> None:
     assert set(nothing.values()) == {None}
 
 
-def test_where_three_queries_are_lost(three: list[QueryOutcome]) -> None:
+def test_where_three_queries_are_lost(three):
     counts = lost(three)
     assert list(counts) == list(PLACES)
     assert sum(counts.values()) == 3
@@ -141,21 +133,12 @@ def test_where_three_queries_are_lost(three: list[QueryOutcome]) -> None:
         ("not_in_c", "ambiguous", None, [0.2, 0.3], [0, 1], [0]),
     ],
 )
-def test_each_place(
-    place: str,
-    status: str,
-    off: Error | None,
-    least: list[float],
-    ranking: list[int],
-    selection: list[int],
-    make_outcome: MakeOutcome,
-    make_pair: MakePair,
-) -> None:
+def test_each_place(place, status, off, least, ranking, selection, make_outcome, make_pair):
     pairs = [make_pair(0, status, off=off), make_pair(1, "rejected")]
     assert place_of(make_outcome(ranking, selection, pairs, least=least)) == place
 
 
-def test_views_to_average(make_pair: MakePair) -> None:
+def test_views_to_average(make_pair):
     pairs = [
         make_pair(0, strength="weak"),
         make_pair(1, scene="there"),
@@ -169,8 +152,8 @@ def test_views_to_average(make_pair: MakePair) -> None:
     assert views_to_average([pairs[2]]) == []
 
 
-def test_pose_error() -> None:
-    truth: Floats = np.eye(4)
+def test_pose_error():
+    truth = np.eye(4)
     truth[:3, 3] = (1, 2, 3)
     off = truth.copy()
     c, s = math.cos(0.3), math.sin(0.3)
@@ -186,18 +169,18 @@ def test_pose_error() -> None:
 CAMERA = Intrinsics(40, 4, 100.0, 100.0, 0.0, 0.0)
 
 
-def dots(*columns: int, shift: float = 0.0, depth: float = 1.01) -> DepthFrame:
+def dots(*columns, shift=0.0, depth=1.01):
     """Single samples in the first row: 10 columns are five voxels at 1 m."""
     image = np.zeros((4, 40), np.float32)
     image[0, list(columns)] = depth
-    pose: Floats = np.eye(4)
+    pose = np.eye(4)
     pose[0, 3] = shift
     return DepthFrame(image, CAMERA, "dots", pose)
 
 
-def test_diversity_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
+def test_diversity_by_hand(make_outcome, make_pair):
     database = [dots(0), dots(0), dots(0, 10), dots(0, 10, 20), dots(30)]
-    poses: list[Floats] = [np.eye(4) for _ in database]
+    poses = [np.eye(4) for _ in database]
     for pose, x in zip(poses, (1.0, 2.0, 4.0, 8.0, 16.0), strict=True):
         pose[0, 3] = x
     one = make_outcome(
@@ -220,7 +203,7 @@ def test_diversity_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> No
     assert (found["queries"], found["queries_validated"]) == (1, 1)
 
 
-def test_json_has_null_for_what_is_infinite(three: list[QueryOutcome]) -> None:
+def test_json_has_null_for_what_is_infinite(three):
     names = ["a", "b", "c", "d"]
     found = without_infinities({"per_query": [per_query(one, names) for one in three]})
     read = json.loads(to_json(found))
@@ -232,14 +215,14 @@ def test_json_has_null_for_what_is_infinite(three: list[QueryOutcome]) -> None:
         to_json({"x": math.nan})
 
 
-def test_answers_of_a_query_by_hand(make_outcome: MakeOutcome, make_pair: MakePair) -> None:
+def test_answers_of_a_query_by_hand(make_outcome, make_pair):
     """Three of R count; C has a weak one, a rejected, a strong and an ambiguous one."""
 
-    def found(match: int, T: Floats | None, *how: str) -> ValidatedPair:
+    def found(match, T, *how):
         one = make_pair(match, *how)
         return replace(one, validation=replace(one.validation, T_match_query=T))
 
-    moved: Floats = np.eye(4)
+    moved = np.eye(4)
     moved[:3, 3] = (1.5, -2.0, math.inf)
     pairs = [
         found(4, np.eye(4), "accepted", "weak"),

@@ -1,11 +1,9 @@
 """Tests of overlap against manual results and a simple loop."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint.types import DepthFrame, Intrinsics
 from sceneprint_lab.evaluation.protocol import (
     GRID,
     PAIR_TOLERANCE,
@@ -19,14 +17,14 @@ from sceneprint_lab.evaluation.protocol import (
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 39.5, 29.5)
 
 
-def wall(shift: float = 0.0, distance: float = 2.0) -> DepthFrame:
+def wall(shift=0.0, distance=2.0):
     """A wall across the whole image, seen from `shift` metres to the right."""
-    pose: Floats = np.eye(4)
+    pose = np.eye(4)
     pose[0, 3] = shift
     return DepthFrame(np.full((60, 80), distance, np.float32), CAMERA, pose=pose)
 
 
-def test_by_hand() -> None:
+def test_by_hand():
     # the grid has 4 columns at 10, 30, 50, 70; 2 m away, 40 px are 40 / 70 * 2 m: two columns
     half = 40 / 70 * 2
     others = [wall(), wall(half), wall(100.0), wall(0.0, 3.0)]
@@ -35,13 +33,13 @@ def test_by_hand() -> None:
     np.testing.assert_allclose(found.least, [[1.0, 0.5, 0.0, 0.0]], atol=1e-12)
 
 
-def test_the_two_tolerances() -> None:
+def test_the_two_tolerances():
     # 10.5 cm apart at 2 m: within 5 cm + 3 % (11 cm), not within 10 cm
     assert overlap(view_of(wall()), view_of(wall(0.0, 2.105))) == (1.0, 0.0)
     assert overlap(view_of(wall()), view_of(wall(0.0, 2.095))) == (1.0, 1.0)
 
 
-def test_the_mean_and_the_smaller_direction() -> None:
+def test_the_mean_and_the_smaller_direction():
     half = wall()
     half.depth[:, 40:] = 0  # sees two of the four columns, and all it sees is seen by the other
     assert overlap(view_of(wall()), view_of(half)) == (0.75, 0.5)
@@ -50,12 +48,12 @@ def test_the_mean_and_the_smaller_direction() -> None:
     assert overlap(view_of(wall()), view_of(empty)) == (0.0, 0.0)
 
 
-def test_a_frame_without_a_pose_has_no_overlap() -> None:
+def test_a_frame_without_a_pose_has_no_overlap():
     with pytest.raises(ValueError, match="has no pose"):
         view_of(DepthFrame(wall().depth, CAMERA, "lost"))
 
 
-def plain_shares(a: DepthFrame, b: DepthFrame) -> tuple[float, float]:
+def plain_shares(a, b):
     """Of the samples of a, those that b sees where they are."""
     assert a.pose is not None
     assert b.pose is not None
@@ -79,7 +77,7 @@ def plain_shares(a: DepthFrame, b: DepthFrame) -> tuple[float, float]:
     return loose / seen, strict / seen
 
 
-def test_against_the_plain_loop(room_frames: tuple[DepthFrame, ...]) -> None:
+def test_against_the_plain_loop(room_frames):
     from sceneprint_lab.synth import synthesise_room
 
     frames = [*room_frames[:3], *synthesise_room(3, 0, 25, along_path=True, step=12).frames]

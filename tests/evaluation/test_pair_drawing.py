@@ -1,41 +1,37 @@
 """Tests of the sampling of pairs from given overlaps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sceneprint.types import Floats
-from sceneprint_lab.evaluation.pair_run import BINS, Drawing, Drawn, FrameOrigin, draw, inside
+from sceneprint_lab.evaluation.pair_run import BINS, Drawing, FrameOrigin, draw, inside
 from sceneprint_lab.evaluation.protocol import Overlaps
 
 ALL = Drawing(pairs=1000, negatives=0, apart=1)
 NO_PLANES = np.zeros(100, bool)
 
 
-def places(scene: str, n: int, run: str = "run") -> list[FrameOrigin]:
+def places(scene, n, run="run"):
     return [FrameOrigin(scene, f"{scene}/{run}", i) for i in range(n)]
 
 
-def of_matrix(least: Floats, mean: Floats | None = None) -> Overlaps:
+def of_matrix(least, mean=None):
     both = np.maximum(least, least.T)
     return Overlaps(both if mean is None else np.maximum(mean, mean.T), both)
 
 
-def couples(drawn: list[Drawn], name: str | None) -> set[tuple[int, int]]:
+def couples(drawn, name):
     return {(one.query, one.match) for one in drawn if one.bin == name}
 
 
-def test_the_edges_of_the_bins() -> None:
+def test_the_edges_of_the_bins():
     assert BINS == ("10-30", "30-50", "50-70", "70-100")
     overlap = np.array([0.0, 0.099, 0.1, 0.299, 0.3, 0.5, 0.7, 1.0])
     found = {name: np.flatnonzero(inside(overlap, name)).tolist() for name in BINS}
     assert found == {"10-30": [2, 3], "30-50": [4], "50-70": [5], "70-100": [6, 7]}
 
 
-def test_every_pair_has_its_bin_and_the_later_frame_asks() -> None:
+def test_every_pair_has_its_bin_and_the_later_frame_asks():
     least = np.zeros((5, 5))
     least[1, 0], least[2, 0], least[2, 1], least[3, 0], least[3, 1] = 0.2, 0.4, 0.6, 1.0, 0.05
     mean = least.copy()
@@ -50,7 +46,7 @@ def test_every_pair_has_its_bin_and_the_later_frame_asks() -> None:
     assert {one.overlap_least for one in drawn if one.bin == "50-70"} == {0.6}
 
 
-def test_neighbours_of_one_sequence_are_left_out() -> None:
+def test_neighbours_of_one_sequence_are_left_out():
     four = [*places("a", 3), *places("a", 3, "other")]
     drawn = draw(four, of_matrix(np.full((6, 6), 0.8)), NO_PLANES[:6], replace(ALL, apart=2))
     within = {(2, 0), (5, 3)}
@@ -58,7 +54,7 @@ def test_neighbours_of_one_sequence_are_left_out() -> None:
     assert couples(drawn, "70-100") == within | between
 
 
-def test_so_many_of_each_bin_each_once_and_the_same_every_time() -> None:
+def test_so_many_of_each_bin_each_once_and_the_same_every_time():
     rng = np.random.default_rng(1)
     truth = of_matrix(np.tril(rng.random((40, 40)), -1))
     few = replace(ALL, pairs=20, seed=3)
@@ -70,16 +66,16 @@ def test_so_many_of_each_bin_each_once_and_the_same_every_time() -> None:
     assert all(truth.least[one.query, one.match] == one.overlap_least for one in drawn)
 
 
-def test_pairs_of_two_scenes_are_shared_out_and_a_quarter_is_planar() -> None:
+def test_pairs_of_two_scenes_are_shared_out_and_a_quarter_is_planar():
     n = 20
     three = [*places("a", n), *places("b", n), *places("c", n)]
-    planar: NDArray[np.bool_] = np.zeros(3 * n, bool)
+    planar = np.zeros(3 * n, bool)
     planar[[1, n + 2]] = True
     nothing = Overlaps(np.zeros((60, 60)), np.zeros((60, 60)))
     drawn = draw(three, nothing, planar, Drawing(pairs=0, negatives=100, apart=1))
     assert len(drawn) == len({(one.query, one.match) for one in drawn}) == 100
     assert {one.kind for one in drawn} == {"cross_scene"}
-    counts: dict[str, list[bool]] = {}
+    counts = {}
     for one in drawn:
         key = three[one.query].scene + three[one.match].scene
         counts.setdefault(key, []).append(one.planar)

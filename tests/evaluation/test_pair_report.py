@@ -1,18 +1,13 @@
 """Tests of the figures of pairs against manual results."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
-from sceneprint.types import Floats
 from sceneprint_lab.evaluation.pair_report import (
     pair_figures,
     pair_table,
@@ -20,33 +15,33 @@ from sceneprint_lab.evaluation.pair_report import (
     support,
 )
 from sceneprint_lab.evaluation.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
-from sceneprint_lab.evaluation.protocol import RIGHT, Error, SignedFrame, ValidatedPair
+from sceneprint_lab.evaluation.protocol import RIGHT, Error, SignedFrame
 from sceneprint_lab.evaluation.report import to_json
 
 ACCEPTANCE = AcceptanceParameters()
 CM3, CM7, CM15, AWAY = Error(0.03, 0.0), Error(0.07, 0.0), Error(0.15, 0.0), Error(2.0, 1.0)
 
 
-def member(number: int, scene: str) -> SignedFrame:
+def member(number, scene):
     return SignedFrame(number, f"{scene}/{number}", scene, np.eye(4), np.empty(0, np.uint8))
 
 
 MEMBERS = [member(0, "here"), member(1, "here"), member(2, "there")]
 
 
-def overlapping(name: str, pair: ValidatedPair, bound: Error = CM3) -> Tried:
+def overlapping(name, pair, bound=CM3):
     drawn = Drawn(1, 0, "overlapping", name, 0.4, int(name.split("-")[0]) / 100, planar=False)
     return Tried(drawn, replace(pair, overlap_least=drawn.overlap_least, bound=bound), None, None)
 
 
-def negative(pair: ValidatedPair, *, planar: bool = False, cross: bool = True) -> Tried:
+def negative(pair, *, planar=False, cross=True):
     kind = "cross_scene" if cross else "same_scene"
-    drawn = Drawn(0, 2 if cross else 1, kind, None, 0.0, 0.0, planar)  # type: ignore[arg-type]
+    drawn = Drawn(0, 2 if cross else 1, kind, None, 0.0, 0.0, planar)
     return Tried(drawn, replace(pair, overlap_least=0.0), None, None)
 
 
 @pytest.fixture
-def tried(make_pair: Callable[..., ValidatedPair]) -> list[Tried]:
+def tried(make_pair):
     """Two pairs of the first bin and three of the second, five negatives, one of them accepted."""
     strange = {"scene": "there"}
     return [
@@ -63,17 +58,17 @@ def tried(make_pair: Callable[..., ValidatedPair]) -> list[Tried]:
     ]
 
 
-def evaluation(tried: list[Tried]) -> PairEvaluation:
+def evaluation(tried):
     planes = np.array([0.2, 0.7, 0.6])
     return PairEvaluation(MEMBERS, RIGHT, ACCEPTANCE, planes, tried, [("here/9", "empty")], 5.0)
 
 
 @pytest.fixture
-def found(tried: list[Tried]) -> dict[str, Any]:
+def found(tried):
     return pair_figures(evaluation(tried), {"seed": 0, "right": RIGHT})
 
 
-def test_precision_is_null_where_none_was_accepted(found: dict[str, Any]) -> None:
+def test_precision_is_null_where_none_was_accepted(found):
     first, second, third, _ = (found["bins"][name]["validation"] for name in BINS)
     assert (first["precision"], first["recall"], first["accepted"]) == (None, None, 0)
     assert (second["precision"], second["accepted"]) == (1.0, 2)
@@ -85,7 +80,7 @@ def test_precision_is_null_where_none_was_accepted(found: dict[str, Any]) -> Non
     assert overall["recall_overlap_30"] == pytest.approx(2 / 3)
 
 
-def test_negatives_and_how_many_may_be(found: dict[str, Any]) -> None:
+def test_negatives_and_how_many_may_be(found):
     of = found["negatives"]
     counts = [of["cross_scene"][k] for k in ("pairs", "planar", "accepted", "accepted_strong")]
     assert counts == [4, 2, 1, 0]
@@ -97,7 +92,7 @@ def test_negatives_and_how_many_may_be(found: dict[str, Any]) -> None:
     assert found["counts"]["planar"] == {"here": 1, "there": 1}
 
 
-def test_failures_are_named_the_worst_first(found: dict[str, Any]) -> None:
+def test_failures_are_named_the_worst_first(found):
     told = [(one["number"], one["what"], one["match"]) for one in found["failures"]]
     assert told == [
         (8, "wrongly_accepted", "there/2"),
@@ -110,7 +105,7 @@ def test_failures_are_named_the_worst_first(found: dict[str, Any]) -> None:
     assert found["failures"][3]["reason"] == "as given"
 
 
-def test_baselines_beside_ours(tried: list[Tried]) -> None:
+def test_baselines_beside_ours(tried):
     others = {
         "FPFH + RANSAC": Other(CM15, CM7, CM3, 400.0),
         "FPFH + FGR": Other(AWAY, AWAY, AWAY, 200.0),
@@ -129,7 +124,7 @@ def test_baselines_beside_ours(tried: list[Tried]) -> None:
     assert (found["pairs"], found["milliseconds"]) == (4, 100.0)
 
 
-def test_the_json_is_one_and_the_table_says_it(found: dict[str, Any]) -> None:
+def test_the_json_is_one_and_the_table_says_it(found):
     assert json.loads(to_json(found)) == json.loads(json.dumps(found))
     lines = "\n".join(pair_table(found))
     assert "1 wrongly accepted, 1 not believed, 1 near, 1 not found" in lines
@@ -137,20 +132,18 @@ def test_the_json_is_one_and_the_table_says_it(found: dict[str, Any]) -> None:
     assert f"{1 - math.sqrt(0.05):.5f}" in lines
 
 
-def at(x: float) -> Floats:
+def at(x):
     T = np.eye(4)
     T[0, 3] = x
     return T
 
 
-def test_a_second_pair_from_another_viewpoint_supports(
-    make_pair: Callable[..., ValidatedPair],
-) -> None:
+def test_a_second_pair_from_another_viewpoint_supports(make_pair):
     """Matches stand at 0, 1 and .05 m; what a pair says of its query is where it puts it."""
     members = [replace(member(i, "here"), pose=at(x)) for i, x in enumerate((0.0, 1.0, 0.05))]
     members += [member(i, "here") for i in (3, 4, 5)]
 
-    def pair(query: int, match: int, says: float, status: str = "accepted") -> Tried:
+    def pair(query, match, says, status="accepted"):
         one = make_pair(match, status, off=CM3)
         T = at(says - float(members[match].pose[0, 3]))
         drawn = Drawn(query, match, "overlapping", "30-50", 0.4, 0.4, planar=False)

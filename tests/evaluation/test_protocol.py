@@ -1,7 +1,5 @@
 """Tests of the split into database and query frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,6 @@ from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
 from sceneprint.types import Intrinsics
 from sceneprint_lab.evaluation.protocol import (
-    EvaluationProtocol,
     PathRanges,
     Range,
     choose,
@@ -20,7 +17,7 @@ from sceneprint_lab.evaluation.protocol import (
 )
 
 
-def scene(folder: Path, sequences: dict[int, int]) -> Path:
+def scene(folder, sequences):
     """A 7-Scenes scene of sequences with so many tiny frames."""
     folder.mkdir(parents=True)
     write_intrinsics(folder, Camera(Intrinsics(8, 6, 7, 7, 3.5, 2.5)))
@@ -34,13 +31,13 @@ def scene(folder: Path, sequences: dict[int, int]) -> Path:
     return folder
 
 
-def split(folder: Path, train: list[int], test: list[int]) -> Path:
+def split(folder, train, test):
     for name, numbers in (("TrainSplit.txt", train), ("TestSplit.txt", test)):
         (folder / name).write_text("".join(f"sequence{n}\n" for n in numbers))
     return folder
 
 
-def names(protocol: EvaluationProtocol, use: str) -> list[str]:
+def names(protocol, use):
     return [f.name.replace("frame-00000", "") for f in protocol.frames if f.use == use]
 
 
@@ -55,17 +52,17 @@ def names(protocol: EvaluationProtocol, use: str) -> list[str]:
         ("::3", [Range(None, None, 3)]),
     ],
 )
-def test_ranges(text: str, ranges: list[Range]) -> None:
+def test_ranges(text, ranges):
     assert list(parse_ranges(text)) == ranges
 
 
 @pytest.mark.parametrize("text", ["", "7", "a:b", "5:5", "9:3", "0:9:0", "0:9:1:1", "-5:9", "0:9,"])
-def test_what_is_no_range(text: str) -> None:
+def test_what_is_no_range(text):
     with pytest.raises(DatasetError, match=r"START:STOP|STOP above START"):
         parse_ranges(text)
 
 
-def test_parts() -> None:
+def test_parts():
     assert parse_part("a/b@c") == PathRanges(Path("a/b@c"))
     assert parse_part("a@b@db=0:9,queries=9:") == PathRanges(
         Path("a@b"), (Range(0, 9, None),), (Range(9, None, None),)
@@ -76,7 +73,7 @@ def test_parts() -> None:
             parse_part(text)
 
 
-def test_ranges_count_over_the_sequences_of_a_path(tmp_path: Path) -> None:
+def test_ranges_count_over_the_sequences_of_a_path(tmp_path):
     path = scene(tmp_path / "kitchen", {1: 4, 2: 4})
     found = choose(
         [PathRanges(path)],
@@ -92,7 +89,7 @@ def test_ranges_count_over_the_sequences_of_a_path(tmp_path: Path) -> None:
     assert names(found, "database") == ["kitchen/seq-01/0", "kitchen/seq-01/3"]
 
 
-def test_splits_and_distractors(tmp_path: Path) -> None:
+def test_splits_and_distractors(tmp_path):
     first = split(scene(tmp_path / "kitchen", {1: 2, 2: 2, 3: 1}), [1], [2])
     second = split(scene(tmp_path / "office", {1: 1, 2: 3}), [2], [1])
     other = scene(tmp_path / "far" / "hall", {1: 1})
@@ -111,7 +108,7 @@ def test_splits_and_distractors(tmp_path: Path) -> None:
     assert first.name == "kitchen"
 
 
-def test_what_cannot_be_measured(tmp_path: Path) -> None:
+def test_what_cannot_be_measured(tmp_path):
     path = scene(tmp_path / "kitchen", {1: 4})
     twin = scene(tmp_path / "other" / "kitchen", {1: 4})
     some, rest = parse_ranges("0:2"), parse_ranges("2:4")

@@ -1,7 +1,5 @@
 """Tests of R and C, for both computations of the distances within R."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from sceneprint_lab.evaluation import judgement
 from sceneprint_lab.evaluation.judgement import rank
 
 
-def test_by_hand() -> None:
+def test_by_hand():
     queries = np.array([[10, 10]], np.uint8)
     database = np.array([[10, 16], [10, 11], [12, 12], [14, 13], [10, 11]], np.uint8)
     allowed = np.array([[True, True, True, True, False]])
@@ -24,16 +22,14 @@ def test_by_hand() -> None:
     assert set(found.milliseconds) == {"rank", "compare_ranking", "diversify"}
 
 
-def test_a_query_that_may_find_nothing() -> None:
+def test_a_query_that_may_find_nothing():
     one = np.zeros((1, 4), np.uint8)
     (found,) = rank(one, one, np.zeros((1, 1), bool), metric="l1")
     assert (found.ranking, found.selection) == ([], [])
 
 
 @pytest.mark.parametrize("metric", ["l1", "l2"])
-def test_both_ways_to_compare_give_the_same(
-    metric: judgement.Metric, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_both_ways_to_compare_give_the_same(metric, monkeypatch):
     rng = np.random.default_rng(3)
     database = rng.integers(0, 255, (150, 64), dtype=np.uint8)
     queries = rng.integers(0, 255, (12, 64), dtype=np.uint8)

@@ -1,7 +1,5 @@
 """Tests of rate bounds against SciPy and their definition, and of curves against counts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import beta, binom
@@ -10,7 +8,7 @@ from sceneprint_lab.evaluation.measures import roc, upper_bound
 
 
 @pytest.mark.parametrize(("seen", "of"), [(0, 1), (0, 2000), (1, 10), (3, 40), (9, 10), (37, 700)])
-def test_the_bound_is_that_of_clopper_and_pearson(seen: int, of: int) -> None:
+def test_the_bound_is_that_of_clopper_and_pearson(seen, of):
     bound = upper_bound(seen, of)
     assert bound is not None
     assert bound == pytest.approx(beta.ppf(0.95, seen + 1, of - seen), rel=1e-9)
@@ -18,13 +16,13 @@ def test_the_bound_is_that_of_clopper_and_pearson(seen: int, of: int) -> None:
     assert binom.cdf(seen, of, bound) == pytest.approx(0.05, rel=1e-6)
 
 
-def test_none_seen_is_the_rule_of_three() -> None:
+def test_none_seen_is_the_rule_of_three():
     assert upper_bound(0, 2000) == pytest.approx(1 - 0.05 ** (1 / 2000), rel=1e-12)
     assert upper_bound(0, 2000) == pytest.approx(3 / 2000, rel=3e-3)
     assert upper_bound(0, 2000, 0.99) == pytest.approx(4.6 / 2000, rel=2e-3)
 
 
-def test_a_curve_by_hand() -> None:
+def test_a_curve_by_hand():
     right = np.array([True, True, False, True, False])
     curve = roc(np.array([5.0, 4.0, 3.0, 3.0, 1.0]), right)
     assert curve is not None
@@ -38,7 +36,7 @@ def test_a_curve_by_hand() -> None:
     ]  # fmt: skip
 
 
-def test_the_area_is_the_share_of_couples_in_order() -> None:
+def test_the_area_is_the_share_of_couples_in_order():
     rng = np.random.default_rng(4)
     scores = rng.normal(size=400).round(1)
     scores[:30] = -np.inf

@@ -1,20 +1,18 @@
 """Tests of recall and travelled distance against manual results."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sceneprint_lab.evaluation.measures import metres_apart, recall
 from sceneprint_lab.evaluation.protocol import SignedFrame, travelled
 
 
-def member(name: str, x: float, y: float = 0.0, scene: str = "hall") -> SignedFrame:
+def member(name, x, y=0.0, scene="hall"):
     pose = np.eye(4)
     pose[:2, 3] = x, y
     return SignedFrame(0, name, scene, pose, np.zeros(4, np.uint8))
 
 
-def test_recall_by_hand() -> None:
+def test_recall_by_hand():
     relevant = np.array([[1, 0, 1], [0, 0, 1], [0, 1, 0], [0, 0, 0]], bool)
     allowed = np.array([[1, 1, 0], [1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
     # the first finds at once; the second at the third place; of the third what is relevant may
@@ -26,12 +24,12 @@ def test_recall_by_hand() -> None:
     assert nothing == {"queries": 0, "at_1": None, "at_5": None, "at_10": None}
 
 
-def test_poses_of_two_scenes_are_not_compared() -> None:
+def test_poses_of_two_scenes_are_not_compared():
     found = metres_apart([member("a/1", 0)], [member("a/2", 3, 4), member("b/1", 0, 0, "shed")])
     np.testing.assert_array_equal(found, [[5.0, np.inf]])
 
 
-def test_travel_leads_through_all_frames_of_a_run() -> None:
+def test_travel_leads_through_all_frames_of_a_run():
     # out to 3 m and back: frame 10 comes after frame 9, at the place of frame 1
     run = [member("hall/1", 0), member("hall/9", 3), member("hall/10", 0)]
     other = member("hall/b/1", 0)

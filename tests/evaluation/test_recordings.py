@@ -1,9 +1,6 @@
 """Tests of the accuracy of a reduced, deterministic evaluation of recordings."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +8,7 @@ from sceneprint.cli import main
 
 
 @pytest.mark.thorough
-def test_redkitchen_among_other_scenes(data_root: Path, tmp_path: Path) -> None:
+def test_redkitchen_among_other_scenes(data_root, tmp_path):
     """Every 15th frame of the forward database, and other scenes in it as well."""
     kitchen, desk = data_root / "7scenes/redkitchen", data_root / "tum/fr1_rpy"
     path = tmp_path / "figures.json"

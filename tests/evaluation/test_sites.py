@@ -1,13 +1,11 @@
 """Tests of answers at a small ambiguous site."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
 
 from sceneprint.models import read_model
-from sceneprint.pipeline import Signer, open_signer
+from sceneprint.pipeline import open_signer
 from sceneprint_lab.evaluation import sites
 from sceneprint_lab.evaluation.protocol import Error, JudgedAnswer
 from sceneprint_lab.evaluation.sites import ask_site, kinds_of
@@ -19,7 +17,7 @@ SCAN = (0.5, 10.0)
 
 
 @pytest.mark.thorough
-def test_a_site_is_asked_and_every_answer_is_one_of_three(small_signer: Signer) -> None:
+def test_a_site_is_asked_and_every_answer_is_one_of_three(small_signer):
     answers = ask_site(small_signer, ("object", 0, 2), seed=5)
     assert [(one.site, one.query, one.answerable) for one in answers] == [
         ("object-000", 0, True),
@@ -36,7 +34,7 @@ def test_a_site_is_asked_and_every_answer_is_one_of_three(small_signer: Signer) 
 
 
 @pytest.mark.thorough
-def test_a_prior_decides_between_places_that_look_alike() -> None:
+def test_a_prior_decides_between_places_that_look_alike():
     signer = open_signer(read_model("depth"))
     alone = ask_site(signer, ("object", 0, 2), seed=5)
     assert [one.answer.status for one in alone] == ["ambiguous", "ambiguous"]
@@ -45,12 +43,12 @@ def test_a_prior_decides_between_places_that_look_alike() -> None:
     assert max(one.answer.error.metres for one in told_where) < 0.1
 
 
-def test_a_model_is_asked_at_places_of_its_sensor() -> None:
+def test_a_model_is_asked_at_places_of_its_sensor():
     assert kinds_of(read_model("depth")) == KINDS + ORDINARY
     assert kinds_of(read_model("lidar")) == SURVEYED_KINDS
 
 
-def test_the_answer_of_a_scanner_may_be_five_times_as_far_off() -> None:
+def test_the_answer_of_a_scanner_may_be_five_times_as_far_off():
     for metres, right, gross in ((0.45, True, False), (0.55, False, False), (2.6, False, True)):
         scanned, seen = (
             JudgedAnswer("found", "strong", Error(share * metres, 0.1), limits=limits)
@@ -62,9 +60,7 @@ def test_the_answer_of_a_scanner_may_be_five_times_as_far_off() -> None:
     assert (turned.right, turned.grossly_wrong) == (False, True)
 
 
-def test_a_site_whose_map_is_one_surface_is_asked_of_views(
-    small_signer: Signer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_site_whose_map_is_one_surface_is_asked_of_views(small_signer, monkeypatch):
     monkeypatch.setattr(sites, "VIEWS", 12)
     answers = ask_site(small_signer, ("object", 0, 1), seed=5, as_surface=True)
     places = [place for one in answers for place in one.answer.places]
@@ -73,7 +69,7 @@ def test_a_site_whose_map_is_one_surface_is_asked_of_views(
 
 
 @pytest.mark.thorough
-def test_a_scanned_site_is_asked() -> None:
+def test_a_scanned_site_is_asked():
     signer = open_signer(read_model("lidar"))
     (answer,) = ask_site(signer, ("bays", 0, 1), seed=1)
     assert (answer.site, answer.answerable) == ("bays-000", True)

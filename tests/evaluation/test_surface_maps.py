@@ -1,7 +1,5 @@
 """Tests of maps that are fused to a surface and rendered as views."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +15,7 @@ from sceneprint_lab.synth.dataset import room_and_rng
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def test_clouds_are_joined_to_a_point_a_voxel() -> None:
+def test_clouds_are_joined_to_a_point_a_voxel():
     """In the parent frame: the mean of what lies in each voxel."""
     quarter = np.array([[0.0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     first = Cloud(np.array([[0.2, 0.2, 0.2], [3.0, 0.5, 0.5]], np.float32), pose=np.eye(4))
@@ -29,7 +27,7 @@ def test_clouds_are_joined_to_a_point_a_voxel() -> None:
     np.testing.assert_array_equal(joined.up, UP)
 
 
-def test_depth_images_are_joined_to_a_mesh_that_views_are_rendered_of() -> None:
+def test_depth_images_are_joined_to_a_mesh_that_views_are_rendered_of():
     room = synthesise_room(3, 0, 12)
     joined = join_frames(room.frames, 0.05, UP)
     assert joined.triangles is not None

@@ -25,7 +25,7 @@ class Lens:
     height: int
 
     @property
-    def rays(self) -> Floats:
+    def rays(self):
         """Return rays (H, W, 3) in optical axes, z = 1."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
@@ -38,7 +38,7 @@ class Room:
     lens = Lens(105.0, 103.0, 38.5, 31.0, 80, 60)
 
     @staticmethod
-    def poses() -> list[Floats]:
+    def poses():
         """Return T_world_camera (4, 4) in optical axes at three places with different rotations."""
         found = []
         for x, y, z, turn, pitch, roll in (
@@ -57,33 +57,32 @@ class Room:
         return found
 
     @staticmethod
-    def distances(origin: Floats, directions: Floats) -> Floats:
+    def distances(origin, directions):
         """Return the distances to the walls from within, in lengths of the directions (..., 3)."""
         with np.errstate(divide="ignore"):
             reach = np.where(directions > 0, SIZE - origin, -origin) / directions
         reach[directions == 0] = np.inf
-        found: Floats = reach.min(axis=-1)
-        return found
+        return reach.min(axis=-1)
 
-    def depth(self, T_world_camera: Floats, lens: Lens | None = None) -> Floats:
+    def depth(self, T_world_camera, lens=None):
         """Return depth (H, W) along the optical axis, metres."""
         rays = (lens or self.lens).rays @ T_world_camera[:3, :3].T
         return self.distances(T_world_camera[:3, 3], rays)
 
-    def points(self, T_world_scan: Floats, count: int = 2000) -> Floats:
+    def points(self, T_world_scan, count=2000):
         """Return points (N, 3) of the walls in the axes of a scanner, in all directions."""
         directions = np.random.default_rng(5).normal(size=(count, 3))
         world = directions @ T_world_scan[:3, :3].T
         return directions * self.distances(T_world_scan[:3, 3], world)[:, None]
 
     @staticmethod
-    def error(points: Floats) -> float:
+    def error(points):
         """Return the greatest distance of points (N, 3) from the walls, metres."""
         outside = np.linalg.norm(np.maximum(0, np.maximum(-points, points - SIZE)), axis=1)
         within = np.minimum(np.abs(points), np.abs(points - SIZE)).min(axis=1)
         return float(np.maximum(outside, np.where(outside > 0, 0, within)).max())
 
-    def error_of_depth(self, depth: NDArray[np.float32], lens: Lens, T: Floats) -> float:
+    def error_of_depth(self, depth, lens, T):
         """Return the greatest error of a complete depth image at a pose, metres."""
         assert (depth > 0).all()
         points = (lens.rays * depth[..., None]).reshape(-1, 3)
@@ -91,5 +90,5 @@ class Room:
 
 
 @pytest.fixture(scope="session")
-def room() -> Room:
+def room():
     return Room()

@@ -1,14 +1,9 @@
 """Tests of Polycam, Record3D, nerfstudio and E57 files, written by their descriptions."""
 
-from __future__ import annotations
-
 import io
 import json
 import shutil
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +11,7 @@ from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError, MissingDependency, UnreadableArchive, UnreadableFrame
 from sceneprint.formats.archive import open_archive
-from sceneprint.formats.dataset import FrameSequence, Layout, find_sequences
+from sceneprint.formats.dataset import Layout, find_sequences
 from sceneprint.formats.depth_file import decode_frame, encode_png
 from sceneprint_client.frame_files import meta_of, sendable
 from sceneprint_client.poses import quaternion_of
@@ -29,17 +24,17 @@ Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 SCALE = 4  #: how much larger the colour images are
 
 
-def png(depth: Floats, units: float = 1000) -> bytes:
+def png(depth, units=1000):
     return encode_png(np.rint(depth * units).astype(np.uint16))
 
 
-def npy(depth: Floats) -> bytes:
+def npy(depth):
     file = io.BytesIO()
     np.save(file, depth.astype(np.float32))
     return file.getvalue()
 
 
-def of_colour(lens: Any) -> dict[str, float]:
+def of_colour(lens):
     """The camera of the colour image; its principal point is measured from the corner."""
     return {
         "fx": lens.fx * SCALE, "fy": lens.fy * SCALE,
@@ -47,7 +42,7 @@ def of_colour(lens: Any) -> dict[str, float]:
     }  # fmt: skip
 
 
-def polycam(folder: Path, room: Any, cameras: str = "corrected_cameras") -> Path:
+def polycam(folder, room, cameras="corrected_cameras"):
     """As github.com/PolyCam/polyform describes raw data."""
     keyframes = folder / "keyframes"
     for name in (cameras, "depth", "confidence"):
@@ -65,13 +60,11 @@ def polycam(folder: Path, room: Any, cameras: str = "corrected_cameras") -> Path
     return folder
 
 
-def nerfstudio(
-    folder: Path, room: Any, suffix: str = "png", *, per_frame: bool = False, **more: Any
-) -> Path:
+def nerfstudio(folder, room, suffix="png", *, per_frame=False, **more):
     """As docs.nerf.studio describes transforms.json; depth in millimetres unless stated."""
     (folder / "depth").mkdir(parents=True)
     units = 1 / float(more.get("depth_unit_scale_factor", 1e-3))
-    camera: dict[str, Any] = {
+    camera = {
         {"fx": "fl_x", "fy": "fl_y"}.get(key, key): value
         for key, value in of_colour(room.lens).items()
     } | {"w": room.lens.width * SCALE, "h": room.lens.height * SCALE}
@@ -92,7 +85,7 @@ def nerfstudio(
     return folder
 
 
-def record3d(folder: Path, room: Any, **more: Any) -> Path:
+def record3d(folder, room, **more):
     """As Record3D stores a capture, unpacked; K is written column by column."""
     lzfse = pytest.importorskip("lzfse", reason="lzfse is not installed")
     (folder / "rgbd").mkdir(parents=True)
@@ -112,7 +105,7 @@ def record3d(folder: Path, room: Any, **more: Any) -> Path:
     return folder
 
 
-def packed(folder: Path, archive: Path, *, top: str = "") -> Path:
+def packed(folder, archive, *, top=""):
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
         for path in sorted(folder.rglob("*")):
             if path.is_file():
@@ -120,7 +113,7 @@ def packed(folder: Path, archive: Path, *, top: str = "") -> Path:
     return archive
 
 
-def errors(room: Any, sequence: FrameSequence, T_room_world: Floats) -> list[float]:
+def errors(room, sequence, T_room_world):
     """How far each frame's points are from the walls, at their poses."""
     found = []
     for reference in sequence.frames:
@@ -133,7 +126,7 @@ def errors(room: Any, sequence: FrameSequence, T_room_world: Floats) -> list[flo
 
 
 @pytest.mark.parametrize("cameras", ["cameras", "corrected_cameras"])
-def test_polycam(room: Any, tmp_path: Path, cameras: str) -> None:
+def test_polycam(room, tmp_path, cameras):
     folder = polycam(tmp_path / "flat", room, cameras)
     [sequence] = find_sequences(folder)
     assert (sequence.layout, sequence.name, sequence.parent_frame) == (
@@ -151,9 +144,7 @@ def test_polycam(room: Any, tmp_path: Path, cameras: str) -> None:
     assert above.name == "flat"
 
 
-def test_polycam_prefers_optimised_poses_and_says_what_is_left_out(
-    room: Any, tmp_path: Path
-) -> None:
+def test_polycam_prefers_optimised_poses_and_says_what_is_left_out(room, tmp_path):
     folder = polycam(tmp_path / "flat", room)
     shutil.copytree(folder / "keyframes/corrected_cameras", folder / "keyframes/cameras")
     depths = sorted((folder / "keyframes/depth").iterdir())
@@ -170,7 +161,7 @@ def test_polycam_prefers_optimised_poses_and_says_what_is_left_out(
 
 @pytest.mark.parametrize("per_frame", [False, True])
 @pytest.mark.parametrize("suffix", ["png", "npy"])
-def test_nerfstudio(room: Any, tmp_path: Path, suffix: str, per_frame: bool) -> None:
+def test_nerfstudio(room, tmp_path, suffix, per_frame):
     [sequence] = find_sequences(nerfstudio(tmp_path / "a", room, suffix, per_frame=per_frame))
     assert sequence.layout is Layout.NERFSTUDIO
     assert max(errors(room, sequence, np.eye(4))) < 1e-3
@@ -178,13 +169,13 @@ def test_nerfstudio(room: Any, tmp_path: Path, suffix: str, per_frame: bool) -> 
 
 
 @pytest.mark.parametrize(("suffix", "factor"), [("npy", 1.0), ("npy", 0.01), ("png", 2e-4)])
-def test_units_of_nerfstudio(room: Any, tmp_path: Path, suffix: str, factor: float) -> None:
+def test_units_of_nerfstudio(room, tmp_path, suffix, factor):
     folder = nerfstudio(tmp_path / "a", room, suffix, depth_unit_scale_factor=factor)
     [sequence] = find_sequences(folder)
     assert max(errors(room, sequence, np.eye(4))) < 1e-3
 
 
-def test_the_applied_transform_of_nerfstudio_is_undone(room: Any, tmp_path: Path) -> None:
+def test_the_applied_transform_of_nerfstudio_is_undone(room, tmp_path):
     applied = [[0, 1, 0, 0.5], [0, 0, 1, 0], [1, 0, 0, -2]]
     [sequence] = find_sequences(nerfstudio(tmp_path / "a", room, applied_transform=applied))
     assert max(errors(room, sequence, np.eye(4))) < 1e-3
@@ -213,9 +204,7 @@ def test_the_applied_transform_of_nerfstudio_is_undone(room: Any, tmp_path: Path
         ({"applied_scale": 0}, "applied_scale is 0"),
     ],
 )
-def test_broken_transforms_are_refused(
-    room: Any, tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
+def test_broken_transforms_are_refused(room, tmp_path, change, message):
     file = nerfstudio(tmp_path / "a", room) / "transforms.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(DatasetError, match=message):
@@ -229,9 +218,7 @@ def test_broken_transforms_are_refused(
         ("depth/none.png", "is missing"), ("depth/a.exr", r"depth format \.exr"),
     ],
 )  # fmt: skip
-def test_depth_files_elsewhere_are_not_read(
-    room: Any, tmp_path: Path, path: str, message: str
-) -> None:
+def test_depth_files_elsewhere_are_not_read(room, tmp_path, path, message):
     file = nerfstudio(tmp_path / "a", room) / "transforms.json"
     fields = json.loads(file.read_text())
     fields["frames"][0]["depth_file_path"] = path
@@ -245,7 +232,7 @@ def test_depth_files_elsewhere_are_not_read(
 
 
 @pytest.mark.parametrize("as_file", [False, True])
-def test_record3d(room: Any, tmp_path: Path, as_file: bool) -> None:
+def test_record3d(room, tmp_path, as_file):
     path = record3d(tmp_path / "flat", room, frameTimestamps=[1.7e9, 1.7e9 + 1, 1.7e9 + 2])
     if as_file:
         path = packed(path, tmp_path / "flat.r3d")
@@ -255,14 +242,14 @@ def test_record3d(room: Any, tmp_path: Path, as_file: bool) -> None:
     assert meta_of(sequence.frames[0]).captured_at is not None
 
 
-def test_record3d_with_a_camera_for_each_frame(room: Any, tmp_path: Path) -> None:
+def test_record3d_with_a_camera_for_each_frame(room, tmp_path):
     coefficients = [list(of_colour(room.lens).values())] * 3
     folder = record3d(tmp_path / "a", room, perFrameIntrinsicCoeffs=coefficients, K=None)
     [sequence] = find_sequences(folder)
     assert max(errors(room, sequence, np.linalg.inv(Y_UP))) < 1e-5
 
 
-def test_broken_captures_of_record3d_are_refused(room: Any, tmp_path: Path) -> None:
+def test_broken_captures_of_record3d_are_refused(room, tmp_path):
     for change, message in (
         ({"poses": None}, "not contain a list of poses.*export the capture as .r3d"),
         ({"poses": [[0, 0, 0, 0, 1, 2, 3]] * 3}, "does not have unit length"),
@@ -287,7 +274,7 @@ def test_broken_captures_of_record3d_are_refused(room: Any, tmp_path: Path) -> N
         find_sequences(file)
 
 
-def test_depth_as_openexr_is_refused_with_the_export_to_choose(tmp_path: Path) -> None:
+def test_depth_as_openexr_is_refused_with_the_export_to_choose(tmp_path):
     for name in ("depth", "rgb"):
         (tmp_path / "EXR_RGBD" / name).mkdir(parents=True)
     (tmp_path / "EXR_RGBD/metadata.json").write_text("{}")
@@ -295,9 +282,7 @@ def test_depth_as_openexr_is_refused_with_the_export_to_choose(tmp_path: Path) -
         find_sequences(tmp_path)
 
 
-def test_without_lzfse_the_package_is_named(
-    room: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_lzfse_the_package_is_named(room, tmp_path, monkeypatch):
     [sequence] = find_sequences(record3d(tmp_path / "a", room))
     monkeypatch.setitem(__import__("sys").modules, "lzfse", None)
     with pytest.raises(MissingDependency, match=r"pip install .lzfse"):
@@ -316,9 +301,7 @@ def test_without_lzfse_the_package_is_named(
         (lambda folder, room: nerfstudio(folder, room, "npy"), np.eye(4)),
     ],
 )
-def test_zips_of_folders(
-    room: Any, tmp_path: Path, write: Callable[..., Path], T_room_world: Floats, top: str
-) -> None:
+def test_zips_of_folders(room, tmp_path, write, T_room_world, top):
     file = packed(write(tmp_path / "a", room), tmp_path / "a.zip", top=top)
     with file.open("rb") as opened, open_archive(opened, tmp_path, "sent") as archive:
         assert archive.refused == []
@@ -338,7 +321,7 @@ def test_zips_of_folders(
             assert room.error_of_depth(frame.depth, shape, T_room_world @ reference.pose) < 1e-3
 
 
-def test_a_capture_of_record3d_is_not_inflated_by_a_service(room: Any, tmp_path: Path) -> None:
+def test_a_capture_of_record3d_is_not_inflated_by_a_service(room, tmp_path):
     file = packed(record3d(tmp_path / "a", room), tmp_path / "a.r3d")
     with (
         file.open("rb") as opened,
@@ -351,7 +334,7 @@ def test_a_capture_of_record3d_is_not_inflated_by_a_service(room: Any, tmp_path:
 # E57.
 
 
-def e57(path: Path, room: Any, **more: Any) -> Path:
+def e57(path, room, **more):
     pye57 = pytest.importorskip("pye57", reason="pye57 is not installed")
     with pye57.E57(str(path), "w") as file:
         for i, T in enumerate(room.poses()):
@@ -365,7 +348,7 @@ def e57(path: Path, room: Any, **more: Any) -> Path:
     return path
 
 
-def test_scans_of_an_e57_file_are_frames(room: Any, tmp_path: Path) -> None:
+def test_scans_of_an_e57_file_are_frames(room, tmp_path):
     path = e57(tmp_path / "hall.e57", room)
     [sequence] = find_sequences(path)
     assert (sequence.layout, sequence.name, sequence.note) == (
@@ -384,7 +367,7 @@ def test_scans_of_an_e57_file_are_frames(room: Any, tmp_path: Path) -> None:
         sendable(path, None, with_pose=False)
 
 
-def test_a_merged_e57_is_refused_with_the_remedy(room: Any, tmp_path: Path) -> None:
+def test_a_merged_e57_is_refused_with_the_remedy(room, tmp_path):
     still = {"rotation": np.array([1.0, 0, 0, 0]), "translation": np.zeros(3)}
     path = e57(tmp_path / "merged.e57", room, **still)
     with pytest.raises(DatasetError, match=r"3 clouds without a viewpoint.*--as-map"):

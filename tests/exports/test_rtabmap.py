@@ -1,16 +1,11 @@
 """Tests of RTAB-Map databases of several schema versions, and of damaged ones."""
 
-from __future__ import annotations
-
 import io
 import pickle
 import sqlite3
 import struct
 import zlib
-from collections.abc import Callable
 from contextlib import closing, suppress
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -62,18 +57,18 @@ SCHEMAS = {
 }
 
 
-def transform(T: Floats) -> bytes:
+def transform(T):
     return T[:3].astype("<f4").tobytes()
 
 
-def matrix(array: NDArray[Any], channels: int = 1) -> bytes:
+def matrix(array, channels=1):
     """As compressData2 packs a cv::Mat."""
     code = {"int32": 4, "float32": 5}[array.dtype.name] + ((channels - 1) << 3)
     rows, columns = array.shape[0], array.shape[1] // channels
     return zlib.compress(array.tobytes()) + struct.pack("<3i", rows, columns, code)
 
 
-def calibration(version: str, lens: Any, *locals_: Floats) -> bytes:
+def calibration(version, lens, *locals_):
     """As DBDriverSqlite3::saveQuery writes the cameras of a node."""
     size, number = (lens.width, lens.height), tuple(map(int, version.split(".")))
     blob = b""
@@ -93,7 +88,7 @@ def calibration(version: str, lens: Any, *locals_: Floats) -> bytes:
     return blob
 
 
-def write(path: Path, version: str, nodes: list[dict[str, Any]], **admin: bytes) -> Path:
+def write(path, version, nodes, **admin):
     """A database with these nodes: columns of Node and Data by their names."""
     node, data, of_admin = SCHEMAS.get(version, SCHEMAS["0.23.0"])
     with closing(sqlite3.connect(path)) as database, database:
@@ -118,17 +113,17 @@ def write(path: Path, version: str, nodes: list[dict[str, Any]], **admin: bytes)
     return path
 
 
-def optimised(poses: dict[int, Floats]) -> dict[str, bytes]:
+def optimised(poses):
     ids = np.array([list(poses)], np.int32)
     rows = np.concatenate([T[:3].reshape(-1) for T in poses.values()]).astype(np.float32)
     return {"opt_ids": matrix(ids), "opt_poses": matrix(rows[None])}
 
 
-def png(depth: Floats) -> bytes:
+def png(depth):
     return encode_png(np.rint(depth * 1000).astype(np.uint16))
 
 
-def float_png(depth: Floats) -> bytes:
+def float_png(depth):
     """Metres as the four bytes of a pixel; OpenCV writes blue, green, red, alpha as R, G, B, A."""
     raw = depth.astype("<f4").view(np.uint8).reshape(*depth.shape, 4)
     file = io.BytesIO()
@@ -136,12 +131,12 @@ def float_png(depth: Floats) -> bytes:
     return file.getvalue()
 
 
-def rvl(depth: Floats) -> bytes:
+def rvl(depth):
     """By the description of the format, a nibble at a time."""
     samples = np.rint(depth * 1000).astype(int)
-    nibbles: list[int] = []
+    nibbles = []
 
-    def put(value: int) -> None:
+    def put(value):
         while True:
             value, low = value >> 3, value & 7
             nibbles.append(low | (8 if value else 0))
@@ -171,7 +166,7 @@ def rvl(depth: Floats) -> bytes:
     return b"DEPTHRVL" + struct.pack("<II", width, height) + np.array(words, "<u4").tobytes()
 
 
-def nodes_of(room: Any, version: str, packed: Callable[[Floats], bytes] = png) -> list[Any]:
+def nodes_of(room, version, packed=png):
     """Nodes whose poses are of the base, so that the camera is where the room's poses are."""
     return [
         {
@@ -183,7 +178,7 @@ def nodes_of(room: Any, version: str, packed: Callable[[Floats], bytes] = png) -
     ]
 
 
-def error_of(room: Any, reference: Any) -> float:
+def error_of(room, reference):
     frame = reference.read()
     assert frame.pose is not None
     lens = frame.intrinsics
@@ -193,9 +188,7 @@ def error_of(room: Any, reference: Any) -> float:
 
 @pytest.mark.parametrize("packed", [png, float_png, rvl])
 @pytest.mark.parametrize("version", SCHEMAS)
-def test_points_of_all_versions_lie_on_the_walls(
-    room: Any, tmp_path: Path, version: str, packed: Callable[[Floats], bytes]
-) -> None:
+def test_points_of_all_versions_lie_on_the_walls(room, tmp_path, version, packed):
     path = write(tmp_path / "flat.db", version, nodes_of(room, version, packed))
     [sequence] = find_sequences(path)
     assert (sequence.name, sequence.parent_frame, session_of(sequence)) == ("flat",) * 3
@@ -212,7 +205,7 @@ def test_points_of_all_versions_lie_on_the_walls(
     assert moved.read_bytes() == sequence.frames[0].read_bytes()
 
 
-def test_optimised_poses_replace_those_of_odometry(room: Any, tmp_path: Path) -> None:
+def test_optimised_poses_replace_those_of_odometry(room, tmp_path):
     nodes = nodes_of(room, "0.21.4")
     right = {i: T @ np.linalg.inv(LOCAL) for i, T in enumerate(room.poses(), start=1)}
     for node in nodes:
@@ -226,7 +219,7 @@ def test_optimised_poses_replace_those_of_odometry(room: Any, tmp_path: Path) ->
     assert "optimised poses; skipped: 1 nodes without an optimised pose" in sequence.note
 
 
-def test_sessions_that_nothing_joins_have_frames_of_their_own(room: Any, tmp_path: Path) -> None:
+def test_sessions_that_nothing_joins_have_frames_of_their_own(room, tmp_path):
     nodes = nodes_of(room, "0.23.0")
     nodes[2]["map_id"] = 4
     sequences = find_sequences(write(tmp_path / "a.db", "0.23.0", nodes))
@@ -237,9 +230,7 @@ def test_sessions_that_nothing_joins_have_frames_of_their_own(room: Any, tmp_pat
 
 @pytest.mark.parametrize("version", ["0.11.11", "0.21.4"])
 @pytest.mark.parametrize("packed", [png, float_png])
-def test_images_of_several_cameras_are_split(
-    room: Any, tmp_path: Path, version: str, packed: Callable[[Floats], bytes]
-) -> None:
+def test_images_of_several_cameras_are_split(room, tmp_path, version, packed):
     other = LOCAL @ np.array([[0.0, 0, 1, 0.1], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
     nodes = []
     for T in room.poses():
@@ -259,7 +250,7 @@ def test_images_of_several_cameras_are_split(
         assert all(error_of(room, one) < 1e-3 for one in sequence.frames)
 
 
-def test_depth_may_be_smaller_than_the_image_of_the_calibration(room: Any, tmp_path: Path) -> None:
+def test_depth_may_be_smaller_than_the_image_of_the_calibration(room, tmp_path):
     large = type(room.lens)(420.0, 412.0, 154.0, 124.0, 320, 240)
     nodes = nodes_of(room, "0.21.4")
     for node in nodes:
@@ -269,9 +260,7 @@ def test_depth_may_be_smaller_than_the_image_of_the_calibration(room: Any, tmp_p
 
 
 @pytest.mark.parametrize("version", ["0.11.11", "0.16.1", "0.21.4"])
-def test_laser_scans_are_taken_where_there_is_no_depth(
-    room: Any, tmp_path: Path, version: str
-) -> None:
+def test_laser_scans_are_taken_where_there_is_no_depth(room, tmp_path, version):
     mounting = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0.9], [0, 0, 0, 1]])
     channels, form = (4, 6) if version != "0.11.11" else (3, 0)
     head = {"0.11.11": (0, 30), "0.16.1": (0, 30, form), "0.21.4": (form, 0.5, 30, 0, 0, 0, 0)}
@@ -295,9 +284,7 @@ def test_laser_scans_are_taken_where_there_is_no_depth(
         assert room.error(world) < 1e-3
 
 
-def test_flat_scans_and_stereo_images_are_refused_with_the_remedy(
-    room: Any, tmp_path: Path
-) -> None:
+def test_flat_scans_and_stereo_images_are_refused_with_the_remedy(room, tmp_path):
     flat = matrix(np.ones((1, 2 * 360), np.float32), 2)
     stereo = np.array([100, 100, 40, 30, 0.1, 80, 60], "<f4").tobytes() + transform(LOCAL)
     pose = transform(np.eye(4))
@@ -311,7 +298,7 @@ def test_flat_scans_and_stereo_images_are_refused_with_the_remedy(
         find_sequences(path)
 
 
-def test_what_is_damaged_costs_only_its_node(room: Any, tmp_path: Path) -> None:
+def test_what_is_damaged_costs_only_its_node(room, tmp_path):
     nodes = nodes_of(room, "0.21.4")
     nodes += nodes_of(room, "0.21.4")
     nodes[1]["calibration"] = nodes[1]["calibration"][:-5]
@@ -331,7 +318,7 @@ def test_what_is_damaged_costs_only_its_node(room: Any, tmp_path: Path) -> None:
 # Databases that are not those of RTAB-Map, or hostile.
 
 
-def test_old_incomplete_and_foreign_databases_are_refused(room: Any, tmp_path: Path) -> None:
+def test_old_incomplete_and_foreign_databases_are_refused(room, tmp_path):
     old = write(tmp_path / "old.db", "0.8.11", nodes_of(room, "0.23.0"))
     with pytest.raises(DatasetError, match=r"RTAB-Map 0\.8\.11.*rtabmap-reprocess old\.db"):
         find_sequences(old)
@@ -348,21 +335,21 @@ def test_old_incomplete_and_foreign_databases_are_refused(room: Any, tmp_path: P
         find_sequences(foreign)
 
 
-def test_a_database_that_is_cut_off_is_refused(room: Any, tmp_path: Path) -> None:
+def test_a_database_that_is_cut_off_is_refused(room, tmp_path):
     path = write(tmp_path / "a.db", "0.21.4", nodes_of(room, "0.21.4"))
     path.write_bytes(path.read_bytes()[:9000])
     with pytest.raises(DatasetError, match=r"cannot be read.*rtabmap-recovery"):
         find_sequences(path)
 
 
-def test_a_database_in_use_is_refused(room: Any, tmp_path: Path) -> None:
+def test_a_database_in_use_is_refused(room, tmp_path):
     path = write(tmp_path / "a.db", "0.21.4", nodes_of(room, "0.21.4"))
     (tmp_path / "a.db-journal").write_bytes(b"half")
     with pytest.raises(DatasetError, match=r"unfinished journal a\.db-journal.*Close RTAB-Map"):
         find_sequences(path)
 
 
-def test_views_in_the_place_of_tables_are_not_run(room: Any, tmp_path: Path) -> None:
+def test_views_in_the_place_of_tables_are_not_run(room, tmp_path):
     path = write(tmp_path / "a.db", "0.21.4", nodes_of(room, "0.21.4"))
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("ALTER TABLE Node RENAME TO Real")
@@ -374,7 +361,7 @@ def test_views_in_the_place_of_tables_are_not_run(room: Any, tmp_path: Path) -> 
         find_sequences(path)
 
 
-def test_random_damage_is_refused_by_an_error_of_ours(room: Any, tmp_path: Path) -> None:
+def test_random_damage_is_refused_by_an_error_of_ours(room, tmp_path):
     rng = np.random.default_rng(11)
     for version, packed in (("0.11.11", png), ("0.21.4", rvl), ("0.23.0", float_png)):
         path = write(tmp_path / f"{version}.db", version, nodes_of(room, version, packed))
@@ -390,7 +377,7 @@ def test_random_damage_is_refused_by_an_error_of_ours(room: Any, tmp_path: Path)
                         reference.read()
 
 
-def test_nothing_is_written_beside_the_database(room: Any, tmp_path: Path) -> None:
+def test_nothing_is_written_beside_the_database(room, tmp_path):
     path = write(tmp_path / "a.db", "0.21.4", nodes_of(room, "0.21.4"))
     before = path.read_bytes()
     find_sequences(path)[0].frames[0].read()
@@ -398,7 +385,7 @@ def test_nothing_is_written_beside_the_database(room: Any, tmp_path: Path) -> No
     assert path.read_bytes() == before
 
 
-def test_rvl_of_random_images_and_zeros_is_read_back() -> None:
+def test_rvl_of_random_images_and_zeros_is_read_back():
     rng = np.random.default_rng(1)
     depth = rng.integers(0, 65_536, (23, 31)) / 1000
     depth[rng.random(depth.shape) < 0.4] = 0
@@ -407,12 +394,12 @@ def test_rvl_of_random_images_and_zeros_is_read_back() -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 400, bytes(400), b"\x77" * 400])
-def test_damaged_rvl_is_refused(content: bytes) -> None:
+def test_damaged_rvl_is_refused(content):
     with pytest.raises(UnreadableFrame, match="RVL-compressed image is damaged"):
         depth_samples(b"DEPTHRVL" + struct.pack("<II", 20, 10) + content)
 
 
-def test_matrices_that_announce_too_much_are_refused(room: Any, tmp_path: Path) -> None:
+def test_matrices_that_announce_too_much_are_refused(room, tmp_path):
     bomb = zlib.compress(bytes(1000)) + struct.pack("<3i", 2**15, 2**15, 5 + (2 << 3))
     [sequence] = find_sequences(
         write(tmp_path / "a.db", "0.10.6", [{"pose": transform(np.eye(4)), "scan": bomb}])

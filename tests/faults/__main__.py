@@ -1,7 +1,5 @@
 """`python -m tests.faults`: try a fault at every call of every operation, and write the report."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import shlex
@@ -15,12 +13,12 @@ from tqdm import tqdm
 
 from benchmarks.machine import measured_on
 from benchmarks.postgres import Server
-from tests.faults.enumeration import Enumeration, Trials, report
+from tests.faults.enumeration import Enumeration, report
 from tests.faults.injection import FAULTS
 from tests.faults.operations import OPERATIONS, small_uploads
 
 
-def main() -> int:
+def main():
     """Run the command; return 1 if an invariant was broken."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("operation", nargs="*", help=f"of {', '.join(OPERATIONS)} (default: all)")
@@ -51,7 +49,7 @@ def main() -> int:
     return 1 if broken else 0
 
 
-def _enumerate(store: str, options: argparse.Namespace) -> dict[tuple[str, str], Trials]:
+def _enumerate(store, options):
     operations, faults = options.operation or list(OPERATIONS), options.fault or list(FAULTS)
     tqdm.monitor_interval = 0  # without its thread, which forks would lack
     with ExitStack() as stack:

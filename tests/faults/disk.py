@@ -15,7 +15,6 @@ import os
 import random
 import stat
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -46,7 +45,7 @@ class Disk:
     deaf : "files" or "folders", whose fsyncs this disk ignores, so that a test must fail
     """
 
-    def __init__(self, root: Path, deaf: str = "") -> None:
+    def __init__(self, root, deaf=""):
         self.root, self.deaf = root.resolve(), deaf
         self._lock = threading.RLock()  # a restore writes in several threads
         self.inodes: dict[int, Inode] = {}
@@ -58,23 +57,23 @@ class Disk:
             inode.sure, inode.sure_names, inode.pending = inode.seen, dict(inode.names), []
         self._keep("begin")
 
-    def _new(self, real: int, *, is_folder: bool) -> int:
+    def _new(self, real, *, is_folder):
         self._ids[real] = len(self.inodes)
         self.inodes[self._ids[real]] = Inode(is_folder)
         return self._ids[real]
 
-    def mark(self, what: str) -> None:
+    def mark(self, what):
         """Record an event elsewhere, such as a commit."""
         with self._lock:
             self._look()
             self._keep(what)
 
-    def synced(self, descriptor: int) -> None:
+    def synced(self, descriptor):
         """Record an fsync."""
         with self._lock:
             self._note_sync(os.fstat(descriptor))
 
-    def _note_sync(self, found: os.stat_result) -> None:
+    def _note_sync(self, found):
         self._look()
         if found.st_ino not in self._ids or found.st_dev != self.root.stat().st_dev:
             return
@@ -88,13 +87,13 @@ class Disk:
                 inode.sure = inode.seen
             self._keep("sync file")
 
-    def about_to(self, event: str) -> None:
+    def about_to(self, event):
         """Record the changes so far, before a call that opens, renames or removes."""
         with self._lock:
             self._look()
             self._keep(f"before {event}")
 
-    def _look(self) -> None:
+    def _look(self):
         """Update the visible state from the real folder."""
         with self._lock:
             while True:
@@ -102,8 +101,8 @@ class Disk:
                     self._read()
                     return
 
-    def _read(self) -> None:
-        found: dict[int, dict[str, int]] = {}
+    def _read(self):
+        found = {}
         named = {self.root.stat().st_ino}
         for place, _, _ in os.walk(self.root):
             own = found[self._ids[Path(place).stat().st_ino]] = {}
@@ -129,17 +128,17 @@ class Disk:
             inode.pending += [*changes, *({name: None} for name in gone if name not in moved)]
             inode.names = names
 
-    def _keep(self, what: str) -> None:
+    def _keep(self, what):
         self.states.append((what, deepcopy(self.inodes)))
 
-    def sure(self) -> dict[str, bytes | None]:
+    def sure(self):
         """Return the folder after a crash now that loses all that is not synced; see `crashes`."""
         self._look()
-        tree: dict[str, bytes | None] = {}
+        tree = {}
         self._left(self.inodes, self._top, "", lambda: False, lambda one: one.sure, tree)
         return tree
 
-    def crashes(self, seeds: int = 3) -> Iterator[tuple[int, str, dict[str, bytes | None]]]:
+    def crashes(self, seeds=3):
         """Yield possible folders after a crash at each step, with none, all or some unsynced data.
 
         Yields
@@ -149,8 +148,8 @@ class Disk:
         tree : content by path, None for a folder; without repetitions within a step
         """
         for step, (what, inodes) in enumerate(self.states):
-            known: list[dict[str, bytes | None]] = []
-            ways: list[tuple[str, Callable[[], bool], Callable[[Inode], bytes]]] = [
+            known = []
+            ways = [
                 ("nothing unsure", lambda: False, lambda one: one.sure),
                 ("all", lambda: True, lambda one: one.seen),
                 ("names alone", lambda: True, lambda one: one.sure),
@@ -160,17 +159,14 @@ class Disk:
                 rng = random.Random(1000 * step + seed)
                 ways.append((f"seed {seed}", *_at_random(rng)))
             for how, keeps, content in ways:
-                tree: dict[str, bytes | None] = {}
+                tree = {}
                 self._left(inodes, self._top, "", keeps, content, tree)
                 if tree not in known:
                     known.append(tree)
                     yield step, f"{what}: {how}", tree
 
-    def _left(
-        self, inodes: dict[int, Inode], number: int, path: str, keeps: Callable[[], bool],
-        content: Callable[[Inode], bytes], tree: dict[str, bytes | None],
-    ) -> None:  # fmt: skip
-        names: dict[str, int] = dict(inodes[number].sure_names)
+    def _left(self, inodes, number, path, keeps, content, tree):
+        names = dict(inodes[number].sure_names)
         for change in inodes[number].pending:
             if keeps():
                 names = {k: v for k, v in {**names, **change}.items() if v is not None}
@@ -183,12 +179,12 @@ class Disk:
                 tree[place] = content(inode)
 
 
-def _zeros(inode: Inode) -> bytes:
+def _zeros(inode):
     return inode.seen if inode.sure == inode.seen else bytes(len(inode.seen))
 
 
-def _at_random(rng: random.Random) -> tuple[Callable[[], bool], Callable[[Inode], bytes]]:
-    def content(inode: Inode) -> bytes:
+def _at_random(rng):
+    def content(inode):
         if inode.sure == inode.seen:
             return inode.seen
         kept = rng.choice((0, rng.randrange(len(inode.seen) + 1), len(inode.seen)))

@@ -10,19 +10,14 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
-from benchmarks.postgres import Server
-from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.errors import SceneprintError
 from tests.faults.injection import Injector
 from tests.faults.operations import (
     ACKNOWLEDGED,
     OPERATIONS,
-    Operation,
     Store,
     contents,
     fill,
@@ -54,7 +49,7 @@ class Child:
     Its memory holds all imports of its parent, which makes many deaths affordable.
     """
 
-    def __init__(self, work: Callable[[Callable[[str], None]], None]) -> None:
+    def __init__(self, work):
         read, write = os.pipe()
         pid = os.fork()
         if pid == 0:
@@ -81,17 +76,17 @@ class Child:
         self.lines, self.status = data.decode().splitlines(), os.waitpid(pid, 0)[1]
 
 
-def _prepare(operation: Operation, store: Store, _say: object) -> None:
+def _prepare(operation, store, _say):
     with Engine(store.settings) as engine:
         operation.prepare(engine, store)
 
 
-def _say_contents(store: Store, say: Callable[[str], None]) -> None:
+def _say_contents(store, say):
     for name, (upload, vector) in contents(store).items():
         say(f"{name} {upload.hex()} {vector.hex()}")
 
 
-def _done(work: Callable[[Callable[[str], None]], None]) -> list[str]:
+def _done(work):
     """Return what a child says that does some work; raise RuntimeError if it fails."""
     child = Child(work)
     if child.status:
@@ -99,7 +94,7 @@ def _done(work: Callable[[Callable[[str], None]], None]) -> list[str]:
     return child.lines
 
 
-def _say(pipe: int, line: str) -> None:
+def _say(pipe, line):
     os.write(pipe, f"{line}\n".encode())
 
 
@@ -113,7 +108,7 @@ class Enumeration:
     server : server of the databases; None for SQLite
     """
 
-    def __init__(self, work: Path, uploads: Sequence[Upload], server: Server | None = None) -> None:
+    def __init__(self, work, uploads, server=None):
         self._work, self._uploads, self._server = work, uploads, server
         self._count = 0
         # in this process, which compiles and imports what its children need
@@ -131,7 +126,7 @@ class Enumeration:
         for name, operation in OPERATIONS.items():
             _done(partial(_prepare, operation, self._store(name, "base")))
 
-    def _store(self, name: str, template: str | None) -> Store:
+    def _store(self, name, template):
         folder = self._work / name
         if template is None:
             folder.mkdir(parents=True)
@@ -140,7 +135,7 @@ class Enumeration:
         url = None if self._server is None else self._server.create(name, template)
         return Store(folder, url, self._uploads)
 
-    def run(self, operation: str, fault: str, *, first: int = 1, step: int = 1) -> Trials:
+    def run(self, operation, fault, *, first=1, step=1):
         """Try a fault at calls `first`, `first + step` and so on, to the end of the operation."""
         trials, at = Trials(), first
         is_over = False
@@ -154,14 +149,14 @@ class Enumeration:
             at += step
         return trials
 
-    def _try(self, operation: str, fault: str, at: int) -> tuple[str, list[str], bool]:
+    def _try(self, operation, fault, at):
         """Return the call that failed, or "" if the operation has fewer; what is wrong; and whether
         the operation had ended before the fault.
         """
         self._count += 1
         store = self._store(f"trial-{self._count}", operation)
 
-        def act(say: Callable[[str], None]) -> None:
+        def act(say):
             with Engine(store.settings) as engine:
                 injector = Injector(store.folder, fault, at)
                 injector.arm()
@@ -187,7 +182,7 @@ class Enumeration:
             failed = failed or "unknown"
             said = [one for one in child.lines if one.split(" ")[0] in ACKNOWLEDGED]
 
-            def check(say: Callable[[str], None]) -> None:
+            def check(say):
                 for one in violations(store, operation, said, self._before):
                     say(one)
 
@@ -199,7 +194,7 @@ class Enumeration:
         return failed, broken, "last" in child.lines
 
 
-def report(trials: dict[tuple[str, str], Trials]) -> Iterator[str]:
+def report(trials):
     """Yield the rows of a table: calls tried for each operation, and violations."""
     totals, faults = Counter[str](), list(dict.fromkeys(fault for _, fault in trials))
     yield "| operation | " + " | ".join(faults) + " | violations |"

@@ -5,17 +5,13 @@ Calls of Python that open a file for writing, rename, link or remove are seen by
 removed: inject in a process that ends afterwards.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import shutil
 import signal
 import sqlite3
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from sqlalchemy.engine.default import DefaultDialect
 
@@ -24,7 +20,7 @@ from tests.faults.disk import Disk
 #: Faults by name: the error of a call on files, and SQLite's message; None for the others.
 #: `power cut` kills the process, and undoes what was not synced. `interrupts` sends signals from
 #: the call on, which interrupt system calls (EINTR).
-FAULTS: dict[str, tuple[int, str] | None] = {
+FAULTS = {
     "full disk": (errno.ENOSPC, "database or disk is full"),
     "input/output error": (errno.EIO, "disk I/O error"),
     "no descriptors": (errno.EMFILE, "unable to open database file"),
@@ -56,31 +52,31 @@ class Injector:
     at : number of the call that fails, from 1
     """
 
-    def __init__(self, root: Path, fault: str, at: int) -> None:
+    def __init__(self, root, fault, at):
         self._root, self._error, self._at = str(root), FAULTS[fault], at
         self._fault, self._only_opens = fault, fault == "no descriptors"
         self._disk = CutDisk(root) if fault == "power cut" else None
         self.calls, self.failed, self._is_armed = 0, "", False
 
-    def arm(self) -> None:
+    def arm(self):
         """Begin to count."""
         signal.signal(signal.SIGALRM, lambda *_: None)
         sys.addaudithook(self._audit)
         for name in ("write", "pwrite", "fsync", "fdatasync"):
             setattr(os, name, self._on_descriptor(name, getattr(os, name)))
-        dialect: Any = DefaultDialect
+        dialect = DefaultDialect
         for name in ("do_execute", "do_executemany", "do_commit"):
             setattr(dialect, name, self._on_database(name, getattr(dialect, name)))
         self._is_armed = True
 
-    def disarm(self) -> None:
+    def disarm(self):
         """Stop counting. A power cut after the last call ends the process."""
         self._is_armed = False
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         if self._disk is not None and not self.failed:
             self._disk.cut()
 
-    def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _audit(self, event, arguments):
         if not self._is_armed or event not in _EVENTS:
             return
         if event == "open" and not (arguments[2] or 0) & _WRITING:
@@ -90,19 +86,19 @@ class Injector:
                 self._disk.look()
             self._count(event, is_open=event == "open")
 
-    def _is_inside(self, path: object) -> bool:
+    def _is_inside(self, path):
         if isinstance(path, int):
             return self._holds(path)
         return isinstance(path, str | os.PathLike) and os.fspath(path).startswith(self._root)
 
-    def _holds(self, descriptor: int) -> bool:
+    def _holds(self, descriptor):
         try:
             return str(Path(f"/proc/self/fd/{descriptor}").readlink()).startswith(self._root)
         except OSError:
             return False
 
-    def _on_descriptor(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        def wrapped(descriptor: int, *more: Any) -> Any:
+    def _on_descriptor(self, name, call):
+        def wrapped(descriptor, *more):
             if self._is_armed and self._holds(descriptor):
                 self._count(f"os.{name}")
             result = call(descriptor, *more)
@@ -112,8 +108,8 @@ class Injector:
 
         return wrapped
 
-    def _on_database(self, name: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        def wrapped(dialect: Any, cursor: Any, statement: str = "COMMIT", *more: Any) -> Any:
+    def _on_database(self, name, call):
+        def wrapped(dialect, cursor, statement="COMMIT", *more):
             if self._is_armed and statement.lstrip().startswith(_STATEMENTS):
                 self._count(" ".join(statement.split()[:3]), cursor=cursor)
             if name == "do_commit":
@@ -122,7 +118,7 @@ class Injector:
 
         return wrapped
 
-    def _count(self, call: str, *, is_open: bool = False, cursor: Any = None) -> None:
+    def _count(self, call, *, is_open=False, cursor=None):
         if self._only_opens and not is_open:
             return
         self.calls += 1
@@ -149,14 +145,14 @@ class Injector:
 class CutDisk(Disk):
     """A disk that loses power once, and keeps no record of earlier states."""
 
-    def _keep(self, what: str) -> None:
+    def _keep(self, what):
         """Keep nothing."""
 
-    def look(self) -> None:
+    def look(self):
         """Record the changes before a call."""
         self._look()
 
-    def cut(self) -> None:
+    def cut(self):
         """Undo all that was not synced, and kill this process. SQLite syncs its files itself."""
         tree = self.sure()
         for path in sorted(self.root.rglob("*"), reverse=True):

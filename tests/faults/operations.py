@@ -6,11 +6,10 @@ import io
 import json
 import tarfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pydantic import SecretStr
 from sqlalchemy import select, update
@@ -58,7 +57,7 @@ class Store:
     uploads: Sequence[Upload]
 
     @property
-    def settings(self) -> Settings:
+    def settings(self):
         """The settings of a process that works on the store."""
         return Settings(
             data_dir=self.folder, database_url=None if self.url is None else SecretStr(self.url),
@@ -80,7 +79,7 @@ class Operation:
     act: Callable[[Engine, Store, Say], None]
 
 
-def fill(store: Store) -> None:
+def fill(store):
     """Create a map with STORED signed frames."""
     with Engine(store.settings) as engine:
         engine.create_map(NewMap(name=MAP, model="depth"))
@@ -90,7 +89,7 @@ def fill(store: Store) -> None:
         engine.publish_due()
 
 
-def work_off(engine: Engine) -> None:
+def work_off(engine):
     """Do all jobs, also those that wait for another attempt or for the end of a lease."""
     for _ in range(20):
         with engine.store.database.write() as connection:
@@ -104,64 +103,64 @@ def work_off(engine: Engine) -> None:
     raise AssertionError("the queue does not become empty")
 
 
-def _nothing(engine: Engine, store: Store) -> None:
+def _nothing(engine, store):
     """Leave a store as it is."""
 
 
-def _upload(engine: Engine, store: Store, say: Say) -> None:
+def _upload(engine, store, say):
     one = store.uploads[STORED]
     say(f"added {engine.add_frame(MAP, one.data, one.meta)[0].frame_id}")
 
 
-def _wait_for_signature(engine: Engine, store: Store) -> None:
+def _wait_for_signature(engine, store):
     _upload(engine, store, lambda _: None)
 
 
-def _sign(engine: Engine, store: Store, say: Say) -> None:
+def _sign(engine, store, say):
     work = engine.claim("w")
     assert work is not None
     engine.run(work)
 
 
-def _publish(engine: Engine, store: Store, say: Say) -> None:
+def _publish(engine, store, say):
     engine.rebuild_index(MAP)
 
 
-def _delete(engine: Engine, store: Store, say: Say) -> None:
+def _delete(engine, store, say):
     name = _first_frame(engine)
     engine.delete_frame(MAP, name)
     say(f"deleted {name}")
 
 
-def _delete_first(engine: Engine, store: Store) -> None:
+def _delete_first(engine, store):
     engine.delete_frame(MAP, _first_frame(engine))
 
 
-def _first_frame(engine: Engine) -> str:
+def _first_frame(engine):
     with engine.store.database.read() as connection:
         found = select(frames.c.id).where(frames.c.state == FrameState.INDEXED)
         return str(connection.execute(found.order_by(frames.c.number)).scalars().first())
 
 
-def _purge(engine: Engine, store: Store, say: Say) -> None:
+def _purge(engine, store, say):
     engine.purging.now()
 
 
-def _back_up(engine: Engine, store: Store, say: Say) -> None:
+def _back_up(engine, store, say):
     bundle = take_backup(store.settings, str(store.folder / BUNDLES))
     say(f"bundle {bundle.manifest.name}")
 
 
-def _back_up_once(engine: Engine, store: Store) -> None:
+def _back_up_once(engine, store):
     _back_up(engine, store, lambda _: None)
 
 
-def _restore(engine: Engine, store: Store, say: Say) -> None:
+def _restore(engine, store, say):
     restored = restore_to_folder(str(store.folder / BUNDLES), store.folder / "restored")
     say(f"restored {restored.manifest.name}")
 
 
-def _import(engine: Engine, store: Store, say: Say) -> None:
+def _import(engine, store, say):
     with engine.imports.receive(MAP, ImportOptions()) as receiver:
         receiver.write(_archive(store.uploads[STORED : STORED + 2]))
         archive = receiver.end()
@@ -170,7 +169,7 @@ def _import(engine: Engine, store: Store, say: Say) -> None:
         engine.run(work)
 
 
-def _archive(uploads: Sequence[Upload]) -> bytes:
+def _archive(uploads):
     packed, camera = io.BytesIO(), uploads[0].meta.intrinsics
     assert camera is not None
     members = {
@@ -197,14 +196,14 @@ OPERATIONS = {
 }
 
 
-def small_uploads() -> tuple[Upload, ...]:
+def small_uploads():
     """Return small frames of a synthetic room."""
     with recordings(None, 1) as folder:
         shots = walks(folder, 1, STORED + 2)[0]
     return tuple(Upload(one.png, one.meta) for one in shots)
 
 
-def contents(store: Store) -> dict[str, tuple[bytes, bytes]]:
+def contents(store):
     """Return the upload and the signature of each frame by id."""
     with Engine(store.settings) as engine, engine.store.database.read() as connection:
         rows = connection.execute(
@@ -214,12 +213,7 @@ def contents(store: Store) -> dict[str, tuple[bytes, bytes]]:
         return {row.id: (engine.store.blobs.get(row.blob), bytes(row.vector)) for row in rows}
 
 
-def violations(
-    store: Store,
-    operation: str,
-    acknowledged: Sequence[str],
-    before: dict[str, tuple[bytes, bytes]],
-) -> Iterator[str]:
+def violations(store, operation, acknowledged, before):
     """Start again after a fault, finish what was begun, and yield each broken invariant.
 
     Parameters
@@ -246,13 +240,11 @@ def violations(
     yield from (f"not repaired: {one.what}" for one in fsck(store.settings, grace_s=0))
 
 
-def _states(engine: Engine) -> dict[str, FrameState]:
+def _states(engine):
     return {one.frame_id: one.state for one in engine.list_frames(MAP).items}
 
 
-def _wrong_frames(
-    engine: Engine, operation: str, said: dict[str, str], before: dict[str, Any]
-) -> Iterator[str]:
+def _wrong_frames(engine, operation, said, before):
     states = _states(engine)
     most = len(before) + {"upload": 1, "signature": 1, "import": 2, "purge": -1}.get(operation, 0)
     least = most - (operation == "deletion")
@@ -271,7 +263,7 @@ def _wrong_frames(
         yield "a search does not find each frame"
 
 
-def _wrong_events(engine: Engine) -> Iterator[str]:
+def _wrong_events(engine):
     number_events(engine.store.database)
     with engine.store.database.read() as connection:
         told = Counter(
@@ -287,7 +279,7 @@ def _wrong_events(engine: Engine) -> Iterator[str]:
                 yield f"frame {name} has {told['frame.' + kind, name]} events {kind}"
 
 
-def _remains(store: Store, parts: Sequence[bytes]) -> Iterator[str]:
+def _remains(store, parts):
     for path in store.folder.rglob("*"):
         inside = path.is_file() and BUNDLES not in path.parts and "restored" not in path.parts
         data = path.read_bytes() if inside else b""
@@ -295,7 +287,7 @@ def _remains(store: Store, parts: Sequence[bytes]) -> Iterator[str]:
             yield f"{path.name} holds bytes of a deleted frame"
 
 
-def _wrong_bundles(store: Store, operation: str, said: dict[str, str]) -> Iterator[str]:
+def _wrong_bundles(store, operation, said):
     if operation not in ("backup", "restore"):
         return
     place = str(store.folder / BUNDLES)

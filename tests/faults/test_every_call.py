@@ -1,7 +1,5 @@
 """A fault at some calls of each operation, or at every call in the thorough tests."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -34,7 +32,7 @@ for at in range(1, 9):
 """
 
 
-def run(*arguments: str) -> str:
+def run(*arguments):
     """Run Python in a process of its own, since children are forked from it."""
     done = subprocess.run(
         [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
@@ -43,20 +41,19 @@ def run(*arguments: str) -> str:
     return done.stdout
 
 
-def counts(*options: str) -> dict[str, dict[str, int]]:
+def counts(*options):
     """Return the numbers of calls tried, by operation and fault; no invariant may be broken."""
     report = run("-m", "tests.faults", "--json", *options)
-    found: dict[str, dict[str, int]] = json.loads(report)
-    return found
+    return json.loads(report)
 
 
-def test_calls_fail_one_after_another(tmp_path: Path) -> None:
+def test_calls_fail_one_after_another(tmp_path):
     # the file and its writer are opened and the file is synced; then its name, and its folder
     calls = ["open", "open", "os.fsync", "os.rename", "os.fsync"]
     assert run("-c", CALLS, str(tmp_path)).split("\n")[:8] == [*calls, "none", "none", "none"]
 
 
-def test_kills_at_some_calls() -> None:
+def test_kills_at_some_calls():
     found = counts("--store", "sqlite", "--fault", "kill", "--first", "3", "--step", "29")
     assert found.keys() == OPERATIONS.keys()
     assert min(tried["kill"] for tried in found.values()) > 0
@@ -65,7 +62,7 @@ def test_kills_at_some_calls() -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("store", ["sqlite", "postgresql"])
 @pytest.mark.parametrize("operation", OPERATIONS)
-def test_every_call(operation: str, store: str) -> None:
+def test_every_call(operation, store):
     found = counts(operation, "--store", store)
     assert found.keys() == {operation}
     assert found[operation].keys() == FAULTS.keys()

@@ -1,7 +1,5 @@
 """Exact clouds of a room with six planes, for any number of directions."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sceneprint.types import Cloud

@@ -1,7 +1,5 @@
 """Fixtures of the geometry tests: golden cases and exact scenes, loaded without a package."""
 
-from __future__ import annotations
-
 from importlib import util
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Manual results of Eq. (1) and Eq. (2); each check takes the module under test."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,11 +1,9 @@
 """Exact scenes: planes in a pinhole camera, and sets of patches."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sceneprint.types import Floats, Intrinsics, Patches, Surface
+from sceneprint.types import Intrinsics, Patches, Surface
 
 #: Camera with the field of view of a Kinect and a quarter of the pixels.
 CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
@@ -21,7 +19,7 @@ def rays(camera):
 
 def plane(camera, normal, point):
     """Return 1 / z of the plane through `point`, 0 where it is not in front of the camera."""
-    q: Floats = rays(camera) @ normal / float(np.dot(normal, point))
+    q = rays(camera) @ normal / float(np.dot(normal, point))
     return np.maximum(q, 0.0)
 
 

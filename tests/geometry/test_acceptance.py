@@ -1,7 +1,5 @@
 """Tests of the acceptance of a transform on both sides of every threshold."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -17,7 +15,7 @@ from sceneprint.geometry.validation.acceptance import (
     objection,
     sparse_evidence_suffices,
 )
-from sceneprint.types import Floats32, Geometry, Intrinsics, Patches, Surface
+from sceneprint.types import Geometry, Intrinsics, Patches, Surface
 from sceneprint_lab.training import preset_parameters
 
 NO_PATCHES = Patches(
@@ -224,7 +222,7 @@ def test_a_violation_costs_three_inliers():
     p, seen = OverlapParameters(), wall(2.0)
     on, before = np.zeros((5, 6), np.float32), np.zeros((2, 6), np.float32)
     on[:, 2], before[:, 2] = 2.0, 1.0  # on the wall, and a metre before it
-    source: Floats32 = np.concatenate([on, before])
+    source = np.concatenate([on, before])
     source[:, 5] = -1.0
     assert agreements(source, seen, np.eye(4)[None], p).tolist() == [[5.0, 2.0]]
     # a share of all points; and the wall's own, of which every one is on it

@@ -1,7 +1,5 @@
 """Tests of ambiguity: motions along a room's planes, and planes that count as equal."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Tests of the robust average of poses, and of its invariances."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,9 +1,5 @@
 """Tests of the fusion of cells against manual results and a loop over points."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -55,7 +51,7 @@ def test_points_go_to_their_cells():
 
 def test_cells_are_those_of_one_point_after_the_other():
     points = np.random.default_rng(3).uniform(-4.0, 4.0, (4000, 3)).round(2)
-    expected: dict[Any, list[Any]] = {}
+    expected = {}
     for point in points:
         expected.setdefault(tuple(np.floor(point / CELL_M).astype(int).tolist()), []).append(point)
     found = view_cells(points, CELL_M, ViewStamp(1, None, NO_SESSION))

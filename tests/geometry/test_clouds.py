@@ -1,7 +1,5 @@
 """Tests of the selection of points of a cloud, and of rotated axes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

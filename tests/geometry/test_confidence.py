@@ -1,7 +1,5 @@
 """Tests of the confidence of a pose: values, monotonicity and reasons."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

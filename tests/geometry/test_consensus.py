@@ -1,7 +1,5 @@
 """Tests of the consensus against NumPy, and among wrong correspondences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

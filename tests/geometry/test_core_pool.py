@@ -1,7 +1,5 @@
 """Tests that two halves run in parallel only on free cores."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest
@@ -33,7 +31,7 @@ def meeting():
 
 def threads_of(halves=2):
     """Which threads run the halves."""
-    names: list[str] = []
+    names = []
 
     def note():
         names.append(threading.current_thread().name)
@@ -66,7 +64,7 @@ def test_halves_run_in_turn_without_a_free_core(two):
 
 def test_a_half_takes_no_core_of_its_own_half(two):
     """What a half calls runs in turn: it has one core, and the other half the other."""
-    inner: list[tuple[str, list[str]]] = []
+    inner = []
     barrier = threading.Barrier(2)
 
     def half():

@@ -90,7 +90,7 @@ def square(error, covariance):
 
 def places(votes):
     """Normalised errors squared of the places that two or more votes agree on."""
-    by_query: dict[tuple[int, int], list[Vote]] = defaultdict(list)
+    by_query = defaultdict(list)
     for one in votes:
         by_query[one.query].append(one)
     found = []

@@ -1,7 +1,5 @@
 """Tests of cycles of edges against a simple search, and of wrong edges."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 

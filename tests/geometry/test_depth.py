@@ -1,7 +1,5 @@
 """Tests of the masking and halving of depth images against manual results."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the k-DPP: Eq. (3), greedy steps against determinants, and its purpose."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of Eq. (2), its normalisation and its storage."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests that results of one frame are computed once, and dropped with the frame."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from dataclasses import replace
@@ -25,7 +23,7 @@ class Frame:
 
 
 def test_a_frame_is_worked_out_once_for_each_of_the_other_arguments():
-    calls: list[tuple[int, int]] = []
+    calls = []
 
     @cached_per_frame
     def squared(frame, n, *, less=0):

@@ -1,7 +1,5 @@
 """Tests of gravity: tilted poses are rejected, level ones stay, and a wrong `up` is reported."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Tests of hierarchy levels: counts, unions and invariants of coarsening."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

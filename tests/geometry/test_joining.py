@@ -1,7 +1,5 @@
 """Tests of the consensus of associations: known transforms, outliers and rejection."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """Tests that compiled kernels are reused only for the code they were compiled from."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import subprocess

@@ -1,7 +1,5 @@
 """Tests of correspondences against a full sort."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tests of the Gaussian mixture against SciPy, scikit-learn and the theorem of EM."""
 
-from __future__ import annotations
-
 import math
 import warnings
 

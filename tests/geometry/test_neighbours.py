@@ -1,7 +1,5 @@
 """Tests of neighbours against all pairs, and of planes against NumPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -65,7 +63,7 @@ def test_links_among_those_kept():
     links = link_points(places, np.zeros(80))
     keep, held = rng.random(80) < 0.7, rng.random(len(links.indices)) < 0.8
     number = {int(i): k for k, i in enumerate(np.flatnonzero(keep))}
-    wanted: list[set[int]] = [set() for _ in number]
+    wanted = [set() for _ in number]
     sources = np.repeat(np.arange(80), np.diff(links.offsets))
     for i, j, is_held in zip(sources.tolist(), links.indices.tolist(), held, strict=True):
         if is_held and i in number and j in number:

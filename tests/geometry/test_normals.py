@@ -1,7 +1,5 @@
 """Tests of plane fits in inverse depth against planes, a sphere and a simple loop."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Tests of the two-pass fit against lstsq for each pixel, in double precision."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sceneprint.geometry.surface.depth_image import NormalParameters, fit_surface

@@ -1,7 +1,5 @@
 """Tests of the overlap of two surfaces against manual results and the definition."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

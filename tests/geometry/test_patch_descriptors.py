@@ -1,7 +1,5 @@
 """Tests of patch descriptors against another formula, and of their invariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

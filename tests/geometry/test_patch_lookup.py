@@ -1,7 +1,5 @@
 """Tests of the patch of a point against a linear search and a segmentation."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sceneprint.geometry.registration.overlap import sample_points

@@ -1,7 +1,5 @@
 """Tests of plans of scans: up, height and relative pose."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tests of the learnt subspace: whitening, signs and independence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tests of Eq. (1) against manual results and the paper, and under rigid motion."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -18,10 +16,10 @@ from sceneprint.geometry.signature.pair_features import (
     pair_properties,
     properties,
 )
-from sceneprint.types import Floats, Patches
+from sceneprint.types import Patches
 
 PARAMETERS = PropertyParameters(radius=3.0, angular_tolerance=math.radians(10), colinearity=0.9995)
-AXES: Floats = np.concatenate([np.eye(3), -np.eye(3)])
+AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 def test_golden(goldens):

@@ -1,7 +1,5 @@
 """Tests of quaternions against SciPy, including degenerate cases."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

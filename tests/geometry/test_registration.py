@@ -1,7 +1,5 @@
 """Tests of refinement: single steps, convergence and failure."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

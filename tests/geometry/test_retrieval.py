@@ -1,14 +1,11 @@
 """Tests of distances against a simple loop, and of rankings against a full sort."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.geometry.retrieval.ranking import (
-    Metric,
     cross_distances,
     distances,
     pairwise_distances,
@@ -17,7 +14,7 @@ from sceneprint.geometry.retrieval.ranking import (
     similarity,
 )
 
-METRICS: tuple[Metric, ...] = ("l1", "l2")
+METRICS = ("l1", "l2")
 
 
 def oracle(queries, database, metric="l1"):

@@ -1,7 +1,5 @@
 """Tests of rigid transforms against NumPy and SciPy, including degenerate cases."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,9 +1,6 @@
 """Tests that all lengths scale together: a scaled world gives the same results."""
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass, replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,7 +51,7 @@ BARE = {
 
 
 def leaves(record):
-    found: list[tuple[Any, str]] = []
+    found = []
     for one in fields(record):
         value = getattr(record, one.name)
         if is_dataclass(value):

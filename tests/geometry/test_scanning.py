@@ -1,7 +1,5 @@
 """Tests of the distance kernels against exact integers."""
 
-from __future__ import annotations
-
 import mmap
 
 import numpy as np
@@ -10,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.geometry.retrieval.ranking import scan
-from sceneprint.types import Bytes
 
 
 def oracle(queries, database, rows):
@@ -74,9 +71,9 @@ def test_any_place_in_memory_and_in_a_mapped_file(offset, tmp_path):
     path.write_bytes(bytes(offset) + database.tobytes())
     with path.open("rb") as file:
         mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    stored: Bytes = np.frombuffer(mapped, np.uint8, offset=offset).reshape(8, n)
+    stored = np.frombuffer(mapped, np.uint8, offset=offset).reshape(8, n)
     assert not stored.flags.writeable
-    memory: Bytes = np.frombuffer(bytes(offset) + queries.tobytes(), np.uint8, offset=offset)
+    memory = np.frombuffer(bytes(offset) + queries.tobytes(), np.uint8, offset=offset)
     asked = memory.reshape(2, n)
     assert scan(asked, stored, rows).tolist() == expected
     assert scan(asked[1:], stored, rows).tolist() == expected[1:]

@@ -1,7 +1,5 @@
 """Tests of the segmentation of exact scenes, and of sums over patches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,10 +1,7 @@
 """Tests of the alignment of neighbour sequences, and of its invariance to rigid motion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -195,7 +192,7 @@ def test_known_correspondences_are_found():
     )
     pairs = sequence_correspondences(patches, other, np.random.default_rng(4), P)
     assert pairs.dtype == np.int32
-    first: dict[int, int] = {}
+    first = {}
     for i, j in pairs.tolist():
         first.setdefault(i, j)
     there = [i for i in first if i in kept]
@@ -246,6 +243,6 @@ def test_two_views_are_aligned_by_sequences():
     again = validate(blank, match, 0, p, matching="sequence")
     assert again.T_match_query is not None
     np.testing.assert_array_equal(again.T_match_query, found.T_match_query)
-    unknown: Any = "letters"
+    unknown = "letters"
     with pytest.raises(ValueError, match="does not exist"):
         validate(query, match, matching=unknown)

@@ -1,7 +1,5 @@
 """Tests of session differences: a box in front of a wall that appears, disappears or stays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sceneprint.geometry.cells import (

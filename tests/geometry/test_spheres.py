@@ -1,7 +1,5 @@
 """Tests of range images: exact planes, cropping, closed gaps and preserved edges."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

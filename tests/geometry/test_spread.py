@@ -1,7 +1,5 @@
 """Tests of points that are spread over a scan, and of their use."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -16,7 +14,7 @@ from sceneprint.geometry.validation.validation import refine_transform
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
-from sceneprint.types import Cloud, Floats32
+from sceneprint.types import Cloud
 
 
 def hall(at, turn=0.0, half=math.pi):
@@ -38,7 +36,7 @@ def hall(at, turn=0.0, half=math.pi):
         hit = (enter < leave) & (enter > 0)
         ranges = np.where(hit, np.minimum(ranges, enter), ranges)
     away = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
-    points: Floats32 = (away * ranges[:, None]).astype(np.float32)
+    points = (away * ranges[:, None]).astype(np.float32)
     return Cloud(points)
 
 

@@ -1,7 +1,5 @@
 """Tests of voxels and supervoxels of a room: normals, connections, gaps, order and rotation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tests of pair counts in the 4-D table against separate invariants."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of signatures from the table against exact signatures of random rooms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

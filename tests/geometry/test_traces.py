@@ -1,7 +1,5 @@
 """Tests of traces: residuals of points, coinciding patches and overlays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

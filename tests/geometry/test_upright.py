@@ -1,7 +1,5 @@
 """Tests of the estimated up direction and units of rotated rooms and halls."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from itertools import product

@@ -1,7 +1,5 @@
 """Tests of the validation of whole frames, independent of its thresholds."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Tests of views of a surface: content, viewpoints and coverage."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

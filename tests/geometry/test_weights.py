@@ -1,7 +1,5 @@
 """Tests of patch weights: values and purpose."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sceneprint.geometry.signature.segmentation import (

@@ -1,7 +1,5 @@
 """Tests of whitened signatures against NumPy, and of their covariance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

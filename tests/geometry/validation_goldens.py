@@ -1,7 +1,5 @@
 """Manual results of validation on small scenes; each check takes the module under test."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import astuple, replace
 from itertools import product

@@ -1,7 +1,5 @@
 """Fixtures of the index tests: signatures of walks through a synthetic place."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

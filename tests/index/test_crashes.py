@@ -1,7 +1,5 @@
 """Tests of builders that are killed or run in parallel, and of concurrent readers."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys
@@ -13,7 +11,6 @@ import numpy as np
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.index.index_manifest import newest_number
 from sceneprint.index.index_version import (
-    IndexVersion,
     Tail,
     newest,
     publish,
@@ -132,7 +129,7 @@ def test_readers_go_on_while_versions_pass(walk, published, tmp_path):
             counts[0] += 1
 
     def follow():
-        known: IndexVersion | None = None
+        known = None
         while not done.is_set():
             found = newest(folder, "model", LENGTH, known=known)
             if found is None or (known is not None and found.number < known.number):

@@ -1,7 +1,5 @@
 """Tests that a damaged file is never used, but an older version or none."""
 
-from __future__ import annotations
-
 import json
 import logging
 

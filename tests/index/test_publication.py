@@ -1,7 +1,5 @@
 """Tests of publication: appending, merging, removal, and reopening."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os
@@ -16,7 +14,6 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.atomic_files import folder_turn
 from sceneprint.index.index_manifest import newest_number
 from sceneprint.index.index_version import clear, newest, publish
-from sceneprint.index.part_files import Block
 
 LENGTH = 256
 
@@ -153,7 +150,7 @@ def test_what_is_open_is_taken_from_there(walk, published, tmp_path, monkeypatch
     assert newest(folder, "model", LENGTH, known=first) is first
     assert newest(folder, "model", LENGTH) is not first
     second = published(np.arange(100, 150), signatures[100:], first)
-    read: list[str] = []
+    read = []
     monkeypatch.setattr(
         "sceneprint.index.index_version.verify", lambda _, name, __: read.append(name) or iter(())
     )
@@ -208,7 +205,7 @@ print(where.split()[1])
 def test_one_builds_at_a_time(walk, published, tmp_path):
     folder, signatures = tmp_path / "map", walk(20)
     first = published(np.arange(10), signatures[:10])
-    new: Block = (np.arange(10, 20), signatures[10:])
+    new = (np.arange(10, 20), signatures[10:])
     with folder_turn(folder) as mine:
         assert mine
         with folder_turn(folder) as another:  # of the same process as well
@@ -232,7 +229,7 @@ def test_an_emptied_folder_is_noticed(walk, published, tmp_path):
     for path in folder.iterdir():
         path.unlink()
     folder.rmdir()
-    new: Block = (np.arange(10, 20), signatures[10:])
+    new = (np.arange(10, 20), signatures[10:])
     assert publish(folder, model_id="model", revision=1, blocks=[new], previous=first) is None
     assert newest(folder, "model", LENGTH) is None
     assert holds(first, frames_of(np.arange(10), signatures[:10]))

@@ -1,7 +1,5 @@
 """Tests of exact search against a simple loop, with and without filters."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of segments: appending, merging, and search over all of them."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np
@@ -12,7 +10,6 @@ from hypothesis import strategies as st
 from sceneprint.errors import DamagedIndex
 from sceneprint.index.index_manifest import SegmentFiles
 from sceneprint.index.index_version import (
-    IndexVersion,
     Tail,
     newest,
     publish,
@@ -26,7 +23,6 @@ from sceneprint.index.segment import (
     merge_plan,
     open_segment,
 )
-from sceneprint.types import Bytes
 
 LENGTH = 24
 NONE = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
@@ -118,8 +114,8 @@ def test_what_is_open_stays_open(walk, published, tmp_path):
 def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, flat, seed):
     """New, signed anew, deleted and indexed again, in any order, against a dict of all frames."""
     folder, rng = tmp_path_factory.mktemp("map"), np.random.default_rng(seed)
-    frames: dict[int, Bytes] = {}
-    made: IndexVersion | None = None
+    frames = {}
+    made = None
     for step in range(data.draw(st.integers(1, 7))):
         new = data.draw(st.sets(st.integers(0, 150), min_size=int(made is None), max_size=70))
         drop = data.draw(st.sets(st.integers(0, 150), max_size=12)) if made is not None else set()

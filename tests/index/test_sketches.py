@@ -1,7 +1,5 @@
 """Tests of the sketches of a large map: exact parts, and measured recall."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

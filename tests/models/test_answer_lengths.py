@@ -1,10 +1,7 @@
 """Tests that the model holds all lengths of answers, and the code none."""
 
-from __future__ import annotations
-
 import ast
 import inspect
-from types import ModuleType
 
 import pytest
 
@@ -20,7 +17,7 @@ FREE = {0.0, 1.0, 1e-9, 1e-12, 22.458}
 
 
 @pytest.mark.parametrize("module", [localization, places, map_verification, verification])
-def test_no_bare_length_is_left(module: ModuleType) -> None:
+def test_no_bare_length_is_left(module):
     tree = ast.parse(inspect.getsource(module))
     records = {
         node
@@ -36,7 +33,7 @@ def test_no_bare_length_is_left(module: ModuleType) -> None:
     assert bare <= FREE
 
 
-def test_every_length_of_the_map_is_a_multiple_of_the_scale() -> None:
+def test_every_length_of_the_map_is_a_multiple_of_the_scale():
     """Those are the fields whose comment speaks of metres."""
     source = inspect.getsource(MapParameters)
     lengths = {line.split(":")[0].strip() for line in source.splitlines() if "metres" in line}
@@ -48,7 +45,7 @@ def test_every_length_of_the_map_is_a_multiple_of_the_scale() -> None:
     assert twice.planes.same_plane == 2.0 * MapParameters().planes.same_plane
 
 
-def test_the_presets_scale_the_lengths_of_the_answer() -> None:
+def test_the_presets_scale_the_lengths_of_the_answer():
     depth, lidar = read_model("depth").answer.map, read_model("lidar").answer.map
     assert depth == MapParameters()
     for name in POWERS[MapParameters]:

@@ -1,11 +1,7 @@
 """Tests of model files: round trips and damage."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,10 +11,10 @@ from sceneprint.errors import UnreadableModel
 from sceneprint.geometry.registration.patch_descriptors import PatchDescriptorParameters
 from sceneprint.geometry.signature.segmentation import SegmentationParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
-from sceneprint.models import PRESETS, Model, parse_model, read_model, save_model
+from sceneprint.models import PRESETS, parse_model, read_model, save_model
 
 
-def test_round_trip(small_model: Model, tmp_path: Path) -> None:
+def test_round_trip(small_model, tmp_path):
     path = tmp_path / "small.safetensors"
     save_model(small_model, path)
     read = read_model(path)
@@ -30,13 +26,13 @@ def test_round_trip(small_model: Model, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["small.safetensors"]
 
 
-def test_files_of_one_model_are_equal(small_model: Model, tmp_path: Path) -> None:
+def test_files_of_one_model_are_equal(small_model, tmp_path):
     save_model(small_model, tmp_path / "a")
     save_model(replace(small_model), tmp_path / "b")
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_id_is_the_content_not_the_name(small_model: Model) -> None:
+def test_id_is_the_content_not_the_name(small_model):
     assert len(small_model.id) == 64
     assert replace(small_model, name="other", provenance={}).id == small_model.id
     depth = replace(small_model.parameters, depth=DepthParameters(maximum_depth=8.99))
@@ -61,7 +57,7 @@ def test_id_is_the_content_not_the_name(small_model: Model) -> None:
     assert len({small_model.id, *(other.id for other in others)}) == 9
 
 
-def test_a_whitening_is_part_of_the_content(small_model: Model, small_whitened: Model) -> None:
+def test_a_whitening_is_part_of_the_content(small_model, small_whitened):
     own = small_whitened.whitening
     assert own is not None
     others = [
@@ -78,7 +74,7 @@ def test_a_whitening_is_part_of_the_content(small_model: Model, small_whitened: 
     assert small_whitened.without_whitening.id == small_model.id
 
 
-def test_round_trip_of_a_whitening(small_whitened: Model, tmp_path: Path) -> None:
+def test_round_trip_of_a_whitening(small_whitened, tmp_path):
     save_model(small_whitened, tmp_path / "m")
     read = read_model(tmp_path / "m")
     assert read.id == small_whitened.id
@@ -86,12 +82,12 @@ def test_round_trip_of_a_whitening(small_whitened: Model, tmp_path: Path) -> Non
     assert (read.unrelated_distance, read.psi_unrelated_distance) == (500_000.0, 1000.0)
 
 
-def test_whitenings_that_are_none(small_whitened: Model, tmp_path: Path) -> None:
+def test_whitenings_that_are_none(small_whitened, tmp_path):
     save_model(small_whitened, tmp_path / "m")
     good = (tmp_path / "m").read_bytes()
 
-    def put(**values: object) -> bytes:
-        def change(header: dict[str, object]) -> None:
+    def put(**values):
+        def change(header):
             told = header["whitening"]
             assert isinstance(told, dict)
             told.update(values)
@@ -115,7 +111,7 @@ def test_whitenings_that_are_none(small_whitened: Model, tmp_path: Path) -> None
         parse_model(with_header(good, lambda header: header.update(schema_version=2)), "a file")
 
 
-def test_sizes(small_model: Model) -> None:
+def test_sizes(small_model):
     assert small_model.level_length == 25 * 8
     assert small_model.signature_bytes == 25 * 8 * 2
 
@@ -124,7 +120,7 @@ def test_sizes(small_model: Model) -> None:
     ("preset", "g", "size", "metric"),
     [("depth", 256, 448, "l2"), ("paper", 1250, 125_000, "l1")],
 )
-def test_presets_ship(preset: str, g: int, size: int, metric: str) -> None:
+def test_presets_ship(preset, g, size, metric):
     model = read_model(preset)
     assert model.name == preset
     assert (len(model.mixture), model.signature_bytes, model.metric) == (g, size, metric)
@@ -137,41 +133,38 @@ def test_presets_ship(preset: str, g: int, size: int, metric: str) -> None:
     assert preset in PRESETS
 
 
-def header_of(data: bytes) -> dict[str, object]:
+def header_of(data):
     length = int.from_bytes(data[:8], "little")
-    header: dict[str, object] = json.loads(
-        json.loads(data[8 : 8 + length])["__metadata__"]["sceneprint"]
-    )
-    return header
+    return json.loads(json.loads(data[8 : 8 + length])["__metadata__"]["sceneprint"])
 
 
-def with_header(data: bytes, change: Callable[[dict[str, object]], None]) -> bytes:
+def with_header(data, change):
     header = header_of(data)
     change(header)
     return save(load(data), {"sceneprint": json.dumps(header)})
 
 
-def with_tensors(data: bytes, **changed: np.ndarray) -> bytes:
+def with_tensors(data, **changed):
     tensors = load(data) | {name.replace("_", "."): t for name, t in changed.items()}
     return save(tensors, {"sceneprint": json.dumps(header_of(data))})
 
 
-def without_tensor(data: bytes, name: str) -> bytes:
+def without_tensor(data, name):
     tensors = {key: tensor for key, tensor in load(data).items() if key != name}
     return save(tensors, {"sceneprint": json.dumps(header_of(data))})
 
 
 @pytest.fixture
-def data(small_model: Model, tmp_path: Path) -> bytes:
+def data(small_model, tmp_path):
     save_model(small_model, tmp_path / "m")
     return (tmp_path / "m").read_bytes()
 
 
-def test_damage_is_noticed(data: bytes) -> None:
-    def drop(key: str) -> Callable[[dict[str, object]], None]:
+def test_damage_is_noticed(data):
+    def drop(key):
         return lambda header: header.pop(key) and None
 
-    def put(key: str, value: object) -> Callable[[dict[str, object]], None]:
+    def put(key, value):
         return lambda header: header.update({key: value})
 
     cases = {
@@ -209,12 +202,12 @@ def test_damage_is_noticed(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("header", ["[1]", '"s"', "{}", '{"schema_version": 1}', "null"])
-def test_headers_that_are_no_headers(data: bytes, header: str) -> None:
+def test_headers_that_are_no_headers(data, header):
     with pytest.raises(UnreadableModel, match=r"^a file: "):
         parse_model(save(load(data), {"sceneprint": header}), "a file")
 
 
-def test_a_name_that_would_drive_a_terminal(data: bytes) -> None:
+def test_a_name_that_would_drive_a_terminal(data):
     escape = with_header(data, lambda header: header.update(name="a\x1b[2J"))
     with pytest.raises(UnreadableModel, match="letters, digits, dots and dashes"):
         parse_model(escape, "a file")
@@ -240,10 +233,8 @@ def test_a_name_that_would_drive_a_terminal(data: bytes) -> None:
         ("surroundings", "middle_radius", float("nan")),
     ],
 )
-def test_parameters_that_would_take_all_memory(
-    data: bytes, stage: str, field: str, value: float
-) -> None:
-    def enlarge(header: dict[str, object]) -> None:
+def test_parameters_that_would_take_all_memory(data, stage, field, value):
+    def enlarge(header):
         parameters = header["parameters"]
         assert isinstance(parameters, dict)
         parameters[stage][field] = value
@@ -252,7 +243,7 @@ def test_parameters_that_would_take_all_memory(
         parse_model(with_header(data, enlarge), "a file")
 
 
-def test_components_beyond_what_the_table_can_name(data: bytes) -> None:
+def test_components_beyond_what_the_table_can_name(data):
     g = 2**15
     tensors = {
         "mixture_weights": np.full(g, 1 / g),
@@ -263,8 +254,8 @@ def test_components_beyond_what_the_table_can_name(data: bytes) -> None:
         parse_model(with_tensors(data, **tensors), "a file")
 
 
-def test_a_parameter_that_is_no_number(data: bytes) -> None:
-    def break_it(header: dict[str, object]) -> None:
+def test_a_parameter_that_is_no_number(data):
+    def break_it(header):
         parameters = header["parameters"]
         assert isinstance(parameters, dict)
         parameters["properties"]["radius"] = "three"
@@ -273,7 +264,7 @@ def test_a_parameter_that_is_no_number(data: bytes) -> None:
         parse_model(with_header(data, break_it), "a file")
 
 
-def test_paths_that_hold_no_model(tmp_path: Path) -> None:
+def test_paths_that_hold_no_model(tmp_path):
     with pytest.raises(UnreadableModel, match=r"cannot be read .*presets \(depth, lidar, paper\)"):
         read_model(tmp_path / "none")
     with pytest.raises(UnreadableModel, match="cannot be read"):

@@ -1,24 +1,21 @@
 """Tests of optional parameter groups, which leave the id unchanged at their defaults."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
 from sceneprint.errors import UnreadableModel
 from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
-from sceneprint.models import Model, ModelParameters, parse_model, read_model, write_model
+from sceneprint.models import ModelParameters, parse_model, read_model, write_model
 from sceneprint.models.model import parse_parameters, to_mapping
 
 
 @pytest.mark.parametrize(
     ("preset", "start"), [("paper", "c8883ac257b4"), ("depth", "da1ec0e37999")]
 )
-def test_ids_of_shipped_models_stay(preset: str, start: str) -> None:
+def test_ids_of_shipped_models_stay(preset, start):
     """Signatures of another id are never compared, so a change of them changes the id."""
     model = read_model(preset)
     assert model.without_whitening.id.startswith(start)
@@ -27,7 +24,7 @@ def test_ids_of_shipped_models_stay(preset: str, start: str) -> None:
     assert model.parameters.validation == ValidationParameters()
 
 
-def changed(model: Model) -> Model:
+def changed(model):
     p = model.parameters
     coarse = replace(p.validation.alignment.coarse, stride=9, first_gate=0.5)
     alignment = replace(p.validation.alignment, coarse=coarse)
@@ -36,7 +33,7 @@ def changed(model: Model) -> Model:
     return replace(model, parameters=replace(p, cloud=cloud, validation=validation))
 
 
-def test_only_what_differs_is_written(small_model: Model) -> None:
+def test_only_what_differs_is_written(small_model):
     model = changed(small_model)
     written = model.header["parameters"]
     assert written["cloud"] == {"maximum_range": 60.0}
@@ -61,7 +58,7 @@ def test_only_what_differs_is_written(small_model: Model) -> None:
         ("validation", {"alignment": 3}),
     ],
 )
-def test_what_is_not_known_is_refused(group: str, value: Any) -> None:
+def test_what_is_not_known_is_refused(group, value):
     with pytest.raises(UnreadableModel, match=f"parameters.{group}"):
         parse_parameters(to_mapping(ModelParameters()) | {group: value})
 
@@ -84,7 +81,7 @@ def test_what_is_not_known_is_refused(group: str, value: Any) -> None:
         CloudParameters(maximum_pixels=1 << 20, radius_px=16),
     ],
 )
-def test_what_would_take_for_ever_is_refused(small_model: Model, cloud: CloudParameters) -> None:
+def test_what_would_take_for_ever_is_refused(small_model, cloud):
     model = replace(small_model, parameters=replace(small_model.parameters, cloud=cloud))
     with pytest.raises(UnreadableModel):
         parse_model(write_model(model), "a file")
@@ -108,10 +105,8 @@ def test_what_would_take_for_ever_is_refused(small_model: Model, cloud: CloudPar
         ("alignment.fine_stride", 0),
     ],
 )
-def test_validation_that_would_take_for_ever_is_refused(
-    small_model: Model, where: str, value: int
-) -> None:
-    def changed(record: Any, names: list[str]) -> Any:
+def test_validation_that_would_take_for_ever_is_refused(small_model, where, value):
+    def changed(record, names):
         first, *rest = names
         return replace(record, **{first: changed(getattr(record, first), rest) if rest else value})
 

@@ -1,16 +1,11 @@
 """Tests of the pair table on disk: built once, memory-mapped, and verified."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
-from sceneprint.geometry.signature.pair_features import PairTable
-from sceneprint.models import Model, build_table, open_table
+from sceneprint.models import build_table, open_table
 
 
-def same(a: PairTable, b: PairTable) -> bool:
+def same(a, b):
     return (
         np.array_equal(a.features, b.features)
         and np.array_equal(a.components, b.components)
@@ -18,8 +13,8 @@ def same(a: PairTable, b: PairTable) -> bool:
     )
 
 
-def test_built_once_and_mapped(small_model: Model, tmp_path: Path) -> None:
-    steps: list[tuple[int, int]] = []
+def test_built_once_and_mapped(small_model, tmp_path):
+    steps = []
     first = open_table(small_model, tmp_path / "cache", lambda done, n: steps.append((done, n)))
     (file,) = (tmp_path / "cache").iterdir()
     assert small_model.id in file.name
@@ -35,7 +30,7 @@ def test_built_once_and_mapped(small_model: Model, tmp_path: Path) -> None:
     assert isinstance(base, np.memmap)
 
 
-def test_a_damaged_file_is_built_anew(small_model: Model, tmp_path: Path) -> None:
+def test_a_damaged_file_is_built_anew(small_model, tmp_path):
     right = build_table(small_model)
     open_table(small_model, tmp_path)
     (file,) = tmp_path.iterdir()
@@ -49,7 +44,7 @@ def test_a_damaged_file_is_built_anew(small_model: Model, tmp_path: Path) -> Non
         assert file.read_bytes() == whole
 
 
-def test_without_a_cache_folder_the_table_is_held(small_model: Model, tmp_path: Path) -> None:
+def test_without_a_cache_folder_the_table_is_held(small_model, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     assert same(open_table(small_model, blocked), build_table(small_model))

@@ -5,19 +5,13 @@ database of PostgreSQL for X, created at the first connection. A copy of the fol
 the database, whose name is in a file of the folder. See tests/conftest.py.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import secrets
 import sys
-from collections.abc import Callable, Sequence
 from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 #: Whether all this is so, and the URL of the server, without a database.
 SWITCH, SERVER = "SCENEPRINT_TEST_DATABASE", "SCENEPRINT_TEST_SERVER"
@@ -29,7 +23,7 @@ MARK = ".database"
 TEMPLATE = "sceneprint_template"
 
 
-def url_of(folder: Path) -> str:
+def url_of(folder):
     """URL of the database of a data folder."""
     from sqlalchemy import make_url
 
@@ -37,7 +31,7 @@ def url_of(folder: Path) -> str:
     return url.render_as_string(hide_password=False)
 
 
-def database_of(folder: Path, execute: Callable[[str], object]) -> str:
+def database_of(folder, execute):
     """Name of the database of a data folder, which is made where there is none."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / MARK).open("a+") as mark:
@@ -54,18 +48,18 @@ def database_of(folder: Path, execute: Callable[[str], object]) -> str:
         return made
 
 
-def _mend_settings(module: ModuleType) -> None:
+def _mend_settings(module):
     from pydantic import SecretStr
 
     settings = module.Settings
     init, copy = settings.__init__, settings.model_copy
 
-    def begin(self: Any, *args: Any, **given: Any) -> None:
+    def begin(self, *args, **given):
         init(self, *args, **given)
         if self.database_url is None:
             self.__dict__["database_url"] = SecretStr(url_of(self.data_dir))
 
-    def copied(self: Any, *, update: Any = None, deep: bool = False) -> Any:
+    def copied(self, *, update=None, deep=False):
         other = copy(self, update=update, deep=deep)
         if "data_dir" in (update or {}) and "database_url" not in (update or {}):
             other.__dict__["database_url"] = SecretStr(url_of(other.data_dir))
@@ -74,16 +68,16 @@ def _mend_settings(module: ModuleType) -> None:
     settings.__init__, settings.model_copy = begin, copied
 
 
-def _mend_psycopg(module: ModuleType) -> None:
+def _mend_psycopg(module):
     connect = module.Connection.connect.__func__
     parsed = module.conninfo.conninfo_to_dict
 
-    def execute(statement: str) -> None:
+    def execute(statement):
         server = os.environ[SERVER].replace("+psycopg", "") + "postgres"
         with connect(module.Connection, server, autocommit=True) as connection:
             connection.execute(statement)
 
-    def resolved(cls: Any, conninfo: str = "", **given: Any) -> Any:
+    def resolved(cls, conninfo="", **given):
         name = given.get("dbname") or parsed(conninfo).get("dbname") or ""
         if name.startswith(PREFIX):
             given["dbname"] = database_of(Path(name.removeprefix(PREFIX)), execute)
@@ -93,12 +87,12 @@ def _mend_psycopg(module: ModuleType) -> None:
     module.connect = module.Connection.connect
 
 
-def _mend_store(module: ModuleType) -> None:
+def _mend_store(module):
     from sqlalchemy import make_url
 
     exists = module.database_exists
 
-    def database_exists(url: str) -> bool:
+    def database_exists(url):
         """Like that of a file: what new ones are copied from has a schema already."""
         name = "" if url.startswith("sqlite") else make_url(url).database or ""
         if name.startswith(PREFIX):
@@ -118,9 +112,7 @@ _MENDED = {
 class _Mending(MetaPathFinder, Loader):
     """Mends the two modules when they are imported, and only then."""
 
-    def find_spec(
-        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, name, path=None, target=None):
         if name not in _MENDED:
             return None
         sys.meta_path.remove(self)
@@ -131,11 +123,11 @@ class _Mending(MetaPathFinder, Loader):
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
-            def run(module: ModuleType) -> None:
+            def run(module):
                 execute(module)
                 _MENDED[name](module)
 
-            spec.loader.exec_module = run  # type: ignore[method-assign]
+            spec.loader.exec_module = run
         return spec
 
 

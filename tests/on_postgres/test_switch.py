@@ -1,12 +1,9 @@
 """Tests of the switch to PostgreSQL: one database for each data folder."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -28,15 +25,15 @@ with Engine(Settings(data_dir=Path(sys.argv[1]))) as engine:
 """
 
 
-def opened(folder: Path) -> Engine:
+def opened(folder):
     return Engine(Settings(data_dir=folder, database_url=None))
 
 
-def names(engine: Engine) -> list[str]:
+def names(engine):
     return [one.name for one in engine.list_maps()]
 
 
-def test_a_folder_has_a_database_and_its_copy_a_copy(tmp_path: Path) -> None:
+def test_a_folder_has_a_database_and_its_copy_a_copy(tmp_path):
     first, copy = tmp_path / "first", tmp_path / "copy"
     with opened(first) as engine:
         assert engine.store.database.dialect == "postgresql"
@@ -54,7 +51,7 @@ def test_a_folder_has_a_database_and_its_copy_a_copy(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.rglob("*.db")] == []
 
 
-def test_a_folder_that_was_removed_begins_anew(tmp_path: Path) -> None:
+def test_a_folder_that_was_removed_begins_anew(tmp_path):
     with opened(tmp_path / "data") as engine:
         engine.create_map(NewMap(name="hall", model="depth"))
     shutil.rmtree(tmp_path / "data")

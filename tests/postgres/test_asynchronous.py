@@ -1,7 +1,5 @@
 """Tests of the promotion of an asynchronous standby, which loses only what it had not received."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 
@@ -9,7 +7,7 @@ import pytest
 
 from sceneprint.errors import StoreAway, UnknownFrame
 from sceneprint.settings import Settings
-from sceneprint.store.events import EventFilter, EventRow
+from sceneprint.store.events import EventFilter
 from sceneprint_client.api import JobState, NewMap, Query
 from service.event_stream import Feed
 from tests.whole_engine import Engine
@@ -41,7 +39,7 @@ def found(engine, frame):
 @pytest.fixture
 def told(engine):
     """What a stream of events tells, from the first on."""
-    found: list[EventRow] = []
+    found = []
     ended = threading.Event()
     thread = threading.Thread(target=_follow, args=(engine.store.database, found, ended))
     thread.start()

@@ -1,11 +1,8 @@
 """Tests of claims of jobs without a lock, in competition with other changes."""
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import ExitStack, contextmanager
-from typing import Any
 
 import pytest
 from sqlalchemy import text, update
@@ -65,7 +62,7 @@ def uncommitted(store):
 
 def beside(store, until, what):
     """Begin something that has to wait for a lock; what waits for its end, and returns it."""
-    found: list[Any] = []
+    found = []
 
     def run():
         try:

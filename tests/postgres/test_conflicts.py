@@ -1,7 +1,5 @@
 """Tests of conflicting transactions, and of unusual server settings."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Tests of writers of single maps: their locks, and the numbers of their events."""
 
-from __future__ import annotations
-
 import threading
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor

@@ -1,11 +1,8 @@
 """Tests of new frames of several maps in one statement, from many threads."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
-from typing import Any
 
 import pytest
 from sqlalchemy import select, text, update
@@ -25,7 +22,7 @@ from sceneprint.store.postgres.connection import MapsInUse, take_turn
 from sceneprint.store.tables import frame_tags, frames, idempotency, jobs, maps, pending_events
 
 MODEL = "ab" * 32
-VALUES: dict[str, Any] = {
+VALUES = {
     "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1}, "depth_scale": 1000.0,
     "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": [],
     "pose_parent": None, "pose": None, "name": None, "sequence": None,
@@ -226,7 +223,7 @@ def test_a_turn_that_does_not_come_is_no_map_in_use(server_store, rows, monkeypa
 
 def together(group, given, until):
     """What came of frames that all waited for one statement."""
-    found: list[Any] = [None] * len(given)
+    found = [None] * len(given)
 
     def run(i):
         try:

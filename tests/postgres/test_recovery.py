@@ -207,7 +207,7 @@ def _check_recovered(settings, small, drill):
 def test_what_it_is_given_is_checked_first(place, at, value, said):
     (place / "base").mkdir()
     (place / "base" / "PG_VERSION").write_text("18")
-    given: list[object] = [place / "base", place / "archive", place / "data", "2026-11-28 12:00+00"]
+    given = [place / "base", place / "archive", place / "data", "2026-11-28 12:00+00"]
     given[at:] = [value, *given[at + 1 :]] if at < len(given) else [5432, "more"]
     done = recover(*given)
     assert (done.returncode, done.stdout) == (2, "")

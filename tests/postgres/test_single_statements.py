@@ -1,9 +1,5 @@
 """Tests that single statements on PostgreSQL have the effect of several statements."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from sqlalchemy import insert, select, update
@@ -35,7 +31,7 @@ CHANCE = {
     "started_at", "token", "turn",
 }  # fmt: skip
 POSE = [[1.0, 0.0, 0.0, 2.5], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
-VALUES: dict[str, Any] = {
+VALUES = {
     "content_id": "c" * 64, "blob": "b" * 64, "bytes": 70, "novelty": None,
     "intrinsics": {"width": 4, "height": 3, "fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 1.5},
     "depth_scale": 1000.0, "depth_along_ray": False, "robot": "cart", "session": "monday",

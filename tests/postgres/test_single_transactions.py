@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import threading
 from contextlib import contextmanager, suppress
-from typing import Any
 
 import pytest
 from sqlalchemy import event, func, insert, literal_column, select, text, update
@@ -29,7 +28,7 @@ from tests.whole_engine import Engine
 
 MODEL = "ab" * 32
 #: What is known of a frame beside its content.
-KNOWN: dict[str, Any] = {
+KNOWN = {
     "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1}, "depth_scale": 1000.0,
     "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": ["a"],
     "pose_parent": None, "pose": None, "name": None, "sequence": None,

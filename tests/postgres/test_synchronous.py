@@ -1,7 +1,5 @@
 """Tests that a commit counts only once its standby has it."""
 
-from __future__ import annotations
-
 import threading
 
 import psycopg

@@ -1,7 +1,5 @@
 """Tests of a writer's lock on PostgreSQL: visible data, and cost."""
 
-from __future__ import annotations
-
 import threading
 
 import pytest

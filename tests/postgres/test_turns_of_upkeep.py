@@ -1,7 +1,5 @@
 """Tests that workers on one map do not block writers of other maps."""
 
-from __future__ import annotations
-
 import re
 import threading
 import time
@@ -39,7 +37,7 @@ def engine(postgres_url, tmp_path):
 @contextmanager
 def turns(engine):
     """Counts how often the turn of all maps, and that of one, is taken."""
-    found: Counter[str] = Counter()
+    found = Counter()
 
     def note(_connection, _cursor, statement, *_):
         found["all"] += _ALL.search(statement) is not None

@@ -1,7 +1,5 @@
 """Tests of wakeup by NOTIFY on all hosts, and of its failures."""
 
-from __future__ import annotations
-
 import os
 import socket
 import threading

@@ -3,14 +3,10 @@
 The code writes real files. An audit hook and `os.fsync` record the order of operations.
 """
 
-from __future__ import annotations
-
 import os
 import sys
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,12 +14,12 @@ from tests.faults.disk import Disk
 
 _EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate")
 #: The active disk; audit hooks cannot be removed.
-_listening: list[Disk] = []
+_listening = []
 
 
 @pytest.fixture(scope="session")
-def _hooked() -> None:
-    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+def _hooked():
+    def hook(event, arguments):
         if event not in _EVENTS or not _listening:
             return
         disk = _listening.pop()  # this code opens files itself
@@ -39,16 +35,13 @@ def _hooked() -> None:
     sys.addaudithook(hook)
 
 
-Recording = Callable[..., Any]
-
-
 @pytest.fixture
-def recorded(_hooked: None, monkeypatch: pytest.MonkeyPatch) -> Recording:
+def recorded(_hooked, monkeypatch):
     """`with recorded(folder) as disk:` records this thread's file operations in a folder."""
     fsync, fdatasync = os.fsync, os.fdatasync
 
-    def listen(after: Callable[[int], None]) -> Callable[[Any], None]:
-        def sync(file: Any) -> None:
+    def listen(after):
+        def sync(file):
             number = file if isinstance(file, int) else file.fileno()
             after(number)
             if _listening:
@@ -64,7 +57,7 @@ def recorded(_hooked: None, monkeypatch: pytest.MonkeyPatch) -> Recording:
     monkeypatch.setattr(os, "fdatasync", listen(fdatasync))
 
     @contextmanager
-    def record(root: Path, deaf: str = "") -> Iterator[Disk]:
+    def record(root, deaf=""):
         assert not _listening
         disk = Disk(root, deaf)
         _listening.append(disk)
@@ -78,11 +71,11 @@ def recorded(_hooked: None, monkeypatch: pytest.MonkeyPatch) -> Recording:
 
 
 @pytest.fixture
-def after_crash(tmp_path: Path) -> Callable[[dict[str, bytes | None]], Path]:
+def after_crash(tmp_path):
     """A function that creates the folder after a crash with a new name, as files may be mapped."""
     made = iter(range(1_000_000))
 
-    def make(tree: dict[str, bytes | None]) -> Path:
+    def make(tree):
         root = tmp_path / f"crashed-{next(made)}"
         root.mkdir()
         for name, content in tree.items():  # folders before their content

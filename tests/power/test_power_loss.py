@@ -3,35 +3,26 @@
 The tests cover blobs and indexes; SQLite protects its own files (synchronous = FULL).
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from sqlalchemy import Connection, event
+from sqlalchemy import event
 
 from sceneprint import atomic_files
 from sceneprint.index import index_version
-from sceneprint.index.index_manifest import IndexManifest
-from sceneprint.index.index_version import IndexVersion, newest, publish
+from sceneprint.index.index_version import newest, publish
 from sceneprint.settings import Settings
 from sceneprint.store import FolderBlobs
-from sceneprint.types import Bytes
 from sceneprint_client.api import FrameMeta, JobState, NewMap
 from tests.whole_engine import Engine
 
 LENGTH = 64
-Recorded = Callable[..., Any]
-AfterCrash = Callable[[dict[str, bytes | None]], Path]
 
 
-def test_what_a_disk_may_drop(tmp_path: Path, recorded: Recorded) -> None:
+def test_what_a_disk_may_drop(tmp_path, recorded):
     """The model itself, against POSIX by hand."""
     root = tmp_path / "disk"
     root.mkdir()
@@ -49,18 +40,18 @@ def test_what_a_disk_may_drop(tmp_path: Path, recorded: Recorded) -> None:
         atomic_files.sync_folder(root / "sub")
         disk.mark("sub synced")
         atomic_files.sync_folder(root)
-    left: dict[str, list[dict[str, bytes | None]]] = {}
+    left = {}
     for _, what, tree in disk.crashes(seeds=20):
         left.setdefault(what.partition(":")[0], []).append(tree)
 
-    old: dict[str, bytes | None] = {"old": b"old"}
-    sub: dict[str, bytes | None] = {"sub": None}
+    old = {"old": b"old"}
+    sub = {"sub": None}
     part, whole = {**sub, "sub/part": b"content"}, {**sub, "sub/whole": b"content"}
 
-    def either(*trees: dict[str, bytes | None]) -> list[dict[str, bytes | None]]:
+    def either(*trees):
         return sorted(trees, key=repr)
 
-    def all_of(what: str) -> list[dict[str, bytes | None]]:
+    def all_of(what):
         return sorted(left[what], key=repr)
 
     assert all_of("begin") == [old]
@@ -73,9 +64,7 @@ def test_what_a_disk_may_drop(tmp_path: Path, recorded: Recorded) -> None:
 
 
 @pytest.fixture
-def lost_blobs(
-    recorded: Recorded, after_crash: AfterCrash, tmp_path: Path
-) -> Callable[[str], set[str]]:
+def lost_blobs(recorded, after_crash, tmp_path):
     """Put blobs on a disk, and say which promises a loss of power breaks."""
     first, second, large = b"depth" * 300, b"another frame" * 100, b"an archive" * 200
     folder = hashlib.sha256(first).hexdigest()[:2]
@@ -85,12 +74,12 @@ def lost_blobs(
         if hashlib.sha256(data).hexdigest().startswith(folder)
     )
 
-    def run(deaf: str) -> set[str]:
+    def run(deaf):
         root = tmp_path / f"disk-{deaf}"
         root.mkdir()
         contents = {hashlib.sha256(one).hexdigest(): one for one in (first, second, beside, large)}
         with recorded(root, deaf) as disk:
-            promised: list[tuple[int, set[str]]] = [(0, set())]
+            promised = [(0, set())]
             blobs = FolderBlobs(root / "data" / "blobs")
             for data in (large, first, second, beside, first):
                 if data is large:
@@ -125,29 +114,27 @@ def lost_blobs(
     return run
 
 
-def test_a_blob_that_was_put_survives(lost_blobs: Callable[[str], set[str]]) -> None:
+def test_a_blob_that_was_put_survives(lost_blobs):
     assert lost_blobs("") == set()
 
 
-def test_who_does_not_sync_blobs_is_found_out(lost_blobs: Callable[[str], set[str]]) -> None:
+def test_who_does_not_sync_blobs_is_found_out(lost_blobs):
     assert lost_blobs("files") == {"a name with another content"}
     assert lost_blobs("folders") == {"a blob that is gone"}
 
 
-def test_no_commit_refers_to_a_blob_that_may_be_lost(
-    tmp_path: Path, recorded: Recorded, small_upload: tuple[bytes, FrameMeta]
-) -> None:
+def test_no_commit_refers_to_a_blob_that_may_be_lost(tmp_path, recorded, small_upload):
     """Upload, signing and deletion as they are: with every commit the blobs it refers to."""
     referred = (
         "SELECT blob FROM frames WHERE state != 'deleted' UNION SELECT geometry FROM signatures"
     )
     root = tmp_path / "data" / "blobs"
-    commits: list[tuple[int, set[str]]] = []
+    commits = []
     with Engine(Settings(data_dir=tmp_path / "data", database_url=None)) as engine:
         engine.create_map(NewMap(name="hall", model="depth"))
         with recorded(root) as disk:
 
-            def note(connection: Connection) -> None:  # before SQLite is asked to commit
+            def note(connection):  # before SQLite is asked to commit
                 rows = {row[0] for row in connection.exec_driver_sql(referred)}
                 disk.mark("commit")
                 commits.append((len(disk.states) - 1, rows))
@@ -178,7 +165,7 @@ def test_no_commit_refers_to_a_blob_that_may_be_lost(
     assert checked > 10
 
 
-def signatures_at(keys: NDArray[np.int64]) -> Bytes:
+def signatures_at(keys):
     return np.stack([np.random.default_rng(k).integers(0, 256, LENGTH, np.uint8) for k in keys])
 
 
@@ -193,15 +180,15 @@ STEPS = (
 )
 
 
-def expected(number: int) -> list[int]:
+def expected(number):
     """Keys of a version, by hand."""
-    keys: list[int] = []
+    keys = []
     for new, dropped, _ in STEPS[:number]:
         keys = [key for key in [*keys, *new] if key not in dropped]
     return keys
 
 
-def publish_step(folder: Path, number: int, previous: IndexVersion | None) -> IndexVersion:
+def publish_step(folder, number, previous):
     new, dropped, flat_bytes = STEPS[number - 1]
     keys = np.array(new)
     made = publish(
@@ -212,7 +199,7 @@ def publish_step(folder: Path, number: int, previous: IndexVersion | None) -> In
     return made
 
 
-def read(folder: Path) -> IndexVersion | None:
+def read(folder):
     """The newest version, which holds just what it should."""
     found = newest(folder, "model", LENGTH)
     if found is not None:
@@ -225,18 +212,16 @@ def read(folder: Path) -> IndexVersion | None:
 
 
 @pytest.fixture
-def lost_versions(
-    recorded: Recorded, after_crash: AfterCrash, tmp_path: Path
-) -> Callable[..., set[str]]:
+def lost_versions(recorded, after_crash, tmp_path):
     """Publish five versions, and say which promises a loss of power breaks."""
 
-    def run(deaf: str = "", steps: int = len(STEPS)) -> set[str]:
+    def run(deaf=""):
         root = tmp_path / f"index-{deaf}"
         root.mkdir()
-        done: list[int] = [0]  # the state after which each version was published
+        done = [0]  # the state after which each version was published
         with recorded(root, deaf) as disk:
             previous = None
-            for number in range(1, steps + 1):
+            for number in range(1, len(STEPS) + 1):
                 previous = publish_step(root / "map", number, previous)
                 disk.mark("published")
                 done.append(len(disk.states) - 1)
@@ -251,38 +236,34 @@ def lost_versions(
             number = 0 if found is None else found.revision // 10
             if number not in (published, published + 1):
                 broken.add(f"{number or 'none'} after {published} ({what})")
-            if what.endswith("nothing unsure") and number < steps and number == published:
+            if what.endswith("nothing unsure") and number < len(STEPS) and number == published:
                 again = publish_step(folder, number + 1, found)  # and it goes on from there
                 assert read(folder) is not None
                 assert again.revision == 10 * (number + 1)
             seen.add((published, number))
         if not broken:  # in every stretch some crashes keep the old one, and some the new one
-            assert seen >= {(n, n) for n in range(steps)} | {(n, n + 1) for n in range(steps)}
+            assert seen >= {(n, n) for n in range(len(STEPS))} | {
+                (n, n + 1) for n in range(len(STEPS))
+            }
         return broken
 
     return run
 
 
-def test_a_version_that_was_published_survives(
-    lost_versions: Callable[..., set[str]],
-) -> None:
+def test_a_version_that_was_published_survives(lost_versions):
     assert lost_versions() == set()
 
 
 @pytest.mark.parametrize("deaf", ["files", "folders"])
-def test_who_does_not_sync_an_index_is_found_out(
-    deaf: str, lost_versions: Callable[..., set[str]]
-) -> None:
+def test_who_does_not_sync_an_index_is_found_out(deaf, lost_versions):
     broken = lost_versions(deaf, steps=2)
     assert {one.partition(" (")[0] for one in broken} >= {"none after 1"}
 
 
-def test_old_versions_removed_too_early_are_found_out(
-    lost_versions: Callable[..., set[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_old_versions_removed_too_early_are_found_out(lost_versions, monkeypatch):
     write = index_version.write_manifest
 
-    def remove_first(folder: Path, manifest: IndexManifest) -> Path:
+    def remove_first(folder, manifest):
         for path in folder.glob("*.json"):
             path.unlink()
         return write(folder, manifest)
@@ -292,6 +273,6 @@ def test_old_versions_removed_too_early_are_found_out(
 
 
 @pytest.fixture(scope="module")
-def small_upload(room_frames: Any, small_image: Any) -> Any:
+def small_upload(room_frames, small_image):
     data, camera = small_image(room_frames[0], 0, 0)
     return data, FrameMeta(intrinsics=camera)

@@ -1,18 +1,11 @@
 """Fixtures of the recording tests: a drive, and its camera images."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
-from sceneprint.types import Floats
-
 
 @pytest.fixture(scope="session")
-def walk(ros: SimpleNamespace) -> list[tuple[float, Floats]]:
+def walk(ros):
     """Poses of a base that drives along a bend, every tenth of a second."""
     return [
         (
@@ -24,10 +17,10 @@ def walk(ros: SimpleNamespace) -> list[tuple[float, Floats]]:
 
 
 @pytest.fixture(scope="session")
-def depth() -> Callable[[int], np.ndarray]:
+def depth():
     """A function that returns the samples of a frame in millimetres, some of them missing."""
 
-    def samples(i: int) -> np.ndarray:
+    def samples(i):
         rng = np.random.default_rng(i)
         found = rng.integers(800, 6000, (60, 80)).astype(np.uint16)
         found[rng.random(found.shape) < 0.1] = 0

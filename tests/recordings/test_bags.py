@@ -1,43 +1,33 @@
 """Tests that bags in all containers and encodings give the poses and samples of the folder."""
 
-from __future__ import annotations
-
 import pickle
-from collections.abc import Callable
 from functools import partial
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.errors import DatasetError, InvalidIntrinsics, UnreadableFrame
-from sceneprint.formats.dataset import FrameSequence, Layout, find_sequences
+from sceneprint.formats.dataset import Layout, find_sequences
 from sceneprint.formats.dataset.frame_reference import session_of
 from sceneprint.formats.recording.outline import bag_outline
 from sceneprint.formats.recording.selection import RecordingOptions
-from sceneprint.types import Cloud, DepthFrame, Floats
+from sceneprint.types import Cloud, DepthFrame
 from sceneprint_client.frame_files import meta_of
 
-Walk = list[tuple[float, Floats]]
-Samples = Callable[[int], np.ndarray]
 ALL = RecordingOptions(keyframe_m=0)
 
 
-def only(path: Path, options: RecordingOptions = ALL) -> FrameSequence:
+def only(path, options=ALL):
     (sequence,) = find_sequences(path, options)
     return sequence
 
 
-def angle(a: Floats, b: Floats) -> float:
+def angle(a, b):
     turn = a[:3, :3].T @ b[:3, :3]
     return float(np.degrees(np.linalg.norm(turn - turn.T) / np.sqrt(8)))
 
 
-def drive(
-    writer: Any, ros: SimpleNamespace, walk: Walk, put: Callable[[Any, int, float], None]
-) -> None:
+def drive(writer, ros, walk, put):
     """A robot with a camera off its base: its frames lie between the stamps of its odometry."""
     writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
     for i, (t, T) in enumerate(walk):
@@ -55,10 +45,9 @@ def drive(
     ],
 )  # fmt: skip
 def test_poses_and_samples_are_those_that_were_recorded(
-    container: str, encoding: str, how: dict[str, Any], tmp_path: Path, ros: SimpleNamespace,
-    walk: Walk, depth: Samples,
-) -> None:  # fmt: skip
-    def put(writer: Any, i: int, t: float) -> None:
+    container, encoding, how, tmp_path, ros, walk, depth
+):
+    def put(writer, i, t):
         if how.get("compressed"):
             writer.compressed(t, depth(i))
         else:
@@ -94,12 +83,10 @@ def test_poses_and_samples_are_those_that_were_recorded(
 
 
 @pytest.mark.parametrize("compression", ["message", "file", "bz2", "lz4", "storage"])
-def test_compressed_bags(
-    compression: str, tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
+def test_compressed_bags(compression, tmp_path, ros, walk, depth):
     container = {"bz2": "ros1", "lz4": "ros1", "storage": "mcap"}.get(compression, "sqlite3")
 
-    def put(writer: Any, i: int, t: float) -> None:
+    def put(writer, i, t):
         writer.image(t, depth(i))
 
     path = ros.write(
@@ -110,10 +97,8 @@ def test_compressed_bags(
     np.testing.assert_array_equal(frames[7].read().depth, (depth(7) / 1000).astype(np.float32))
 
 
-def test_metres_are_taken_as_they_are(
-    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
-    def put(writer: Any, i: int, t: float) -> None:
+def test_metres_are_taken_as_they_are(tmp_path, ros, walk, depth):
+    def put(writer, i, t):
         metres = depth(i).astype(np.float32) / 777
         metres[depth(i) == 0] = np.nan
         writer.image(t, metres, "32FC1", padding=4 * (i % 3), big=i % 2 == 1)
@@ -124,15 +109,13 @@ def test_metres_are_taken_as_they_are(
         np.testing.assert_array_equal(reference.read().depth, expected)
 
 
-def test_inverse_depth_by_hand(
-    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
+def test_inverse_depth_by_hand(tmp_path, ros, walk, depth):
     """z = a / (v - b), with the parameters that the transport writes for a depth up to 10 m."""
     a, b = 10100.0, 1.0 - 10100.0 / 10.0
     stored = np.zeros((60, 80), np.uint16)
     stored[:, 1:] = np.arange(1, 80) * 100
 
-    def put(writer: Any, i: int, t: float) -> None:
+    def put(writer, i, t):
         writer.compressed(t, stored, "32FC1", a=a, b=b)
 
     path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))
@@ -146,15 +129,13 @@ def test_inverse_depth_by_hand(
 
 @pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
 @pytest.mark.parametrize("layout", ["plain", "packed", "organised", "doubles", "whole"])
-def test_points_of_any_layout(
-    container: str, layout: str, tmp_path: Path, ros: SimpleNamespace, walk: Walk
-) -> None:
+def test_points_of_any_layout(container, layout, tmp_path, ros, walk):
     rng = np.random.default_rng(3)
     xyz = rng.uniform(-5, 5, (120, 3)).astype(np.float32)
     xyz[5] = np.nan
     xyz[17, 1] = np.inf
     xyz[40] = 0.0
-    form: Any = {
+    form = {
         "plain": [("x", "<f4"), ("y", "<f4"), ("z", "<f4")],
         "packed": {"names": ["ring", "z", "intensity", "x", "y"],
                    "formats": ["<u2", "<f4", "<f4", "<f4", "<f4"],
@@ -170,7 +151,7 @@ def test_points_of_any_layout(
         rows[name] = xyz[:, axis]
     organised = {"height": 8, "padding": 9, "big": True} if layout == "organised" else {}
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0.0, {("base_link", "lidar"): ros.camera}, "/tf_static")
         for t, T in walk:
             writer.transforms(t, {("odom", "base_link"): T})
@@ -187,11 +168,11 @@ def test_points_of_any_layout(
     np.testing.assert_allclose(cloud.pose, walk[2][1] @ ros.camera, atol=1e-9)
 
 
-def test_interpolation_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+def test_interpolation_by_hand(tmp_path, ros, depth):
     """A base that turns by 40 degrees and drives 2 m in 0.4 s, seen after 0.1 s and later."""
     turn = np.radians(20)
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         writer.transforms(0.0, {("base_link", "camera"): ros.transform(0.3, 0, 0.5)}, "/tf_static")
         writer.transforms(1.0, {("odom", "base_link"): ros.transform(1, 0, 0)})
@@ -219,7 +200,7 @@ def test_interpolation_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samp
     assert sequence.lost == 3
 
 
-def test_keyframes_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+def test_keyframes_by_hand(tmp_path, ros, depth):
     """0.3 m or 15 degrees from the last one that was taken, not from the last one."""
     places = [
         (0, 0),
@@ -232,7 +213,7 @@ def test_keyframes_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samples)
         (0.76, 16),
     ]
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
         for i, (x, degrees) in enumerate(places):
@@ -255,10 +236,8 @@ def test_keyframes_by_hand(tmp_path: Path, ros: SimpleNamespace, depth: Samples)
     assert [f.name for f in wide.frames] == ["run/000000", "run/000005"]
 
 
-def test_without_poses_frames_are_taken_by_time(
-    tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_without_poses_frames_are_taken_by_time(tmp_path, ros, depth):
+    def fill(writer):
         writer.camera_info(0.0)
         for i in range(20):
             writer.image(0.1 * i, depth(i))
@@ -274,10 +253,8 @@ def test_without_poses_frames_are_taken_by_time(
     assert len(only(path, RecordingOptions(keyframe_s=0)).frames) == 20
 
 
-def test_odometry_gives_poses_where_tf_does_not(
-    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_odometry_gives_poses_where_tf_does_not(tmp_path, ros, walk, depth):
+    def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
         writer.camera_info(0.0)
         for i, (t, T) in enumerate(walk):
@@ -289,15 +266,13 @@ def test_odometry_gives_poses_where_tf_does_not(
         np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
 
 
-def test_transforms_come_before_odometry_of_the_same_frames(
-    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
+def test_transforms_come_before_odometry_of_the_same_frames(tmp_path, ros, walk, depth):
     """Wheels slip: what a filter makes of their odometry is in tf."""
 
     found = []
     for name in ("with", "without"):
 
-        def put(writer: Any, i: int, t: float, name: str = name) -> None:
+        def put(writer, i, t, name=name):
             if name == "with":
                 writer.odometry(t + 0.03, ros.transform(9, 9, 9))
             writer.image(t + 0.03, depth(i))
@@ -309,17 +284,15 @@ def test_transforms_come_before_odometry_of_the_same_frames(
 
 
 @pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
-def test_the_stamp_counts_and_not_the_time_of_recording(
-    container: str, tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
+def test_the_stamp_counts_and_not_the_time_of_recording(container, tmp_path, ros, walk, depth):
     """Images are recorded 0.35 s late, as by slow drivers."""
 
-    def put(writer: Any, i: int, t: float) -> None:
+    def put(writer, i, t):
         writer.late = 0.35
         writer.image(t, depth(i))
         writer.late = 0.0
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         drive(writer, ros, walk[:3], put)
 
     frames = only(ros.write(tmp_path, fill, container)).frames
@@ -328,12 +301,10 @@ def test_the_stamp_counts_and_not_the_time_of_recording(
         np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
 
 
-def test_a_map_comes_before_odometry_and_either_can_be_chosen(
-    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
+def test_a_map_comes_before_odometry_and_either_can_be_chosen(tmp_path, ros, walk, depth):
     T_map_odom = ros.transform(5, 6, 0, 0, 0, 1, 1)
 
-    def put(writer: Any, i: int, t: float) -> None:
+    def put(writer, i, t):
         writer.image(t, depth(i))
         writer.transforms(t, {("/map", "/odom"): T_map_odom})  # ROS 1 wrote the slash
 
@@ -348,12 +319,10 @@ def test_a_map_comes_before_odometry_and_either_can_be_chosen(
         only(path, RecordingOptions(pose_frame="mars"))
 
 
-def test_fixed_joints_that_are_published_again_and_again(
-    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
+def test_fixed_joints_that_are_published_again_and_again(tmp_path, ros, walk, depth):
     """As by robot_state_publisher of ROS 1, seldom and at other times than the frames."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         for i, (t, T) in enumerate(walk):
             if i in (0, 10):
@@ -368,12 +337,12 @@ def test_fixed_joints_that_are_published_again_and_again(
     assert frames[20].base.base_frame == "base_footprint"
 
 
-def test_up_of_an_imu_at_rest(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+def test_up_of_an_imu_at_rest(tmp_path, ros, depth):
     """The IMU hangs upside down beside the camera; the robot stands, and drives off after 3 s."""
     T_base_imu = ros.transform(0, 0.1, 0.2, 1, 0, 0, 0)  # half a turn about x
     rng = np.random.default_rng(1)
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         fixed = {("base_link", "camera"): ros.camera, ("base_link", "imu"): T_base_imu}
         writer.transforms(0.0, fixed, "/tf_static")
@@ -393,10 +362,8 @@ def test_up_of_an_imu_at_rest(tmp_path: Path, ros: SimpleNamespace, depth: Sampl
     assert meta_of(frames[0]).up is not None
 
 
-def test_without_a_transform_from_the_imu_there_is_no_up(
-    tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_without_a_transform_from_the_imu_there_is_no_up(tmp_path, ros, depth):
+    def fill(writer):
         writer.camera_info(0.0)
         for i in range(100):
             writer.imu(0.01 * i, (0, 0, 9.81))
@@ -410,12 +377,10 @@ def test_without_a_transform_from_the_imu_there_is_no_up(
 # Cameras.
 
 
-def one_image(
-    ros: SimpleNamespace, folder: Path, topic: str = "/camera/depth/image_raw", **info: Any
-) -> Path:
+def one_image(ros, folder, topic="/camera/depth/image_raw", **info):
     samples = np.full((60, 80), 2000, np.uint16)
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0, topic.rpartition("/")[0] + "/camera_info", **info)
         writer.image(0.1, samples, topic=topic)
 
@@ -438,10 +403,7 @@ def one_image(
         ((0, 0, 0, 0), "equidistant", ()),
     ],
 )
-def test_lenses(
-    d: tuple[float, ...], model: str, expected: tuple[float, ...], tmp_path: Path,
-    ros: SimpleNamespace,
-) -> None:  # fmt: skip
+def test_lenses(d, model, expected, tmp_path, ros):
     (frame,) = only(one_image(ros, tmp_path, d=d, model=model)).frames
     assert frame.camera is not None
     assert frame.camera.intrinsics.distortion == expected
@@ -457,17 +419,13 @@ def test_lenses(
         ({"k": (70.0, 71.0, float("nan"), 29.5)}, "principal point"),
     ],
 )
-def test_lenses_that_are_not_supported(
-    more: dict[str, Any], message: str, tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_lenses_that_are_not_supported(more, message, tmp_path, ros):
     with pytest.raises(InvalidIntrinsics, match=message) as caught:
         only(one_image(ros, tmp_path, **more))
     assert "run.mcap, /camera/depth/camera_info: " in str(caught.value)
 
 
-def test_rectified_images_have_the_camera_of_the_projection(
-    tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_rectified_images_have_the_camera_of_the_projection(tmp_path, ros):
     made = {"d": (0.1, 0.2, 0, 0, 0), "p": (65.0, 66.0, 38.0, 28.0)}
     (frame,) = only(one_image(ros, tmp_path, "/camera/depth/image_rect", **made)).frames
     assert frame.camera is not None
@@ -475,7 +433,7 @@ def test_rectified_images_have_the_camera_of_the_projection(
     assert (k.fx, k.fy, k.cx, k.cy, k.distortion) == (65, 66, 38, 28, ())
 
 
-def test_a_part_of_the_image(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_a_part_of_the_image(tmp_path, ros):
     roi = {"x_offset": 10, "y_offset": 20, "width": 80, "height": 60}
     (frame,) = only(one_image(ros, tmp_path, size=(640, 480), **roi)).frames
     assert frame.camera is not None
@@ -484,7 +442,7 @@ def test_a_part_of_the_image(tmp_path: Path, ros: SimpleNamespace) -> None:
     assert frame.read().depth.shape == (60, 80)
 
 
-def test_a_camera_that_is_nowhere(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+def test_a_camera_that_is_nowhere(tmp_path, ros, depth):
     path = ros.write(tmp_path, lambda writer: writer.image(0.0, depth(0)))
     with pytest.raises(DatasetError, match=r"image_raw is unknown.*--camera-info"):
         only(path)
@@ -494,12 +452,12 @@ def test_a_camera_that_is_nowhere(tmp_path: Path, ros: SimpleNamespace, depth: S
     assert len(only(path).frames) == 1
 
 
-def test_an_uncalibrated_camera(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_an_uncalibrated_camera(tmp_path, ros):
     with pytest.raises(DatasetError, match="is not calibrated"):
         only(one_image(ros, tmp_path, k=(0.0, 0.0, 0.0, 0.0)))
 
 
-def test_a_camera_of_another_size(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_a_camera_of_another_size(tmp_path, ros):
     (frame,) = only(one_image(ros, tmp_path, size=(640, 480))).frames
     reason = "80 x 60 pixels, but the intrinsics are for 640 x 480"
     with pytest.raises(InvalidIntrinsics, match=reason):
@@ -509,12 +467,10 @@ def test_a_camera_of_another_size(tmp_path: Path, ros: SimpleNamespace) -> None:
 # Topics.
 
 
-def test_images_that_are_no_depth_by_name_must_be_named(
-    tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
+def test_images_that_are_no_depth_by_name_must_be_named(tmp_path, ros, depth):
     confidence = "/zed/confidence/confidence_map"
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         writer.image(0.0, depth(0), topic=confidence)
         writer.image(0.0, depth(0), topic="/ir/image_raw")
@@ -528,7 +484,7 @@ def test_images_that_are_no_depth_by_name_must_be_named(
     camera = RecordingOptions(topic=confidence, camera_info="/camera/depth/camera_info")
     assert len(only(path, camera).frames) == 1
 
-    def fill_both(writer: Any) -> None:
+    def fill_both(writer):
         fill(writer)
         writer.image(0.0, depth(0), topic="/ir_camera/depth/image_raw")
 
@@ -537,11 +493,11 @@ def test_images_that_are_no_depth_by_name_must_be_named(
     assert "1 of 1 frames of /ir_camera/depth/image_raw taken" in sequence.note
 
 
-def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: Samples) -> None:
+def test_several_topics_are_listed(tmp_path, ros, depth):
     rows = np.zeros(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     rows["x"] = np.arange(20) + 1
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         writer.camera_info(0.0, "/other/camera_info", frame="elsewhere")
         writer.image(0.0, np.zeros((2, 6)), "rgb8", "/camera/color/image_raw")
@@ -574,16 +530,14 @@ def test_several_topics_are_listed(tmp_path: Path, ros: SimpleNamespace, depth: 
     assert outline.sequences == ()
 
 
-def test_a_bag_without_frames(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_a_bag_without_frames(tmp_path, ros):
     path = ros.write(tmp_path, lambda writer: writer.imu(0.0, (0, 0, 9.8)))
     with pytest.raises(DatasetError, match=r"no topic of depth images .* or of points"):
         only(path)
 
 
-def test_a_camera_elsewhere_is_found_by_its_frame(
-    tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_a_camera_elsewhere_is_found_by_its_frame(tmp_path, ros, depth):
+    def fill(writer):
         writer.camera_info(0.0, "/a/info", frame="color", k=(1.0, 1.0, 1.0, 1.0))
         writer.camera_info(0.0, "/b/info", frame="camera")
         writer.image(0.0, depth(0))
@@ -596,10 +550,8 @@ def test_a_camera_elsewhere_is_found_by_its_frame(
 # References.
 
 
-def test_a_reference_travels_to_another_process(
-    tmp_path: Path, ros: SimpleNamespace, walk: Walk, depth: Samples
-) -> None:
-    def put(writer: Any, i: int, t: float) -> None:
+def test_a_reference_travels_to_another_process(tmp_path, ros, walk, depth):
+    def put(writer, i, t):
         writer.image(t, depth(i))
 
     path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))
@@ -610,12 +562,10 @@ def test_a_reference_travels_to_another_process(
     assert len({frame.path for frame in only(path).frames}) == len(walk)
 
 
-def test_several_messages_at_one_time_are_told_apart(
-    tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
+def test_several_messages_at_one_time_are_told_apart(tmp_path, ros, depth):
     for container in ros.containers:
 
-        def fill(writer: Any) -> None:
+        def fill(writer):
             writer.camera_info(0.0)
             for i in range(3):
                 message = depth(i)
@@ -630,10 +580,8 @@ def test_several_messages_at_one_time_are_told_apart(
             )
 
 
-def test_one_image_of_another_encoding_costs_no_other(
-    tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_one_image_of_another_encoding_costs_no_other(tmp_path, ros, depth):
+    def fill(writer):
         writer.camera_info(0.0)
         writer.image(0.0, depth(0))
         writer.image(1.0, np.zeros((2, 6)), "rgb8")

@@ -1,11 +1,6 @@
 """Tests of cameras in recordings: the camera info at each frame, and the unit of depth."""
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,12 +18,10 @@ IMAGE = np.full((60, 80), 2000, np.uint16)
 
 @pytest.mark.parametrize("container", ["mcap", "ros1"])
 @pytest.mark.parametrize("way", ["beside each frame", "after each frame", "now and then"])
-def test_each_frame_has_the_camera_info_of_its_time(
-    way: str, container: str, tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_each_frame_has_the_camera_info_of_its_time(way, container, tmp_path, ros):
     """The focal length changes at 1 s, and a driver that starts again sends zeros."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         for i in range(8):
             t = 0.25 * i
             f = 70.0 if t < 1 else 50.0
@@ -51,12 +44,10 @@ def test_each_frame_has_the_camera_info_of_its_time(
     )
 
 
-def test_a_camera_info_of_another_run_is_not_that_of_this_one(
-    tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_a_camera_info_of_another_run_is_not_that_of_this_one(tmp_path, ros):
     """Two runs of a simulation with other cameras, their stamps between each other."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         for run, f in enumerate((70.0, 50.0)):
             writer.late = 10.0 * run
             for i in range(4):
@@ -68,10 +59,10 @@ def test_a_camera_info_of_another_run_is_not_that_of_this_one(
     assert focal == [[70.0] * 4, [50.0] * 4]
 
 
-def test_depth_in_other_units(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_depth_in_other_units(tmp_path, ros):
     """0.1 mm: ten times too far as millimetres, which is doubted, and right with its scale."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         writer.image(0.0, np.full((60, 80), 17_500, np.uint16))
         writer.image(1.0, np.full((60, 80), 12_500, np.uint16))
@@ -86,8 +77,8 @@ def test_depth_in_other_units(tmp_path: Path, ros: SimpleNamespace) -> None:
     )
 
 
-def test_metres_have_no_depth_scale(tmp_path: Path, ros: SimpleNamespace) -> None:
-    def fill(writer: Any) -> None:
+def test_metres_have_no_depth_scale(tmp_path, ros):
+    def fill(writer):
         writer.camera_info(0.0)
         writer.image(0.0, np.full((60, 80), 1.5), "32FC1")
 
@@ -98,11 +89,11 @@ def test_metres_have_no_depth_scale(tmp_path: Path, ros: SimpleNamespace) -> Non
 # Compressed images.
 
 
-def rvl(samples: np.ndarray) -> bytes:
+def rvl(samples):
     """RVL as its paper writes it: number by number, nibble by nibble."""
-    nibbles: list[int] = []
+    nibbles = []
 
-    def put(number: int) -> None:
+    def put(number):
         while True:
             more = number > 7
             nibbles.append(number & 7 | 8 * more)
@@ -131,7 +122,7 @@ def rvl(samples: np.ndarray) -> bytes:
     return struct.pack(f"<II{len(words)}I", width, height, *words)
 
 
-def test_rvl_by_hand() -> None:
+def test_rvl_by_hand():
     """Two zeros; then 1000, 1001 and 990: differences 1000, 1 and -11, zigzag 2000, 2 and 21."""
     groups = "2 3 | 0 2 7 3 | 2 | 5 2 | 1 0"
     ends = {0, 1, 5, 6, 8, 9, 10}
@@ -143,14 +134,14 @@ def test_rvl_by_hand() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
-def test_compressed_depth_by_rvl(encoding: str, tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_compressed_depth_by_rvl(encoding, tmp_path, ros):
     rng = np.random.default_rng(4)
     samples = rng.integers(300, 9000, (60, 80)).astype(np.uint16)
     samples[rng.random(samples.shape) < 0.3] = 0
     samples[3] = 65_535
     a, b = (0.0, 0.0) if encoding == "16UC1" else (10100.0, -1009.0)
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         head = struct.pack("<iff", 0, a, b)
         message = writer.make(
@@ -176,14 +167,14 @@ def test_compressed_depth_by_rvl(encoding: str, tmp_path: Path, ros: SimpleNames
             rvl_samples(rvl(samples)[:cut])
 
 
-def test_rvl_of_more_than_16_bits_is_damaged() -> None:
+def test_rvl_of_more_than_16_bits_is_damaged():
     for wrong in (65_536, -1):
         with pytest.raises(UnreadableFrame, match="RVL-compressed image is damaged"):
             rvl_samples(rvl(np.array([[5, wrong, 7]])))
     np.testing.assert_array_equal(rvl_samples(rvl(np.array([[5, 65_535]]))), [[5, 65_535]])
 
 
-def test_an_inverse_depth_of_no_distance_is_missing(ros: SimpleNamespace) -> None:
+def test_an_inverse_depth_of_no_distance_is_missing(ros):
     """z = a / (v - b): at v = b it is nowhere, and below b behind the camera."""
     data = struct.pack("<iff", 0, 100.0, 7.0) + rvl(np.array([[6, 7, 8]]))
     message = ros.messages().make(
@@ -193,8 +184,8 @@ def test_an_inverse_depth_of_no_distance_is_missing(ros: SimpleNamespace) -> Non
     np.testing.assert_array_equal(compressed_depth(message).body(), [[0.0, 0.0, 100.0]])
 
 
-def test_what_cannot_be_read_is_not_promised(tmp_path: Path, ros: SimpleNamespace) -> None:
-    def fill(writer: Any) -> None:
+def test_what_cannot_be_read_is_not_promised(tmp_path, ros):
+    def fill(writer):
         writer.camera_info(0.0)
         for i in range(4):
             writer.compressed(float(i), IMAGE, form="16UC1; compressedDepth rvl")
@@ -205,10 +196,10 @@ def test_what_cannot_be_read_is_not_promised(tmp_path: Path, ros: SimpleNamespac
 
 
 @pytest.mark.parametrize("form", ["16UC1; png compressed ", "png", "mono16; png compressed"])
-def test_png_of_16_bits(form: str, tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_png_of_16_bits(form, tmp_path, ros):
     topic = "/camera/depth/image_raw/compressed"
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.camera_info(0.0)
         writer.compressed(0.0, IMAGE, form=form, topic=topic)
 
@@ -216,8 +207,8 @@ def test_png_of_16_bits(form: str, tmp_path: Path, ros: SimpleNamespace) -> None
     np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))
 
 
-def test_images_that_are_no_depth_are_named(tmp_path: Path, ros: SimpleNamespace) -> None:
-    def fill(writer: Any) -> None:
+def test_images_that_are_no_depth_are_named(tmp_path, ros):
+    def fill(writer):
         writer.image(0.0, np.zeros((2, 6)), "rgb8", "/camera/color/image_raw")
         writer.compressed(0.0, IMAGE, form="32FC1; png compressed", topic="/metres")
 
@@ -229,13 +220,13 @@ def test_images_that_are_no_depth_are_named(tmp_path: Path, ros: SimpleNamespace
         find_sequences(path, RecordingOptions(topic="/metres"))
 
 
-def mcap_of(bag: Path, profile: str) -> bytes:
+def mcap_of(bag, profile):
     """Return the messages of a ROS 1 bag in MCAP, without an index, as its specification says."""
 
-    def text(value: str) -> bytes:
+    def text(value):
         return struct.pack("<I", len(value)) + value.encode()
 
-    def record(kind: int, content: bytes) -> bytes:
+    def record(kind, content):
         return struct.pack("<BQ", kind, len(content)) + content
 
     magic = b"\x89MCAP0\r\n"
@@ -254,8 +245,8 @@ def mcap_of(bag: Path, profile: str) -> bytes:
 
 
 @pytest.mark.parametrize("profile", ["ros1", ""])
-def test_messages_of_ros_1_in_mcap(tmp_path: Path, ros: SimpleNamespace, profile: str) -> None:
-    def fill(writer: Any) -> None:
+def test_messages_of_ros_1_in_mcap(tmp_path, ros, profile):
+    def fill(writer):
         for t in (0.0, 1.0):
             writer.camera_info(t)
             writer.image(t, IMAGE)
@@ -271,8 +262,8 @@ def test_messages_of_ros_1_in_mcap(tmp_path: Path, ros: SimpleNamespace, profile
         np.testing.assert_array_equal(one.read_depth().depth, np.float32(2))
 
 
-def test_an_mcap_without_a_profile(tmp_path: Path, ros: SimpleNamespace) -> None:
-    def fill(writer: Any) -> None:
+def test_an_mcap_without_a_profile(tmp_path, ros):
+    def fill(writer):
         writer.camera_info(0.0)
         writer.image(0.0, IMAGE)
 

@@ -1,14 +1,11 @@
 """Tests that commands treat a bag like the folder that it was written from."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +16,6 @@ from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import decode_png, find_sequences
 from sceneprint.formats.recording import bag
 from sceneprint_client import Client
-from sceneprint_client.api import Frame
 from sceneprint_lab.cli.demo import serving
 
 Run = Callable[..., Any]
@@ -27,20 +23,20 @@ FRAMES = 8
 
 
 @pytest.fixture(scope="module")
-def service_url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def service_url(tmp_path_factory):
     with serving(tmp_path_factory.mktemp("service"), 1) as url:
         yield url
 
 
 @pytest.fixture
-def sceneprint(service_url: str, run_command: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
+def sceneprint(service_url, run_command, monkeypatch):
     """Runs a command in this process against the service and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_URL", service_url)
     return run_command
 
 
 @pytest.fixture(scope="module")
-def folder(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(building, tmp_path_factory):
     """The first frames of a walk through a room."""
     made = tmp_path_factory.mktemp("folder") / "room"
     made.mkdir()
@@ -53,10 +49,10 @@ def folder(building: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def record(ros: SimpleNamespace, place: Path, name: str, frames: Sequence[Any]) -> Path:
+def record(ros, place, name, frames):
     """Frames as a robot would have recorded them, its camera off its base."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
         for i, one in enumerate(frames):
             assert one.pose is not None
@@ -72,14 +68,14 @@ def record(ros: SimpleNamespace, place: Path, name: str, frames: Sequence[Any]) 
 
 
 @pytest.fixture(scope="module")
-def recording(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(folder, ros, tmp_path_factory):
     """The frames of the folder."""
     (sequence,) = find_sequences(folder)
     return record(ros, tmp_path_factory.mktemp("recording"), "lab", sequence.frames)
 
 
 @pytest.fixture(scope="module")
-def bags(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bags(folder, ros, tmp_path_factory):
     """A folder with two bags of some of the frames, one in the folder of a day: an MCAP file, and
     a rosbag2 folder.
     """
@@ -93,18 +89,14 @@ def bags(folder: Path, ros: SimpleNamespace, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.fixture(scope="module")
-def maps(
-    service_url: str, folder: Path, recording: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[str, str]:
+def maps(service_url, folder, recording, tmp_path_factory):
     """One map of the folder, one of the recording."""
     for name, path in (("folder", folder), ("bag", recording)):
         assert main(["upload", name, str(path), "--keyframe-m", "0", "--url", service_url]) == 0
     return "folder", "bag"
 
 
-def test_frames_of_a_bag_are_those_of_the_folder(
-    maps: tuple[str, str], service_url: str, ros: SimpleNamespace
-) -> None:
+def test_frames_of_a_bag_are_those_of_the_folder(maps, service_url, ros):
     with Client(service_url) as client:
         of_folder, of_bag = ({one.content_id: one for one in client.frames(m)} for m in maps)
     assert len(of_folder) == FRAMES
@@ -121,7 +113,7 @@ def test_frames_of_a_bag_are_those_of_the_folder(
         np.testing.assert_allclose(one.T_base_sensor.matrix, ros.camera, atol=1e-6)
 
 
-def check_pose(expected: Frame, found: Frame) -> None:
+def check_pose(expected, found):
     """Equal to 1 mm and 0.01 degrees."""
     assert expected.pose is not None
     assert found.pose is not None
@@ -131,9 +123,7 @@ def check_pose(expected: Frame, found: Frame) -> None:
     assert np.degrees(np.linalg.norm(turn - turn.T) / np.sqrt(8)) < 0.01
 
 
-def test_uploading_again_changes_nothing(
-    sceneprint: Run, maps: tuple[str, str], recording: Path
-) -> None:
+def test_uploading_again_changes_nothing(sceneprint, maps, recording):
     done = sceneprint("upload", "bag", recording, "--keyframe-m", 0)
     assert done.stdout.startswith(f"{FRAMES} frames: 0 received, {FRAMES} already there; ")
     assert done.stderr == (
@@ -142,18 +132,14 @@ def test_uploading_again_changes_nothing(
     )
 
 
-def test_keyframes_are_uploaded_and_the_rest_is_counted(
-    sceneprint: Run, recording: Path, service_url: str
-) -> None:
+def test_keyframes_are_uploaded_and_the_rest_is_counted(sceneprint, recording, service_url):
     done = sceneprint("upload", "sparse", recording, "--keyframe-m", 100, "--keyframe-deg", 360)
     assert "1 frames: 1 received" in done.stdout
     assert f"1 of {FRAMES} frames" in done.stderr
     assert f"skipped: {FRAMES - 1} between keyframes" in done.stderr
 
 
-def test_localize_and_sequences_of_a_bag(
-    sceneprint: Run, maps: tuple[str, str], recording: Path
-) -> None:
+def test_localize_and_sequences_of_a_bag(sceneprint, maps, recording):
     done = sceneprint("localize", "bag", recording, "--keyframe-m", 0, "--frame", 0)
     assert done.stdout.startswith("lab/000000: found")
     done = sceneprint("localize", "bag", recording, "--keyframe-m", 0, "--frame", 4, "--last", 3)
@@ -162,7 +148,7 @@ def test_localize_and_sequences_of_a_bag(
     assert "Set --frame to an index from 0 to" in done.stderr
 
 
-def test_each_bag_of_a_folder_is_a_session(sceneprint: Run, bags: Path, service_url: str) -> None:
+def test_each_bag_of_a_folder_is_a_session(sceneprint, bags, service_url):
     options = ("--keyframe-m", 0)
     done = sceneprint("upload", "days", bags, *options)
     _, counts, summary, _ = done.stdout.splitlines()
@@ -182,9 +168,7 @@ def test_each_bag_of_a_folder_is_a_session(sceneprint: Run, bags: Path, service_
     assert done.stdout.count(" frames of /camera/depth/image_raw taken, poses of ") == 2
 
 
-def test_a_folder_of_bags_is_signed_and_evaluated(
-    sceneprint: Run, bags: Path, tmp_path: Path
-) -> None:
+def test_a_folder_of_bags_is_signed_and_evaluated(sceneprint, bags, tmp_path):
     sceneprint("sign", bags, "--out", tmp_path / "signed", "--keyframe-m", 0)
     signed = {one.relative_to(tmp_path / "signed").as_posix()
               for one in (tmp_path / "signed").rglob("*.sig")}  # fmt: skip
@@ -196,9 +180,7 @@ def test_a_folder_of_bags_is_signed_and_evaluated(
     assert json.loads(figures.read_text())
 
 
-def test_bags_beside_other_frames_are_an_error(
-    sceneprint: Run, bags: Path, folder: Path, tmp_path: Path
-) -> None:
+def test_bags_beside_other_frames_are_an_error(sceneprint, bags, folder, tmp_path):
     mixed = tmp_path / "mixed"
     (mixed / "room").mkdir(parents=True)
     (mixed / "run.mcap").write_bytes(b"never read")
@@ -217,7 +199,7 @@ def test_bags_beside_other_frames_are_an_error(
     assert "The recording would have the same name as run.bag, run." in done.stderr
 
 
-def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
+def test_what_a_bag_holds(sceneprint, recording):
     done = sceneprint("bag", recording, "--keyframe-m", 0)
     head, *lines = done.stdout.splitlines()
     assert head == f"{recording}: ROS 2, 25 messages of 4 topics, 1.4 s from 2023-11-14T22:13:20Z"
@@ -238,9 +220,7 @@ def test_what_a_bag_holds(sceneprint: Run, recording: Path) -> None:
     assert table[5].startswith("camera: 640 x 480, fx ")
 
 
-def test_a_bag_of_which_nothing_would_be_taken(
-    sceneprint: Run, tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_a_bag_of_which_nothing_would_be_taken(sceneprint, tmp_path, ros):
     path = ros.write(tmp_path, lambda writer: writer.imu(0.0, (0, 0, 9.8)), "ros1")
     done = sceneprint("bag", path, expect=1)
     assert "ROS 1, 1 messages of 1 topics" in done.stdout
@@ -250,7 +230,7 @@ def test_a_bag_of_which_nothing_would_be_taken(
     assert done.stderr.count("\n") == 1
 
 
-def test_files_that_are_no_bags(sceneprint: Run, tmp_path: Path) -> None:
+def test_files_that_are_no_bags(sceneprint, tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"no bag")
     done = sceneprint("bag", tmp_path / "a.mcap", expect=2)
     assert re.fullmatch(
@@ -263,9 +243,7 @@ def test_files_that_are_no_bags(sceneprint: Run, tmp_path: Path) -> None:
     assert "The file or folder does not exist" in done.stderr
 
 
-def test_without_rosbags_the_extra_is_named(
-    sceneprint: Run, recording: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_rosbags_the_extra_is_named(sceneprint, recording, monkeypatch):
     bag._types.cache_clear()
     monkeypatch.setitem(sys.modules, "rosbags", None)
     done = sceneprint("upload", "bag", recording, expect=2)
@@ -275,19 +253,19 @@ def test_without_rosbags_the_extra_is_named(
     )
 
 
-def test_a_client_is_told_that_a_bag_is_no_frame(service_url: str, recording: Path) -> None:
+def test_a_client_is_told_that_a_bag_is_no_frame(service_url, recording):
     with Client(service_url) as client, pytest.raises(DatasetError, match="may hold several"):
         client.localize("bag", recording)
 
 
-def test_options_that_are_none(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_that_are_none(recording, capsys):
     for given in ("-1", "nan", "x"):
         with pytest.raises(SystemExit):
             main(["bag", str(recording), "--keyframe-m", given])
         assert "is not a number of at least 0" in capsys.readouterr().err
 
 
-def test_rosbags_is_loaded_when_a_bag_is_opened_and_not_before(folder: Path) -> None:
+def test_rosbags_is_loaded_when_a_bag_is_opened_and_not_before(folder):
     program = (
         "import sys\nfrom pathlib import Path\nimport sceneprint.cli.upload\n"
         "from sceneprint.formats.dataset import find_sequences\n"

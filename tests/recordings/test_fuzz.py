@@ -1,16 +1,10 @@
 """Tests of damaged bags: only documented errors, in bounded time and memory."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import struct
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,16 +13,11 @@ from sceneprint.errors import DatasetError, SceneprintError, UnreadableCloud, Un
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.outline import bag_outline
 from sceneprint.formats.recording.selection import RecordingOptions
-from sceneprint.types import Floats
-
-Walk = list[tuple[float, Floats]]
-Samples = Callable[[int], np.ndarray]
-
 
 DEPTH, POINTS = "/camera/depth/image_raw", "/points"
 
 
-def read_all(path: Path) -> int:
+def read_all(path):
     """How many frames can be read of whatever is there; what is raised is ours."""
     count = 0
     for topic in (DEPTH, POINTS):
@@ -52,7 +41,7 @@ def read_all(path: Path) -> int:
     return count
 
 
-def check(error: SceneprintError) -> None:
+def check(error):
     """An error is one line that says what to do."""
     told = str(error)
     assert told.isprintable()
@@ -61,16 +50,14 @@ def check(error: SceneprintError) -> None:
 
 
 @pytest.fixture(scope="module")
-def small(
-    tmp_path_factory: pytest.TempPathFactory, ros: SimpleNamespace, walk: Walk
-) -> dict[str, Path]:
+def small(tmp_path_factory, ros, walk):
     """A bag of everything in each container, small enough to be cut at many places."""
     rng = np.random.default_rng(0)
     rows = np.zeros(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     for name in "xyz":
         rows[name] = rng.uniform(1, 5, 30)
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
         for i, (t, T) in enumerate(walk[:4]):
             writer.transforms(t, {("odom", "base_link"): T})
@@ -88,7 +75,7 @@ def small(
     return made
 
 
-def damaged(bag: Path, folder: Path, content: bytes, number: int) -> Path:
+def damaged(bag, folder, content, number):
     """A copy of a bag with another content of its file."""
     if bag.is_file():
         path = folder / f"{number}{bag.suffix}"
@@ -100,7 +87,7 @@ def damaged(bag: Path, folder: Path, content: bytes, number: int) -> Path:
     return copy
 
 
-def content_of(bag: Path) -> bytes:
+def content_of(bag):
     return (bag if bag.is_file() else next(bag.glob("*.db3"))).read_bytes()
 
 
@@ -110,15 +97,13 @@ DAMAGED = [24, pytest.param(60, marks=pytest.mark.thorough)]
 
 
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_whole_bags_are_read(kind: str, small: dict[str, Path]) -> None:
+def test_whole_bags_are_read(kind, small):
     assert read_all(small[kind]) == 8
 
 
 @pytest.mark.parametrize("times", DAMAGED)
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_bags_that_were_cut_off(
-    kind: str, times: int, small: dict[str, Path], tmp_path: Path
-) -> None:
+def test_bags_that_were_cut_off(kind, times, small, tmp_path):
     whole = content_of(small[kind])
     places = {0, 1, 7, 8, 9, 13, 40, len(whole) - 1, len(whole) - 8, len(whole) - 37}
     places |= set(np.random.default_rng(1).integers(0, len(whole), times - 10).tolist())
@@ -128,9 +113,7 @@ def test_bags_that_were_cut_off(
 
 @pytest.mark.parametrize("times", DAMAGED)
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_bags_with_other_bytes(
-    kind: str, times: int, small: dict[str, Path], tmp_path: Path
-) -> None:
+def test_bags_with_other_bytes(kind, times, small, tmp_path):
     whole, rng = content_of(small[kind]), np.random.default_rng(2)
     for number in range(times):
         content = bytearray(whole)
@@ -153,7 +136,7 @@ def test_bags_with_other_bytes(
         "rosbag2_bagfile_information: {version: 9, relative_file_paths: [gone.db3]}", "\x00",
     ],
 )  # fmt: skip
-def test_folders_with_other_metadata(text: str, small: dict[str, Path], tmp_path: Path) -> None:
+def test_folders_with_other_metadata(text, small, tmp_path):
     copy = tmp_path / "bag"
     shutil.copytree(small["sqlite3"], copy)
     (copy / "metadata.yaml").write_text(text)
@@ -161,10 +144,8 @@ def test_folders_with_other_metadata(text: str, small: dict[str, Path], tmp_path
         find_sequences(copy)
 
 
-def test_unknown_types_beside_ours_cost_nothing(
-    tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_unknown_types_beside_ours_cost_nothing(tmp_path, ros, depth):
+    def fill(writer):
         unknown = "my_robot/msg/Thing"
         writer.connections["/thing"] = writer.writer.add_connection(
             "/thing", unknown, msgdef="not (a definition", rihs01="RIHS01_" + "0" * 64
@@ -177,7 +158,7 @@ def test_unknown_types_beside_ours_cost_nothing(
     assert sequence.frames[0].read().depth.any()
 
 
-def messages(writer: Any, depth: Samples) -> Iterator[tuple[str, bytes]]:
+def messages(writer, depth):
     """Images whose sizes contradict each other, or are absurd."""
     name = "sensor_msgs/msg/Image"
     for width, height, step, bytes_there in (
@@ -198,10 +179,8 @@ def messages(writer: Any, depth: Samples) -> Iterator[tuple[str, bytes]]:
 
 
 @pytest.mark.parametrize("container", ["mcap", "ros1"])
-def test_images_of_absurd_sizes(
-    container: str, tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_images_of_absurd_sizes(container, tmp_path, ros, depth):
+    def fill(writer):
         writer.camera_info(0.0)
         writer.image(0.0, depth(0))
         for number, (name, data) in enumerate(messages(writer, depth)):
@@ -224,7 +203,7 @@ def test_images_of_absurd_sizes(
         {"width": 2**31, "point_step": 2**31}, {"row_step": 3}, {"row_step": 1},
     ],
 )  # fmt: skip
-def test_points_of_absurd_sizes(more: dict[str, int], tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_points_of_absurd_sizes(more, tmp_path, ros):
     rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     path = ros.write(tmp_path, lambda writer: writer.points(0.0, rows, **({"height": 2} | more)))
     (sequence,) = find_sequences(path)
@@ -232,7 +211,7 @@ def test_points_of_absurd_sizes(more: dict[str, int], tmp_path: Path, ros: Simpl
         sequence.frames[0].read()
 
 
-def test_points_without_coordinates(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_points_without_coordinates(tmp_path, ros):
     rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("intensity", "<f4")])
     (sequence,) = find_sequences(ros.write(tmp_path, lambda writer: writer.points(0.0, rows)))
     with pytest.raises(UnreadableCloud, match="has the fields x, y, intensity, but x, y and z"):
@@ -248,10 +227,8 @@ def test_points_without_coordinates(tmp_path: Path, ros: SimpleNamespace) -> Non
         (b"\x00" * 12 + b"\x89PNG\r\n\x1a\n", "truncated"),
     ],
 )  # fmt: skip
-def test_compressed_images_that_are_none(
-    data: bytes, message: str, tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_compressed_images_that_are_none(data, message, tmp_path, ros, depth):
+    def fill(writer):
         writer.camera_info(0.0)
         writer.compressed(0.0, depth(0))
         name = "sensor_msgs/msg/CompressedImage"
@@ -270,10 +247,8 @@ def test_compressed_images_that_are_none(
     ("a", "b"),
     [(np.nan, 1.0), (np.inf, 0.0), (-1.0, 0.0), (0.0, 0.0), (1.0, np.nan)],
 )  # fmt: skip
-def test_parameters_of_inverse_depth_that_are_none(
-    a: float, b: float, tmp_path: Path, ros: SimpleNamespace, depth: Samples
-) -> None:
-    def fill(writer: Any) -> None:
+def test_parameters_of_inverse_depth_that_are_none(a, b, tmp_path, ros, depth):
+    def fill(writer):
         writer.camera_info(0.0)
         writer.compressed(0.0, depth(0), "32FC1", a=a, b=b)
 
@@ -282,17 +257,17 @@ def test_parameters_of_inverse_depth_that_are_none(
         sequence.frames[0].read()
 
 
-def test_a_chunk_that_grows_beyond_what_it_announces(tmp_path: Path) -> None:
+def test_a_chunk_that_grows_beyond_what_it_announces(tmp_path):
     """A gigabyte of zeros in a small file: refused, and never held."""
     backports = pytest.importorskip("backports.zstd")
     bomb = backports.compress(bytes(1 << 30), 1)
     assert len(bomb) < 200_000
     out = io.BytesIO()
 
-    def record(op: int, content: bytes) -> None:
+    def record(op, content):
         out.write(bytes([op]) + struct.pack("<Q", len(content)) + content)
 
-    def text(value: bytes) -> bytes:
+    def text(value):
         return struct.pack("<I", len(value)) + value
 
     out.write(b"\x89MCAP0\r\n")
@@ -321,9 +296,7 @@ def test_a_chunk_that_grows_beyond_what_it_announces(tmp_path: Path) -> None:
     assert int(peak) < 400_000  # KB
 
 
-def test_a_chunk_of_ros_1_that_grows(
-    small: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_chunk_of_ros_1_that_grows(small, tmp_path, monkeypatch):
     monkeypatch.setattr("sceneprint.formats.recording.bag.MAXIMUM_CHUNK_BYTES", 2000)
     with pytest.raises(DatasetError):
         find_sequences(small["bz2"], RecordingOptions(topic="/points"))

@@ -1,22 +1,16 @@
 """Tests of scans of a recording that are joined by odometry, from messages to poses."""
 
-from __future__ import annotations
-
 import pickle
 import tracemalloc
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.errors import DatasetError, UnreadableCloud
-from sceneprint.formats.dataset import FrameSequence, find_sequences
+from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.scan import BagScan
 from sceneprint.formats.recording.scan_window import scan_windows
 from sceneprint.formats.recording.selection import RecordingOptions
-from sceneprint.types import Floats
 from sceneprint_client import Client, Tracker
 from sceneprint_client.frame_files import meta_of
 from sceneprint_client.transforms import TransformTree
@@ -29,7 +23,7 @@ JOINED = RecordingOptions(join_m=2.05, keyframe_m=0.5)
 SCAN_S, ODOMETRY_S = 0.1, 0.01
 
 
-def pose(t: float, phase: float = 0.0, side: float = 0.0) -> Floats:
+def pose(t, phase=0.0, side=0.0):
     """A drive along x at 1 m/s that turns to both sides by up to 34 degrees a second."""
     yaw = 0.4 * np.sin(1.5 * t + phase)
     T = np.eye(4)
@@ -38,7 +32,7 @@ def pose(t: float, phase: float = 0.0, side: float = 0.0) -> Floats:
     return T
 
 
-def skewed(points: Floats, t: float, seconds: Floats, **drive: float) -> Floats:
+def skewed(points, t, seconds, **drive):
     """Return points (N, 3) of the world as a moving sensor measures them, each at its time."""
     measured = np.empty_like(points)
     for i, moment in enumerate(t + seconds):
@@ -47,19 +41,19 @@ def skewed(points: Floats, t: float, seconds: Floats, **drive: float) -> Floats:
     return measured
 
 
-def write_odometry(writer: Any, count: int, **drive: float) -> None:
+def write_odometry(writer, count, **drive):
     writer.transforms(0.0, {("base_link", "livox_frame"): np.eye(4)}, "/tf_static")
     for k in range(10 * count + 11):
         t = ODOMETRY_S * k
         writer.transforms(t, {("odom", "base_link"): pose(t, **drive)})
 
 
-def wall(number: int) -> Floats:
+def wall(number):
     """Twenty points of the world that scan `number` sees, each in a voxel of its own."""
     return np.array([[12.05, 0.5 * i - 5 + 0.05, 0.1 * number + 0.05] for i in range(20)])
 
 
-def write_walls(writer: Any, kind: str) -> None:
+def write_walls(writer, kind):
     seconds = np.linspace(0.0, 0.0999, 20)
     write_odometry(writer, 30)
     for number in range(30):
@@ -77,7 +71,7 @@ def write_walls(writer: Any, kind: str) -> None:
         writer.points(t, rows, "/livox/lidar", frame="livox_frame")
 
 
-def check_walls(sequence: FrameSequence, tolerance: float) -> None:
+def check_walls(sequence, tolerance):
     """Each frame has the walls of its scans, in the axes of the newest."""
     for one in sequence.frames:
         assert one.sequence is not None
@@ -99,9 +93,7 @@ def check_walls(sequence: FrameSequence, tolerance: float) -> None:
         ("time", "ros1"),
     ],
 )
-def test_scans_are_joined_without_their_motion(
-    kind: str, container: str, tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_scans_are_joined_without_their_motion(kind, container, tmp_path, ros):
     path = ros.write(tmp_path, lambda writer: write_walls(writer, kind), container)
     (sequence,) = find_sequences(path, JOINED)
     median = np.median([min(one.sequence + 1, 21) for one in sequence.frames])
@@ -115,10 +107,10 @@ def test_scans_are_joined_without_their_motion(
     assert travelled.read_bytes() == sequence.frames[-1].read_bytes()
 
 
-def test_registered_scans_are_joined_as_they_are(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_registered_scans_are_joined_as_they_are(tmp_path, ros):
     """Points in the world frame, as of FAST-LIO, whose times would move them twice."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         for number in range(30):
             t = SCAN_S * number
             writer.transforms(t, {("camera_init", "body"): pose(t)})
@@ -133,7 +125,7 @@ def test_registered_scans_are_joined_as_they_are(tmp_path: Path, ros: SimpleName
     check_walls(sequence, 1e-3)
 
 
-def test_untimed_scans_keep_their_motion(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_untimed_scans_keep_their_motion(tmp_path, ros):
     path = ros.write(tmp_path, lambda writer: write_walls(writer, "untimed"))
     (sequence,) = find_sequences(path, JOINED)
     assert sequence.note.endswith(", without correction for motion")
@@ -142,7 +134,7 @@ def test_untimed_scans_keep_their_motion(tmp_path: Path, ros: SimpleNamespace) -
     check_walls(sequence, 1.0)
 
 
-def test_single_scans_of_a_livox_are_read_as_they_are(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_single_scans_of_a_livox_are_read_as_they_are(tmp_path, ros):
     path = ros.write(tmp_path, lambda writer: write_walls(writer, "livox_ros_driver2"))
     (sequence,) = find_sequences(path, RecordingOptions(keyframe_m=0))
     assert len(sequence.frames) == 30
@@ -150,14 +142,14 @@ def test_single_scans_of_a_livox_are_read_as_they_are(tmp_path: Path, ros: Simpl
     np.testing.assert_allclose(sequence.frames[7].read().points, measured, atol=1e-6)
 
 
-def test_what_cannot_be_joined_is_refused(tmp_path: Path, ros: SimpleNamespace) -> None:
-    def alone(writer: Any) -> None:
+def test_what_cannot_be_joined_is_refused(tmp_path, ros):
+    def alone(writer):
         writer.livox(0.0, wall(0), np.zeros(20))
 
     with pytest.raises(DatasetError, match="Scans are joined by odometry: omit --join-m"):
         find_sequences(ros.write(tmp_path / "alone", alone), JOINED)
 
-    def images(writer: Any) -> None:
+    def images(writer):
         writer.camera_info(0.0)
         writer.image(0.0, np.full((60, 80), 2000))
 
@@ -165,8 +157,8 @@ def test_what_cannot_be_joined_is_refused(tmp_path: Path, ros: SimpleNamespace) 
         find_sequences(ros.write(tmp_path / "images", images), JOINED)
 
 
-def test_a_damaged_scan_is_left_out(tmp_path: Path, ros: SimpleNamespace) -> None:
-    def fill(writer: Any) -> None:
+def test_a_damaged_scan_is_left_out(tmp_path, ros):
+    def fill(writer):
         write_odometry(writer, 3)
         name = "livox_ros_driver2/msg/CustomMsg"
         for number in range(3):
@@ -184,10 +176,8 @@ def test_a_damaged_scan_is_left_out(tmp_path: Path, ros: SimpleNamespace) -> Non
         sequence.frames[2].read()
 
 
-def test_empty_and_damaged_scans_at_the_start_change_nothing(
-    tmp_path: Path, ros: SimpleNamespace
-) -> None:
-    def fill(writer: Any) -> None:
+def test_empty_and_damaged_scans_at_the_start_change_nothing(tmp_path, ros):
+    def fill(writer):
         rows = np.zeros(1, [("x", "<f4")])  # without y and z
         writer.points(-0.3, rows, "/livox/lidar", frame="livox_frame")
         rows = np.zeros(0, [(name, "<f4") for name in ("x", "y", "z", "time")])
@@ -198,8 +188,8 @@ def test_empty_and_damaged_scans_at_the_start_change_nothing(
     assert sequence.note.endswith(", corrected for motion")
 
 
-def test_scans_are_read_one_at_a_time(tmp_path: Path, ros: SimpleNamespace) -> None:
-    def fill(writer: Any) -> None:
+def test_scans_are_read_one_at_a_time(tmp_path, ros):
+    def fill(writer):
         write_odometry(writer, 20)
         wide = {"names": ["x", "y", "z"], "formats": ["<f4"] * 3, "offsets": [0, 4, 8]}
         for number in range(20):
@@ -217,7 +207,7 @@ def test_scans_are_read_one_at_a_time(tmp_path: Path, ros: SimpleNamespace) -> N
     assert peak < 20e6  # all scans have 40 MB
 
 
-def test_a_window_has_the_samples_around_its_scans() -> None:
+def test_a_window_has_the_samples_around_its_scans():
     tree, order = TransformTree(), np.random.default_rng(3).permutation(1000)
     for child in ("base_link", "arm"):
         for k in order.tolist():
@@ -238,7 +228,7 @@ def test_a_window_has_the_samples_around_its_scans() -> None:
     np.testing.assert_allclose(T[:3, 3], [49.95, 1, 0])
 
 
-def write_drive(writer: Any, count: int, seed: int, **drive: float) -> None:
+def write_drive(writer, count, seed, **drive):
     """Write scans of a Livox in a hall, and odometry whose origin is that of the hall."""
     premises, rng = premises_and_rng(4200, 0, "hall")
     start = walk(premises, 1, rng)[0]
@@ -252,7 +242,7 @@ def write_drive(writer: Any, count: int, seed: int, **drive: float) -> None:
         writer.livox(t, skewed(points @ T[:3, :3].T + T[:3, 3], t, seconds, **drive), seconds)
 
 
-def test_from_a_bag_with_scans_of_a_livox_to_poses(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_from_a_bag_with_scans_of_a_livox_to_poses(tmp_path, ros):
     """One drive is mapped; on the next one, 40 cm beside it, each answer and the tracker agree."""
     mapped = ros.write(tmp_path, lambda writer: write_drive(writer, 30, 1), "ros1", "mapped")
     later = ros.write(

@@ -1,29 +1,23 @@
 """Tests of a bag of redkitchen in every container against the folder."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
-from sceneprint.formats.dataset import FrameReference, decode_png, find_sequences
+from sceneprint.formats.dataset import decode_png, find_sequences
 from sceneprint.formats.recording.selection import RecordingOptions
-from sceneprint.types import Cloud, DepthFrame, Floats
+from sceneprint.types import Cloud
 
 STEP, COUNT = 10, 12
 KINDS = ("16UC1", "compressedDepth", "points")
 
 
 @pytest.fixture(scope="module")
-def kitchen(data_root: Path) -> tuple[FrameReference, ...]:
+def kitchen(data_root):
     (sequence,) = find_sequences(data_root / "7scenes/redkitchen/seq-01")
     return sequence.frames[::STEP][:COUNT]
 
 
-def points_of(frame: DepthFrame) -> np.ndarray:
+def points_of(frame):
     """Points of every third pixel, organised, NaN where depth is missing."""
     k = frame.intrinsics
     v, u = np.mgrid[0 : k.height : 3, 0 : k.width : 3]
@@ -36,14 +30,11 @@ def points_of(frame: DepthFrame) -> np.ndarray:
 
 @pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bag_of_a_kitchen(
-    kind: str, container: str, kitchen: tuple[FrameReference, ...], tmp_path: Path,
-    ros: SimpleNamespace,
-) -> None:  # fmt: skip
+def test_a_bag_of_a_kitchen(kind, container, kitchen, tmp_path, ros):
     poses = [one.pose for one in kitchen]
     assert all(pose is not None for pose in poses)
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
         for i, one in enumerate(kitchen):
             assert one.camera is not None
@@ -72,7 +63,7 @@ def test_a_bag_of_a_kitchen(
             assert frame.intrinsics == expected.intrinsics
 
 
-def check_pose(expected: Floats | None, found: Floats | None) -> None:
+def check_pose(expected, found):
     """Equal to 1 mm and 0.01 degrees."""
     assert expected is not None
     assert found is not None

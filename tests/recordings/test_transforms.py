@@ -1,19 +1,13 @@
 """Tests of recordings with faults in the clock or the transforms."""
 
-from __future__ import annotations
-
 import pickle
-from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.errors import DatasetError
-from sceneprint.formats.dataset import FrameSequence, find_sequences
+from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.selection import RecordingOptions
 
 ALL = RecordingOptions(keyframe_m=0, keyframe_s=0)
@@ -21,28 +15,24 @@ IMAGE = np.full((60, 80), 2000, np.uint16)
 MOUNTING = {("base_link", "camera"): np.eye(4)}
 
 
-def sequences(
-    ros: SimpleNamespace, folder: Path, fill: Callable[[Any], None], **how: Any
-) -> tuple[FrameSequence, ...]:
-    def with_camera(writer: Any) -> None:
+def sequences(ros, folder, fill, **how):
+    def with_camera(writer):
         writer.camera_info(0.0)
         fill(writer)
 
     return find_sequences(ros.write(folder, with_camera, **how), ALL)
 
 
-def positions(sequence: FrameSequence) -> list[list[float]]:
+def positions(sequence):
     return [[round(float(x), 6) for x in one.pose[:3, 3]] for one in sequence.frames]
 
 
 @pytest.mark.parametrize("container", ["mcap", "ros1"])
 @pytest.mark.parametrize("source", ["odometry", "tf"])
-def test_a_clock_that_is_set_back_splits_a_recording(
-    source: str, container: str, tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path, ros):
     """A simulation is reset twice; each run drives along x, ten metres beside the one before."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0.0, MOUNTING, "/tf_static")
         for run, last in enumerate((4, 3, 6)):
             writer.late = 60.0 * run
@@ -69,10 +59,8 @@ def test_a_clock_that_is_set_back_splits_a_recording(
     )
 
 
-def test_stamps_that_are_out_of_order_by_little_split_nothing(
-    tmp_path: Path, ros: SimpleNamespace
-) -> None:
-    def fill(writer: Any) -> None:
+def test_stamps_that_are_out_of_order_by_little_split_nothing(tmp_path, ros):
+    def fill(writer):
         writer.transforms(0.0, MOUNTING, "/tf_static")
         for i in (0, 1, 3, 2, 4):
             t = 1 + 0.05 * i
@@ -84,12 +72,10 @@ def test_stamps_that_are_out_of_order_by_little_split_nothing(
     assert sorted(positions(found)) == [[round(0.1 * i, 6), 0, 0] for i in range(5)]
 
 
-def test_two_publishers_with_delays_of_their_own_split_nothing(
-    tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_two_publishers_with_delays_of_their_own_split_nothing(tmp_path, ros):
     """Both say the same; the stamps of one are a second ahead."""
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0.0, MOUNTING, "/tf_static")
         for i in range(40):
             for ahead in (0.0, 1.0):
@@ -106,10 +92,8 @@ def test_two_publishers_with_delays_of_their_own_split_nothing(
 @pytest.mark.parametrize(
     ("period", "order"), [(0.1, "AB"), (0.1, "AABB"), (0.02, "BAAAA"), (0.4, "AB")]
 )
-def test_two_publishers_that_contradict_each_other(
-    period: float, order: str, tmp_path: Path, ros: SimpleNamespace
-) -> None:
-    def fill(writer: Any) -> None:
+def test_two_publishers_that_contradict_each_other(period, order, tmp_path, ros):
+    def fill(writer):
         writer.transforms(0.0, MOUNTING, "/tf_static")
         for i in range(36):
             t, who = period * i, order[i % len(order)]
@@ -127,11 +111,11 @@ def test_two_publishers_that_contradict_each_other(
     assert str(caught.value).endswith("select another frame with --pose-frame.")
 
 
-def test_frames_within_a_jump_are_left_out(tmp_path: Path, ros: SimpleNamespace) -> None:
+def test_frames_within_a_jump_are_left_out(tmp_path, ros):
     """20 m within 0.1 s; before and after it the robot drives at 5 m/s, stops and turns back."""
     x = [0, 0.5, 1, 1.5, 21.5, 22, 22.4, 22.5, 22.4, 22, 21.5]
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         writer.transforms(0.0, MOUNTING, "/tf_static")
         for i, one in enumerate(x):
             writer.transforms(0.1 * i, {("odom", "base_link"): ros.transform(one, 0, 0)})
@@ -146,10 +130,8 @@ def test_frames_within_a_jump_are_left_out(tmp_path: Path, ros: SimpleNamespace)
 
 
 @pytest.mark.parametrize("length", [0.0, 0.5, 1.02, float("nan")])
-def test_quaternions_that_are_not_of_length_1(
-    length: float, tmp_path: Path, ros: SimpleNamespace
-) -> None:
-    def fill(writer: Any) -> None:
+def test_quaternions_that_are_not_of_length_1(length, tmp_path, ros):
+    def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static", length=length)
         for i in range(3):
             writer.odometry(0.1 * i, ros.transform(float(i), 0, 0))
@@ -174,10 +156,8 @@ def test_quaternions_that_are_not_of_length_1(
 
 
 @pytest.mark.parametrize("other", ["/tf_static", "/tf"])
-def test_a_fixed_transform_with_two_values_is_passed_over(
-    other: str, tmp_path: Path, ros: SimpleNamespace
-) -> None:
-    def fill(writer: Any) -> None:
+def test_a_fixed_transform_with_two_values_is_passed_over(other, tmp_path, ros):
+    def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.transform(0, 0, 1)}, "/tf_static")
         writer.transforms(0.0, {("base_link", "camera"): ros.transform(0, 0, 1.3)}, other)
         for i in range(3):
@@ -195,7 +175,7 @@ def test_a_fixed_transform_with_two_values_is_passed_over(
 # Points in the frame of the world.
 
 
-def registered(ros: SimpleNamespace, writer: Any, *, frame: str, tf: str, leaf: str = "") -> None:
+def registered(ros, writer, *, frame, tf, leaf=""):
     """Points ahead of a LiDAR that drives along a bend, in the frame of the world."""
     if tf:
         fixed = {("body", "lidar"): ros.transform(0.1, 0, 0.4)}
@@ -216,9 +196,7 @@ SEEN = np.array([[4.0 + 0.2 * i, i % 3 - 1.0, 0.1 * i] for i in range(12)])
 
 
 @pytest.mark.parametrize("frame", ["camera_init", "odom", "start"])
-def test_registered_clouds_are_taken_back_to_their_sensor(
-    frame: str, tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_registered_clouds_are_taken_back_to_their_sensor(frame, tmp_path, ros):
     (found,) = sequences(
         ros, tmp_path, lambda writer: registered(ros, writer, frame=frame, tf="yes")
     )
@@ -232,9 +210,7 @@ def test_registered_clouds_are_taken_back_to_their_sensor(
     assert travelled.read_bytes() == found.frames[3].read_bytes()
 
 
-def test_registered_clouds_of_an_unknown_sensor_are_refused(
-    tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_registered_clouds_of_an_unknown_sensor_are_refused(tmp_path, ros):
     path = ros.write(tmp_path, lambda w: registered(ros, w, frame="camera_init", tf=""))
     with pytest.raises(DatasetError, match=r"are in camera_init, .* Record /tf or odometry"):
         find_sequences(path, ALL)
@@ -249,12 +225,10 @@ def test_registered_clouds_of_an_unknown_sensor_are_refused(
         find_sequences(two, RecordingOptions(sensor_frame="wheel"))
 
 
-def test_points_in_the_base_of_a_robot_with_an_arm_stay_there(
-    tmp_path: Path, ros: SimpleNamespace
-) -> None:
+def test_points_in_the_base_of_a_robot_with_an_arm_stay_there(tmp_path, ros):
     rows = np.ones(12, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         for i in range(3):
             writer.transforms(0.1 * i, {("base_link", "hand"): ros.transform(0.1 * i, 0, 1)})
             writer.points(0.1 * i, rows, frame="base_link")

@@ -6,7 +6,7 @@ rosbags creates, serialises and reads the messages.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -31,13 +31,13 @@ Arrived = tuple[str, str, Any]
 
 
 @pytest.fixture(scope="session")
-def room(building: Path) -> tuple[Any, ...]:
+def room(building):
     (sequence,) = find_sequences(building / "room-0" / "seq-01")
     return sequence.frames[:FRAMES]
 
 
 @pytest.fixture(scope="session")
-def service_url(service_url: str, room: tuple[Any, ...]) -> str:
+def service_url(service_url, room):
     """Return the service of all clients, with a map `room`."""
     with Client(service_url) as client:
         client.create_map("room", model="depth")
@@ -50,13 +50,13 @@ def service_url(service_url: str, room: tuple[Any, ...]) -> str:
 
 
 @pytest.fixture(scope="session")
-def drive(room: tuple[Any, ...], ros: SimpleNamespace) -> Callable[..., list[Arrived]]:
+def drive(room, ros):
     """A function that returns the messages of a drive through the room, with a frame every 0.5 s.
 
     `kind` is the encoding of depth, and `turn` a delay of all messages, seconds.
     """
 
-    def carried(kind: str = "depth", *, later: float = 0.0, frames: int = FRAMES) -> list[Arrived]:
+    def carried(kind="depth", *, later=0.0, frames=FRAMES):
         writer = ros.messages()
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
         for i, one in enumerate(room[:frames]):
@@ -72,7 +72,7 @@ def drive(room: tuple[Any, ...], ros: SimpleNamespace) -> Callable[..., list[Arr
     return carried
 
 
-def send(writer: Any, kind: str, t: float, samples: np.ndarray, k: Any) -> None:
+def send(writer, kind, t, samples, k):
     if kind == "depth":
         writer.image(t, samples)
     elif kind == "metres":
@@ -120,7 +120,7 @@ class Bus:
     log: list[str] = field(default_factory=list)
     is_up: bool = False
 
-    def on(self, topic: str) -> list[Any]:
+    def on(self, topic):
         """Return the messages that were published on a topic."""
         return [message for name, _, message in self.published if name == topic]
 
@@ -131,33 +131,30 @@ class StubNode:
     bus: Bus
     types: Any
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name):
         self.name = name
 
-    def get_name(self) -> str:
+    def get_name(self):
         return self.name
 
-    def declare_parameter(self, name: str, default: Any, descriptor: Any) -> None:
+    def declare_parameter(self, name, default, descriptor):
         self.bus.declared[name] = default
         self.bus.described[name] = descriptor.description
 
-    def get_parameter(self, name: str) -> SimpleNamespace:
+    def get_parameter(self, name):
         default = self.bus.declared[name]
         value = self.bus.parameters.get(name, default)
         assert type(value) is type(default), name  # rclpy checks this too
         return SimpleNamespace(value=value)
 
-    def trigger_configure(self) -> Any:
-        return self.on_configure(None)  # type: ignore[attr-defined]
+    def trigger_configure(self):
+        return self.on_configure(None)
 
-    def trigger_activate(self) -> Any:
-        return self.on_activate(None)  # type: ignore[attr-defined]
+    def trigger_activate(self):
+        return self.on_activate(None)
 
-    def create_subscription(
-        self, kind: Any, topic: str, callback: Callable[[Any], None], qos: object, *,
-        raw: bool = False,
-    ) -> str:  # fmt: skip
-        def serialized(message: Any) -> None:
+    def create_subscription(self, kind, topic, callback, qos, *, raw=False):
+        def serialized(message):
             callback(bytes(self.types.serialize_cdr(message, kind.ros_name)))
 
         self.bus.callbacks[topic] = serialized if raw else callback
@@ -165,20 +162,20 @@ class StubNode:
         self.bus.qos[topic] = qos
         return topic
 
-    def destroy_subscription(self, topic: str) -> None:
+    def destroy_subscription(self, topic):
         del self.bus.callbacks[topic]
 
-    def destroy_publisher(self, publisher: object) -> None:
+    def destroy_publisher(self, publisher):
         self.bus.publishers.remove(publisher)
 
-    def destroy_service(self, name: str) -> None:
+    def destroy_service(self, name):
         del self.bus.services[name]
 
-    def destroy_timer(self, timer: tuple[float, Callable[[], None]]) -> None:
+    def destroy_timer(self, timer):
         self.bus.timers.remove(timer)
 
-    def create_publisher(self, kind: Any, topic: str, qos: object) -> SimpleNamespace:
-        def publish(message: Any) -> None:
+    def create_publisher(self, kind, topic, qos):
+        def publish(message):
             data = self.types.serialize_cdr(plain(message), kind.ros_name)
             read = self.types.deserialize_cdr(data, kind.ros_name)
             self.bus.published.append((topic, kind.ros_name, read))
@@ -187,27 +184,25 @@ class StubNode:
         self.bus.publishers.append(publisher)
         return publisher
 
-    def create_service(self, kind: Any, name: str, callback: Callable[[Any, Any], Any]) -> str:
+    def create_service(self, kind, name, callback):
         self.bus.services[name] = callback
         return name
 
-    def create_timer(
-        self, period_s: float, callback: Callable[[], None]
-    ) -> tuple[float, Callable[[], None]]:
+    def create_timer(self, period_s, callback):
         self.bus.timers.append((period_s, callback))
         return self.bus.timers[-1]
 
-    def get_clock(self) -> Any:
+    def get_clock(self):
         return SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=self.bus.now_ns))
 
-    def get_logger(self) -> Any:
+    def get_logger(self):
         return SimpleNamespace(info=self.bus.log.append, error=self.bus.log.append)
 
-    def destroy_node(self) -> None:
+    def destroy_node(self):
         self.bus.is_up = False
 
 
-def plain(message: Any) -> Any:
+def plain(message):
     """Return a message for rosbags, which uses numbers for rclpy's bytes of length 1."""
     if hasattr(message, "level"):
         assert isinstance(message.level, bytes)
@@ -218,26 +213,26 @@ def plain(message: Any) -> Any:
     return message
 
 
-def message_class(types: Any, name: str) -> Any:
+def message_class(types, name):
     """Return a class for messages like rclpy's, with named fields and zero defaults."""
 
-    def make(**fields: Any) -> Any:
+    def make(**fields):
         message = zero(types, name)
         for key, value in fields.items():
             assert hasattr(message, key), key
             setattr(message, key, value)
         return message
 
-    make.ros_name = name  # type: ignore[attr-defined]
+    make.ros_name = name
     return make
 
 
-def zero(types: Any, name: str) -> Any:
+def zero(types, name):
     """Return a message with zeros and empty lists."""
     from rosbags.interfaces import Nodetype
 
     plain_values = {"string": "", "bool": False, "float64": 0.0, "float32": 0.0}
-    values: dict[str, Any] = {}
+    values = {}
     for key, (kind, told) in types.fielddefs[name][1]:
         if kind == Nodetype.NAME:
             values[key] = zero(types, told)
@@ -251,12 +246,12 @@ def zero(types: Any, name: str) -> Any:
 
 
 @pytest.fixture
-def bus(ros: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Bus:
+def bus(ros, monkeypatch):
     """A bus on which `start_node` runs a node with stand-in modules."""
     made = Bus()
     types = ros.messages().types
 
-    def module(name: str, **names: Any) -> None:
+    def module(name, **names):
         one = ModuleType(name)
         vars(one).update(names)
         monkeypatch.setitem(sys.modules, name, one)
@@ -299,7 +294,7 @@ def bus(ros: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> Bus:
 
 
 @pytest.fixture
-def node_module(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+def node_module(bus, monkeypatch):
     """The module of the node, with the stand-ins."""
     yield import_module("sceneprint_ros.relocaliser_node")
     for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):

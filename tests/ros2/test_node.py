@@ -3,14 +3,11 @@
 The real rclpy is not tested here.
 """
 
-from __future__ import annotations
-
 import ast
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +25,7 @@ SECOND = 1_000_000_000
 DEPTH = "/camera/depth/image_raw"
 
 
-def pose_of(message: Any) -> np.ndarray:
+def pose_of(message):
     """(4, 4) of a Pose or a Transform."""
     place = getattr(message, "position", None) or message.translation
     turn = getattr(message, "orientation", None) or message.rotation
@@ -38,7 +35,7 @@ def pose_of(message: Any) -> np.ndarray:
     return T
 
 
-def play(node: Any, bus: Any, arrived: list[Any]) -> None:
+def play(node, bus, arrived):
     """Give a node its messages; its timers run when a transform came, answers are waited for."""
     for topic, name, message in arrived:
         assert bus.kinds[topic] == name
@@ -53,16 +50,13 @@ def play(node: Any, bus: Any, arrived: list[Any]) -> None:
             diagnose()
 
 
-def started(node_module: ModuleType) -> Any:
+def started(node_module):
     node = node_module.RelocaliserNode()
     assert (node.trigger_configure(), node.trigger_activate()) == ("success", "success")
     return node
 
 
-def test_a_node_on_a_drive(
-    bus: Any, node_module: ModuleType, drive: Any, room: Any, service_url: str,
-    ros: SimpleNamespace, tmp_path: Path,
-) -> None:  # fmt: skip
+def test_a_node_on_a_drive(bus, node_module, drive, room, service_url, ros, tmp_path):
     bus.parameters = {
         "url": service_url, "map": "room", "topic": DEPTH, "map_frame": "world",
         "transform_tolerance_s": 0.25, "log_file": str(tmp_path / "drive.jsonl"),
@@ -115,9 +109,7 @@ def test_a_node_on_a_drive(
     assert states[-1].status == "lost"
 
 
-def test_without_transforms_and_initial_poses(
-    bus: Any, node_module: ModuleType, drive: Any, service_url: str
-) -> None:
+def test_without_transforms_and_initial_poses(bus, node_module, drive, service_url):
     """Beside AMCL, or with another source of map -> odom: only poses are told."""
     bus.parameters = {"url": service_url, "map": "room", "topic": "/points", "kind": "points",
                       "publish_tf": False, "initial_pose_topic": "", "imu_topic": "/imu",
@@ -131,7 +123,7 @@ def test_without_transforms_and_initial_poses(
     node.destroy_node()
 
 
-def test_a_manager_starts_and_stops_a_node(bus: Any, node_module: ModuleType, drive: Any) -> None:
+def test_a_manager_starts_and_stops_a_node(bus, node_module, drive):
     """Topics exist from configuration to cleanup; frames count only while the node is active."""
     bus.parameters = {"map": "m", "topic": DEPTH, "autostart": False, "url": "http://127.0.0.1:9"}
     assert node_module.main() == 0
@@ -165,9 +157,7 @@ def test_a_manager_starts_and_stops_a_node(bus: Any, node_module: ModuleType, dr
     node.destroy_node()
 
 
-def test_a_node_with_scans_of_a_livox(
-    bus: Any, node_module: ModuleType, ros: SimpleNamespace
-) -> None:
+def test_a_node_with_scans_of_a_livox(bus, node_module, ros):
     bus.parameters = {"map": "m", "topic": "/livox/lidar", "kind": "livox", "join_m": 2.0,
                       "url": "http://127.0.0.1:9"}  # fmt: skip
     node = started(node_module)
@@ -184,9 +174,7 @@ def test_a_node_with_scans_of_a_livox(
     node.destroy_node()
 
 
-def test_a_node_without_the_messages_of_livox(
-    bus: Any, node_module: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_without_the_messages_of_livox(bus, node_module, monkeypatch):
     monkeypatch.setitem(sys.modules, "livox_ros_driver2.msg", None)
     bus.parameters = {"map": "m", "topic": "/livox/lidar", "kind": "livox"}
     node = node_module.RelocaliserNode()
@@ -199,9 +187,7 @@ def test_a_node_without_the_messages_of_livox(
 @pytest.mark.parametrize(
     "wrong", [{"map": ""}, {"topic": ""}, {"kind": "colour"}, {"url": "no address"}]
 )
-def test_parameters_that_are_none_end_it(
-    wrong: dict[str, str], bus: Any, node_module: ModuleType, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parameters_that_are_none_end_it(wrong, bus, node_module, capsys):
     bus.parameters = {"map": "m", "topic": DEPTH, **wrong}
     assert node_module.main() == 2
     said = capsys.readouterr().err
@@ -210,7 +196,7 @@ def test_parameters_that_are_none_end_it(
     assert not bus.is_up
 
 
-def test_a_node_that_is_stopped_closes(bus: Any, node_module: ModuleType) -> None:
+def test_a_node_that_is_stopped_closes(bus, node_module):
     """Without a service and without frames it says so, and goes."""
     bus.parameters = {"map": "m", "topic": "/camera/depth/image_rect_raw",
                       "url": "http://127.0.0.1:9"}  # fmt: skip
@@ -222,7 +208,7 @@ def test_a_node_that_is_stopped_closes(bus: Any, node_module: ModuleType) -> Non
 # What lies beside the node.
 
 
-def test_every_parameter_is_in_the_readme(bus: Any, node_module: ModuleType) -> None:
+def test_every_parameter_is_in_the_readme(bus, node_module):
     bus.parameters = {"map": "m", "topic": DEPTH}
     node_module.RelocaliserNode().destroy_node()
     text = (PACKAGE / "README.md").read_text()
@@ -236,7 +222,7 @@ def test_every_parameter_is_in_the_readme(bus: Any, node_module: ModuleType) -> 
         assert bus.declared.get(name, one.default) == one.default  # in two places, and equal
 
 
-def test_launch_files_set_what_the_node_declares(bus: Any, node_module: ModuleType) -> None:
+def test_launch_files_set_what_the_node_declares(bus, node_module):
     from ruamel.yaml import YAML
 
     bus.parameters = {"map": "m", "topic": DEPTH}
@@ -257,7 +243,7 @@ def test_launch_files_set_what_the_node_declares(bus: Any, node_module: ModuleTy
                 assert keys - {"use_sim_time"} <= bus.declared.keys(), path
 
 
-def test_launched_sensors_are_those_of_the_documentation() -> None:
+def test_launched_sensors_are_those_of_the_documentation():
     """Topics, packages and launch files, which are constants of the launch file."""
     tree = ast.parse((PACKAGE / "launch" / "relocaliser.launch.py").read_text())
     (table,) = (one.value for one in tree.body if isinstance(one, ast.Assign))
@@ -278,7 +264,7 @@ def test_launched_sensors_are_those_of_the_documentation() -> None:
         assert kind == (["points"] if "--model lidar" in text else [])
 
 
-def test_the_package_names_what_it_is_made_of() -> None:
+def test_the_package_names_what_it_is_made_of():
     manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()
     needed = {one.text for one in manifest.iter("exec_depend")}
     imported = set()

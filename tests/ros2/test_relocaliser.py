@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +17,6 @@ from sceneprint_client.relocaliser import (
     Level,
     Relocaliser,
     RelocaliserParameters,
-    Report,
     planar,
     write_pose,
     write_stamp,
@@ -34,19 +31,19 @@ SECOND = 1_000_000_000
 class ScriptedLocalizer:
     """A client that answers every question with the truth, or as it was told."""
 
-    def __init__(self, found_at: Callable[[int], np.ndarray | None] | None = None) -> None:
+    def __init__(self, found_at=None):
         self.asked: list[dict[str, Any]] = []
         self.found_at = found_at or (lambda number: np.eye(4))
 
-    def localize(self, map_name: str, frame: Any, meta: Any = None, **how: Any) -> Localization:
+    def localize(self, map_name, frame, meta=None, **how):
         self.asked.append({"frame": frame, "meta": meta, **how})
         return self._answer()
 
-    def localize_sequence(self, map_name: str, frames: Any, metas: Any, **how: Any) -> Localization:
+    def localize_sequence(self, map_name, frames, metas, **how):
         self.asked.append({"frame": frames[-1], "meta": metas[-1], **how})
         return self._answer()
 
-    def _answer(self) -> Localization:
+    def _answer(self):
         matrix = self.found_at(len(self.asked) - 1)
         pose = None
         if matrix is not None:
@@ -69,15 +66,13 @@ class ScriptedLocalizer:
 
 
 @contextmanager
-def scripted(
-    found_at: Callable[[int], np.ndarray | None] | None = None, **parameters: Any
-) -> Iterator[tuple[Relocaliser, ScriptedLocalizer]]:
-    client: Any = ScriptedLocalizer(found_at)
+def scripted(found_at=None, **parameters):
+    client = ScriptedLocalizer(found_at)
     with Relocaliser(Tracker(client, "m"), RelocaliserParameters(**parameters)) as core:
         yield core, client
 
 
-def take(core: Relocaliser, topic: str, name: str, message: Any) -> None:
+def take(core, topic, name, message):
     """As the node does it."""
     kind = name.rpartition("/")[2]
     if kind == "TFMessage":
@@ -92,7 +87,7 @@ def take(core: Relocaliser, topic: str, name: str, message: Any) -> None:
         core.take_frame(message)
 
 
-def run(core: Relocaliser, arrived: list[Any]) -> list[Report]:
+def run(core, arrived):
     """A report for each frame that went on, when its answer is there."""
     reports = []
     for one in arrived:
@@ -103,7 +98,7 @@ def run(core: Relocaliser, arrived: list[Any]) -> list[Report]:
     return reports
 
 
-def still(ros: SimpleNamespace, count: int = 1, every: float = 0.5, start: float = 0.0) -> Any:
+def still(ros, count=1, every=0.5, start=0.0):
     """A writer with images of a robot that stands at the origin of its odometry."""
     writer = ros.messages()
     writer.transforms(start, {("base_link", "camera"): np.eye(4)}, "/tf_static")
@@ -115,9 +110,7 @@ def still(ros: SimpleNamespace, count: int = 1, every: float = 0.5, start: float
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_drive_is_tracked_as_the_truth_is(
-    kind: str, drive: Any, service_url: str, room: Any, ros: SimpleNamespace
-) -> None:
+def test_a_drive_is_tracked_as_the_truth_is(kind, drive, service_url, room, ros):
     count = 6 if kind == "depth" else 4
     arrived = drive(kind, frames=count)
     with Client(service_url) as client, Relocaliser(Tracker(client, "room")) as core:
@@ -143,7 +136,7 @@ def test_a_drive_is_tracked_as_the_truth_is(
         assert report.values["map_is"] == "site"
 
 
-def test_nothing_is_told_of_a_place_that_is_not_known(ros: SimpleNamespace) -> None:
+def test_nothing_is_told_of_a_place_that_is_not_known(ros):
     with scripted(lambda number: None) as (core, _):
         before = core.report(ros.start * SECOND)
         assert (before.level, before.message) == (Level.STALE, "no frame has arrived")
@@ -153,7 +146,7 @@ def test_nothing_is_told_of_a_place_that_is_not_known(ros: SimpleNamespace) -> N
     assert report.message.startswith("lost: ")
 
 
-def test_frames_are_asked_for_no_oftener_than_told(ros: SimpleNamespace) -> None:
+def test_frames_are_asked_for_no_oftener_than_told(ros):
     with scripted(interval_s=0.5) as (core, client):
         reports = run(core, still(ros, 31, every=1 / 15).written)
     assert len(reports) == 31
@@ -161,7 +154,7 @@ def test_frames_are_asked_for_no_oftener_than_told(ros: SimpleNamespace) -> None
     assert [round((one.stamp_ns - ros.start * SECOND) * 15e-9) for one in reports] == [*range(31)]
 
 
-def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros: SimpleNamespace) -> None:
+def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros):
     writer = still(ros, 1)
     with scripted(interval_s=0.0, wait_s=0.4) as (core, client):
         for one in writer.written:
@@ -187,7 +180,7 @@ def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros: SimpleName
     assert len(client.asked) == 2
 
 
-def test_what_is_silent_is_not_told(ros: SimpleNamespace) -> None:
+def test_what_is_silent_is_not_told(ros):
     with scripted() as (core, _):
         (report,) = run(core, still(ros).written)
         assert report.is_fix
@@ -199,7 +192,7 @@ def test_what_is_silent_is_not_told(ros: SimpleNamespace) -> None:
         assert (again.pose is not None, again.is_fix) == (True, False)
 
 
-def test_relocalising_forgets_and_asks_at_once(ros: SimpleNamespace) -> None:
+def test_relocalising_forgets_and_asks_at_once(ros):
     with scripted(interval_s=60.0) as (core, client):
         reports = run(core, still(ros, 3).written)
         assert [one.state.status for one in reports] == ["tracking"] * 3
@@ -214,7 +207,7 @@ def test_relocalising_forgets_and_asks_at_once(ros: SimpleNamespace) -> None:
         assert client.asked[1]["prior"] is None
 
 
-def test_a_clock_that_jumps_back_begins_anew(ros: SimpleNamespace) -> None:
+def test_a_clock_that_jumps_back_begins_anew(ros):
     with scripted() as (core, client):
         run(core, still(ros, 3, start=100.0).written)
         reports = run(core, still(ros, 2, start=0.0).written)
@@ -226,7 +219,7 @@ def test_a_clock_that_jumps_back_begins_anew(ros: SimpleNamespace) -> None:
     assert len(client.asked) == 5
 
 
-def test_the_pose_is_that_of_the_base_and_so_is_its_covariance(ros: SimpleNamespace) -> None:
+def test_the_pose_is_that_of_the_base_and_so_is_its_covariance(ros):
     """The camera sits 2 m before the base: its heading's error moves the base sideways."""
     T_base_camera = ros.transform(2.0, 0, 0)
     writer = ros.messages()
@@ -255,7 +248,7 @@ def test_the_pose_is_that_of_the_base_and_so_is_its_covariance(ros: SimpleNamesp
     assert along == pytest.approx(heading @ state.covariance[:2, :2] @ heading)
 
 
-def test_on_a_plane_only_heading_and_place_are_told(ros: SimpleNamespace) -> None:
+def test_on_a_plane_only_heading_and_place_are_told(ros):
     tilted = ros.transform(1, 2, 0.3, 0.02, -0.03, np.sin(0.4), np.cos(0.4))
     flat = planar(tilted)
     np.testing.assert_allclose(flat[:3, 3], (1, 2, 0))
@@ -269,7 +262,7 @@ def test_on_a_plane_only_heading_and_place_are_told(ros: SimpleNamespace) -> Non
     np.testing.assert_allclose(report.pose.T_map_odom, flat)  # odometry is at its origin
 
 
-def test_a_fix_in_another_frame_is_not_told(ros: SimpleNamespace) -> None:
+def test_a_fix_in_another_frame_is_not_told(ros):
     with scripted(parent_frame="hall") as (core, _):
         (report,) = run(core, still(ros).written)
     assert (report.state.status, report.pose) == ("tracking", None)
@@ -278,7 +271,7 @@ def test_a_fix_in_another_frame_is_not_told(ros: SimpleNamespace) -> None:
     )  # fmt: skip
 
 
-def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros: SimpleNamespace) -> None:
+def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros):
     writer = ros.messages()
     writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
     writer.camera_info(0.0, size=(8, 6))
@@ -300,7 +293,7 @@ def test_odometry_of_its_own_topic_serves_where_tf_has_none(ros: SimpleNamespace
         assert core.step() == 0
 
 
-def test_up_is_sent_while_the_robot_is_at_rest(ros: SimpleNamespace) -> None:
+def test_up_is_sent_while_the_robot_is_at_rest(ros):
     """The IMU is mounted on its side: its x axis points up."""
     T_base_imu = ros.transform(0, 0, 0.2, 0, -np.sin(np.pi / 4), 0, np.cos(np.pi / 4))
     for moves, expected in ((False, (0, 0, 1)), (True, None)):
@@ -321,7 +314,7 @@ def test_up_is_sent_while_the_robot_is_at_rest(ros: SimpleNamespace) -> None:
             np.testing.assert_allclose((up.x, up.y, up.z), expected, atol=1e-9)
 
 
-def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros: SimpleNamespace) -> None:
+def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros):
     writer = ros.messages()
     writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
     for i, encoding in enumerate(("16UC1", "rgb8", "16UC1")):
@@ -340,14 +333,14 @@ def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros: SimpleNamespace)
     assert "encoding 'rgb8'" in reports[1].message
 
 
-def test_an_error_of_the_service_is_told(service_url: str, ros: SimpleNamespace) -> None:
+def test_an_error_of_the_service_is_told(service_url, ros):
     with Client(service_url) as client, Relocaliser(Tracker(client, "nowhere")) as core:
         reports = run(core, still(ros, 2).written)
     assert reports[1].level is Level.ERROR
     assert "nowhere" in reports[1].message
 
 
-def test_transforms_of_hours_take_no_more_memory(ros: SimpleNamespace) -> None:
+def test_transforms_of_hours_take_no_more_memory(ros):
     writer = ros.messages()
     with scripted() as (core, _):
         for i in range(3000):
@@ -362,7 +355,7 @@ def test_transforms_of_hours_take_no_more_memory(ros: SimpleNamespace) -> None:
         assert core._tree._count == len(edge.stamps_ns)
 
 
-def test_messages_of_ros_are_filled_as_rosbags_reads_them(ros: SimpleNamespace) -> None:
+def test_messages_of_ros_are_filled_as_rosbags_reads_them(ros):
     writer = ros.messages()
     T = ros.transform(1, -2, 3, 0.1, 0.2, -0.3, 0.9)
     writer.transforms(0.0, {("a", "b"): np.eye(4)})
@@ -383,14 +376,14 @@ def test_messages_of_ros_are_filled_as_rosbags_reads_them(ros: SimpleNamespace) 
     np.testing.assert_allclose((pose.position.x, pose.orientation.w), (1, turn.w))
 
 
-def turning_scans(ros: SimpleNamespace, *, every: float = 0.2) -> list[Any]:
+def turning_scans(ros, *, every=0.2):
     """Scans of four points on a wall at x = 10, taken while the robot drives and turns."""
     writer = ros.messages()
     writer.transforms(0.0, {("base_link", "lidar"): ros.transform(0, 0, 1)}, "/tf_static")
     wall = np.array([[10.0, y, 1.0] for y in (-3.0, -1.0, 1.0, 3.0)])
     seconds = np.array([0.0, 0.02, 0.06, 0.095])
 
-    def pose(t: float) -> np.ndarray:
+    def pose(t):
         return np.asarray(ros.transform(2 * t, 0, 0, 0, 0, np.sin(0.3 * t), np.cos(0.3 * t)))
 
     for scan in range(3):
@@ -409,7 +402,7 @@ def turning_scans(ros: SimpleNamespace, *, every: float = 0.2) -> list[Any]:
     return list(writer.written)
 
 
-def test_scans_of_a_drive_are_joined_without_their_motion(ros: SimpleNamespace) -> None:
+def test_scans_of_a_drive_are_joined_without_their_motion(ros):
     with scripted(join_m=0.5, interval_s=0.0) as (core, client):
         assert len(run(core, turning_scans(ros))) == 3
     # the last query joins the scans at 0.4 and 0.8 m, but not that at 0 m
@@ -421,7 +414,7 @@ def test_scans_of_a_drive_are_joined_without_their_motion(ros: SimpleNamespace) 
     np.testing.assert_allclose(in_odom, expected, atol=1e-3)
 
 
-def test_a_scan_waits_for_the_odometry_of_its_last_point(ros: SimpleNamespace) -> None:
+def test_a_scan_waits_for_the_odometry_of_its_last_point(ros):
     arrived = turning_scans(ros)[:13]  # the mounting, a scan, and odometry of 0 to 0.1 s
     with scripted(join_m=0.5) as (core, client):
         steps = []
@@ -433,7 +426,7 @@ def test_a_scan_waits_for_the_odometry_of_its_last_point(ros: SimpleNamespace) -
     assert len(client.asked) == 1
 
 
-def test_a_scan_without_odometry_to_its_end_is_left_out(ros: SimpleNamespace) -> None:
+def test_a_scan_without_odometry_to_its_end_is_left_out(ros):
     arrived = turning_scans(ros, every=1.0)
     del arrived[6:13]  # odometry from 0.04 to 0.1 s
     with scripted(join_m=0.5, interval_s=0.0, wait_s=0.1) as (core, client):

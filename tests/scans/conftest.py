@@ -1,30 +1,25 @@
 """Fixtures of the scan tests: files of points, written byte by byte as their formats specify."""
 
-from __future__ import annotations
-
 import io
 import struct
-from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 POINTS = np.arange(36, dtype=np.float64).reshape(12, 3) / 4 - 3
 
-Write = Callable[..., bytes]
-
 
 @pytest.fixture
-def points() -> np.ndarray:
+def points():
     """Twelve points (12, 3) that every number type represents exactly, even times four."""
     return POINTS.copy()
 
 
 @pytest.fixture(scope="session")
-def ply() -> Write:
+def ply():
     """A function that returns a PLY file of points, a list of odd lengths, and a triangle."""
 
-    def write(points: np.ndarray = POINTS, form: str = "binary_little_endian") -> bytes:
+    def write(points=POINTS, form="binary_little_endian"):
         header = (
             f"ply\nformat {form} 1.0\ncomment by hand\nelement camera 1\n"
             "property list uchar short marks\nproperty double focal\n"
@@ -45,12 +40,10 @@ def ply() -> Write:
 
 
 @pytest.fixture(scope="session")
-def pcd() -> Write:
+def pcd():
     """A function that returns a PCD file of points with two more fields, one of three values."""
 
-    def write(
-        points: np.ndarray = POINTS, form: str = "binary", viewpoint: str = "0 0 0 1 0 0 0"
-    ) -> bytes:
+    def write(points=POINTS, form="binary", viewpoint="0 0 0 1 0 0 0"):
         n = len(points)
         header = (
             "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS normal x y z ring\n"
@@ -78,7 +71,7 @@ def pcd() -> Write:
     return write
 
 
-def lzf_of(data: bytes) -> bytes:
+def lzf_of(data):
     """Return data compressed with the longest repetition at each byte."""
     out, i = bytearray(), 0
     while i < len(data):
@@ -102,22 +95,22 @@ def lzf_of(data: bytes) -> bytes:
 
 
 @pytest.fixture(scope="session")
-def lzf() -> Callable[[bytes], bytes]:
+def lzf():
     """A simple LZF compressor."""
     return lzf_of
 
 
 @pytest.fixture(scope="session")
-def kitti() -> Write:
-    def write(points: np.ndarray = POINTS) -> bytes:
+def kitti():
+    def write(points=POINTS):
         return b"".join(struct.pack("<4f", x, y, z, 0.5) for x, y, z in points)
 
     return write
 
 
 @pytest.fixture(scope="session")
-def npy() -> Write:
-    def write(array: np.ndarray = POINTS) -> bytes:
+def npy():
+    def write(array=POINTS):
         buffer = io.BytesIO()
         np.save(buffer, array)
         return buffer.getvalue()
@@ -126,12 +119,10 @@ def npy() -> Write:
 
 
 @pytest.fixture(scope="session")
-def las() -> Write:
+def las():
     """A function that returns a LAS 1.2 file of point format 1, in millimetres from an offset."""
 
-    def write(
-        points: np.ndarray = POINTS, offset: tuple[float, float, float] = (10.0, 20.0, 30.0)
-    ) -> bytes:
+    def write(points=POINTS, offset=(10.0, 20.0, 30.0)):
         header = bytearray(227)
         header[:4], header[24:26] = b"LASF", bytes([1, 2])
         struct.pack_into("<HII", header, 94, 227, 229, 0)

@@ -1,21 +1,14 @@
 """Tests of E57 files of the reference implementation, and of damaged files."""
 
-from __future__ import annotations
-
 import math
 import struct
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.e57 import (
-    E57Scan,
     _checksums,
     read_e57,
     unpacked,
@@ -23,17 +16,16 @@ from sceneprint.formats.points.e57 import (
 )
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is not installed")
-Points = NDArray[np.float64]
 POINTS = np.random.default_rng(7).uniform((-9, -4, 0), (9, 4, 3), (200_003, 3))
 
 
-def points_of(scan: E57Scan) -> Points:
+def points_of(scan):
     with np.errstate(all="ignore"):
         points = np.concatenate(list(scan.points().blocks))
     return points[np.isfinite(points).all(axis=1)]
 
 
-def written(path: Path, fields: dict[str, Any], columns: dict[str, Any], **header: Any) -> bytes:
+def written(path, fields, columns, **header):
     """A file with one scan whose fields are packed as they are here; by libE57."""
     lib, n = pye57.libe57, len(next(iter(columns.values())))
     with pye57.E57(str(path), "w") as file:
@@ -56,7 +48,7 @@ def written(path: Path, fields: dict[str, Any], columns: dict[str, Any], **heade
     return path.read_bytes()
 
 
-def simple(path: Path, points: Points = POINTS, **more: Any) -> bytes:
+def simple(path, points=POINTS, **more):
     """A file of one scan as pye57 writes it by default: float32."""
     with pye57.E57(str(path), "w") as file:
         columns = {f"cartesian{axis}": points[:, k].copy() for k, axis in enumerate("XYZ")}
@@ -64,15 +56,15 @@ def simple(path: Path, points: Points = POINTS, **more: Any) -> bytes:
     return path.read_bytes()
 
 
-def scaled(low: int, high: int, scale: float, offset: float) -> Callable[[Any, Any], Any]:
+def scaled(low, high, scale, offset):
     return lambda lib, imf: lib.ScaledIntegerNode(imf, 0, low, high, scale, offset)
 
 
-def real(*, single: bool) -> Callable[[Any, Any], Any]:
+def real(*, single):
     return lambda lib, imf: lib.FloatNode(imf, 0.0, lib.E57_SINGLE if single else lib.E57_DOUBLE)
 
 
-def test_float_points_and_the_pose_are_read_back(tmp_path: Path) -> None:
+def test_float_points_and_the_pose_are_read_back(tmp_path):
     turn = np.array([math.cos(0.35), 0.0, 0.0, math.sin(0.35)])
     data = simple(
         tmp_path / "a.e57", rotation=turn, translation=np.array([500_000.25, 2.0, 3.0]), name="hall"
@@ -90,9 +82,7 @@ def test_float_points_and_the_pose_are_read_back(tmp_path: Path) -> None:
     assert np.abs(ours[:, 1] - theirs["cartesianY"]).max() < 1e-9
 
 
-def test_points_that_are_marked_invalid_are_missing_and_a_grid_has_a_viewpoint(
-    tmp_path: Path,
-) -> None:
+def test_points_that_are_marked_invalid_are_missing_and_a_grid_has_a_viewpoint(tmp_path):
     points, places = POINTS[:5000], np.arange(5000)
     invalid = places % 3 == 0
     columns = {
@@ -106,7 +96,7 @@ def test_points_that_are_marked_invalid_are_missing_and_a_grid_has_a_viewpoint(
     assert np.abs(points_of(scans[0]) - points[~invalid]).max() < 1e-6
 
 
-def test_scaled_whole_numbers_of_any_width_are_read_back(tmp_path: Path) -> None:
+def test_scaled_whole_numbers_of_any_width_are_read_back(tmp_path):
     fields = {
         "cartesianX": scaled(-100_000, 99_999, 1e-4, 0.5),  # 18 bits
         "rowIndex": lambda lib, imf: lib.IntegerNode(imf, 0, 0, 6),  # 3 bits
@@ -122,7 +112,7 @@ def test_scaled_whole_numbers_of_any_width_are_read_back(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("single", [True, False])
-def test_ranges_and_angles_become_positions(tmp_path: Path, single: bool) -> None:
+def test_ranges_and_angles_become_positions(tmp_path, single):
     distance = np.linalg.norm(POINTS, axis=1)
     columns = {
         "sphericalRange": distance,
@@ -137,7 +127,7 @@ def test_ranges_and_angles_become_positions(tmp_path: Path, single: bool) -> Non
     assert np.abs(points_of(scan) - POINTS).max() < (5e-6 if single else 1e-12)
 
 
-def test_a_merged_cloud_has_no_viewpoint_and_registered_scans_have(tmp_path: Path) -> None:
+def test_a_merged_cloud_has_no_viewpoint_and_registered_scans_have(tmp_path):
     merged = read_e57(simple(tmp_path / "a.e57", POINTS[:100]))
     assert with_viewpoint(merged) == [False]
     shift, turn = np.array([5e5, 4e6, 0]), np.array([0.8, 0, 0, 0.6])
@@ -156,7 +146,7 @@ def test_a_merged_cloud_has_no_viewpoint_and_registered_scans_have(tmp_path: Pat
 
 
 @pytest.mark.parametrize("bits", range(65))
-def test_bits_are_unpacked_as_long_division_does(bits: int) -> None:
+def test_bits_are_unpacked_as_long_division_does(bits):
     rng = np.random.default_rng(bits)
     values = [int(rng.integers(0, 2**63)) * 2 + 1 & (1 << bits) - 1 for _ in range(83)]
     packed = sum(value << (i * bits) for i, value in enumerate(values))
@@ -167,7 +157,7 @@ def test_bits_are_unpacked_as_long_division_does(bits: int) -> None:
 # Files that are damaged or lie.
 
 
-def changed(data: bytes, at: int, content: bytes) -> bytes:
+def changed(data, at, content):
     """A file with other bytes and the checksums that fit them, by a loop over bits."""
     altered = bytearray(data)
     altered[at : at + len(content)] = content
@@ -181,7 +171,7 @@ def changed(data: bytes, at: int, content: bytes) -> bytes:
     return bytes(altered)
 
 
-def reworded(data: bytes, old: bytes, new: bytes) -> bytes:
+def reworded(data, old, new):
     """A file whose description says something else, in as many bytes, within one page."""
     at = data.index(old)
     assert len(old) == len(new)
@@ -190,20 +180,20 @@ def reworded(data: bytes, old: bytes, new: bytes) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def file(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def file(tmp_path_factory):
     return simple(tmp_path_factory.mktemp("e57") / "a.e57", POINTS[:3000])
 
 
-def everything(data: bytes) -> int:
+def everything(data):
     return sum(len(points_of(one)) for one in read_e57(data))
 
 
-def test_checksums_are_those_of_the_standard(file: bytes) -> None:
+def test_checksums_are_those_of_the_standard(file):
     assert changed(file, 0, file[:1020]) == file
 
 
 @pytest.mark.parametrize("at", [60, 5000, 20_000])
-def test_a_flipped_bit_is_noticed(file: bytes, at: int) -> None:
+def test_a_flipped_bit_is_noticed(file, at):
     broken = bytearray(file)
     broken[at] ^= 0x10
     with pytest.raises(UnreadableCloud, match=r"checksum of its page \d+ is wrong.*Copy the file"):
@@ -211,7 +201,7 @@ def test_a_flipped_bit_is_noticed(file: bytes, at: int) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.99])
-def test_a_file_that_ends_early_is_refused(file: bytes, share: float) -> None:
+def test_a_file_that_ends_early_is_refused(file, share):
     with pytest.raises(UnreadableCloud, match="Copy the file again"):
         everything(file[: int(share * len(file))])
 
@@ -228,14 +218,12 @@ def test_a_file_that_ends_early_is_refused(file: bytes, share: float) -> None:
         (b"<data3D ", b"<data4D ", "damaged"),
     ],
 )
-def test_a_description_that_lies_is_refused(
-    file: bytes, old: bytes, new: bytes, message: str
-) -> None:
+def test_a_description_that_lies_is_refused(file, old, new, message):
     with pytest.raises(UnreadableCloud, match=message):
         everything(reworded(file, old, new))
 
 
-def test_a_later_version_and_huge_pages_are_refused(file: bytes) -> None:
+def test_a_later_version_and_huge_pages_are_refused(file):
     with pytest.raises(UnreadableCloud, match=r"version 2 of E57.*Export the scan as PLY"):
         everything(changed(file, 8, struct.pack("<I", 2)))
     with pytest.raises(UnreadableCloud, match="pages of 1125899906842624 bytes"):
@@ -244,7 +232,7 @@ def test_a_later_version_and_huge_pages_are_refused(file: bytes) -> None:
         everything(b"ply\n" + file[4:])
 
 
-def test_random_damage_behind_right_checksums_is_an_error_of_ours(file: bytes) -> None:
+def test_random_damage_behind_right_checksums_is_an_error_of_ours(file):
     rng = np.random.default_rng(4)
     pages = np.frombuffer(file, np.uint8).reshape(-1, 1024)
     for _ in range(150):
@@ -256,7 +244,7 @@ def test_random_damage_behind_right_checksums_is_an_error_of_ours(file: bytes) -
             everything(broken.tobytes())
 
 
-def test_packets_that_lie_are_refused(file: bytes) -> None:
+def test_packets_that_lie_are_refused(file):
     for at, content in ((80, b"\x07"), (82, b"\x00\x00"), (84, b"\x09\x00"), (86, b"\xff\xff")):
         with pytest.raises(UnreadableCloud, match="packed points of the file are damaged"):
             everything(changed(file, at, content))

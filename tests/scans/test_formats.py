@@ -1,15 +1,11 @@
 """Tests that all formats give the same points, and are recognised by their first bytes."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 from sceneprint_client.formats import format_of
-
-Write = Callable[..., bytes]
 
 FORMS = {
     "ply": ("ascii", "binary_little_endian", "binary_big_endian"),
@@ -18,7 +14,7 @@ FORMS = {
 
 
 @pytest.mark.parametrize(("name", "form"), [(n, f) for n, fs in FORMS.items() for f in fs])
-def test_forms(request: pytest.FixtureRequest, points: np.ndarray, name: str, form: str) -> None:
+def test_forms(request, points, name, form):
     data = request.getfixturevalue(name)(form=form)
     scan = decode_scan(data, name="here")
     np.testing.assert_array_equal(scan.cloud.points, points)
@@ -29,7 +25,7 @@ def test_forms(request: pytest.FixtureRequest, points: np.ndarray, name: str, fo
     assert format_of(data) == name
 
 
-def test_kitti_has_to_be_said(kitti: Write, points: np.ndarray, ply: Write) -> None:
+def test_kitti_has_to_be_said(kitti, points, ply):
     assert format_of(kitti()) is None
     np.testing.assert_array_equal(decode_cloud(kitti(), file_format="kitti").points, points)
     with pytest.raises(UnreadableCloud, match=r"its first bytes.*specify the format kitti"):
@@ -40,7 +36,7 @@ def test_kitti_has_to_be_said(kitti: Write, points: np.ndarray, ply: Write) -> N
         decode_cloud(ply(), file_format="kitti")
 
 
-def scan_rows(values: int) -> np.ndarray:
+def scan_rows(values):
     """What a scanner 1.8 m above the floor of a hall sees, with so many values a row."""
     rng = np.random.default_rng(4)
     turn, tilt = rng.uniform(-np.pi, np.pi, 6000), rng.uniform(-0.4, 0.2, 6000)
@@ -52,13 +48,13 @@ def scan_rows(values: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("values", [3, 5, 6, 7, 8])
-def test_rows_of_another_length_are_no_kitti(values: int) -> None:
+def test_rows_of_another_length_are_no_kitti(values):
     data = scan_rows(values).tobytes()
     with pytest.raises(UnreadableCloud, match=rf"row of the file has {values} .*--row x,y,z"):
         decode_cloud(data, file_format="kitti")
 
 
-def test_rows_of_four_are_kitti() -> None:
+def test_rows_of_four_are_kitti():
     rows = scan_rows(4)
     for scale in (1.0, 1 / 255, 0.0):
         rows[:, 3] *= scale
@@ -68,7 +64,7 @@ def test_rows_of_four_are_kitti() -> None:
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
-def test_axes_in_capitals(pcd: Write, ply: Write, points: np.ndarray, form: str) -> None:
+def test_axes_in_capitals(pcd, ply, points, form):
     data = pcd(form=form).replace(b" x y z", b" X Y Z")
     np.testing.assert_array_equal(decode_cloud(data).points, points)
     data = ply(form="ascii" if form == "ascii" else "binary_little_endian")
@@ -80,7 +76,7 @@ def test_axes_in_capitals(pcd: Write, ply: Write, points: np.ndarray, form: str)
 
 @pytest.mark.parametrize("dtype", ["<f4", ">f8", "<f2"])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_npy(npy: Write, points: np.ndarray, dtype: str, order: str) -> None:
+def test_npy(npy, points, dtype, order):
     wide = np.concatenate([points, np.full((12, 1), np.nan)], axis=1)  # intensity may be anything
     for array in (points, wide):
         data = npy(np.asarray(array, dtype=dtype, order=order))
@@ -88,7 +84,7 @@ def test_npy(npy: Write, points: np.ndarray, dtype: str, order: str) -> None:
         np.testing.assert_array_equal(decode_cloud(data).points, points)
 
 
-def test_npy_of_another_shape_or_type(npy: Write) -> None:
+def test_npy_of_another_shape_or_type(npy):
     depth = npy(np.ones((12, 16), np.float32))
     assert format_of(depth) is None  # an image
     with pytest.raises(UnreadableCloud, match=r"shape of points, \(N, 3\)"):
@@ -99,11 +95,11 @@ def test_npy_of_another_shape_or_type(npy: Write) -> None:
         decode_cloud(npy(np.ones((12, 3), np.float32))[:-1])
 
 
-def test_nothing_known(ply: Write) -> None:
+def test_nothing_known(ply):
     for data, message in ((b"", "empty"), (b"hello", "none of PLY, PCD"), (b"plywood", "none of")):
         with pytest.raises(UnreadableCloud, match=message):
             decode_cloud(data)
     with pytest.raises(UnreadableCloud, match="not a PCD file"):
         decode_cloud(ply(), file_format="pcd")
     with pytest.raises(UnreadableCloud, match="not a point cloud format"):
-        decode_cloud(ply(), file_format="stl")  # type: ignore[arg-type]
+        decode_cloud(ply(), file_format="stl")

@@ -3,7 +3,6 @@
 import builtins
 import io
 import struct
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,12 +11,10 @@ from sceneprint.errors import MissingDependency, UnreadableCloud
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 from sceneprint_client.formats import format_of
 
-Write = Callable[..., bytes]
-
 N = 60_000  #: two chunks
 
 
-def test_las(las: Write, points: np.ndarray) -> None:
+def test_las(las, points):
     scan = decode_scan(las())
     assert (scan.file_format, scan.file_points, format_of(las())) == ("las", 12, "las")
     np.testing.assert_allclose(scan.cloud.points, points, atol=1e-6)
@@ -25,7 +22,7 @@ def test_las(las: Write, points: np.ndarray) -> None:
     np.testing.assert_array_equal(decode_cloud(las() + b"more").points, scan.cloud.points)
 
 
-def changed(data: bytes, at: int, form: str, value: float) -> bytes:
+def changed(data, at, form, value):
     copy = bytearray(data)
     struct.pack_into(f"<{form}", copy, at, value)
     return bytes(copy)
@@ -49,20 +46,20 @@ def changed(data: bytes, at: int, form: str, value: float) -> bytes:
         (104, "B", 0x81, "how its points are packed"),
     ],
 )
-def test_lies(las: Write, at: int, form: str, value: float, message: str) -> None:
+def test_lies(las, at, form, value, message):
     if value == 0x81:
         pytest.importorskip("lazrs", reason="lazrs is not installed")
     with pytest.raises(UnreadableCloud, match=message):
         decode_cloud(changed(las(), at, form, value))
 
 
-def test_without_lazrs(las: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_lazrs(las, monkeypatch):
     imported = builtins.__import__
 
-    def refuse(name: str, *rest: object) -> object:
+    def refuse(name, *rest):
         if name == "lazrs":
             raise ImportError(name)
-        return imported(name, *rest)  # type: ignore[arg-type]
+        return imported(name, *rest)
 
     monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(MissingDependency, match=r"sceneprint\[las\]"):
@@ -71,11 +68,11 @@ def test_without_lazrs(las: Write, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture(scope="module")
-def laz() -> Callable[..., bytes]:
+def laz():
     laspy = pytest.importorskip("laspy", reason="laspy is not installed")
     pytest.importorskip("lazrs", reason="lazrs is not installed")
 
-    def write(form: int, n: int = N, extra: bool = False, packed: bool = True) -> bytes:
+    def write(form, n=N, extra=False, packed=True):
         header = laspy.LasHeader(point_format=form, version="1.4" if form > 5 else "1.2")
         header.scales, header.offsets = [0.001] * 3, [1.0, 2.0, 3.0]
         if extra:
@@ -90,21 +87,21 @@ def laz() -> Callable[..., bytes]:
     return write
 
 
-def path(n: int) -> np.ndarray:
+def path(n):
     rng = np.random.default_rng(0)
     return np.round(np.cumsum(rng.normal(0, 0.05, (n, 3)), axis=0), 3)
 
 
 @pytest.mark.parametrize("extra", [False, True])
 @pytest.mark.parametrize("form", [0, 3, 6, 8])
-def test_another_writer(laz: Write, form: int, extra: bool) -> None:
+def test_another_writer(laz, form, extra):
     for packed in (False, True):
         data = laz(form, extra=extra, packed=packed)
         np.testing.assert_allclose(decode_cloud(data).points, path(N), atol=2e-6)
 
 
 @pytest.mark.parametrize("form", [1, 7])
-def test_packed_lies(laz: Write, form: int) -> None:
+def test_packed_lies(laz, form):
     data, whole = laz(form, 500), laz(form, 500, packed=False)
     (start,) = struct.unpack_from("<I", data, 96)
     (table,) = struct.unpack_from("<q", data, start)

@@ -2,7 +2,6 @@
 
 import struct
 import tracemalloc
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,10 +12,8 @@ from sceneprint.errors import FrameError, UnreadableCloud
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 from sceneprint.formats.points.pcd import inflate
 
-Write = Callable[..., bytes]
 
-
-def test_viewpoint(pcd: Write, points: np.ndarray) -> None:
+def test_viewpoint(pcd, points):
     data = pcd(viewpoint="4000 -2000 0 1 0 0 0")
     scan = decode_scan(data)
     assert scan.viewpoint == (4000.0, -2000.0, 0.0)
@@ -32,7 +29,7 @@ def test_viewpoint(pcd: Write, points: np.ndarray) -> None:
         decode_cloud(pcd(viewpoint="nan 0 0 1 0 0 0"))
 
 
-def test_headers_of_other_writers(pcd: Write, points: np.ndarray) -> None:
+def test_headers_of_other_writers(pcd, points):
     """Without the comment, without COUNT, with CRLF, of rows and columns, or of version .5."""
     data = pcd(form="ascii").replace(b"\n0 0 1 ", b"\n")
     data = data.replace(b"normal ", b"").replace(b"SIZE 4 ", b"SIZE ").replace(b"TYPE F", b"TYPE")
@@ -68,7 +65,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("case", LIES)
-def test_lies(pcd: Write, case: str) -> None:
+def test_lies(pcd, case):
     old, new, message = LIES[case]
     with pytest.raises(UnreadableCloud, match=message):
         decode_cloud(pcd().replace(old, new).replace(b"POINTS 12", b"POINTS " + (
@@ -77,7 +74,7 @@ def test_lies(pcd: Write, case: str) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_a_header_alone_asks_for_nothing(count: int) -> None:
+def test_a_header_alone_asks_for_nothing(count):
     """Of a hundred fields, each of as many values as may be."""
     header = (
         f"VERSION 0.7\nFIELDS x y z{' a' * 100}\nSIZE{' 4' * 103}\nTYPE{' F' * 103}\n"
@@ -93,13 +90,13 @@ def test_a_header_alone_asks_for_nothing(count: int) -> None:
 
 
 @pytest.mark.parametrize("form", ["binary", "binary_compressed"])
-def test_bytes_after_the_points_are_passed_over(pcd: Write, points: np.ndarray, form: str) -> None:
+def test_bytes_after_the_points_are_passed_over(pcd, points, form):
     """Some programs pad their files; PCL reads them as well."""
     for rest in (b"\0", b"\0" * 4096, b"more"):
         np.testing.assert_array_equal(decode_cloud(pcd(form=form) + rest).points, points)
 
 
-def test_truncated(pcd: Write) -> None:
+def test_truncated(pcd):
     for form in ("ascii", "binary", "binary_compressed"):
         whole = pcd(form=form)
         start = whole.index(b"DATA")
@@ -108,7 +105,7 @@ def test_truncated(pcd: Write) -> None:
                 decode_cloud(whole[:end])
 
 
-def compressed(count: int, inflated: int, packed: bytes) -> bytes:
+def compressed(count, inflated, packed):
     header = (
         f"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH {count}\nHEIGHT 1\n"
         f"POINTS {count}\nDATA binary_compressed\n"
@@ -116,7 +113,7 @@ def compressed(count: int, inflated: int, packed: bytes) -> bytes:
     return header.encode() + struct.pack("<II", len(packed), inflated) + packed
 
 
-def test_bombs() -> None:
+def test_bombs():
     zeros = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * 1000  # 1 + 264,000 bytes of 3,002
     assert inflate(np.frombuffer(zeros, np.uint8), 264_001).sum() == 0
     with pytest.raises(UnreadableCloud, match=r"declares 240000000 bytes compressed to 3002"):
@@ -138,7 +135,7 @@ def test_bombs() -> None:
         decode_cloud(wide)
 
 
-def unpacked(packed: bytes) -> bytes:
+def unpacked(packed):
     """By the description of the format, one byte after the other."""
     out, left = bytearray(), list(packed)
     while left:
@@ -162,7 +159,7 @@ def unpacked(packed: bytes) -> bytes:
         lambda parts: b"".join(part * n for part, n in parts)[:4000]
     )
 )
-def test_packing_round(lzf: Callable[[bytes], bytes], data: bytes) -> None:
+def test_packing_round(lzf, data):
     packed = lzf(data)
     assert unpacked(packed) == data
     assert inflate(np.frombuffer(packed, np.uint8), len(data)).tobytes() == data
@@ -170,7 +167,7 @@ def test_packing_round(lzf: Callable[[bytes], bytes], data: bytes) -> None:
 
 @settings(max_examples=150)
 @given(st.binary(max_size=60), st.integers(0, 5))
-def test_any_bytes_inflate_as_the_format_says(packed: bytes, beyond: int) -> None:
+def test_any_bytes_inflate_as_the_format_says(packed, beyond):
     try:
         expected = unpacked(packed)
     except IndexError:

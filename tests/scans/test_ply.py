@@ -1,7 +1,6 @@
 """Tests of valid and invalid headers of PLY files."""
 
 import struct
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,13 +9,11 @@ from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.export import write_ply
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 
-Write = Callable[..., bytes]
-
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 BINARY = "ply\nformat binary_little_endian 1.0\n"
 
 
-def test_our_own(points: np.ndarray) -> None:
+def test_our_own(points):
     data = write_ply(points, points, np.zeros((12, 3), np.uint8), np.array([[0, 1, 2]]))
     np.testing.assert_array_equal(decode_cloud(data).points, points)
 
@@ -27,7 +24,7 @@ def test_our_own(points: np.ndarray) -> None:
      ("uint32", "I"), ("float32", "f"), ("double", "d")],
 )  # fmt: skip
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_types(word: str, kind: str, order: str) -> None:
+def test_types(word, kind, order):
     wanted = np.arange(30).reshape(10, 3)
     form = "binary_little_endian" if order == "<" else "binary_big_endian"
     rows = "".join(f"property {word} {name}\n" for name in "xyz")
@@ -37,7 +34,7 @@ def test_types(word: str, kind: str, order: str) -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_vertices_with_lists(points: np.ndarray, order: str) -> None:
+def test_vertices_with_lists(points, order):
     """Rows of different lengths, the list between the coordinates."""
     form = "binary_little_endian" if order == "<" else "binary_big_endian"
     header = (
@@ -57,7 +54,7 @@ def test_vertices_with_lists(points: np.ndarray, order: str) -> None:
     np.testing.assert_array_equal(decode_cloud(text.encode()).points, points)
 
 
-def test_numbers_written_out() -> None:
+def test_numbers_written_out():
     """As Python reads them, or as missing where some printf writes a NaN."""
     words = [
         "1", "-1.5", "+.25", "3.", "1e3", "-2.5E-3", "1.7976931348623157e2", "0.1",
@@ -77,13 +74,13 @@ def test_numbers_written_out() -> None:
     assert scan.cloud.note == "8 missing points skipped"
 
 
-def test_old_line_ends(points: np.ndarray) -> None:
+def test_old_line_ends(points):
     rows = "".join(f"{x} {y} {z}\r" for x, y, z in points)
     header = f"ply\nformat ascii 1.0\nelement vertex 12\n{XYZ}end_header\n".replace("\n", "\r")
     np.testing.assert_array_equal(decode_cloud((header + rows).encode()).points, points)
 
 
-def described(lines: str, body: bytes = b"\0" * 120) -> bytes:
+def described(lines, body=b"\0" * 120):
     return f"{BINARY}{lines}end_header\n".encode() + body
 
 
@@ -142,7 +139,7 @@ LIES = {
 
 
 @pytest.mark.parametrize("case", LIES)
-def test_lies(case: str) -> None:
+def test_lies(case):
     data, message = LIES[case]
     with pytest.raises(UnreadableCloud, match=message):
         decode_cloud(data)
@@ -161,7 +158,7 @@ def test_lies(case: str) -> None:
         ("1.0 2.0 3.0\n" * 4 + "1.0 2.0 3.0\0\n" * 6, "Row 5 of 10.*not a number"),
     ],
 )
-def test_rows_that_are_none(rows: str, message: str) -> None:
+def test_rows_that_are_none(rows, message):
     header = f"ply\nformat ascii 1.0\nelement vertex 10\n{XYZ}end_header\n"
     with pytest.raises(UnreadableCloud, match=message):
         decode_cloud((header + rows).encode())

@@ -1,12 +1,8 @@
 """Tests of serialised PointCloud2 messages, valid and damaged."""
 
-from __future__ import annotations
-
 import random
 import struct
 import tracemalloc
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +21,7 @@ LAYOUTS = (
 )
 
 
-def rows_of(points: np.ndarray, layout: list[tuple[str, str]]) -> np.ndarray:
+def rows_of(points, layout):
     rows = np.zeros(len(points), layout)
     for axis, name in enumerate("xyz"):
         rows[name] = points[:, axis]
@@ -33,11 +29,11 @@ def rows_of(points: np.ndarray, layout: list[tuple[str, str]]) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def serialize(ros: SimpleNamespace) -> Any:
+def serialize(ros):
     """Bytes of a PointCloud2 of records, by rosbags."""
     writer = ros.messages()
 
-    def made(rows: np.ndarray, *, little: bool = True, **how: Any) -> bytes:
+    def made(rows, *, little=True, **how):
         writer.points(1.5, rows, **how)
         return bytes(writer.types.serialize_cdr(writer.last(), NAME, little_endian=little))
 
@@ -47,9 +43,7 @@ def serialize(ros: SimpleNamespace) -> Any:
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("little", [True, False])
 @pytest.mark.parametrize(("height", "padding"), [(1, 0), (3, 0), (3, 5)])
-def test_any_layout_is_read_as_rosbags_wrote_it(
-    serialize: Any, points: np.ndarray, layout: Any, little: bool, height: int, padding: int
-) -> None:
+def test_any_layout_is_read_as_rosbags_wrote_it(serialize, points, layout, little, height, padding):
     whole = np.round(points)  # as some fields are whole numbers
     rows = rows_of(whole, layout)
     big = layout[0][1].startswith(">")
@@ -61,9 +55,7 @@ def test_any_layout_is_read_as_rosbags_wrote_it(
     np.testing.assert_array_equal(scan.cloud.points, expected.astype(np.float32))
 
 
-def test_its_fields_are_those_that_rosbags_reads(
-    ros: SimpleNamespace, serialize: Any, points: np.ndarray
-) -> None:
+def test_its_fields_are_those_that_rosbags_reads(ros, serialize, points):
     for little in (True, False):
         data = serialize(rows_of(points, LAYOUTS[0]), little=little, frame="os_sensor")
         ours = read_point_cloud(data)
@@ -78,7 +70,7 @@ def test_its_fields_are_those_that_rosbags_reads(
         np.testing.assert_array_equal(cloud_points(ours), cloud_points(theirs))
 
 
-def test_what_a_sensor_missed_is_left_out(serialize: Any, points: np.ndarray) -> None:
+def test_what_a_sensor_missed_is_left_out(serialize, points):
     rows = rows_of(np.vstack([points + 10, np.zeros((2, 3)), np.full((3, 3), np.nan)]), LAYOUTS[0])
     scan = decode_scan(serialize(rows))
     np.testing.assert_array_equal(scan.cloud.points, (points + 10).astype(np.float32))
@@ -87,9 +79,7 @@ def test_what_a_sensor_missed_is_left_out(serialize: Any, points: np.ndarray) ->
         decode_scan(serialize(rows[:0]))
 
 
-def test_a_message_may_end_with_its_last_byte_and_no_earlier(
-    serialize: Any, points: np.ndarray
-) -> None:
+def test_a_message_may_end_with_its_last_byte_and_no_earlier(serialize, points):
     rows = rows_of(points, LAYOUTS[0])
     data = serialize(rows)
     end = data.rindex(rows.tobytes()) + rows.nbytes + 1  # is_dense; what follows is padding
@@ -98,7 +88,7 @@ def test_a_message_may_end_with_its_last_byte_and_no_earlier(
         read_point_cloud(data[: end - 1])
 
 
-def test_other_files_are_no_clouds(serialize: Any, points: np.ndarray) -> None:
+def test_other_files_are_no_clouds(serialize, points):
     data = serialize(rows_of(points, LAYOUTS[0]))
     flat = serialize(np.zeros(3, [("x", "<f4"), ("y", "<f4")]))
     empty = (b"", b"\0", b"\0\1\0\0", bytes(16), bytes(4096), b"\0\1\0\0" * 4)
@@ -110,16 +100,16 @@ def test_other_files_are_no_clouds(serialize: Any, points: np.ndarray) -> None:
         decode_scan(data, file_format="kitti")
 
 
-def fields_at(data: bytes) -> int:
+def fields_at(data):
     """Where point_step is, and row_step and the size of the data after it."""
     return data.index(b"z\0") + 2 + 2 + 4 + 4 + 4 + 4
 
 
-def patched(data: bytes, place: int, word: int) -> bytes:
+def patched(data, place, word):
     return data[:place] + struct.pack("<I", word) + data[place + 4 :]
 
 
-def test_wrong_numbers_are_named(serialize: Any, points: np.ndarray) -> None:
+def test_wrong_numbers_are_named(serialize, points):
     data = serialize(rows_of(points, LAYOUTS[0]), frame="lidar")
     read_point_cloud(data)
     count = data.index(b"lidar\0") + 8  # of height, after what aligns it
@@ -147,9 +137,7 @@ def test_wrong_numbers_are_named(serialize: Any, points: np.ndarray) -> None:
         decode_scan(data + bytes(8))
 
 
-def test_damaged_messages_are_refused_or_read_in_bounded_memory(
-    serialize: Any, points: np.ndarray
-) -> None:
+def test_damaged_messages_are_refused_or_read_in_bounded_memory(serialize, points):
     rng, read, refused = random.Random(5), 0, 0
     whole = [serialize(rows_of(points, layout), little=little, height=height)
              for layout in LAYOUTS[:2] for little in (True, False)

@@ -1,7 +1,6 @@
 """Tests of units, viewpoints, missing points, limits and thinning of clouds."""
 
 import struct
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -10,10 +9,8 @@ from sceneprint.errors import InvalidPose, UnreadableCloud, UselessFrame
 from sceneprint.formats.points import cloud as reading
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan, thinned
 
-Write = Callable[..., bytes]
 
-
-def test_millimetres(las: Write, kitti: Write, points: np.ndarray) -> None:
+def test_millimetres(las, kitti, points):
     scan = decode_scan(
         kitti(1000 * points), file_format="kitti", units_per_metre=1000, viewpoint=(1.0, 2.0, 3.0)
     )
@@ -23,7 +20,7 @@ def test_millimetres(las: Write, kitti: Write, points: np.ndarray) -> None:
             decode_cloud(las(), units_per_metre=units)
 
 
-def test_viewpoint(kitti: Write, points: np.ndarray) -> None:
+def test_viewpoint(kitti, points):
     cloud = decode_cloud(kitti(), file_format="kitti", viewpoint=None)
     assert not cloud.has_viewpoint
     np.testing.assert_array_equal(cloud.points, points)
@@ -32,7 +29,7 @@ def test_viewpoint(kitti: Write, points: np.ndarray) -> None:
             decode_cloud(kitti(), file_format="kitti", viewpoint=wrong)
 
 
-def test_coordinates_of_a_map(las: Write, points: np.ndarray) -> None:
+def test_coordinates_of_a_map(las, points):
     """UTM in float64: with the viewpoint to the millimetre, without it an error that tells."""
     east = np.array([512_345.25, 5_412_345.5, 210.0])
     data = las(points + east, (512_000.0, 5_412_000.0, 0.0))
@@ -42,14 +39,14 @@ def test_coordinates_of_a_map(las: Write, points: np.ndarray) -> None:
         decode_cloud(data)
 
 
-def test_a_scale_beyond_all_numbers(las: Write) -> None:
+def test_a_scale_beyond_all_numbers(las):
     data = bytearray(las())
     data[131:139] = struct.pack("<d", 1e308)
     with pytest.raises(UselessFrame, match="12 of 12 points are missing"):
         decode_cloud(bytes(data))
 
 
-def test_ten_kilometres(npy: Write, points: np.ndarray) -> None:
+def test_ten_kilometres(npy, points):
     points[3] = (0.0, -10_000.0, 10_000.0)
     np.testing.assert_array_equal(decode_cloud(npy(points)).points, points)
     points[3, 1] = -10_000.1
@@ -57,7 +54,7 @@ def test_ten_kilometres(npy: Write, points: np.ndarray) -> None:
         decode_cloud(npy(points))
 
 
-def test_missing_points(pcd: Write, npy: Write, points: np.ndarray) -> None:
+def test_missing_points(pcd, npy, points):
     points[[2, 7], [0, 2]] = np.nan, np.inf
     for form in ("ascii", "binary", "binary_compressed"):
         scan = decode_scan(pcd(points, form))
@@ -76,13 +73,13 @@ def test_missing_points(pcd: Write, npy: Write, points: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("rank", [0, 1, 2])
-def test_shapes_that_are_flat(npy: Write, points: np.ndarray, rank: int) -> None:
+def test_shapes_that_are_flat(npy, points, rank):
     """Duplicates, a line, a plane: they are read; what can be signed is not decided here."""
     points[:, rank:] = 1.0
     np.testing.assert_array_equal(decode_cloud(npy(points)).points, points)
 
 
-def test_pose(npy: Write) -> None:
+def test_pose(npy):
     rough = np.eye(4)
     rough[0, 1] = 1e-3
     pose = decode_cloud(npy(), pose=rough).pose
@@ -92,19 +89,19 @@ def test_pose(npy: Write) -> None:
         decode_cloud(npy(), pose=np.diag([2.0, 2.0, 2.0, 1.0]), name="scan")
 
 
-def test_errors_begin_with_the_name(npy: Write) -> None:
+def test_errors_begin_with_the_name(npy):
     with pytest.raises(UnreadableCloud, match=r"^scan-7: According to its first bytes"):
         decode_cloud(b"?", name="scan-7")
 
 
-def test_thinned_as_one_would_by_hand() -> None:
+def test_thinned_as_one_would_by_hand():
     rng = np.random.default_rng(4)
     points = rng.uniform(-0.2, 0.2, (3000, 3)).astype(np.float32)
     points[rng.integers(0, 3000, 500)] = points[7]
     points[0] = (-10_000.0, 10_000.0, 10_000.0)
     for most in (8, 60, 700, 2400):
         found, edge = thinned(points, most)
-        firsts: dict[tuple[int, ...], int] = {}
+        firsts = {}
         for i, voxel in enumerate(np.floor(points.astype(float) * (1.0 / edge)).astype(int)):
             firsts.setdefault(tuple(voxel.tolist()), i)
         np.testing.assert_array_equal(found, points[sorted(firsts.values())])
@@ -114,7 +111,7 @@ def test_thinned_as_one_would_by_hand() -> None:
             assert len(np.unique(finer, axis=0)) > most
 
 
-def test_more_than_five_million() -> None:
+def test_more_than_five_million():
     """On a plane, 4 mm apart: one of each of their 1 cm squares stays."""
     steps = np.arange(2240, dtype=np.float32) * np.float32(0.004) + np.float32(0.001)
     rows = np.zeros((2240, 2240, 4), "<f4")
@@ -126,7 +123,7 @@ def test_more_than_five_million() -> None:
     assert scan.cloud.note == f"thinned from {2240**2} points to {side**2}, one to 1.0 cm"
 
 
-def test_nothing_of_more_than_five_million_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_of_more_than_five_million_is_left(monkeypatch):
     """All in one place: as useless as so few points that were sent."""
     rows = np.full((100, 4), 2.0, "<f4")
     assert len(decode_scan(rows.tobytes(), file_format="kitti").cloud.points) == 100

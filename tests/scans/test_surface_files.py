@@ -1,14 +1,9 @@
 """Tests of whole maps from other programs, and of damaged and hostile files."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json
 import struct
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +13,6 @@ from numpy.typing import NDArray
 from sceneprint.errors import UnreadableCloud, UselessFrame
 from sceneprint.formats.surface_file.raw_surface import gather
 from sceneprint.formats.surface_file.reading import SurfaceOptions, read_surface
-from sceneprint.types import ReferenceSurface
 
 Points = NDArray[np.float64]
 N = 30_001
@@ -26,12 +20,12 @@ MILLIMETRE = 1e-3
 STATED = SurfaceOptions(units_per_metre=1.0, up="z")
 
 
-def path(n: int = N) -> Points:
+def path(n=N):
     """Points of a walk through a hall, not all of whose coordinates float32 holds exactly."""
     return np.cumsum(np.random.default_rng(1).normal(0, 0.05, (n, 3)), axis=0)
 
 
-def steps() -> trimesh.Trimesh:
+def steps():
     """Three boxes in a row, each higher than the one before."""
     boxes = [trimesh.creation.box((1, 1, k + 1)) for k in range(3)]
     for k, box in enumerate(boxes):
@@ -39,13 +33,13 @@ def steps() -> trimesh.Trimesh:
     return trimesh.util.concatenate(boxes)
 
 
-def corners(surface: ReferenceSurface) -> Points:
+def corners(surface):
     """Coordinates (M, 9) of each triangle in the file's frame, in an order of their own."""
     assert surface.triangles is not None
     return sorted_rows((surface.points.astype(np.float64) + surface.offset)[surface.triangles])
 
 
-def sorted_rows(triangles: Points) -> Points:
+def sorted_rows(triangles):
     """Rows (M, 9) from triangles (M, 3, 3), each turned to begin with its least corner."""
     rows = []
     for one in np.round(triangles, 4).tolist():
@@ -54,7 +48,7 @@ def sorted_rows(triangles: Points) -> Points:
     return np.array(sorted(rows))
 
 
-def exported(mesh: trimesh.Trimesh | trimesh.Scene, form: str) -> bytes:
+def exported(mesh, form):
     """A file by trimesh; of a glTF with its buffers embedded."""
     if form != "gltf":
         data = mesh.export(file_type=form)
@@ -71,7 +65,7 @@ def exported(mesh: trimesh.Trimesh | trimesh.Scene, form: str) -> bytes:
 
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "compressed", "ply", "ply ascii"])
-def test_clouds_by_open3d(with_open3d: None, tmp_path: Path, form: str) -> None:
+def test_clouds_by_open3d(with_open3d, tmp_path, form):
     import open3d
 
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(path()))
@@ -88,7 +82,7 @@ def test_clouds_by_open3d(with_open3d: None, tmp_path: Path, form: str) -> None:
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_far_coordinates_by_laspy_keep_their_millimetres(packed: bool) -> None:
+def test_far_coordinates_by_laspy_keep_their_millimetres(packed):
     laspy = pytest.importorskip("laspy", reason="laspy is not installed")
     header = laspy.LasHeader(point_format=3, version="1.2")
     far = np.array([432_100.0, 5_412_345.0, 310.0])
@@ -106,7 +100,7 @@ def test_far_coordinates_by_laspy_keep_their_millimetres(packed: bool) -> None:
     assert (read.units, read.up_from) == ("estimated", "file")
 
 
-def test_scans_by_libe57_are_one_cloud(tmp_path: Path) -> None:
+def test_scans_by_libe57_are_one_cloud(tmp_path):
     pye57 = pytest.importorskip("pye57", reason="pye57 is not installed")
     file = tmp_path / "map.e57"
     places = [(500_000.0, 2.0, 3.0), (500_010.0, -2.0, 3.0)]
@@ -123,7 +117,7 @@ def test_scans_by_libe57_are_one_cloud(tmp_path: Path) -> None:
     assert (read.units, read.file_points) == ("file", 2 * N)
 
 
-def test_rows_of_numpy_and_what_is_missing() -> None:
+def test_rows_of_numpy_and_what_is_missing():
     points = path()
     points[5] = np.nan
     file = io.BytesIO()
@@ -134,7 +128,7 @@ def test_rows_of_numpy_and_what_is_missing() -> None:
     assert read.notes == ("1 missing points were skipped.",)
 
 
-def test_stated_units_and_up(pcd: Callable[..., bytes], points: Points) -> None:
+def test_stated_units_and_up(pcd, points):
     read = read_surface(pcd(), "map.pcd", SurfaceOptions(units_per_metre=0.5, up="-y"))
     np.testing.assert_allclose(read.surface.points, points * 2, atol=1e-6)
     np.testing.assert_array_equal(read.surface.up, [0, -1, 0])
@@ -143,7 +137,7 @@ def test_stated_units_and_up(pcd: Callable[..., bytes], points: Points) -> None:
             SurfaceOptions(**wrong)
 
 
-def las_with(record: int, body: bytes) -> bytes:
+def las_with(record, body):
     """A LAS file of twelve points with a record that describes its coordinates."""
     vlr = struct.pack("<2x16sHH32x", b"LASF_Projection", record, len(body)) + body
     header = bytearray(227)
@@ -155,7 +149,7 @@ def las_with(record: int, body: bytes) -> bytes:
     return bytes(header) + vlr + rows
 
 
-def keys(*pairs: tuple[int, int]) -> bytes:
+def keys(*pairs):
     body = struct.pack("<4H", 1, 1, 0, len(pairs))
     return body + b"".join(struct.pack("<4H", key, 0, 1, value) for key, value in pairs)
 
@@ -174,7 +168,7 @@ FEET_WKT = (
         (2112, FEET_WKT, 1 / 0.3048006096012192),
     ],
 )
-def test_units_of_a_las_file(record: int, body: bytes, units: float) -> None:
+def test_units_of_a_las_file(record, body, units):
     read = read_surface(las_with(record, body), "map.las")
     assert (read.units, read.up_from) == ("file", "file")
     assert read.units_per_metre == pytest.approx(units)
@@ -186,7 +180,7 @@ def test_units_of_a_las_file(record: int, body: bytes, units: float) -> None:
 @pytest.mark.parametrize(
     ("record", "body"), [(34735, keys((1024, 2))), (2112, b'GEOGCS["WGS 84",UNIT["degree",1]]')]
 )
-def test_degrees_are_refused(record: int, body: bytes) -> None:
+def test_degrees_are_refused(record, body):
     with pytest.raises(UnreadableCloud, match=r"map\.las: .*degrees.*Convert them to metres"):
         read_surface(las_with(record, body), "map.las")
 
@@ -201,7 +195,7 @@ def test_degrees_are_refused(record: int, body: bytes) -> None:
         ("glb", "a.dat"), ("gltf", "a.gltf"),
     ],
 )  # fmt: skip
-def test_meshes_by_trimesh(form: str, name: str) -> None:
+def test_meshes_by_trimesh(form, name):
     mesh = steps()
     mesh.apply_translation((0.123456, 5.5, -2))
     read = read_surface(exported(mesh, form), name)
@@ -212,7 +206,7 @@ def test_meshes_by_trimesh(form: str, name: str) -> None:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_meshes_by_open3d(with_open3d: None, tmp_path: Path, text: bool) -> None:
+def test_meshes_by_open3d(with_open3d, tmp_path, text):
     import open3d
 
     mesh = steps()
@@ -226,7 +220,7 @@ def test_meshes_by_open3d(with_open3d: None, tmp_path: Path, text: bool) -> None
     np.testing.assert_allclose(corners(read.surface), sorted_rows(mesh.triangles), atol=MILLIMETRE)
 
 
-def test_parts_of_a_scene_are_placed_and_a_mirrored_one_keeps_its_front() -> None:
+def test_parts_of_a_scene_are_placed_and_a_mirrored_one_keeps_its_front():
     box, scene = trimesh.creation.box((1, 1, 1)), trimesh.Scene()
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     mirror[0, 3] = 7.0
@@ -242,7 +236,7 @@ def test_parts_of_a_scene_are_placed_and_a_mirrored_one_keeps_its_front() -> Non
     assert read.notes == ("1 parts without triangles were skipped.",)
 
 
-def ply(faces: list[list[int]], order: str, vertices: Points) -> bytes:
+def ply(faces, order, vertices):
     """A PLY file of polygons, with a number and another list beside each."""
     head = (
         f"ply\nformat {order} 1.0\nelement vertex {len(vertices)}\nproperty double x\n"
@@ -265,7 +259,7 @@ ORDERS = ["ascii", "binary_little_endian", "binary_big_endian"]
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_polygons_become_fans(order: str) -> None:
+def test_polygons_become_fans(order):
     vertices = path(9)
     data = ply([[0, 1, 2], [3, 4, 5, 6], [8, 7, 6, 5, 4], [2, 1, 7]], order, vertices)
     fans = [(0, 1, 2), (3, 4, 5), (3, 5, 6), (8, 7, 6), (8, 6, 5), (8, 5, 4), (2, 1, 7)]
@@ -284,12 +278,12 @@ def test_polygons_become_fans(order: str) -> None:
         ([[0, 1]], "corners"),
     ],
 )
-def test_wrong_polygons(order: str, faces: list[list[int]], message: str) -> None:
+def test_wrong_polygons(order, faces, message):
     with pytest.raises(UnreadableCloud, match=f"{message}.*again"):
         read_surface(ply(faces, order, path(9)), "map.ply")
 
 
-def test_what_is_no_triangle_is_left_out() -> None:
+def test_what_is_no_triangle_is_left_out():
     vertices = path(9)
     vertices[3] = np.nan
     vertices[6:8] = vertices[5]
@@ -304,7 +298,7 @@ def test_what_is_no_triangle_is_left_out() -> None:
 
 
 @pytest.mark.parametrize("form", ["obj", "ply"])
-def test_a_mesh_without_a_face_is_a_cloud(form: str) -> None:
+def test_a_mesh_without_a_face_is_a_cloud(form):
     data = exported(trimesh.PointCloud(path(50)), "ply")
     if form == "obj":
         data = "".join(f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in path(50)).encode()
@@ -313,7 +307,7 @@ def test_a_mesh_without_a_face_is_a_cloud(form: str) -> None:
     np.testing.assert_allclose(read.surface.points, path(50), atol=MILLIMETRE)
 
 
-def test_polygons_and_indices_from_the_end_in_obj() -> None:
+def test_polygons_and_indices_from_the_end_in_obj():
     text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv .5 2 0\nvn 0 0 1\n"
     for faces in ("f 1//1 2//1 3//1 4//1\n", "f -5 -4 -3 -2\n", "f 1 2 3 4 \\\n\n"):
         read = read_surface(f"mtllib no.mtl\n{text}usemtl x\n{faces}".encode(), "a.obj", STATED)
@@ -324,7 +318,7 @@ def test_polygons_and_indices_from_the_end_in_obj() -> None:
     assert len(read.surface.triangles) == 4
 
 
-def test_millimetres_are_recognised() -> None:
+def test_millimetres_are_recognised():
     box = trimesh.creation.box((6000, 4500, 2500))
     read = read_surface(exported(box, "stl"), "room.stl")
     assert (read.units, read.units_per_metre) == ("estimated", 1000.0)
@@ -337,7 +331,7 @@ def test_millimetres_are_recognised() -> None:
 # Broken and hostile files.
 
 
-def files() -> dict[str, bytes]:
+def files():
     """A file of each format."""
     mesh, cloud = steps(), trimesh.PointCloud(path(100))
     buffer = io.BytesIO()
@@ -359,7 +353,7 @@ def files() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", [name for name in files() if name != "a.obj"])
-def test_cut_files_are_refused_with_a_remedy(name: str) -> None:
+def test_cut_files_are_refused_with_a_remedy(name):
     data = files()[name]
     read_surface(data, name)
     for share in (0.3, 0.6, 0.97):
@@ -370,7 +364,7 @@ def test_cut_files_are_refused_with_a_remedy(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(files()))
-def test_noise_in_any_file_is_an_error_of_ours_or_none(name: str) -> None:
+def test_noise_in_any_file_is_an_error_of_ours_or_none(name):
     data, rng = files()[name], np.random.default_rng(5)
     for _ in range(60):
         broken = bytearray(data)
@@ -383,7 +377,7 @@ def test_noise_in_any_file_is_an_error_of_ours_or_none(name: str) -> None:
             continue
 
 
-def changed_gltf(change: Callable[[dict[str, Any]], None]) -> bytes:
+def changed_gltf(change):
     tree = json.loads(exported(steps(), "gltf"))
     change(tree)
     return json.dumps(tree).encode()
@@ -404,14 +398,12 @@ def changed_gltf(change: Callable[[dict[str, Any]], None]) -> bytes:
         (lambda t: t.update(scenes=[{"nodes": []}], scene=0), "neither triangles nor points"),
     ],
 )
-def test_gltf_that_needs_more_than_its_bytes(
-    change: Callable[[dict[str, Any]], None], message: str
-) -> None:
+def test_gltf_that_needs_more_than_its_bytes(change, message):
     with pytest.raises(UnreadableCloud, match=message):
         read_surface(changed_gltf(change), "a.gltf")
 
 
-def test_a_part_that_is_placed_too_often_is_refused_unbuilt() -> None:
+def test_a_part_that_is_placed_too_often_is_refused_unbuilt():
     ball = trimesh.creation.icosphere(subdivisions=5)
     tree = json.loads(exported(ball, "gltf"))
     mesh = next(node["mesh"] for node in tree["nodes"] if "mesh" in node)
@@ -436,13 +428,13 @@ def test_a_part_that_is_placed_too_often_is_refused_unbuilt() -> None:
         ("a.gltf", b"[" * 100_000, "not JSON"),
     ],
 )  # fmt: skip
-def test_headers_that_announce_what_is_not_there(name: str, data: bytes, message: str) -> None:
+def test_headers_that_announce_what_is_not_there(name, data, message):
     with pytest.raises(UnreadableCloud, match=message):
         read_surface(data, name)
 
 
 @pytest.mark.parametrize("far", [3e4, 1e20, 1e300])
-def test_a_place_of_more_than_twenty_kilometres_is_refused(far: float) -> None:
+def test_a_place_of_more_than_twenty_kilometres_is_refused(far):
     file, points = io.BytesIO(), path(100)
     points[50, 1] = far
     np.save(file, points)
@@ -453,7 +445,7 @@ def test_a_place_of_more_than_twenty_kilometres_is_refused(far: float) -> None:
 # Thinning while reading.
 
 
-def test_a_cloud_of_too_many_points_is_thinned_while_it_is_read() -> None:
+def test_a_cloud_of_too_many_points_is_thinned_while_it_is_read():
     rng = np.random.default_rng(3)
     points = rng.uniform((-20, -15, 0), (20, 15, 5), (50_000, 3)) + np.array([5e5, 4e6, 0])
     blocks = np.array_split(points, 13)
@@ -473,7 +465,7 @@ def test_a_cloud_of_too_many_points_is_thinned_while_it_is_read() -> None:
     np.testing.assert_array_equal(found, other)
 
 
-def test_few_points_are_kept_as_they_are() -> None:
+def test_few_points_are_kept_as_they_are():
     found, origin, voxel = gather(iter([path(40)]), 40, lambda _: 1.0, most=40)
     np.testing.assert_array_equal(found, path(40).astype(np.float32))
     assert (voxel, origin.tolist()) == (None, [0, 0, 0])

@@ -1,10 +1,5 @@
 """Tests of the times of points, and of CustomMsg of Livox."""
 
-from __future__ import annotations
-
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -26,9 +21,7 @@ XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
         ("offset_time", "<u4", 1e9, 0),
     ],
 )
-def test_times_of_drivers(
-    name: str, kind: str, unit: float, epoch: int, points: np.ndarray, ros: SimpleNamespace
-) -> None:
+def test_times_of_drivers(name, kind, unit, epoch, points, ros):
     rows = np.zeros(len(points), [*XYZ, ("ring", "<u2"), (name, kind)])
     for axis, axis_name in enumerate("xyz"):
         rows[axis_name] = points[:, axis] + 10
@@ -43,9 +36,7 @@ def test_times_of_drivers(
     np.testing.assert_allclose(seconds, SECONDS[rest], atol=1e-6)
 
 
-def test_times_of_another_clock_begin_at_the_stamp(
-    points: np.ndarray, ros: SimpleNamespace
-) -> None:
+def test_times_of_another_clock_begin_at_the_stamp(points, ros):
     rows = np.zeros(len(points), [*XYZ, ("timestamp", "<f8")])
     rows["x"], rows["timestamp"] = 1.0, 55.0 + SECONDS  # seconds since the start of the sensor
     writer = ros.messages()
@@ -54,9 +45,7 @@ def test_times_of_another_clock_begin_at_the_stamp(
 
 
 @pytest.mark.parametrize("step", [0.2, np.nan])
-def test_times_that_no_scan_takes_are_ignored(
-    step: float, points: np.ndarray, ros: SimpleNamespace
-) -> None:
+def test_times_that_no_scan_takes_are_ignored(step, points, ros):
     rows = np.zeros(len(points), [*XYZ, ("time", "<f4")])
     rows["x"], rows["time"] = 1.0, step * np.arange(12)
     writer = ros.messages()
@@ -66,7 +55,7 @@ def test_times_that_no_scan_takes_are_ignored(
     assert seconds is None
 
 
-def livox_bytes(writer: Any, serialization: str) -> bytes:
+def livox_bytes(writer, serialization):
     name, message = writer.written[-1][1:]
     if serialization == "ros1":
         return bytes(writer.types.serialize_ros1(message, name))
@@ -76,9 +65,7 @@ def livox_bytes(writer: Any, serialization: str) -> bytes:
 @pytest.mark.parametrize("serialization", ["little", "big", "ros1"])
 @pytest.mark.parametrize("frame", ["livox_frame", "l", "odd"])
 @pytest.mark.parametrize("package", ["livox_ros_driver", "livox_ros_driver2"])
-def test_livox_scans_are_read_as_rosbags_wrote_them(
-    serialization: str, frame: str, package: str, points: np.ndarray, ros: SimpleNamespace
-) -> None:
+def test_livox_scans_are_read_as_rosbags_wrote_them(serialization, frame, package, points, ros):
     # first and second returns remain; third returns and points of low confidence do not
     tags = [0x00, 0x10, 0x20, 0x30, 0x0F, 0x12, 0x22, 0xC0, 0, 0, 0, 0]
     rest = np.array([not tag & 0x20 for tag in tags])
@@ -97,7 +84,7 @@ def test_livox_scans_are_read_as_rosbags_wrote_them(
             read_livox_scan(data[:end], ros1=ros1)
 
 
-def test_other_messages_are_no_livox_scans(points: np.ndarray, ros: SimpleNamespace) -> None:
+def test_other_messages_are_no_livox_scans(points, ros):
     writer = ros.messages()
     writer.points(1.5, np.zeros(12, XYZ))
     for data in (b"", bytes(3), livox_bytes(writer, "little")):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,11 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import (
     Camera,
-    FrameReference,
     find_sequences,
     write_depth_png,
     write_intrinsics,
     write_pose,
 )
-from sceneprint.types import DepthFrame
 from sceneprint_client import Client, meta_of
 from sceneprint_viewers.scene import Moment, SceneEntity
 
@@ -37,7 +34,7 @@ class Logged:
     values: dict[str, Any]
 
 
-def _rows(path: Path) -> Iterator[Logged]:
+def _rows(path):
     from rerun.chunk import McapReader  # takes half a second
 
     for chunk in McapReader(path).stream():
@@ -52,20 +49,20 @@ def _rows(path: Path) -> Iterator[Logged]:
             yield Logged(chunk.entity_path, time_ns, values)
 
 
-def mcap_rows(path: Path) -> list[Logged]:
+def mcap_rows(path):
     """Return all messages of an MCAP file, read by Rerun instead of Foxglove's library."""
     return [one for one in _rows(path) if not one.path.startswith("/__")]
 
 
-def moves_of(rows: list[Logged], child: str) -> list[Logged]:
+def moves_of(rows, child):
     """Return the transforms of a coordinate frame in order of time."""
     key = "Transform3D:child_frame"
     return [one for one in rows if one.values.get(key) == [child]]
 
 
-def drawn_at(rows: list[Logged], topic: str) -> dict[str, Any]:
+def drawn_at(rows, topic):
     """Return the final lines and labels of a topic by path."""
-    drawn: dict[str, Any] = {}
+    drawn = {}
     for row in rows:
         if row.path == topic and UPDATE in row.values:
             [update] = row.values[UPDATE]
@@ -82,32 +79,29 @@ class ListWriter:
     moments: list[Moment] = field(default_factory=list)
     gone: list[Collection[SceneEntity]] = field(default_factory=list)
 
-    def write(self, moment: Moment, gone: Collection[SceneEntity]) -> None:
+    def write(self, moment, gone):
         self.moments.append(moment)
         self.gone.append(gone)
 
-    def contents(self, moment: int = -1) -> dict[str, Any]:
+    def contents(self, moment=-1):
         """Return the contents of a moment by path."""
         return {"/".join(one.path): one.content for one in self.moments[moment].entities}
 
 
 @pytest.fixture(scope="session")
-def walk(building: Path) -> tuple[FrameReference, ...]:
+def walk(building):
     """The first frames of a walk through a room, which are in the map."""
     return find_sequences(building / "room-0" / "seq-01")[0].frames[:WALK]
 
 
 @pytest.fixture(scope="session")
-def unseen(building: Path) -> tuple[FrameReference, ...]:
+def unseen(building):
     """Frames of the same walk that are not in the map."""
     return find_sequences(building / "room-0" / "seq-02")[0].frames[:2]
 
 
 @pytest.fixture(scope="session")
-def client(
-    service_url: str, walk: tuple[FrameReference, ...], room_frames: tuple[DepthFrame, ...],
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Client]:  # fmt: skip
+def client(service_url, walk, room_frames, tmp_path_factory):
     """A read-only client of a service whose map MAP has a walk in `room` and a frame in `yard`."""
     folder, far = tmp_path_factory.mktemp("yard"), room_frames[3]
     assert far.pose is not None
@@ -125,16 +119,13 @@ def client(
 
 
 @pytest.fixture
-def sceneprint(
-    service_url: str, client: Client, run_command: Callable[..., Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> Callable[..., Any]:  # fmt: skip
+def sceneprint(service_url, client, run_command, monkeypatch):
     """A function that runs a command in this process with the service and checks its exit code."""
     monkeypatch.setenv("SCENEPRINT_URL", service_url)
     return run_command
 
 
-def moved(T: Any, points: Any) -> Any:
+def moved(T, points):
     """Return points transformed by a (4, 4) matrix."""
     T = np.asarray(T, float)
     return np.asarray(points, float) @ T[:3, :3].T + T[:3, 3]

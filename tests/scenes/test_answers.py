@@ -1,16 +1,11 @@
 """Tests of scenes of answers against the service's records and clouds."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.formats.dataset import FrameReference
-from sceneprint_client import Client, meta_of
-from sceneprint_client.api import Alternative, Answer
+from sceneprint_client import meta_of
+from sceneprint_client.api import Alternative
 from sceneprint_viewers.answer_scene import MANY, ONE, AnswerScene
 from sceneprint_viewers.map_scene import map_runs
 from sceneprint_viewers.scene import (
@@ -28,19 +23,19 @@ from .conftest import MAP, ListWriter, moved
 
 
 @pytest.fixture(scope="module")
-def frame(unseen: tuple[FrameReference, ...]) -> FrameReference:
+def frame(unseen):
     return unseen[0]
 
 
 @pytest.fixture(scope="module")
-def answer(client: Client, frame: FrameReference) -> Answer:
+def answer(client, frame):
     answer = client.query(MAP, frame)
     assert answer.status == "found", answer.reason
     assert answer.location is not None
     return answer
 
 
-def drawn(client: Client, answer: Answer, map_frames: int = 3) -> ListWriter:
+def drawn(client, answer, map_frames=3):
     writer = ListWriter()
     scene = AnswerScene(SceneStream(writer), client, map_frames=map_frames)
     camera = next(client.frames(MAP)).intrinsics
@@ -48,9 +43,7 @@ def drawn(client: Client, answer: Answer, map_frames: int = 3) -> ListWriter:
     return writer
 
 
-def test_the_query_lies_where_the_answer_says(
-    client: Client, frame: FrameReference, answer: Answer
-) -> None:
+def test_the_query_lies_where_the_answer_says(client, frame, answer):
     writer = drawn(client, answer)
     there = writer.contents()
     assert answer.location is not None
@@ -68,9 +61,7 @@ def test_the_query_lies_where_the_answer_says(
     assert np.linalg.norm(placed.T_parent_child - truth) < 0.05
 
 
-def test_matches_lie_where_the_map_has_them(
-    client: Client, frame: FrameReference, answer: Answer
-) -> None:
+def test_matches_lie_where_the_map_has_them(client, frame, answer):
     there = drawn(client, answer).contents()
     placed = [m for m in answer.matches if m.validation.status in ("accepted", "ambiguous")]
     assert len(placed) >= 2
@@ -96,9 +87,7 @@ def test_matches_lie_where_the_map_has_them(
     assert f"{space}/matches/{len(placed) + 1}" not in there
 
 
-def test_rejected_matches_are_not_placed(
-    client: Client, frame: FrameReference, answer: Answer
-) -> None:
+def test_rejected_matches_are_not_placed(client, frame, answer):
     first, *others = answer.matches
     verdict = first.validation.model_copy(update={"status": "rejected", "strength": None})
     rejected = first.model_copy(update={"validation": verdict, "pose_in_map": None})
@@ -110,9 +99,7 @@ def test_rejected_matches_are_not_placed(
     assert len(before) - len(there) == 5  # placement, points, sensor, label, vote
 
 
-def test_alternatives_are_told_from_the_answer(
-    client: Client, frame: FrameReference, answer: Answer
-) -> None:
+def test_alternatives_are_told_from_the_answer(client, frame, answer):
     assert answer.location is not None
     pose = answer.location.pose
     shifted = np.array(pose.matrix)
@@ -142,7 +129,7 @@ def test_alternatives_are_told_from_the_answer(
     assert there["query.optical/query/label"].text == "my frame: ambiguous"
 
 
-def test_what_is_not_found_lies_in_a_space_of_its_own(client: Client, answer: Answer) -> None:
+def test_what_is_not_found_lies_in_a_space_of_its_own(client, answer):
     lost = answer.model_copy(update={"status": "not_found", "location": None, "matches": []})
     writer = drawn(client, lost)
     there = writer.contents()
@@ -151,14 +138,14 @@ def test_what_is_not_found_lies_in_a_space_of_its_own(client: Client, answer: An
     assert writer.contents(-2)["query.optical"].up.tolist() == [0, -1, 0]
 
 
-def test_a_query_without_validation_has_no_points(client: Client, frame: FrameReference) -> None:
+def test_a_query_without_validation_has_no_points(client, frame):
     ranked = client.query(MAP, frame, stages=("retrieve",))
     there = drawn(client, ranked, map_frames=0).contents()
     assert len(there["query.optical/query/points"].points) == 0
     assert there["query.optical/query/label"].text == "my frame: unvalidated"
 
 
-def test_the_map_is_drawn_once_and_where_its_frames_are(client: Client, answer: Answer) -> None:
+def test_the_map_is_drawn_once_and_where_its_frames_are(client, answer):
     writer = ListWriter()
     scene = AnswerScene(SceneStream(writer), client, MANY)
     for index in (0, 3):
@@ -184,7 +171,7 @@ def test_the_map_is_drawn_once_and_where_its_frames_are(client: Client, answer: 
 
 
 @pytest.fixture
-def unposed(client: Client, walk: tuple[FrameReference, ...]) -> Iterator[str]:
+def unposed(client, walk):
     """A map of a frame without a pose."""
     client.create_map("unposed")
     client.upload("unposed", walk[0], meta_of(walk[0], with_pose=False), wait_s=PATIENCE_S)
@@ -192,9 +179,7 @@ def unposed(client: Client, walk: tuple[FrameReference, ...]) -> Iterator[str]:
     client.delete_map("unposed")
 
 
-def test_without_poses_the_query_lies_in_its_best_match(
-    client: Client, walk: tuple[FrameReference, ...], unposed: str
-) -> None:
+def test_without_poses_the_query_lies_in_its_best_match(client, walk, unposed):
     answer = client.query(unposed, walk[1])
     [match] = answer.matches
     assert match.validation.status == "accepted"
@@ -211,7 +196,7 @@ def test_without_poses_the_query_lies_in_its_best_match(
     assert writer.contents(-2)[space].up.tolist() == [0, -1, 0]
 
 
-def test_a_moment_takes_the_place_of_the_one_before() -> None:
+def test_a_moment_takes_the_place_of_the_one_before():
     writer = ListWriter()
     stream = SceneStream(writer)
     assert stream.is_empty

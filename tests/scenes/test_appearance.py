@@ -1,7 +1,5 @@
 """Tests of outlines and colours against manual results."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sceneprint_client.api.base import CameraIntrinsics
@@ -18,7 +16,7 @@ from sceneprint_viewers.scene import (
 CAMERA = CameraIntrinsics(width=4, height=2, fx=2, fy=2, cx=1.5, cy=0.5)
 
 
-def test_the_outline_of_a_camera() -> None:
+def test_the_outline_of_a_camera():
     drawn = frustum(CAMERA, (1, 2, 3))
     d, h = FRUSTUM_M, FRUSTUM_M / 2
     corners = [(-d, -h, d), (d, -h, d), (d, h, d), (-d, h, d)]
@@ -33,7 +31,7 @@ def test_the_outline_of_a_camera() -> None:
     assert small.width_px < drawn.width_px
 
 
-def test_colours_rise_with_height() -> None:
+def test_colours_rise_with_height():
     points = np.zeros((101, 3))
     points[:, 1] = np.linspace(0, -5, 101)  # y down
     up = np.array([0.0, -1.0, 0.0])
@@ -47,7 +45,7 @@ def test_colours_rise_with_height() -> None:
     assert len({tuple(one) for one in height_colours(np.ones((5, 3)), up).tolist()}) == 1
 
 
-def test_up_is_where_sensors_are_carried_upright() -> None:
+def test_up_is_where_sensors_are_carried_upright():
     level = np.eye(4)  # x right, y down, z forward in a parent whose z is up
     level[:3, :3] = np.array([(1, 0, 0), (0, 0, -1), (0, 1, 0)]).T
     tilted = level.copy()

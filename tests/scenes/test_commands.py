@@ -1,11 +1,7 @@
 """Tests of the scenes that commands write against their output."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,22 +10,17 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.scenes import stamps_of
 from sceneprint.formats.dataset import Camera, FrameReference
 from sceneprint.types import Intrinsics
-from sceneprint_client import Client
 
-from .conftest import MAP, WALK, Logged, drawn_at, mcap_rows, moved, moves_of
-
-Run = Callable[..., Any]
+from .conftest import MAP, WALK, drawn_at, mcap_rows, moved, moves_of
 
 
-def values(rows: list[Logged], path: str, component: str) -> Any:
+def values(rows, path, component):
     """The only value of a component at a path."""
     [one] = [row.values[component] for row in rows if row.path == path and component in row.values]
     return one
 
 
-def test_a_query_is_shown_where_it_was_found(
-    sceneprint: Run, client: Client, unseen: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_a_query_is_shown_where_it_was_found(sceneprint, client, unseen, tmp_path):
     mcap = tmp_path / "a.mcap"
     said = sceneprint("query", MAP, unseen[0].path, "--map-frames", 2, "--json", "--mcap", mcap)
     assert said.stderr == f"wrote {mcap}\n"
@@ -56,9 +47,7 @@ def test_a_query_is_shown_where_it_was_found(
     assert np.linalg.norm(matrix[:3, 3] - truth[:3, 3]) < 0.05
 
 
-def test_a_folder_is_a_time_line(
-    sceneprint: Run, unseen: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_a_folder_is_a_time_line(sceneprint, unseen, tmp_path):
     folder = tmp_path / "two"
     folder.mkdir()
     for number, one in enumerate(unseen):
@@ -80,7 +69,7 @@ def test_a_folder_is_a_time_line(
     assert times == [0, 1_000_000_000]
 
 
-def test_the_frames_of_a_map_are_shown(sceneprint: Run, client: Client, tmp_path: Path) -> None:
+def test_the_frames_of_a_map_are_shown(sceneprint, client, tmp_path):
     mcap = tmp_path / "a.mcap"
     listed = sceneprint("frames", MAP, "--session", "room", "--mcap", mcap).stdout
     assert len(listed.splitlines()) == 1 + WALK
@@ -98,7 +87,7 @@ def test_the_frames_of_a_map_are_shown(sceneprint: Run, client: Client, tmp_path
         np.testing.assert_allclose(told, [[at.x, at.y, at.z]], atol=1e-6)
 
 
-def test_one_frame_is_shown(sceneprint: Run, client: Client, tmp_path: Path) -> None:
+def test_one_frame_is_shown(sceneprint, client, tmp_path):
     mcap = tmp_path / "a.mcap"
     frame = next(client.frames(MAP, session="yard"))
     sceneprint("frames", MAP, frame.frame_id, "--mcap", mcap)
@@ -113,7 +102,7 @@ def test_one_frame_is_shown(sceneprint: Run, client: Client, tmp_path: Path) -> 
 
 
 @pytest.fixture
-def halves(client: Client, walk: tuple[FrameReference, ...]) -> Any:
+def halves(client, walk):
     """The walk as two sessions, every other frame of each, in frames of their own: that of the
     second is moved.
     """
@@ -134,9 +123,7 @@ def halves(client: Client, walk: tuple[FrameReference, ...]) -> Any:
     client.delete_map("halves")
 
 
-def test_joined_sessions_are_shown_in_one_space(
-    sceneprint: Run, client: Client, halves: Any, tmp_path: Path
-) -> None:
+def test_joined_sessions_are_shown_in_one_space(sceneprint, client, halves, tmp_path):
     mcap = tmp_path / "a.mcap"
     how = ("--json", "--mcap", mcap)
     said = sceneprint(
@@ -166,9 +153,7 @@ def test_joined_sessions_are_shown_in_one_space(
     assert sum(len(one["lines"]) for one in edges) == told["result"]["edges"]
 
 
-def test_what_cannot_be_is_refused_first(
-    sceneprint: Run, unseen: tuple[FrameReference, ...], tmp_path: Path
-) -> None:
+def test_what_cannot_be_is_refused_first(sceneprint, unseen, tmp_path):
     query = ("query", MAP, unseen[0].path)
     file = tmp_path / "a"
     for arguments, why in (
@@ -190,7 +175,7 @@ def test_what_cannot_be_is_refused_first(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_frames_that_cannot_be_read_leave_no_scene(sceneprint: Run, tmp_path: Path) -> None:
+def test_frames_that_cannot_be_read_leave_no_scene(sceneprint, tmp_path):
     (tmp_path / "intrinsics.json").write_text(
         '{"width": 4, "height": 4, "fx": 4, "fy": 4, "cx": 2, "cy": 2}'
     )
@@ -200,14 +185,14 @@ def test_frames_that_cannot_be_read_leave_no_scene(sceneprint: Run, tmp_path: Pa
     assert sorted(one.name for one in tmp_path.iterdir()) == ["a.png", "intrinsics.json"]
 
 
-def frames_at(*stamps: float | None) -> list[FrameReference]:
+def frames_at(*stamps):
     camera = Camera(Intrinsics(width=4, height=4, fx=4, fy=4, cx=2, cy=2))
     return [
         FrameReference(f"{i}", Path(f"{i}.png"), camera, timestamp=t) for i, t in enumerate(stamps)
     ]
 
 
-def test_moments_have_the_stamps_of_frames_if_all_have() -> None:
+def test_moments_have_the_stamps_of_frames_if_all_have():
     assert stamps_of(frames_at(1.5, 2.0)) == [1_500_000_000, 2_000_000_000]
     assert stamps_of(frames_at(1.5, None)) == [None, None]
     assert stamps_of(frames_at(2.0, 1.5)) == [None, None]

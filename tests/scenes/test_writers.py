@@ -1,12 +1,8 @@
 """Tests of written scenes, which Rerun reads back."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +21,7 @@ from sceneprint_viewers.scene import (
     UpAxis,
 )
 
-from .conftest import UPDATE, Logged, drawn_at, mcap_rows, moves_of
+from .conftest import UPDATE, drawn_at, mcap_rows, moves_of
 
 #: 2023-11-14, and the second moment 1.5 s later.
 START = 1_700_000_000_123_456_789
@@ -38,7 +34,7 @@ T[:3, 3] = 1.5, -2.0, 0.25
 SQUARE = np.array([[0.0, 0, 0], [0, 1, 0], [0, 1, 1]])
 
 
-def written(stream: SceneStream) -> None:
+def written(stream):
     """A map, then a query with a label, then nothing but a text."""
     stream.write(
         Moment(
@@ -65,16 +61,16 @@ def written(stream: SceneStream) -> None:
     stream.write(Moment([SceneEntity(("answer",), TextPage("lost"))], 1, LATER))
 
 
-def packed(colours: Any) -> list[int]:
+def packed(colours):
     """Colours as Rerun has them: red, green, blue, opaque in one number."""
     return [(int(r) << 24) + (int(g) << 16) + (int(b) << 8) + 255 for r, g, b in colours]
 
 
-def at(rows: list[Logged], path: str, component: str) -> list[Logged]:
+def at(rows, path, component):
     return [one for one in rows if one.path == path and component in one.values]
 
 
-def test_an_mcap_file_for_foxglove(tmp_path: Path) -> None:
+def test_an_mcap_file_for_foxglove(tmp_path):
     path = tmp_path / "a.mcap"
     with mcap_file(path) as writer:
         written(SceneStream(writer))
@@ -106,7 +102,7 @@ def test_an_mcap_file_for_foxglove(tmp_path: Path) -> None:
     assert [one.name for one in tmp_path.iterdir()] == ["a.mcap"]
 
 
-def test_lines_and_labels_for_foxglove(tmp_path: Path) -> None:
+def test_lines_and_labels_for_foxglove(tmp_path):
     path = tmp_path / "a.mcap"
     with mcap_file(path) as writer:
         written(SceneStream(writer))
@@ -129,21 +125,21 @@ def test_lines_and_labels_for_foxglove(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, 0, 0.8)])
-def test_up_is_turned_to_z(up: tuple[float, float, float]) -> None:
+def test_up_is_turned_to_z(up):
     R = upright(np.array(up, float))[:3, :3]
     np.testing.assert_allclose(R @ up, (0, 0, 1), atol=1e-12)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1)
 
 
-def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_file_is_there_whole_or_not_at_all(tmp_path):
     path = tmp_path / "scene"
     with mcap_file(path):
         pass
     assert list(tmp_path.iterdir()) == []  # nothing was shown, as all frames were refused
     path.write_bytes(b"old")
 
-    def interrupted() -> None:
+    def interrupted():
         with mcap_file(path) as writer:
             written(SceneStream(writer))
             raise KeyboardInterrupt
@@ -157,12 +153,12 @@ def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
     assert len(path.read_bytes()) > 1000
 
 
-def test_a_full_disk_is_told_and_nothing_is_left(tmp_path: Path) -> None:
+def test_a_full_disk_is_told_and_nothing_is_left(tmp_path):
     rng = np.random.default_rng(0)
     cloud = PointSet(rng.uniform(size=(100_000, 3)), np.zeros((100_000, 3), np.uint8), 0.01)
     path = tmp_path / "scene"
 
-    def fill() -> None:
+    def fill():
         with mcap_file(path) as writer:
             stream = SceneStream(writer)
             for i in range(3):
@@ -179,7 +175,7 @@ def test_a_full_disk_is_told_and_nothing_is_left(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_without_stamps_moments_are_a_second_apart(tmp_path: Path) -> None:
+def test_without_stamps_moments_are_a_second_apart(tmp_path):
     path = tmp_path / "a.mcap"
     with mcap_file(path) as writer:
         stream = SceneStream(writer)
@@ -189,7 +185,7 @@ def test_without_stamps_moments_are_a_second_apart(tmp_path: Path) -> None:
     assert [row.time_ns for row in logs] == [0, 1_000_000_000, 4_000_000_000]
 
 
-def test_nothing_is_loaded_that_no_option_needs() -> None:
+def test_nothing_is_loaded_that_no_option_needs():
     code = "import sys; import sceneprint.cli.query; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "foxglove" not in done.stdout.split()

@@ -10,14 +10,12 @@ import socket
 import ssl
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -31,8 +29,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint.settings import Settings
-from sceneprint.types import DepthFrame, Floats32, Intrinsics
-from sceneprint_client.api.admin import Scope
+from sceneprint.types import Intrinsics
 from service.app import create_app
 from tests.whole_engine import Engine
 
@@ -41,7 +38,7 @@ BIN = Path(sys.executable).parent
 FLEET = "https://fleet.example"
 
 
-def members(group: int) -> list[int]:
+def members(group):
     """Return the running processes of a group."""
     found = []
     for entry in Path("/proc").iterdir():
@@ -68,12 +65,12 @@ class Server:
     )
 
     @property
-    def workers(self) -> list[int]:
+    def workers(self):
         """Return the child processes that run our code."""
         lines = {pid: Path(f"/proc/{pid}/cmdline") for pid in members(self.process.pid)}
         return [pid for pid, line in lines.items() if b"spawn_main" in line.read_bytes()]
 
-    def log(self, message: str = "") -> list[dict[str, Any]]:
+    def log(self, message=""):
         """Return the JSON lines of standard error, optionally only those with a message."""
         text = self.errors.read_text()
         # Only this character separates lines: names may contain others, such as U+2028.
@@ -84,37 +81,37 @@ class Server:
             raise AssertionError(f"not JSON in the log: {error.doc[:500]!r}") from error
         return [line for line in lines if not message or line["message"] == message]
 
-    def connect(self) -> socket.socket:
+    def connect(self):
         """Open a connection on which a test can send anything."""
         url = httpx.URL(self.url)
         return socket.create_connection((url.host, url.port), timeout=PATIENCE_S)
 
-    def index(self, path: str, shot: Shot, **meta: object) -> str:
+    def index(self, path, shot, **meta):
         """Upload a frame to the map at `path`, wait for its signature, and return its id."""
         wait = {"Prefer": "wait=200"}
         sent = self.client.post(f"{path}/frames", **shot.form(**meta), headers=wait)
         assert (sent.status_code, sent.json()["state"]) == (201, "indexed"), sent.text
         return str(sent.json()["frame_id"])
 
-    def ready(self, workers: int = 1) -> None:
+    def ready(self, workers=1):
         """Wait until `workers` workers have started in total."""
         until(lambda: len(self.log("worker ready")) >= workers)
 
-    def tell(self, number: int) -> None:
+    def tell(self, number):
         """Send a signal to the main process only."""
         self.process.send_signal(number)
 
-    def end(self, number: int | None = None) -> int:
+    def end(self, number=None):
         """Return the exit code, after sending a signal if one is passed."""
         if number is not None:
             self.tell(number)
         return self.process.wait(PATIENCE_S)
 
-    def gone(self) -> None:
+    def gone(self):
         """Wait until the group has no process left."""
         until(lambda: not members(self.process.pid))
 
-    def kill(self) -> None:
+    def kill(self):
         """Kill the whole group."""
         self.client.close()
         if members(self.process.pid):
@@ -125,7 +122,7 @@ class Server:
 
 
 @pytest.fixture(scope="session")
-def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def certificate(tmp_path_factory):
     """A self-signed certificate of this machine, and its key."""
     folder = tmp_path_factory.mktemp("certificate")
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
@@ -149,7 +146,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return folder / "certificate.pem", folder / "key.pem"
 
 
-def promised(document: dict[str, Any], answer: httpx.Response) -> None:
+def promised(document, answer):
     """Check that the OpenAPI document declares the status and the type of an answer."""
     method, path = answer.request.method.lower(), answer.request.url.path
     for pattern, operations in document["paths"].items():
@@ -162,14 +159,11 @@ def promised(document: dict[str, Any], answer: httpx.Response) -> None:
 
 
 @pytest.fixture(scope="session")
-def starter(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Server]:
+def starter(tmp_path_factory):
     """A function like `begin`; with `stack`, the server ends with the stack."""
-    document: dict[str, Any] = {}  # document of the first server, which all others share
+    document = {}  # document of the first server, which all others share
 
-    def start(
-        stack: ExitStack, *arguments: str, folder: Path | None = None,
-        command: tuple[str, ...] | None = None, wait: bool = True, **settings: object,
-    ) -> Server:  # fmt: skip
+    def start(stack, *arguments, folder=None, command=None, wait=True, **settings):
         folder = folder or tmp_path_factory.mktemp("server")
         errors = tmp_path_factory.mktemp("errors") / "stderr"
         given = {f"SCENEPRINT_{name.upper()}": str(value) for name, value in settings.items()}
@@ -203,14 +197,14 @@ def starter(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Server]:
 
 
 @pytest.fixture(scope="module")
-def begin(starter: Callable[..., Server]) -> Iterator[Callable[..., Server]]:
+def begin(starter):
     """A function that starts `sceneprint serve` or another command with the passed settings."""
     with ExitStack() as stack:
         yield partial(starter, stack)
 
 
 @pytest.fixture(scope="session")
-def served(starter: Callable[..., Server], folder_stack: ExitStack) -> Server:
+def served(starter, folder_stack):
     """A server for all tests that change only their own maps."""
     return starter(folder_stack, cors_origins=FLEET, decoders=2)
 
@@ -223,7 +217,7 @@ class Shot:
     camera: dict[str, float]
     pose: list[list[float]] | None = None
 
-    def form(self, **meta: object) -> dict[str, Any]:
+    def form(self, **meta):
         """Return the arguments of a request that uploads the frame."""
         known = {"intrinsics": self.camera, **meta}
         parts = {"frame": ("frame.png", self.png, "image/png")}
@@ -231,11 +225,11 @@ class Shot:
 
 
 @pytest.fixture(scope="session")
-def shoot(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Shot]:
+def shoot(tmp_path_factory):
     """A function that returns a depth image as it is sent."""
     path = tmp_path_factory.mktemp("png") / "frame.png"
 
-    def of(depth: Floats32, intrinsics: Intrinsics, pose: Any = None) -> Shot:
+    def of(depth, intrinsics, pose=None):
         write_depth_png(path, depth, 1000.0)
         names = ("width", "height", "fx", "fy", "cx", "cy")
         return Shot(path.read_bytes(), {n: getattr(intrinsics, n) for n in names}, pose)
@@ -244,7 +238,7 @@ def shoot(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Shot]:
 
 
 @pytest.fixture(scope="session")
-def shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
+def shots(room_frames, shoot):
     """Three views of each of two rooms, with their poses."""
     return [
         shoot(one.depth, one.intrinsics, None if one.pose is None else one.pose.tolist())
@@ -253,7 +247,7 @@ def shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot]) -> li
 
 
 @pytest.fixture(scope="session")
-def small_shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot]) -> list[Shot]:
+def small_shots(room_frames, shoot):
     """96 small frames: every fourth sample from each of 16 offsets of each of six views."""
     found = []
     for frame in room_frames:
@@ -267,10 +261,10 @@ def small_shots(room_frames: tuple[DepthFrame, ...], shoot: Callable[..., Shot])
 
 
 @pytest.fixture(scope="session")
-def make_map() -> Callable[..., str]:
+def make_map():
     """A function that creates a map on a server and returns its path."""
 
-    def make(server: Server, name: str, model: str = "depth") -> str:
+    def make(server, name, model="depth"):
         made = server.client.post("/v1/maps", json={"name": name, "model": model})
         assert made.status_code == 201, made.text
         return f"/v1/maps/{name}"
@@ -279,13 +273,13 @@ def make_map() -> Callable[..., str]:
 
 
 @pytest.fixture(scope="session")
-def refused() -> Callable[..., dict[str, Any]]:
+def refused():
     """A function that checks an answer's problem document and returns it."""
 
-    def check(answer: httpx.Response, status: int, kind: str, text: str = "") -> dict[str, Any]:
+    def check(answer, status, kind, text=""):
         assert answer.status_code == status, answer.text
         assert answer.headers["content-type"] == "application/problem+json"
-        problem: dict[str, Any] = answer.json()
+        problem = answer.json()
         assert (problem["status"], problem["type"]) == (status, f"/problems/{kind}"), problem
         assert {"type", "title", "status", "detail", "instance"} <= set(problem)
         assert problem["instance"] == f"/requests/{answer.headers['x-request-id']}"
@@ -304,16 +298,13 @@ class Walled:
     server: Server
     secrets: dict[str, str]
 
-    def ask(self, key: str, method: str, path: str, **request: Any) -> httpx.Response:
+    def ask(self, key, method, path, **request):
         """Send a request with a key."""
         headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
         return self.server.client.request(method, path, headers=headers, **request)
 
 
-def _walled(
-    begin: Callable[..., Server], keys: dict[str, dict[str, Scope]], *arguments: str,
-    **settings: object,
-) -> Walled:  # fmt: skip
+def _walled(begin, keys, *arguments, **settings):
     server = begin("--host", "0.0.0.0", *arguments, **settings)
     # The printed address is that of all interfaces.
     server.client.base_url = server.url = server.url.replace("0.0.0.0", "127.0.0.1")
@@ -323,13 +314,13 @@ def _walled(
 
 
 @pytest.fixture(scope="module")
-def wall(begin: Callable[..., Server]) -> Callable[..., Walled]:
+def wall(begin):
     """A function that starts a server with keys, whose grants follow from their names."""
     return partial(_walled, begin)
 
 
 @pytest.fixture(scope="session")
-def walled(starter: Callable[..., Server], folder_stack: ExitStack) -> Walled:
+def walled(starter, folder_stack):
     """A server that requires keys, for all tests that change only their own maps.
 
     Its maps `alpha` and `bravo` belong to test_isolation.
@@ -357,22 +348,19 @@ class House:
     engine: Engine
     secrets: dict[str, str]
 
-    def ask(self, key: str, method: str, path: str, **request: Any) -> httpx.Response:
+    def ask(self, key, method, path, **request):
         headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
         asked = partial(self.client.request, method, path, headers=headers, **request)
-        answer: httpx.Response = self.portal.call(asked)
-        return answer
+        return self.portal.call(asked)
 
-    def work(self) -> None:
+    def work(self):
         """Run all queued jobs."""
         while (work := self.engine.claim("here:1")) is not None:
             self.engine.run(work)
 
 
 @contextmanager
-def _opened(
-    folder: Path, url: str | None, keys: Mapping[str, Mapping[str, Scope]], **more: object
-) -> Iterator[House]:
+def _opened(folder, url, keys, **more):
     (folder / "blobs").mkdir()
     given = {
         "data_dir": folder,
@@ -395,13 +383,13 @@ def _opened(
 
 
 @pytest.fixture(scope="session")
-def open_house() -> Callable[..., Any]:
+def open_house():
     """A function that opens a service with keys in a folder, by default on SQLite."""
     return _opened
 
 
 @pytest.fixture
-def house(request: Any, tmp_path: Path, store_url: str) -> Iterator[Any]:
+def house(request, tmp_path, store_url):
     """A service with the maps alpha and bravo, and with the keys of the test's module."""
     with _opened(tmp_path, store_url, request.module.KEYS) as opened:
         for name in ("alpha", "bravo"):

@@ -1,19 +1,16 @@
 """Tests of query options over HTTP in JSON, in forms and beside a bare frame."""
 
-from __future__ import annotations
-
 import json
 import random
-from typing import Any
 
 import pytest
 
-OPTIONS: dict[str, Any] = {
+OPTIONS = {
     "k": 2, "seed": 5, "candidates": 3, "diversity": {"sigma": 0.5},
     "validation": {"weak": 0.0, "mode": "full"}, "explain": True, "exact": True,
     "filter": {"robot": "r1"}, "keep": False, "stages": "retrieve,diversify,validate",
 }  # fmt: skip
-JUNK: list[Any] = [
+JUNK = [
     None, True, -1, 0, 1, 2**70, 1.5, 1e308, "", "x", "*", ",", "\x00", "a" * 300, "{}", "[1]",
     [], ["x"], [None], {}, {"x": 1}, {"map": "ask-a"}, {"map": "ask-a", "frame_id": "x"},
     {"sigma": -1}, {"mode": "none"}, "true", "1e3", ["retrieve"], [["retrieve"]], "é",
@@ -38,17 +35,17 @@ def maps(served, make_map, shots):
     return found
 
 
-def told(answer, status: int = 200) -> dict[str, Any]:
+def told(answer, status=200):
     assert answer.status_code == status, answer.text
-    found: dict[str, Any] = answer.json()
+    found = answer.json()
     return {k: v for k, v in found.items() if k not in ("query_id", "milliseconds")}
 
 
-def as_text(options: dict[str, Any]) -> dict[str, str]:
+def as_text(options):
     return {n: one if isinstance(one, str) else json.dumps(one) for n, one in options.items()}
 
 
-def sent(served, path: str, shot, options: dict[str, Any], *, bare: bool) -> Any:
+def sent(served, path, shot, options, *, bare):
     """A frame with options: in a form, or as the body."""
     if bare:
         query = {**as_text(options), **{k: str(v) for k, v in shot.camera.items()}}
@@ -86,7 +83,7 @@ def test_what_cannot_be_asked_is_refused(served, maps, shots, refused, make_map)
     make_map(served, "ask-paper", "paper")
     named = {"map": "ask-a", "frame_id": maps["ask-a"][0]}
 
-    def refuse(path: str, body: Any, status: int, kind: str, text: str) -> None:
+    def refuse(path, body, status, kind, text):
         refused(served.client.post(path, json=body), status, kind, text)
 
     bad = (422, "invalid-request")
@@ -148,7 +145,7 @@ def test_no_body_breaks_a_route(served, maps):
     named = {"map": "ask-a", "frame_id": maps["ask-a"][0]}
     fields = [*OPTIONS, "deadline_ms", "explain_frame", "frame", "maps", "frame_id", "frame_a",
               "frame_b", "validate", "model"]  # fmt: skip
-    whole: dict[str, dict[str, Any]] = {
+    whole = {
         "/v1/maps/ask-a/queries": {"frame_id": maps["ask-a"][0]},
         "/v1/maps/ask-a/localize": {"frame_id": maps["ask-a"][0]},
         "/v1/queries": {"maps": ["ask-a", "ask-b"], "frame": named},
@@ -166,7 +163,7 @@ def test_no_body_breaks_a_route(served, maps):
 
 
 def test_an_answer_lists_its_stages_and_is_counted_but_its_frame_is_not_kept(served, maps, shots):
-    def figure(name: str) -> float:
+    def figure(name):
         lines = served.client.get("/metrics").text.splitlines()
         return sum(float(line.split()[-1]) for line in lines if line.startswith(name))
 

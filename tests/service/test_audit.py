@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from typing import Any
 
 import pytest
 
@@ -20,7 +19,7 @@ READING = {
 class Recorder:
     """Sends requests and finds the lines of the audit log that each one wrote."""
 
-    def __init__(self, client: Any) -> None:
+    def __init__(self, client):
         self._client, self._sent = client, 0
         self.tried: set[str] = set()
         document = client.get("/openapi.json").json()
@@ -30,7 +29,7 @@ class Recorder:
             for method, operation in methods.items()
         }
 
-    def do(self, name: str, wanted: list[str], path: dict[str, str], **more: Any) -> Any:
+    def do(self, name, wanted, path, **more):
         """Send a request; its answer. The actions of its lines must be the wanted ones."""
         self._sent += 1
         request_id = f"audited-{self._sent}"
@@ -51,7 +50,7 @@ def recorder(begin):
     return Recorder(begin().client)
 
 
-def pose_of(x: float) -> dict[str, Any]:
+def pose_of(x):
     return {
         "parent_frame": "hall", "translation": {"x": x, "y": 0, "z": 0},
         "rotation": {"w": 1, "x": 0, "y": 0, "z": 0},
@@ -61,10 +60,10 @@ def pose_of(x: float) -> dict[str, Any]:
 def test_each_change_has_its_lines(recorder, small_shots, until):
     do, client, hall = recorder.do, recorder._client, {"map_name": "hall"}
 
-    def state(job_id: str) -> str:
+    def state(job_id):
         return str(client.get(f"/v1/jobs/{job_id}").json()["state"])
 
-    def job_of(answer: Any) -> dict[str, str]:
+    def job_of(answer):
         return {**hall, "job_id": answer.headers["location"].rpartition("/")[2]}
 
     do("create_map", ["map.created"], {}, json={"name": "hall", "model": "depth"})

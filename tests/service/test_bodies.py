@@ -1,12 +1,8 @@
 """Tests of invalid forms, bodies that are too large, and aborted requests."""
 
-from __future__ import annotations
-
 import gzip
 import json
-import socket
 import time
-from pathlib import Path
 
 import pytest
 
@@ -30,7 +26,7 @@ def wire(narrow):
         yield opened
 
 
-def answer(wire: socket.socket) -> tuple[int, dict[str, str], bytes]:
+def answer(wire):
     """All that comes until the other side closes."""
     data = b""
     try:
@@ -44,12 +40,12 @@ def answer(wire: socket.socket) -> tuple[int, dict[str, str], bytes]:
     return int(first.split()[1]), headers, body
 
 
-def post(path: str, *headers: str) -> bytes:
+def post(path, *headers):
     lines = (f"POST {path} HTTP/1.1", "Host: localhost", *headers)
     return "".join(f"{line}\r\n" for line in lines).encode() + b"\r\n"
 
 
-def part(name: str, content: bytes, file: str | None = None, end: bytes = b"\r\n") -> bytes:
+def part(name, content, file=None, end=b"\r\n"):
     named = "" if file is None else f'; filename="{file}"'
     head = f'--x\r\nContent-Disposition: form-data; name="{name}"{named}\r\n\r\n'
     return head.encode() + content + end
@@ -118,7 +114,7 @@ def test_a_form_that_is_none_is_refused(narrow, refused, name):
     assert kept(narrow.folder) == []
 
 
-def kept(folder: Path) -> list[Path]:
+def kept(folder):
     return [path for path in (folder / "blobs").rglob("*") if path.is_file()]
 
 

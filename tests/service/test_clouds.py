@@ -1,24 +1,20 @@
 """Tests of point clouds over HTTP: upload, query, download, and errors."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct
-from typing import Any
 
 import numpy as np
 import pytest
 
 from sceneprint.formats.export import write_ply
-from sceneprint.types import DepthFrame, Floats
 
 WAIT = {"Prefer": "wait=200"}
 #: Where the second of three clouds says that it was seen from, metres in its own coordinates.
 VIEWPOINT = (2.0, -1.0, 0.5)
 
 
-def points_of(frame: DepthFrame, every: int = 4) -> Floats:
+def points_of(frame, every=4):
     """What a depth image sees, in its optical frame."""
     depth, k = frame.depth[::every, ::every].astype(float), frame.intrinsics
     y, x = np.nonzero(depth)
@@ -28,7 +24,7 @@ def points_of(frame: DepthFrame, every: int = 4) -> Floats:
     ).astype(np.float32).astype(float)  # fmt: skip
 
 
-def pcd(points: Floats, viewpoint: tuple[float, float, float]) -> bytes:
+def pcd(points, viewpoint):
     """In metres from elsewhere: the viewpoint is in the header."""
     place = " ".join(map(str, viewpoint))
     head = (
@@ -39,17 +35,17 @@ def pcd(points: Floats, viewpoint: tuple[float, float, float]) -> bytes:
     return head.encode() + (points + viewpoint).astype("<f8").tobytes()
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array):
     out = io.BytesIO()
     np.save(out, array)
     return out.getvalue()
 
 
-def form(data: bytes, **meta: object) -> dict[str, Any]:
+def form(data, **meta):
     return {"files": {"frame": ("a", data)}, "data": {"meta": json.dumps(meta)}}
 
 
-def raw(data: bytes, **params: object) -> dict[str, Any]:
+def raw(data, **params):
     kind = {"Content-Type": "application/octet-stream"}
     return {"content": data, "params": params, "headers": {**kind, **WAIT}}
 
@@ -75,9 +71,9 @@ def hall(served, make_map, shots, small_shots, clouds):
     return path, ids
 
 
-def found(answer: Any, status: str = "found") -> dict[str, Any]:
+def found(answer, status="found"):
     assert answer.status_code == 200, answer.text
-    told: dict[str, Any] = answer.json()
+    told = answer.json()
     assert told["status"] == status, told["reason"]
     return told
 
@@ -97,7 +93,7 @@ def test_what_is_told_of_a_cloud(served, hall, clouds):
         == ("cloud", other["viewpoint"])  # fmt: skip
 
 
-def pointcloud2(ros: Any, points: Floats, *, little: bool = True) -> bytes:
+def pointcloud2(ros, points, *, little=True):
     """As a node of ROS 2 would send it, serialised by rosbags: fields in another order."""
     rows = np.zeros(len(points), [("z", "<f4"), ("ring", "<u2"), ("x", "<f4"), ("y", "<f4")])
     for axis, name in enumerate("xyz"):
@@ -132,7 +128,7 @@ def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
     path, ids = hall
     http = served.client
 
-    def post(sent: dict[str, Any]) -> Any:
+    def post(sent):
         return http.post(f"{path}/frames", **sent)
 
     other = form(pcd(clouds[2], VIEWPOINT))
@@ -177,7 +173,7 @@ XYZ = "property float x\nproperty float y\nproperty float z\n"
 TEN = np.arange(30.0).reshape(10, 3)
 
 #: bytes and parameters -> status, type of the problem, text of its detail
-BAD: dict[str, tuple[bytes, dict[str, Any], int, str, str]] = {
+BAD = {
     "empty": (b"", {}, 422, "unreadable-frame", "empty"),
     "text": (b"hello", {}, 422, "unreadable-frame", ""),
     "KITTI unsaid": (TEN.astype("<f4").tobytes(), {}, 422, "unreadable-frame", "format=kitti"),

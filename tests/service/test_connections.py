@@ -3,17 +3,13 @@
 The limits are short. Tests wait for the other side to act, and measure no times.
 """
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket
 import ssl
 import threading
-from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from functools import partial
-from typing import Any
 
 import pytest
 import uvicorn
@@ -39,7 +35,7 @@ LARGE = 8 << 20
 PATIENCE_S = 30
 
 
-async def app(scope: Any, receive: Any, send: Any) -> None:
+async def app(scope, receive, send):
     """Answers with the length of the body; otherwise where the path says so."""
     body = b"" if scope["path"] == "/unread" else await Request(scope, receive).body()
     if scope["path"] == "/wait":
@@ -49,8 +45,8 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
 
 
 @contextmanager
-def running(application: Any, context: ssl.SSLContext | None = None) -> Iterator[tuple[str, int]]:
-    http: Any = Connection if context is None else partial(Handshake, context)
+def running(application, context=None):
+    http = Connection if context is None else partial(Handshake, context)
     config = uvicorn.Config(
         application, http=http, lifespan="off", log_config=None, access_log=False
     )
@@ -79,10 +75,10 @@ def opened(monkeypatch, request, certificate):
     monkeypatch.setattr(connections, "READING_S", 1.0)
     monkeypatch.setattr(limits, "IDLE_S", 0.8)
     settings = Settings(max_upload_bytes=1 << 20, cors_origins=())
-    made: list[socket.socket] = []
+    made = []
     with running(RequestMiddleware(app, settings, Origins(()), Metrics()), context) as address:
 
-        def connect(said: bytes = b"", *, bare: bool = False) -> socket.socket:
+        def connect(said=b"", *, bare=False):
             wire = socket.create_connection(address, timeout=PATIENCE_S)
             if asked is not None and not bare:
                 wire = asked.wrap_socket(
@@ -103,7 +99,7 @@ by_both = pytest.mark.parametrize("opened", ["http", "https"], indirect=True)
 by_tls = pytest.mark.parametrize("opened", ["https"], indirect=True)
 
 
-def rest(wire: socket.socket) -> bytes:
+def rest(wire):
     """All that comes until the other side closes."""
     data = b""
     try:
@@ -114,7 +110,7 @@ def rest(wire: socket.socket) -> bytes:
     return data
 
 
-def ask(path: str, *headers: str, method: str = "GET") -> bytes:
+def ask(path, *headers, method="GET"):
     lines = (f"{method} {path} HTTP/1.1", "Host: localhost", *headers, "", "")
     return "\r\n".join(lines).encode()
 
@@ -127,11 +123,11 @@ def test_a_silent_connection_is_closed_without_a_word(opened):
 
 
 @contextmanager
-def dripping(wire: socket.socket, drop: bytes) -> Iterator[None]:
+def dripping(wire, drop):
     """Meanwhile something comes again and again."""
     ended = threading.Event()
 
-    def drip() -> None:
+    def drip():
         while not ended.wait(0.05):
             try:
                 wire.sendall(drop)
@@ -179,16 +175,16 @@ def test_the_rest_of_a_body_that_was_refused_is_not_read_for_ever(opened):
 @pytest.fixture
 def lost(monkeypatch):
     """Waits until the service has given up the connection of an address."""
-    gone: set[Any] = set()
+    gone = set()
     ended = threading.Event()
     before = Connection.connection_lost
 
-    def noted(self: Connection, exc: Exception | None) -> None:
+    def noted(self, exc):
         before(self, exc)
         gone.add(self.client)
         ended.set()
 
-    def wait(address: Any) -> None:
+    def wait(address):
         while address not in gone:
             assert ended.wait(PATIENCE_S)
             ended.clear()
@@ -305,7 +301,7 @@ def test_a_certificate_that_cannot_be_used_is_said(certificate, tmp_path):
         connections.tls_context(Settings(tls_cert=cert, tls_key=locked))
 
 
-def refusal(said: bytes) -> tuple[int, dict[str, Any]]:
+def refusal(said):
     head, _, body = said.partition(b"\r\n\r\n")
     assert b"application/problem+json" in head
     assert b"connection: close" in head.lower()
@@ -334,15 +330,15 @@ def test_each_received_mebibyte_gives_more_time(monkeypatch):
     now, left = [0.0], []
 
     @asynccontextmanager
-    async def timeout(seconds: float) -> AsyncIterator[None]:
+    async def timeout(seconds):
         left.append(seconds)
         yield
 
-    async def receive() -> dict[str, Any]:
+    async def receive():
         now[0] += 3
         return {"type": "http.request", "body": bytes(1 << 20), "more_body": True}
 
-    async def read() -> None:
+    async def read():
         body = limits.RequestBody(receive, 1 << 30)
         for _ in range(4):
             await body.next()

@@ -1,7 +1,5 @@
 """Tests of the dashboard's files over HTTP; tests/dashboard tests them in a browser."""
 
-from __future__ import annotations
-
 import gzip
 import re
 
@@ -13,7 +11,7 @@ POLICY = "default-src 'self'; frame-ancestors 'none'; base-uri 'none'; form-acti
 HTML = {"Accept": "text/html,application/xhtml+xml,*/*;q=0.8"}
 
 
-def names() -> list[str]:
+def names():
     return [p.relative_to(dashboard.PAGES).as_posix() for p in dashboard.PAGES.rglob("*.*")]
 
 

@@ -1,20 +1,14 @@
 """Tests of the OpenAPI document, to which `promised` holds the answers of all other tests."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import Any
-
 import pytest
 
 
 @pytest.fixture(scope="module")
 def document(served):
-    found: dict[str, Any] = served.client.get("/openapi.json").json()
-    return found
+    return served.client.get("/openapi.json").json()
 
 
-def references(part: Any) -> Iterator[str]:
+def references(part):
     if isinstance(part, dict):
         if isinstance(part.get("$ref"), str):
             yield part["$ref"]
@@ -25,7 +19,7 @@ def references(part: Any) -> Iterator[str]:
             yield from references(value)
 
 
-def operations(document: dict[str, Any]) -> dict[tuple[str, str], dict[str, Any]]:
+def operations(document):
     return {
         (method, path): operation
         for path, methods in document["paths"].items()
@@ -39,7 +33,7 @@ def test_the_document_is_whole(document):
     found = set(references(document))
     assert len(found) >= 20
     for reference in found:
-        place: Any = document
+        place = document
         for step in reference.removeprefix("#/").split("/"):
             place = place[step]
         assert isinstance(place, dict)

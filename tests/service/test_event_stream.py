@@ -1,20 +1,15 @@
 """Tests of event streams: polling, lagging streams, silence and shutdown."""
 
-from __future__ import annotations
-
 import asyncio
-from collections.abc import AsyncIterator
 
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import Busy
-from sceneprint.store import Database, open_store
-from sceneprint.store.events import EventFilter, EventRow, record_event, remove_events
+from sceneprint.store import open_store
+from sceneprint.store.events import EventFilter, record_event, remove_events
 from service import event_stream as feeds
 from service.event_stream import Feed
-
-Batch = tuple[list[EventRow], int]
 
 
 @pytest.fixture
@@ -29,19 +24,19 @@ def hasty(monkeypatch):
     monkeypatch.setattr(feeds, "POLL_S", 0.01)
 
 
-def write(database: Database, *names: str) -> None:
+def write(database, *names):
     for name in names:
         with database.write() as connection:
             record_event(connection, "frame.received", name, name)
 
 
-def ids(batch: Batch) -> list[int]:
+def ids(batch):
     return [event.number for event in batch[0]]
 
 
-async def gather(batches: AsyncIterator[Batch], count: int) -> list[int]:
+async def gather(batches, count):
     """The numbers of so many events, as they come."""
-    found: list[int] = []
+    found = []
     while len(found) < count:
         batch = await asyncio.wait_for(anext(batches), PATIENCE_S)
         assert not batch[0] or batch[1] >= batch[0][-1].number
@@ -49,7 +44,7 @@ async def gather(batches: AsyncIterator[Batch], count: int) -> list[int]:
     return found
 
 
-def always() -> bool:
+def always():
     return True
 
 
@@ -58,7 +53,7 @@ def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
     monkeypatch.setattr(feeds, "MOST", 3)
     write(database, *("hall" for _ in range(20)))
 
-    async def run() -> None:
+    async def run():
         feed = Feed(database, most=9, retained=1000)
         streams = [(EventFilter(), 0), (EventFilter(), 13), (EventFilter(frozenset(("shop",))), 0)]
         begun = [feed.batches(wanted, after, always) for wanted, after in streams]
@@ -69,7 +64,7 @@ def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
         assert await gather(begun[1], 47) == list(range(14, 61))  # beyond what is held
         assert await gather(begun[0], 40) == list(range(21, 61))
         assert await gather(begun[2], 20) == list(range(21, 61, 2))
-        looks: list[int] = []
+        looks = []
         monkeypatch.setattr(feeds, "next_events", lambda *_: looks.append(1))
         write(database, "shop", "hall")  # all are near: memory has it
         for stream in begun[:2]:
@@ -85,7 +80,7 @@ def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
 def test_from_now_on_means_from_when_it_was_asked(database):
     write(database, "hall")
 
-    async def run() -> None:
+    async def run():
         feed = Feed(database, most=1, retained=1000)
         feed.join()
         stream = feed.batches(EventFilter(), None, always)
@@ -106,7 +101,7 @@ def test_what_is_gone_is_said_to_be(database):
     with database.write() as connection:
         remove_events(connection, [1, 3])
 
-    async def run() -> None:
+    async def run():
         feed = Feed(database, most=9, retained=9)
         for after, place in ((1, 1), (99, 12)):
             stream = feed.batches(EventFilter(), after, always)
@@ -123,13 +118,13 @@ def test_what_is_gone_is_said_to_be(database):
 def test_silence_is_broken_and_a_key_that_opens_nothing_ends_it(database, monkeypatch):
     monkeypatch.setattr(feeds, "ALIVE_S", 0.05)
     write(database, "hall")
-    asked: list[int] = []
+    asked = []
 
-    def twice() -> bool:
+    def twice():
         asked.append(1)
         return len(asked) < 3
 
-    async def run() -> list[Batch]:
+    async def run():
         feed = Feed(database, most=1, retained=9)
         return [batch async for batch in feed.batches(EventFilter(), None, twice)]
 
@@ -140,17 +135,17 @@ def test_silence_is_broken_and_a_key_that_opens_nothing_ends_it(database, monkey
 def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
     """Neither to keep silent, nor to keep a stream whose key opens nothing any more."""
     monkeypatch.setattr(feeds, "ALIVE_S", 0.2)
-    asked: list[int] = []
+    asked = []
 
-    def twice() -> bool:
+    def twice():
         asked.append(1)
         return len(asked) < 3
 
-    async def run(wanted: EventFilter) -> list[Batch]:
+    async def run(wanted):
         feed, found = Feed(database, most=1, retained=1000), []
         asked.clear()
 
-        async def busy() -> None:
+        async def busy():
             while True:
                 write(database, "hall")
                 await asyncio.sleep(0.02)
@@ -169,7 +164,7 @@ def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
 
 
 def test_there_are_so_many_places_and_all_end_together(database):
-    async def run() -> None:
+    async def run():
         feed = Feed(database, most=2, retained=9)
         for _ in range(2):
             feed.join()

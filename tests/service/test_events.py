@@ -1,15 +1,10 @@
 """Tests of events over HTTP, as resumable streams and as pages, by permission."""
 
-from __future__ import annotations
-
 import json
 import signal
 import threading
-from collections.abc import Iterator
 from contextlib import ExitStack
-from typing import Any
 
-import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
@@ -30,7 +25,7 @@ def guarded(begin):
 @pytest.fixture(scope="module")
 def keys(guarded):
     """Headers that show a key, by what it may."""
-    grants: dict[str, Any] = {
+    grants = {
         "admin": {"*": "admin"}, "every": {"*": "read"}, "mine": {"mine": "write"}
     }  # fmt: skip
     with Engine(Settings(data_dir=guarded.folder)) as engine:
@@ -42,9 +37,9 @@ def keys(guarded):
     return headers
 
 
-def parts(response: httpx.Response) -> Iterator[list[str]]:
+def parts(response):
     """The messages of a stream, as lines."""
-    lines: list[str] = []
+    lines = []
     for line in response.iter_lines():
         if line:
             lines.append(line)
@@ -53,15 +48,15 @@ def parts(response: httpx.Response) -> Iterator[list[str]]:
             lines = []
 
 
-def event(lines: list[str]) -> dict[str, Any]:
+def event(lines):
     number, data = lines
     assert data.startswith("data: ")
-    found: dict[str, Any] = json.loads(data.removeprefix("data: "))
+    found = json.loads(data.removeprefix("data: "))
     assert number == f"id: {found['id']}"
     return found
 
 
-def next_event(messages: Iterator[list[str]]) -> dict[str, Any]:
+def next_event(messages):
     """The next message that is an event: on a busy machine `: alive` may come before it."""
     return event(next(lines for lines in messages if lines[0] != ": alive"))
 
@@ -129,7 +124,7 @@ def test_a_map_that_is_not_there_has_no_events(served, refused):
 
 
 def test_a_key_is_told_of_its_maps_alone(guarded, keys, refused):
-    def kinds(who: str, **asked: object) -> set[tuple[str, str | None]]:
+    def kinds(who, **asked):
         answer = guarded.client.get("/v1/events", params=asked, headers=keys[who])
         return {(one["kind"], one["map"]) for one in answer.json()["items"]}
 
@@ -155,7 +150,7 @@ def test_a_key_is_told_of_its_maps_alone(guarded, keys, refused):
         assert next_event(came)["kind"] == "map.reencoding"
 
 
-def asks(keys: dict[str, dict[str, str]]) -> dict[str, Any]:
+def asks(keys):
     return {"headers": keys["admin"]}
 
 
@@ -163,7 +158,7 @@ def test_places_are_given_back_and_the_end_comes_at_once(guarded, keys, refused,
     """Last in this file: it stops the server."""
     headers = keys["admin"] | STREAM
 
-    def streams() -> float:
+    def streams():
         text = guarded.client.get("/metrics", headers=keys["admin"]).text
         (line,) = [one for one in text.splitlines() if one.startswith("sceneprint_event_streams ")]
         return float(line.split()[1])
@@ -182,7 +177,7 @@ def test_places_are_given_back_and_the_end_comes_at_once(guarded, keys, refused,
     until(lambda: streams() == 0)  # who hangs up frees the place
     ended = threading.Event()
 
-    def listen() -> None:
+    def listen():
         with guarded.client.stream("GET", "/v1/events", headers=headers) as stream:
             begun.set()
             for _ in stream.iter_lines():

@@ -1,7 +1,5 @@
 """Tests of machine faults under a running service, reported without secrets."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

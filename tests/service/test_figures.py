@@ -1,7 +1,5 @@
 """Tests of statistics over several processes, and of request ids in all answers."""
 
-from __future__ import annotations
-
 import json
 import logging
 import resource
@@ -10,7 +8,6 @@ import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -30,7 +27,7 @@ def test_waiting_jobs_have_series_by_kind_while_they_wait(tmp_path):
         stats = engine.statistics.collect(1)
     metrics = Metrics()
 
-    def series(ages: dict[str, float]) -> list[str]:
+    def series(ages):
         figures = Figures(stats.model_copy(update={"oldest_waiting_s": ages}), 0, 0, {})
         lines = metrics.text(figures, 0, 0, {}, {}).decode().splitlines()
         return [one for one in lines if one.startswith("sceneprint_oldest_")]
@@ -54,16 +51,16 @@ def test_history_has_an_hour(served, refused, asked):
 def test_all_figures_are_there(served, make_map, until):
     make_map(served, "plain")
 
-    def figures() -> dict[str, float]:
+    def figures():
         lines = served.client.get("/metrics").text.splitlines()
         pairs = (line.rpartition(" ")[::2] for line in lines if not line.startswith("#"))
         return {name: float(value) for name, value in pairs}
 
-    def worked() -> int:
+    def worked():
         seen = figures()
         return sum(int(seen[f'sceneprint_workers{{state="{one}"}}']) for one in ("idle", "busy"))
 
-    def have_begun() -> bool:  # workers start after the service
+    def have_begun():  # workers start after the service
         return worked() == len(served.workers) and figures()["sceneprint_workers_began"] >= 1
 
     until(have_begun)
@@ -78,7 +75,7 @@ def test_all_figures_are_there(served, make_map, until):
     )
     with Engine(Settings(data_dir=served.folder, database_url=None)) as engine:
 
-        def agree() -> bool:  # once the jobs of the tests before have told all
+        def agree():  # once the jobs of the tests before have told all
             newest = served.client.get("/v1/events").json()["newest"]
             return figures()["sceneprint_newest_event"] == engine.store.seals.open("event", newest)
 
@@ -107,7 +104,7 @@ def test_models_and_reencoding_over_http(served, make_map, refused):
     assert begun.json()["name"] == "anew"
 
 
-def answered(status: str, seconds: float) -> Answer:
+def answered(status, seconds):
     return Answer.model_construct(status=status, milliseconds={"total": 1e3 * seconds})
 
 
@@ -161,7 +158,7 @@ def test_an_id_goes_with_its_request_to_the_worker(served, make_map, until):
                    and line["logger"].startswith("sceneprint.engine")])  # fmt: skip
 
 
-def flat() -> bytes:
+def flat():
     import io
 
     import numpy as np
@@ -174,10 +171,9 @@ def flat() -> bytes:
 
 
 def test_lines_name_the_request_that_is_worked_on():
-    def line() -> dict[str, Any]:
+    def line():
         record = logging.LogRecord("a", logging.INFO, "", 0, "text", None, None)
-        found: dict[str, Any] = json.loads(JsonFormatter().format(record))
-        return found
+        return json.loads(JsonFormatter().format(record))
 
     assert "request_id" not in line()
     with of_request("one"):

@@ -1,7 +1,5 @@
 """Tests of frame names and sequence numbers in forms, query strings, lists and imports."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -24,7 +22,7 @@ def test_names_are_sent_in_every_way_and_searched(served, make_map, small_shots)
     batch = ask.post(f"{path}/frames/batch", files=files, data={"metas": json.dumps(metas)})
     assert [item["status"] for item in batch.json()["items"]] == [202, 202]
 
-    def names(**wanted: object) -> list[str]:
+    def names(**wanted):
         listed = ask.get(f"{path}/frames", params=wanted)
         assert listed.status_code == 200, listed.text
         return [frame["name"] for frame in listed.json()["items"]]

@@ -1,7 +1,5 @@
 """Tests of the gate: a few requests run, some wait for a limited time, and others are rejected."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 
@@ -14,14 +12,14 @@ from service.limits import Gate
 
 def test_who_waits_too_long_is_sent_away_and_nothing_of_it_is_begun():
     done = threading.Event()
-    begun: list[str] = []
+    begun = []
 
-    def work(name: str) -> str:
+    def work(name):
         begun.append(name)
         assert done.wait(PATIENCE_S)
         return name
 
-    async def test() -> None:
+    async def test():
         gate = Gate(1, 5, longest_s=0.2)
         first = asyncio.create_task(gate.run(lambda: work("first")))
         while not begun:
@@ -41,7 +39,7 @@ def test_who_waits_too_long_is_sent_away_and_nothing_of_it_is_begun():
 def test_who_hangs_up_while_it_waits_leaves_no_turn_behind():
     done = threading.Event()
 
-    async def test() -> None:
+    async def test():
         gate = Gate(1, 5, longest_s=30)
         first = asyncio.create_task(gate.run(lambda: done.wait(PATIENCE_S)))
         await asyncio.sleep(0.05)
@@ -58,7 +56,7 @@ def test_who_hangs_up_while_it_waits_leaves_no_turn_behind():
 
 
 def test_as_many_have_a_place_as_may():
-    async def test() -> None:
+    async def test():
         gate = Gate(1, 1, longest_s=1)
         async with gate.place(), gate.place():
             with pytest.raises(Busy, match="queue of uploads and queries is full"):

@@ -1,7 +1,5 @@
 """Tests of a service on a faulty machine, which still answers and loses no data."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource
@@ -29,11 +27,11 @@ BIN = Path(sys.executable).parent
 NARROW = 1 << 17
 
 
-def pending(server) -> dict[str, int]:
+def pending(server):
     return dict(server.client.get("/readyz").json()["jobs"])
 
 
-def members(server) -> list[int]:
+def members(server):
     return [server.process.pid, *server.workers]
 
 
@@ -42,11 +40,11 @@ class Mounted:
 
     kinds = (507, "store-full", "30", "The service's disk is full, so nothing was stored")
 
-    def __init__(self, server) -> None:
+    def __init__(self, server):
         self.server = server
         self.folder = Path(f"/proc/{server.process.pid}/root{server.folder}")
 
-    def fill(self) -> None:
+    def fill(self):
         with (self.folder / "ballast").open("wb", buffering=0) as file:
             try:
                 while True:
@@ -59,7 +57,7 @@ class Mounted:
             except OSError:
                 pass
 
-    def free(self) -> None:
+    def free(self):
         (self.folder / "ballast").unlink()
 
 
@@ -68,21 +66,21 @@ class Limited:
 
     kinds = (503, "unusable-store", "1", "nothing was stored")
 
-    def __init__(self, server) -> None:
+    def __init__(self, server):
         self.server, self.folder = server, server.folder
 
-    def _limit(self, size: int) -> None:
+    def _limit(self, size):
         for pid in members(self.server):
             resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
-    def fill(self) -> None:
+    def fill(self):
         self._limit(NARROW)
 
-    def free(self) -> None:
+    def free(self):
         self._limit(resource.RLIM_INFINITY)
 
 
-def mountable() -> tuple[str, ...] | None:
+def mountable():
     """How to get a namespace in which a disk can be mounted."""
     if shutil.which("unshare") is None:
         return None
@@ -109,7 +107,7 @@ def narrow(request, begin, tmp_path):
     return Mounted(begin(folder=folder, command=("unshare", *how, *script), job_lease_s=3))
 
 
-def tree(folder: Path) -> set[str]:
+def tree(folder):
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
@@ -176,7 +174,7 @@ def kept(begin, make_map, small_shots):
 def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shots, refused, until):
     path = "/v1/maps/hall"
 
-    def upload(i: int) -> object:
+    def upload(i):
         return kept.client.post(f"{path}/frames", **small_shots[i].form())
 
     with (
@@ -273,7 +271,7 @@ def sealed(request, stored):
         path.chmod(0o755 if path.is_dir() else 0o644)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 

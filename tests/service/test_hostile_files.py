@@ -1,10 +1,7 @@
 """Tests of missing, damaged and mismatched files under running processes."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,11 +15,11 @@ HALL = "/v1/maps/hall"
 NEAREST = {"stages": ["retrieve"], "k": 9, "exact": True}
 
 
-def opened(folder: Path, **more: object) -> Engine:
+def opened(folder, **more):
     return Engine(Settings.model_validate({"data_dir": folder, "database_url": None, **more}))
 
 
-def meta_of(shot: Any) -> FrameMeta:
+def meta_of(shot):
     return FrameMeta.model_validate({"intrinsics": shot.camera})
 
 
@@ -49,11 +46,11 @@ def folder(stored, tmp_path):
     return Path(shutil.copytree(stored, tmp_path / "data"))
 
 
-def found(answer: dict[str, Any]) -> list[tuple[str, int]]:
+def found(answer):
     return [(match["frame_id"], match["distance"]) for match in answer["matches"]]
 
 
-def nearest(server, frame_id: str) -> dict[str, Any]:
+def nearest(server, frame_id):
     answer = server.client.post(f"{HALL}/queries", json={"frame_id": frame_id, **NEAREST})
     assert answer.status_code == 200, answer.text
     return dict(answer.json())

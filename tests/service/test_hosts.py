@@ -1,7 +1,5 @@
 """Tests that pages and names of other hosts cannot reach a local service."""
 
-from __future__ import annotations
-
 import pytest
 
 HERE = ["localhost", "LocalHost", "127.0.0.1", "127.8.9.10", "[::1]", "[0:0:0:0:0:0:0:1]"]

@@ -19,7 +19,7 @@ class After(Before):
     gripper: str | None = "none"
 
 
-def print_of(part: Given) -> str:
+def print_of(part):
     once = idempotent_request(Caller("fleet", {}), "k", "route", part)
     return once.fingerprint
 

@@ -1,19 +1,16 @@
 """Tests of archives over HTTP: checks, imports, and dying workers."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile
 import zipfile
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
 
 
-def zipped(shots: list[Any], folder: str = "run", **more: bytes) -> bytes:
+def zipped(shots, folder="run", **more):
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w") as archive:
         archive.writestr(f"{folder}/intrinsics.json", json.dumps(shots[0].camera))
@@ -24,7 +21,7 @@ def zipped(shots: list[Any], folder: str = "run", **more: bytes) -> bytes:
     return made.getvalue()
 
 
-def sent(data: bytes, kind: str = "application/zip", **params: str) -> dict[str, Any]:
+def sent(data, kind="application/zip", **params):
     return {"content": data, "params": params, "headers": {"Content-Type": kind}}
 
 
@@ -36,7 +33,7 @@ def yard(served, make_map):
 def test_what_is_wrong_is_said_at_the_door(served, yard, small_shots, refused):
     http, data = served.client, zipped(small_shots[:1])
 
-    def post(**said: Any) -> Any:
+    def post(**said):
         return http.post(f"{yard}/imports", **said)
 
     refused(post(**sent(data, "application/json")), 415, "unsupported-type", "application/zip")
@@ -60,14 +57,14 @@ def test_an_archive_has_a_limit_of_its_own(open_house, tmp_path, small_shots, re
         check_limits(post, zipped(small_shots[:3]), refused)
 
 
-def check_limits(post: Any, small: bytes, refused: Any) -> None:
+def check_limits(post, small, refused):
     imports = "/v1/maps/yard/imports"
     assert 20_000 < len(small) < 60_000
     assert post(imports, **sent(small)).status_code == 202
     large = small + bytes(60_000)
     refused(post(imports, **sent(large)), 413, "too-large", "60000")
 
-    async def chunks() -> Any:  # their length is not sent
+    async def chunks():  # their length is not sent
         yield large[:30_000]
         yield large[30_000:]
 
@@ -85,7 +82,7 @@ def check_limits(post: Any, small: bytes, refused: Any) -> None:
 def test_recordings_are_sent_with_their_options(served, make_map, refused, ros, tmp_path, until):
     path = make_map(served, "bags")
 
-    def fill(writer: Any) -> None:
+    def fill(writer):
         for name in ("/a", "/b"):
             writer.image(0, np.full((60, 80), 2000), topic=f"{name}/image_raw")
             writer.camera_info(0, f"{name}/camera_info")
@@ -94,7 +91,7 @@ def test_recordings_are_sent_with_their_options(served, make_map, refused, ros, 
     said = {"as": "recording", "name": "run.bag"}
     kind = "application/octet-stream"
 
-    def imported(**more: str) -> Any:
+    def imported(**more):
         answer = served.client.post(f"{path}/imports", **sent(bag, kind, **said, **more))
         assert answer.status_code == 202
         place = answer.headers["Location"]

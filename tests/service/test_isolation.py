@@ -12,7 +12,6 @@ import zlib
 from dataclasses import dataclass, field
 from typing import Any
 
-import httpx
 import pytest
 
 from sceneprint.settings import Settings
@@ -172,7 +171,7 @@ class There:
     session: str
     artifact: str
 
-    def of(self, operation: str, what: str) -> str:
+    def of(self, operation, what):
         """The id that a part of a path stands for."""
         kinds = {
             "associations": self.association, "reconstructions": self.reconstruction,
@@ -185,14 +184,14 @@ class There:
             "digest": self.artifact if "/artifacts/" in operation else self.tile,
         }[what]  # fmt: skip
 
-    def fill(self, text: str) -> str:
+    def fill(self, text):
         return (
             text.replace("{map}", self.map).replace("{frame}", self.frame)
             .replace("{session}", self.session).replace("{coverage}", self.coverage)
         )  # fmt: skip
 
     @property
-    def ids(self) -> list[str]:
+    def ids(self):
         return [
             self.map,
             self.frame,
@@ -262,7 +261,7 @@ def there(walled, small_shots, until):
     return found
 
 
-def copied(walled: Any, key: str, name: str) -> list[list[Any]]:
+def copied(walled, key, name):
     """The lines of the one part of a map's copy: names, and a row for each frame."""
     answer = walled.ask(key, "POST", f"/v1/maps/{name}/copy", json={})
     _, _, data = answer.content.partition(b"\n")
@@ -280,14 +279,14 @@ def operations(walled):
     }
 
 
-def request_of(operation: str, case: Case, path: There, rest: There) -> dict[str, Any]:
+def request_of(operation, case, path, rest):
     """Arguments of a request: the map of the path is of one, all other ids of another."""
 
-    def part(found: re.Match[str]) -> str:
+    def part(found):
         return (path if found[1] == "map_name" else rest).of(operation, found[1])
 
     method, pattern = operation.split()
-    made: dict[str, Any] = {"method": method, "path": re.sub(r"\{(\w+)\}", part, pattern)}
+    made = {"method": method, "path": re.sub(r"\{(\w+)\}", part, pattern)}
     if case.query:
         made["params"] = {name: rest.fill(value) for name, value in case.query.items()}
     if case.body is not None:
@@ -296,10 +295,10 @@ def request_of(operation: str, case: Case, path: There, rest: There) -> dict[str
     return made
 
 
-def told(answer: httpx.Response, about: There) -> tuple[int, dict[str, str], str]:
+def told(answer, about):
     """All that an answer tells, but for what was asked for and the request's own id."""
 
-    def blank(text: str) -> str:
+    def blank(text):
         text = text.replace(answer.headers["x-request-id"], "<request>")
         for one in (*about.ids, about.session):
             text = text.replace(one, "<asked>")
@@ -467,7 +466,7 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
         assert job not in walled.ask("admin", "GET", path).text, path
 
 
-def unseen(walled: Any, method: str, path: str, id_: str) -> None:
+def unseen(walled, method, path, id_):
     """See that an id is to the key as one that nothing has."""
     answers = [
         (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"--------"))

@@ -7,18 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
 from sceneprint.geometry.rigid import inverse, pose_difference
-from sceneprint.types import DepthFrame, Floats
+from sceneprint.types import DepthFrame
 from tests.service.conftest import Server, Shot, until
 
 pytestmark = [pytest.mark.thorough, pytest.mark.timeout(600)]
 
 
-def _origin(seed: int) -> Floats:
+def _origin(seed):
     rng = np.random.default_rng(seed)
     u, _, vt = np.linalg.svd(rng.normal(size=(3, 3)))
     T = np.eye(4)
@@ -54,18 +53,18 @@ class Rooms:
     association: str
     bob: Shot
 
-    def post(self, path: str, **body: Any) -> dict[str, Any]:
+    def post(self, path, **body):
         """Queue a job of the map, and return it once it has succeeded."""
         begun = self.server.client.post(f"{self.path}/{path}", json=body)
         assert begun.status_code == 202, begun.text
         return until(lambda: self._succeeded(begun.headers["location"]))
 
-    def _succeeded(self, location: str) -> dict[str, Any] | None:
-        job: dict[str, Any] = self.server.client.get(location).json()
+    def _succeeded(self, location):
+        job = self.server.client.get(location).json()
         assert job["state"] not in ("failed", "dead", "cancelled"), job
         return job if job["state"] == "succeeded" else None
 
-    def ask(self, frame: DepthFrame, **query: Any) -> dict[str, Any]:
+    def ask(self, frame, **query):
         """Return the answer to a query."""
         form = self.shoot(frame.depth, frame.intrinsics).form()
         form["data"] |= {name: json.dumps(value) for name, value in query.items()}
@@ -74,13 +73,13 @@ class Rooms:
         return answer.json()
 
 
-def _sent(frame: DepthFrame, parent: str, shoot: Callable[..., Shot]) -> Shot:
+def _sent(frame, parent, shoot):
     assert frame.pose is not None
     pose = inverse(ORIGINS[parent]) @ frame.pose
     return shoot(frame.depth, frame.intrinsics, pose.tolist())
 
 
-def _add(server: Server, path: str, shot: Shot, robot: str, second: int) -> httpx.Response:
+def _add(server, path, shot, robot, second):
     form = shot.form(
         robot=robot, session=SESSIONS[robot], pose={"matrix": shot.pose},
         captured_at=f"2026-01-01T00:{second // 60:02}:{second % 60:02}Z",

@@ -1,7 +1,5 @@
 """Tests of keys: required for remote callers, created by a command, and stored as hashes."""
 
-from __future__ import annotations
-
 import asyncio
 from types import SimpleNamespace
 
@@ -87,10 +85,10 @@ def test_who_uses_a_key_waits_for_no_note_of_it(tmp_path):
         engine.create_key("idle")
         secret = engine.create_key("busy").secret
 
-        def used() -> dict[str, bool]:
+        def used():
             return {one.name: one.last_used_at is not None for one in list_keys(engine.store).items}
 
-        async def serve() -> None:
+        async def serve():
             service = Service(engine.context, Metrics())
             async with housekeeping(service):
                 assert service.find_key(secret).name == "busy"
@@ -104,7 +102,7 @@ def test_a_key_is_looked_up_while_every_shared_thread_is_taken(tmp_path):
     """Slow requests of some keep nobody from being told who they are."""
     app = create_app(Settings(data_dir=tmp_path, host="0.0.0.0", workers=0))
 
-    async def ask() -> str:
+    async def ask():
         async with app.router.lifespan_context(app):
             here = app.state.service
             secret = create_key(here.context.store, "robot").secret

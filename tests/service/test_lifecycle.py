@@ -1,7 +1,5 @@
 """Tests of the serve command from start to end: signals, crashes and errors."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -125,7 +123,7 @@ def test_a_newer_store_is_refused_in_one_line(begin, newer, what):
     assert server.process.stdout.read() == ""
 
 
-def refusal(begin, *arguments: str, folder=None) -> str:
+def refusal(begin, *arguments, folder=None):
     server = begin(*arguments, folder=folder, wait=False)
     assert server.end() == 2
     (line,) = server.errors.read_text().splitlines()

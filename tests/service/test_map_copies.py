@@ -1,17 +1,13 @@
 """Tests of the copies of a map that a service sends, on both databases."""
 
-from __future__ import annotations
-
 import base64
 import json
 import zlib
 from hashlib import sha256
-from typing import Any
 
 from sceneprint.models import parse_model, read_model
-from sceneprint_client.api.admin import Scope
 
-KEYS: dict[str, dict[str, Scope]] = {
+KEYS = {
     "boss": {"*": "admin"}, "reader": {"alpha": "read"}, "other": {"bravo": "admin"},
 }  # fmt: skip
 ALPHA = "/v1/maps/alpha"
@@ -35,13 +31,13 @@ def test_a_reader_copies_what_is_indexed_and_nothing_else(house, small_shots, re
     house.ask("boss", "DELETE", f"{ALPHA}/frames/{ids[2]}")
     house.ask("boss", "POST", f"{ALPHA}/frames", **small_shots[3].form())
 
-    def get(path: str, key: str = "reader") -> Any:
+    def get(path, key="reader"):
         return house.ask(key, "GET", f"{ALPHA}/copy{path}")
 
-    def copy(key: str = "reader", **body: Any) -> Any:
+    def copy(key="reader", **body):
         return house.ask(key, "POST", f"{ALPHA}/copy", json=body)
 
-    def rows_of(answer: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    def rows_of(answer):
         """The head of a copy, and the rows of its one part."""
         assert answer.headers["content-type"] == "application/octet-stream"
         line, _, data = answer.content.partition(b"\n")

@@ -1,7 +1,5 @@
 """Tests of maps and frames over HTTP: creation, upload, lists and deletion."""
 
-from __future__ import annotations
-
 from datetime import datetime
 
 import pytest

@@ -1,7 +1,5 @@
 """Tests of downloads and edits of frames over HTTP: headers and errors."""
 
-from __future__ import annotations
-
 import base64
 import io
 import re
@@ -111,7 +109,7 @@ def test_who_does_not_read_an_upload_costs_no_memory(served, make_map):
     )  # fmt: skip
     assert sent.status_code == 202, sent.text
 
-    def resident() -> int:
+    def resident():
         status = Path(f"/proc/{served.process.pid}/status").read_text()
         return int(re.findall(r"VmRSS:\s+(\d+) kB", status)[0]) << 10
 

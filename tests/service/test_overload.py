@@ -1,12 +1,9 @@
 """Tests of overload: some requests wait, and others receive Retry-After."""
 
-from __future__ import annotations
-
 import os
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 
-import httpx
 import pytest
 
 
@@ -21,7 +18,7 @@ def busy(begin, make_map, small_shots):
 
 
 def test_who_comes_too_many_is_sent_away_and_may_come_back(busy, shots, refused):
-    def ask(_: int) -> httpx.Response:
+    def ask(_):
         return busy.client.post("/v1/maps/hall/queries", **shots[0].form())
 
     with ThreadPoolExecutor(13) as pool:
@@ -50,10 +47,10 @@ def test_as_many_wait_as_may_and_not_one_more(busy, until, refused, rows):
     path.unlink()
     os.mkfifo(path)
 
-    def ask() -> httpx.Response:
+    def ask():
         return busy.client.post("/v1/maps/hall/queries", json={"frame_id": frame_id})
 
-    def opened() -> int:
+    def opened():
         try:
             return os.open(path, os.O_WRONLY | os.O_NONBLOCK)
         except OSError:
@@ -89,7 +86,7 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, s
     with busy.connect() as wire:
         wire.sendall(b"\r\n".join(lines) + b"\r\n\r\n" + request.read())
 
-        def came() -> set[str]:
+        def came():
             page = busy.client.get("/v1/maps/hall/frames").json()
             return {one["frame_id"] for one in page["items"]} - before
 
@@ -97,7 +94,7 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, s
     again = busy.client.post("/v1/maps/hall/frames", **form)
     assert (again.status_code, again.json()["frame_id"]) == (200, frame_id)
 
-    def state() -> str:
+    def state():
         return str(busy.client.get(f"/v1/maps/hall/frames/{frame_id}").json()["state"])
 
     until(lambda: state() not in ("received", "signing"))

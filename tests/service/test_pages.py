@@ -24,14 +24,14 @@ class _Row(ApiRecord):
 
 
 #: Threads that wrote a row as JSON.
-_WRITERS: list[int] = []
+_WRITERS = []
 
 
 class _Traced(ApiRecord):
     number: int
 
     @field_serializer("number")
-    def write(self, number: int) -> int:
+    def write(self, number):
         _WRITERS.append(threading.get_ident())
         return number
 
@@ -66,7 +66,7 @@ def test_rows_are_not_written_in_the_event_loop():
 
     app.include_router(router)
 
-    async def ask() -> tuple[int, httpx.Response]:
+    async def ask():
         transport = httpx.ASGITransport(app)
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
             return threading.get_ident(), await client.get("/rows?limit=3")

@@ -9,14 +9,12 @@ import asyncio
 import errno
 import json
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable
 from tempfile import SpooledTemporaryFile
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import starlette.formparsers
-from fastapi import FastAPI
 
 from sceneprint.engine.maps import map_lifecycle
 from sceneprint.settings import Settings
@@ -34,7 +32,7 @@ END = b"\r\n--x--\r\n"
 class Asked:
     """One request that is being answered, and how many pieces of its body were asked for."""
 
-    def __init__(self, app: FastAPI, path: str, kind: str, pieces: list[bytes]) -> None:
+    def __init__(self, app, path, kind, pieces):
         self.read, self.status, self.body = 0, 0, b""
         self._pieces, self.more = pieces, asyncio.Event()
         self.more.set()
@@ -49,24 +47,23 @@ class Asked:
         }  # fmt: skip
         self._done: Awaitable[None] = asyncio.ensure_future(app(scope, self._receive, self._send))
 
-    async def _receive(self) -> dict[str, Any]:
+    async def _receive(self):
         self.read += 1
         piece = self._pieces.pop(0)
         if not self._pieces:
             await self.more.wait()  # the last piece comes when the test lets it
         return {"type": "http.request", "body": piece, "more_body": bool(self._pieces)}
 
-    async def _send(self, message: Any) -> None:
+    async def _send(self, message):
         self.status = message.get("status", self.status)
         self.body += message.get("body", b"")
 
-    async def answer(self) -> dict[str, Any]:
+    async def answer(self):
         """What it is answered with."""
         await self._done
-        found: dict[str, Any] = json.loads(self.body)
-        return found
+        return json.loads(self.body)
 
-    async def problem(self) -> dict[str, Any]:
+    async def problem(self):
         """What it is refused with."""
         found = await self.answer()
         assert found["status"] == self.status
@@ -77,10 +74,10 @@ class Asked:
 def inside(tmp_path):
     """Runs a test's coroutine with an application of these settings."""
 
-    def run(test: Callable[[FastAPI], Awaitable[Any]], **settings: Any) -> Any:
+    def run(test, **settings):
         app = create_app(Settings(data_dir=tmp_path, **settings))
 
-        async def whole() -> Any:
+        async def whole():
             async with app.router.lifespan_context(app):
                 return await test(app)
 
@@ -91,7 +88,7 @@ def inside(tmp_path):
 
 @pytest.mark.parametrize("path", ["/v1/maps", "/v1/maps/a/frames", "/v1/maps/a/queries"])
 def test_without_a_key_not_a_byte_is_read(inside, path):
-    async def test(app: FastAPI) -> None:
+    async def test(app):
         for kind in (JSON, FORM):
             asked = Asked(app, path, kind, [b"[" * 1000])
             assert (await asked.problem())["type"] == "/problems/key-required"
@@ -102,7 +99,7 @@ def test_without_a_key_not_a_byte_is_read(inside, path):
 
 @pytest.mark.parametrize("path", ["/v1/maps", "/v1/maps/a/queries"])
 def test_of_json_no_more_is_read_than_anyone_has_to_say(inside, path):
-    async def test(app: FastAPI) -> None:
+    async def test(app):
         asked = Asked(app, path, JSON, [b" " * (1 << 16)] * 100)
         problem = await asked.problem()
         assert (problem["status"], problem["type"]) == (413, "/problems/too-large")
@@ -112,11 +109,11 @@ def test_of_json_no_more_is_read_than_anyone_has_to_say(inside, path):
 
 
 def test_a_map_is_made_off_the_event_loop(inside, monkeypatch):
-    async def test(app: FastAPI) -> None:
+    async def test(app):
         threads = []
         make = map_lifecycle.create_map
 
-        def noted(store: Any, new: Any) -> Any:
+        def noted(store, new):
             threads.append(threading.current_thread())
             return make(store, new)
 
@@ -130,7 +127,7 @@ def test_a_map_is_made_off_the_event_loop(inside, monkeypatch):
 
 
 def test_at_most_twenty_fields_are_listed(inside):
-    async def test(app: FastAPI) -> None:
+    async def test(app):
         wrong = {f"x{i}": 1 for i in range(300)} | {"y" * 999: 1, "name": "a"}
         problem = await Asked(app, "/v1/maps", JSON, [json.dumps(wrong).encode()]).problem()
         assert [one["field"] for one in problem["errors"]] == [f"x{i}" for i in range(20)]
@@ -145,7 +142,7 @@ def test_at_most_twenty_fields_are_listed(inside):
 
 @pytest.mark.parametrize(("kind", "other"), [("frames", "queries"), ("queries", "frames")])
 def test_bodies_that_are_still_read_take_places_among_their_like(inside, kind, other):
-    async def test(app: FastAPI) -> None:
+    async def test(app):
         path = f"/v1/maps/a/{kind}"
         # uploads mostly wait for the disk, and more of them are in hand at once
         places = 2 + (UPLOADS if kind == "frames" else 1)
@@ -188,12 +185,12 @@ def test_where_there_is_no_room_to_read_nothing_is_taken(
     inside, monkeypatch, caplog, number, status, kind
 ):
     class Full(SpooledTemporaryFile[bytes]):
-        def write(self, data: Any) -> int:
+        def write(self, data):
             raise OSError(number, "no room in /the/folder")
 
     monkeypatch.setattr(starlette.formparsers, "SpooledTemporaryFile", Full)
 
-    async def test(app: FastAPI) -> None:
+    async def test(app):
         for _ in range(3):  # each gives its place back
             asked = Asked(app, "/v1/maps/a/frames", FORM, [HEAD, END])
             problem = await asked.problem()
@@ -211,24 +208,24 @@ def test_where_there_is_no_room_to_read_nothing_is_taken(
 def test_a_wait_looks_less_and_less_often_and_ends_with_its_caller(
     monkeypatch, hung_up_after, looks
 ):
-    pauses: list[float] = []
+    pauses = []
     clock = SimpleNamespace(monotonic=lambda: sum(pauses))
 
-    async def sleep(seconds: float) -> None:
+    async def sleep(seconds):
         pauses.append(seconds)
 
-    async def is_disconnected() -> bool:
+    async def is_disconnected():
         return len(pauses) >= hung_up_after
 
     monkeypatch.setattr(frames, "time", clock)
     monkeypatch.setattr(frames.anyio, "sleep", sleep)
     frame = SimpleNamespace(state="received", reason=None)
 
-    async def run(*_: object) -> object:
+    async def run(*_):
         return frame
 
-    here: Any = SimpleNamespace(context=SimpleNamespace(store=None), run=run)
-    request: Any = SimpleNamespace(is_disconnected=is_disconnected)
+    here = SimpleNamespace(context=SimpleNamespace(store=None), run=run)
+    request = SimpleNamespace(is_disconnected=is_disconnected)
     added = Added(frame_id="f", job_id="j", state="received", reason=None)
     settled = asyncio.run(frames._wait_for_frame(request, here, "m", added, 10.0))
     assert settled.state == "received"

@@ -1,7 +1,5 @@
 """Tests of points over HTTP: type, ETag, limits and errors."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

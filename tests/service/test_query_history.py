@@ -3,24 +3,17 @@
 They run on both databases, and execute the jobs in this process.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
-from sceneprint_client.api.admin import Scope
-
-KEYS: dict[str, dict[str, Scope]] = {
+KEYS = {
     "boss": {"*": "admin"}, "robot": {"alpha": "write"}, "other": {"bravo": "admin"},
     "both": {"alpha": "read", "bravo": "read"},
 }  # fmt: skip
 ALPHA = "/v1/maps/alpha"
 
 
-def listed(house: Any, key: str, **params: Any) -> list[dict[str, Any]]:
+def listed(house, key, **params):
     answer = house.ask(key, "GET", "/v1/queries", params=params)
     assert answer.status_code == 200, answer.text
-    items: list[dict[str, Any]] = answer.json()["items"]
-    return items
+    return answer.json()["items"]
 
 
 def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):

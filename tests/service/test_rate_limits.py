@@ -1,7 +1,5 @@
 """Tests of token buckets with a controlled clock."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import pytest
@@ -12,10 +10,10 @@ from service.limits import TokenBucket, network_of, request_cost
 
 
 class Clock:
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 100.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 

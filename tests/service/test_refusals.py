@@ -1,10 +1,7 @@
 """Tests of rejected requests and their problem documents, as a table."""
 
-from __future__ import annotations
-
 import io
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,13 +15,13 @@ def hall(served, make_map):
     return make_map(served, "refusals")
 
 
-def png(image: Image.Image) -> bytes:
+def png(image):
     out = io.BytesIO()
     image.save(out, "PNG")
     return out.getvalue()
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array):
     out = io.BytesIO()
     np.save(out, array, allow_pickle=True)
     return out.getvalue()
@@ -57,7 +54,7 @@ TURN = {"x": 0, "y": 0, "z": 0}
 SKEW = [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 #: what is other in `meta` -> type of the problem, text of its detail, fields at fault
-META: dict[str, tuple[dict[str, Any], str, str, list[str]]] = {
+META = {
     "unknown": ({"colour": 1}, "invalid-request", "colour: Extra", ["colour"]),
     "scale": ({"depth_scale": 1e300}, "useless-frame", "are missing", []),
     "no parent": ({"pose": {"matrix": np.eye(4).tolist()}}, "invalid-request",

@@ -1,9 +1,6 @@
 """Tests of stored queries: their results, and repetitions with the same or other options."""
 
-from __future__ import annotations
-
 import io
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,23 +25,22 @@ def asked(served, make_map, shots):
     )
     form["data"] |= {"seed": "3", "validation": '{"residual_m": 0.05}'}
     reply = served.client.post(f"{path}/queries", **form)
-    answer: dict[str, Any] = reply.json()
+    answer = reply.json()
     assert answer["status"] == "found"
     assert served.client.get(f"/v1/queries/{answer['query_id']}").text == reply.text
     return answer
 
 
-def again(served, query_id: str, **options: Any) -> dict[str, Any]:
+def again(served, query_id, **options):
     question = served.client.get(f"/v1/queries/{query_id}/question").json()
     body = {"maps": question["maps"], **question["options"], **options, "query_id": query_id}
     body = {name: value for name, value in body.items() if value is not None}
     reply = served.client.post("/v1/queries", json=body)
     assert reply.status_code == 200, reply.text
-    told: dict[str, Any] = reply.json()
-    return told
+    return reply.json()
 
 
-def same(answer: dict[str, Any]) -> dict[str, Any]:
+def same(answer):
     """What of an answer must not change when it is asked again."""
     return {
         name: value for name, value in answer.items() if name not in ("query_id", "milliseconds")
@@ -100,7 +96,7 @@ def test_a_stored_frame_is_asked_again_of_other_maps(served, asked, make_map, sh
 def test_another_frame_of_the_same_id_is_not_asked_in_its_place(served, make_map, shots, refused):
     path = make_map(served, "again-other")
 
-    def put(i: int) -> None:
+    def put(i):
         reply = served.client.put(
             f"{path}/frames/door", **shots[i].form(), headers={"Prefer": "wait=200"}
         )

@@ -1,13 +1,10 @@
 """Tests of headers, origins, proxies, rate limits and keys."""
 
-from __future__ import annotations
-
 import os
 import re
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
 
-import httpx
 import pytest
 
 from sceneprint.errors import InvalidRequest
@@ -28,7 +25,7 @@ def held(wall):
     )  # fmt: skip
 
 
-def guarded(answer: httpx.Response) -> None:
+def guarded(answer):
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert answer.headers["x-frame-options"] == "DENY"
     assert answer.headers["referrer-policy"] == "no-referrer"
@@ -115,7 +112,7 @@ def test_a_page_of_another_origin_may_not(served, held, refused, origin):
     assert (answer.status_code, "access-control-allow-origin" in answer.headers) == (200, False)
 
 
-def asked_before(origin: str) -> dict[str, str]:
+def asked_before(origin):
     return {
         "Origin": origin, "Access-Control-Request-Method": "PUT",
         "Access-Control-Request-Headers": "authorization",
@@ -220,10 +217,10 @@ def test_one_key_does_not_take_every_place(walled, refused, until):
     ).encode()
     with ExitStack() as held:
 
-        def hold() -> None:
+        def hold():
             held.enter_context(walled.server.connect()).sendall(head)
 
-        def full() -> bool:
+        def full():
             hold()  # one more: the question itself may have had the place of another
             return walled.ask("reader", "GET", "/v1/keys/me").status_code == 429
 
@@ -240,7 +237,7 @@ def test_one_key_does_not_take_every_place(walled, refused, until):
 
 
 def test_wrong_keys_are_counted_and_right_ones_are_not_kept_out_by_them(held, refused):
-    def try_key(secret: str) -> httpx.Response:
+    def try_key(secret):
         return held.server.client.get("/v1/maps", headers={"Authorization": f"Bearer {secret}"})
 
     answers = [try_key(f"sp_wrong{number}") for number in range(4)]

@@ -1,7 +1,5 @@
 """Tests of the listening socket, and of TLS."""
 
-from __future__ import annotations
-
 import signal
 import socket
 

@@ -1,18 +1,13 @@
 """Tests of requests while the application loads."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import subprocess
 import sys
 import threading
-from collections.abc import Awaitable, Callable
-from typing import Any
 
 import httpx
 import pytest
-from fastapi import FastAPI
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint import __version__
@@ -22,10 +17,10 @@ from service.app import create_app
 from service.startup import Front
 
 
-async def _lived(front: Front, test: Callable[[httpx.AsyncClient], Awaitable[Any]]) -> Any:
+async def _lived(front, test):
     """Run a test between a front's start and its end."""
-    told: asyncio.Queue[dict[str, str]] = asyncio.Queue()
-    said: asyncio.Queue[Any] = asyncio.Queue()
+    told = asyncio.Queue()
+    said = asyncio.Queue()
     life = asyncio.create_task(front({"type": "lifespan"}, told.get, said.put))
     await told.put({"type": "lifespan.startup"})
     assert (await said.get())["type"] == "lifespan.startup.complete"
@@ -44,7 +39,7 @@ def slow(tmp_path):
     """A front whose application comes once the event is set."""
     settings, go = Settings(data_dir=tmp_path), threading.Event()
 
-    def load() -> FastAPI:
+    def load():
         assert go.wait(PATIENCE_S)
         return create_app(settings)
 
@@ -54,7 +49,7 @@ def slow(tmp_path):
 def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(slow):
     front, go = slow
 
-    async def test(client: httpx.AsyncClient) -> None:
+    async def test(client):
         early, head = await client.get("/healthz"), await client.head("/healthz")
         assert front.app is None
         assert (early.status_code, early.json()) == (200, {"status": "ok", "version": __version__})
@@ -83,12 +78,12 @@ def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(slow):
 def test_an_application_that_cannot_be_made_ends_the_service(tmp_path):
     ended = threading.Event()
 
-    def load() -> FastAPI:
+    def load():
         raise UnusableStore("the disk is gone")
 
     front = Front(Settings(data_dir=tmp_path), load, ended.set)
 
-    async def test(client: httpx.AsyncClient) -> None:
+    async def test(client):
         with pytest.raises(RuntimeError, match="the service could not start"):
             await client.get("/readyz")
         assert ended.is_set()
@@ -123,7 +118,7 @@ def test_while_kernels_are_compiled_readyz_says_so_and_who_needs_them_waits(
         assert (ready.status_code, ready.json()["status"]) == (200, "ready")
         house.engine.signers.hold()
 
-        def is_ready() -> bool:
+        def is_ready():
             return bool(house.ask("robot", "GET", "/readyz").status_code == 200)
 
         until(lambda: not is_ready())  # what it says is up to a second old

@@ -3,13 +3,9 @@
 They use HTTP with keys on both databases, and execute the jobs in this process.
 """
 
-from __future__ import annotations
-
 import json
 
-from sceneprint_client.api.admin import Scope
-
-KEYS: dict[str, dict[str, Scope]] = {
+KEYS = {
     "boss": {"*": "admin"}, "tenant": {"alpha": "admin", "later": "admin"},
     "robot": {"alpha": "write"}, "other": {"bravo": "admin"},
 }  # fmt: skip

@@ -1,7 +1,5 @@
 """Tests that keys of one tenant share its limits, and other tenants are not affected."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import time
@@ -39,10 +37,10 @@ from tests.whole_engine import Engine
 
 
 class Clock:
-    def __init__(self) -> None:
+    def __init__(self):
         self.now = 100.0
 
-    def __call__(self) -> float:
+    def __call__(self):
         return self.now
 
 
@@ -69,7 +67,7 @@ def test_two_authorization_headers_are_refused_whoever_sends_them(shared, refuse
 
 
 def test_keys_of_a_tenant_share_its_streams_and_leave_some_to_others(shared, until):
-    def listen(key: str, stack: ExitStack) -> bytes:
+    def listen(key, stack):
         wire = stack.enter_context(shared.server.connect())
         wire.sendall(
             "GET /v1/events HTTP/1.1\r\nHost: localhost\r\nAccept: text/event-stream\r\n"
@@ -133,11 +131,11 @@ def test_a_tenant_holds_three_quarters_at_most_and_gives_it_back():
 
 
 def test_turns_alternate_between_tenants_and_leave_half_to_others():
-    async def test() -> list[str]:
+    async def test():
         clock = Clock()
         turns, order = Turns(4, clock=clock), []
 
-        async def ask(tenant: str, weight: int = 1) -> None:
+        async def ask(tenant, weight=1):
             await turns.acquire(tenant, weight)
             order.append(tenant)
 
@@ -167,7 +165,7 @@ def test_turns_alternate_between_tenants_and_leave_half_to_others():
 
 
 def test_who_rested_gets_its_turn_though_nobody_asks_meanwhile():
-    async def test() -> float:
+    async def test():
         turns, clock = Turns(4, 1, rests=True), time.monotonic
         await turns.acquire("b")
         await turns.acquire("a")
@@ -183,10 +181,10 @@ def test_who_rested_gets_its_turn_though_nobody_asks_meanwhile():
 
 
 def test_everybody_gets_a_turn_however_the_rests_fall():
-    async def test() -> int:
+    async def test():
         turns, done = Turns(4, 1, rests=True), 0
 
-        async def ask(tenant: str, number: int) -> None:
+        async def ask(tenant, number):
             nonlocal done
             for _ in range(100):
                 held = await turns.acquire(tenant, 1 + number)
@@ -202,7 +200,7 @@ def test_everybody_gets_a_turn_however_the_rests_fall():
 
 
 def test_who_gives_up_takes_no_turn():
-    async def test() -> None:
+    async def test():
         turns = Turns(1)
         await turns.acquire("a")
         gone = asyncio.create_task(turns.acquire("b"))
@@ -225,7 +223,7 @@ def test_who_gives_up_takes_no_turn():
 def test_refusals_come_late_to_who_does_not_stop(status):
     """Of one address; another is answered at once."""
 
-    async def refuse(scope, receive, send) -> None:
+    async def refuse(scope, receive, send):
         del scope, receive
         await send({"type": "http.response.start", "status": status, "headers": []})
         await send({"type": "http.response.body", "body": b"no"})
@@ -238,13 +236,13 @@ def test_refusals_come_late_to_who_does_not_stop(status):
         full.count("", "192.0.2.10")
     whole.state.refusals = full
     app = RequestMiddleware(refuse, settings, origins_of(settings), Metrics())
-    answered: list[str] = []
+    answered = []
 
     async def receive():
         return {"type": "http.request"}
 
-    async def ask(address: str) -> None:
-        async def send(message) -> None:
+    async def ask(address):
+        async def send(message):
             if message["type"] == "http.response.start":
                 answered.append(address)
 
@@ -254,7 +252,7 @@ def test_refusals_come_late_to_who_does_not_stop(status):
         }  # fmt: skip
         await app(scope, receive, send)
 
-    async def test() -> None:
+    async def test():
         asking = [asyncio.create_task(ask("192.0.2.1")) for _ in range(REFUSALS + 5)]
         other = asyncio.create_task(ask("192.0.2.2"))
         await other
@@ -281,7 +279,7 @@ def test_every_route_that_works_in_a_thread_takes_a_turn():
 class SmallSpool(BodySpool):
     """With room for eight MiB."""
 
-    def _room(self) -> int:
+    def _room(self):
         return 8 << 20
 
 
@@ -291,7 +289,7 @@ def test_a_body_is_charged_before_it_is_written_and_given_back():
     async def receive():
         return {"type": "http.request", "body": bytes(half), "more_body": True}
 
-    async def read(body: RequestBody, count: int) -> None:
+    async def read(body, count):
         for _ in range(count):
             await body.next()
 
@@ -325,7 +323,7 @@ def test_metrics_tell_tenants_apart(shared, until):
         for _ in range(3):
             enqueue(connection, "purge", None)
 
-    def series(name: str) -> dict[str, float]:
+    def series(name):
         found = shared.ask("victim", "GET", "/metrics").text
         pattern = rf"^sceneprint_tenant_{name}{{(.*)}} (.*)$"
         return {one[0]: float(one[1]) for one in re.findall(pattern, found, re.MULTILINE)}

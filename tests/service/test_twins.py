@@ -9,16 +9,13 @@ from __future__ import annotations
 import json
 import re
 import secrets
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 
-from sceneprint_client.api.admin import Scope
-
-KEYS: dict[str, dict[str, Scope]] = {
+KEYS = {
     "boss": {"*": "admin"}, "admin": {"alpha": "admin"}, "reader": {"alpha": "read"},
 }  # fmt: skip
 #: Ids and seals, the beginnings of ids in names of files, and cursors; times; how long something
@@ -51,13 +48,13 @@ class Twin:
     ids: dict[str, str] = field(default_factory=dict)
     sent: int = 0
 
-    def ask(self, key: str, method: str, path: str, **request: Any) -> Any:
+    def ask(self, key, method, path, **request):
         answer = self.house.ask(key, method, path, **request)
         # queries are logged when there is time, and their events have that time
         assert self.house.engine.query_log.flush(60)
         return answer
 
-    def disturb(self) -> None:
+    def disturb(self):
         """What would show, if anything of it did: rows of every table that others number too."""
         if not self.busy:
             return
@@ -70,7 +67,7 @@ class Twin:
         frames = self.ask("boss", "GET", "/v1/maps/bravo/frames?limit=1").json()["items"]
         self.ask("boss", "DELETE", f"/v1/maps/bravo/frames/{frames[0]['frame_id']}")
 
-    def told(self, key: str, method: str, path: str, **request: Any) -> str:
+    def told(self, key, method, path, **request):
         """All that an answer tells, on lines."""
         answer = self.ask(key, method, path, **request)
         assert answer.status_code < 500, answer.text
@@ -79,7 +76,7 @@ class Twin:
         return f"{key} {method} {path}\n{answer.status_code} {json.dumps(kept)}\n{text}\n"
 
 
-def live(one: Twin, small_model: Any) -> None:
+def live(one, small_model):
     """What happens in alpha, and in the busy one always something else before and after."""
     path = "/v1/maps/alpha"
     for number, shot in enumerate(one.shots[:5]):
@@ -125,7 +122,7 @@ def live(one: Twin, small_model: Any) -> None:
     one.disturb()
 
 
-def path_of(one: Twin, pattern: str) -> str:
+def path_of(one, pattern):
     """A path of the document, about what there is in alpha."""
     paths = {"association": "associations", "reconstruction": "reconstructions",
              "coverage": "coverage", "difference": "differences"}  # fmt: skip
@@ -138,7 +135,7 @@ def path_of(one: Twin, pattern: str) -> str:
     return re.sub(r"\{(\w+)\}", lambda found: names[found[1]], pattern)
 
 
-def everything(one: Twin) -> Iterator[str]:
+def everything(one):
     """All that the keys for alpha can read, and what changes of alpha are answered with."""
     document = one.ask("boss", "GET", "/openapi.json").json()
     queries = {
@@ -187,11 +184,11 @@ def everything(one: Twin) -> Iterator[str]:
         one.disturb()
 
 
-def plain(told: list[str]) -> list[str]:
+def plain(told):
     """Without times, and with what is by chance numbered as it first came."""
-    numbers: dict[str, int] = {}
+    numbers = {}
 
-    def number(found: re.Match[str]) -> str:
+    def number(found):
         return f"<{numbers.setdefault(found[0], len(numbers))}>"
 
     return [TOOK.sub("<took>", TIMES.sub("<time>", CHANCE.sub(number, one))) for one in told]

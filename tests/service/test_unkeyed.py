@@ -1,16 +1,12 @@
 """Tests that requests without a key cost little."""
 
-from __future__ import annotations
-
 import asyncio
 import hashlib
 import json
 import time
-from typing import Any
 
 import pytest
 from sqlalchemy import Engine, event
-from starlette.types import Message
 
 from service.running_service import READY_S
 
@@ -25,23 +21,22 @@ def house(open_house, tmp_path_factory):
         yield found
 
 
-def answers(house: Any, path: str, headers: dict[str, str] | None = None) -> list[Any]:
+def answers(house, path, headers=None):
     """Return the answers of requests that are sent all at once."""
 
-    async def ask() -> list[Any]:
+    async def ask():
         asked = (house.client.get(path, headers=headers) for _ in range(AT_ONCE))
         return list(await asyncio.gather(*asked))
 
-    found: list[Any] = house.portal.call(ask)
-    return found
+    return house.portal.call(ask)
 
 
 @pytest.fixture
 def statements():
     """The statements that databases execute, as their drivers get them."""
-    found: list[str] = []
+    found = []
 
-    def note(_connection: Any, _cursor: Any, statement: str, *_: Any) -> None:
+    def note(_connection, _cursor, statement, *_):
         found.append(statement)
 
     event.listen(Engine, "before_cursor_execute", note)
@@ -79,20 +74,20 @@ def test_readyz_is_at_most_a_second_old(house, truth):
 def test_the_document_is_rendered_once(house):
     """All answers have the same bytes in memory, not only equal ones."""
     app = house.client._transport.app
-    bodies: list[bytes] = []
+    bodies = []
 
-    async def ask() -> int:
-        scope: dict[str, Any] = {
+    async def ask():
+        scope = {
             "type": "http", "method": "GET", "path": "/openapi.json", "query_string": b"",
             "headers": [(b"host", b"here")], "http_version": "1.1", "scheme": "http",
             "asgi": {"version": "3.0"}, "client": ("203.0.113.7", 1), "server": ("here", 80),
         }  # fmt: skip
         status = 0
 
-        async def receive() -> Message:
+        async def receive():
             return {"type": "http.request", "body": b"", "more_body": False}
 
-        async def send(message: Message) -> None:
+        async def send(message):
             nonlocal status
             status = message.get("status", status)
             if message["type"] == "http.response.body":
@@ -101,7 +96,7 @@ def test_the_document_is_rendered_once(house):
         await app(scope, receive, send)
         return status
 
-    async def ask_all() -> list[int]:
+    async def ask_all():
         return list(await asyncio.gather(*(ask() for _ in range(AT_ONCE))))
 
     assert house.portal.call(ask_all) == [200] * AT_ONCE

@@ -1,12 +1,8 @@
 """Tests of uploads under an id, as bodies, with idempotency keys, priorities and in batches."""
 
-from __future__ import annotations
-
 import io
 import json
-from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
@@ -18,7 +14,7 @@ def hall(served, make_map):
     return make_map(served, "put-hall")
 
 
-def query(shot, **more: object) -> dict[str, Any]:
+def query(shot, **more):
     """The same shot as the body, and what is known of it as parameters."""
     camera = {name: shot.camera[name] for name in ("fx", "fy", "cx", "cy")}
     return {
@@ -181,7 +177,7 @@ def test_a_key_makes_an_upload_take_effect_once(served, hall, small_shots, refus
     refused(bad, 422, "invalid-request", "Idempotency-Key")
 
 
-def batch(shots: list[Any], metas: object, **fields: str) -> dict[str, Any]:
+def batch(shots, metas, **fields):
     files = [("frame", ("f.png", one if isinstance(one, bytes) else one.png)) for one in shots]
     return {"files": files, "data": {"metas": json.dumps(metas), **fields}}
 
@@ -189,7 +185,7 @@ def batch(shots: list[Any], metas: object, **fields: str) -> dict[str, Any]:
 def test_a_batch_that_is_none_is_refused_whole(served, hall, small_shots, refused):
     http, shot, meta = served.client, small_shots[12], {"intrinsics": small_shots[12].camera}
 
-    def post(**sent: Any) -> httpx.Response:
+    def post(**sent):
         return http.post(f"{hall}/frames/batch", **sent)
 
     refused(post(**batch([shot], [meta, meta])), 422, "invalid-request", "a list of 2")

@@ -1,33 +1,30 @@
 """Tests that the generated pages describe all of the code, once."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import sceneprint_client
 from sceneprint_client import Client
 from tools.site import http_pages
-from tools.site.reference import GeneratedPage, api_document, generated_pages
+from tools.site.reference import api_document, generated_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def document() -> dict[str, Any]:
+def document():
     return api_document()
 
 
 @pytest.fixture(scope="module")
-def pages() -> dict[str, GeneratedPage]:
+def pages():
     return {one.path: one for one in generated_pages()}
 
 
-def sections(text: str, level: int = 2) -> dict[str, str]:
+def sections(text, level=2):
     """Text below each heading of a level, by the heading without its anchor."""
     parts = re.split(rf"^{'#' * level} (.*)$", text, flags=re.MULTILINE)
     return {
@@ -35,15 +32,13 @@ def sections(text: str, level: int = 2) -> dict[str, str]:
     }
 
 
-def rows(text: str) -> list[list[str]]:
+def rows(text):
     """Cells of the rows of tables."""
     lines = re.findall(r"^\| (.*) \|$", text, re.MULTILINE)
     return [re.split(r" \| ", line) for line in lines]
 
 
-def test_every_operation_is_described_once_on_the_page_of_its_resource(
-    document: dict[str, Any], pages: dict[str, GeneratedPage]
-) -> None:
+def test_every_operation_is_described_once_on_the_page_of_its_resource(document, pages):
     frozen = json.loads((ROOT / "tests/golden/openapi.json").read_text())["paths"]
     wanted = {
         (f"{method.upper()} {path}", body["tags"][0])
@@ -66,7 +61,7 @@ def test_every_operation_is_described_once_on_the_page_of_its_resource(
     assert pages["reference/http/index.md"].text.splitlines()[2].startswith(f"{len(wanted)} opera")
 
 
-def test_everything_that_the_client_offers_is_described(pages: dict[str, GeneratedPage]) -> None:
+def test_everything_that_the_client_offers_is_described(pages):
     found = sections(pages["reference/client.md"].text)
     assert list(found) == [name for name in sceneprint_client.__all__ if name[0] != "_"]
     methods = sections(found["Client"], 3)

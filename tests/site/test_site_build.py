@@ -8,7 +8,6 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from functools import partial
 from html.parser import HTMLParser
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -21,7 +20,7 @@ import pytest
 from tools.site.reference import generated_pages
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    pass
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What axe finds in the theme's own markup (two landmarks of one name, tables that scroll and that
@@ -30,7 +29,7 @@ KNOWN = {"landmark-unique", "scrollable-region-focusable", "empty-table-header"}
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     """The site, built as `make docs` builds it: a warning is an error."""
     folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
@@ -47,14 +46,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class PageReader(HTMLParser):
     """What a page links to, what it loads, and the anchors that it has."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.links: list[str] = []
         self.loads: list[str] = []
         self.anchors: set[str] = set()
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         given = {name: value or "" for name, value in attrs}
         self.anchors |= {given[name] for name in ("id", "name") if name in given}
         if "src" in given:
@@ -66,11 +65,11 @@ class PageReader(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def read(site: Path) -> dict[Path, PageReader]:
+def read(site):
     return {path: PageReader(path.read_text()) for path in site.rglob("*.html")}
 
 
-def test_every_page_is_there(site: Path, read: dict[Path, PageReader]) -> None:
+def test_every_page_is_there(site, read):
     pages = {path.relative_to(site).as_posix() for path in read}
     docs = ROOT / "docs"
     written = {
@@ -85,7 +84,7 @@ def test_every_page_is_there(site: Path, read: dict[Path, PageReader]) -> None:
     assert written | generated | outside | {"index.html", "404.html"} <= pages
 
 
-def test_no_link_and_no_anchor_is_dead(site: Path, read: dict[Path, PageReader]) -> None:
+def test_no_link_and_no_anchor_is_dead(site, read):
     dead = []
     checked = 0
     for path, page in read.items():
@@ -107,7 +106,7 @@ def test_no_link_and_no_anchor_is_dead(site: Path, read: dict[Path, PageReader])
     assert checked > 5_000
 
 
-def test_nothing_is_loaded_from_another_host(site: Path, read: dict[Path, PageReader]) -> None:
+def test_nothing_is_loaded_from_another_host(site, read):
     loaded = {url for page in read.values() for url in page.loads}
     assert {url for url in loaded if urlsplit(url).netloc} == set()
     styles = "".join(path.read_text() for path in site.rglob("*.css"))
@@ -116,12 +115,12 @@ def test_nothing_is_loaded_from_another_host(site: Path, read: dict[Path, PageRe
 
 
 class _QuietHandler(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
+    def log_message(self, *_):
         """Say nothing."""
 
 
 @pytest.fixture(scope="module")
-def address(site: Path) -> Iterator[str]:
+def address(site):
     """Where the site is served."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_QuietHandler, directory=str(site)))
     thread = threading.Thread(target=server.serve_forever)
@@ -133,7 +132,7 @@ def address(site: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     from playwright.sync_api import sync_playwright
 
     names = ("chromium", "chromium-browser", "google-chrome")
@@ -148,14 +147,12 @@ def browser() -> Iterator[Browser]:
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 1280), ("light", 390)])
-def test_pages_are_read_and_searched_in_a_browser(
-    address: str, browser: Browser, scheme: str, width: int
-) -> None:
+def test_pages_are_read_and_searched_in_a_browser(address, browser, scheme, width):
     from axe_playwright_python.sync_playwright import Axe
 
-    asked: list[str] = []
+    asked = []
     page = browser.new_page(
-        color_scheme=scheme, viewport={"width": width, "height": 900}  # type: ignore[arg-type]
+        color_scheme=scheme, viewport={"width": width, "height": 900}
     )  # fmt: skip
     page.on("request", lambda request: asked.append(request.url))
     for path in ("index.html", "architecture.html", "reference/http/jobs.html"):

@@ -1,13 +1,10 @@
 """Fixtures of the store tests: an open store, jobs to claim, and racing processes."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
 import sys
 from contextlib import contextmanager
-from typing import Any
 
 import pytest
 from sqlalchemy import event, update
@@ -123,7 +120,7 @@ def received(store, hall):
     """A function that inserts a frame with default fields."""
 
     def add(content, row=hall, frame_id=None, within=None, **given):
-        values: dict[str, Any] = {
+        values = {
             "content_id": content, "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1},
             "depth_scale": 1000.0, "depth_along_ray": False, "robot": None, "session": None,
             "captured_at": None, "tags": [], "pose_parent": None, "pose": None, "name": None,
@@ -199,7 +196,7 @@ def plans():
 
     @contextmanager
     def looked_at(connection):
-        told: list[str] = []
+        told = []
 
         def explain(_, cursor, statement, parameters, *__):
             cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)

@@ -1,7 +1,5 @@
 """Tests of the audit log: entries in the transaction of their event, retention and filters."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import insert, select
 

@@ -237,7 +237,7 @@ def test_a_file_where_a_folder_should_be_is_said(tmp_path):
 
 def test_a_blob_may_be_put_and_removed_at_once(blobs, tmp_path):
     """What removes is the sweep; an upload of the same content must not stumble over it."""
-    raised: list[BaseException] = []
+    raised = []
     over = threading.Event()
 
     def sweep():
@@ -287,7 +287,7 @@ def test_what_to_do_depends_on_what_failed(blobs, monkeypatch, number, kind, adv
 def test_what_is_there_already_is_made_durable_too(blobs, monkeypatch):
     """Who put it first may have been killed between the name and its fsync."""
     blobs.put(b"depth")
-    synced: list[int] = []
+    synced = []
     monkeypatch.setattr(os, "fsync", lambda number: synced.append(os.fstat(number).st_ino))
     blobs.put(b"depth")
     folder = blobs.path(DIGEST).parent

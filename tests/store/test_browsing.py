@@ -1,11 +1,8 @@
 """Tests of lists of frames and sessions against plain Python with random metadata."""
 
-from __future__ import annotations
-
 from collections import Counter
 from datetime import UTC, datetime, timedelta
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +18,7 @@ from sceneprint.store.frame_queries import (
 )
 from sceneprint.store.frames import write_frame
 from sceneprint.store.maps import add_map
-from sceneprint.store.tables import FrameRow, frames
+from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.listing import FrameListing, Run
 
@@ -108,7 +105,7 @@ def passes(one, w):
 
 def some_listing(rng):
     a, b, c, d = (START + timedelta(seconds=int(n)) for n in rng.integers(0, 30, 4))
-    every: dict[str, Any] = {
+    every = {
         "state": rng.choice(["indexed", "rejected", "deleted"]),
         "robot": ["r1"] if rng.random() < 0.5 else ["r2", "r1"],
         "session": str(rng.choice(["s1", "s2", "nobody"])),
@@ -140,7 +137,7 @@ def test_every_list_is_that_of_plain_python(store, hall, mixed):
                 expected.reverse()
             elif wanted.order == "taken":
                 expected.sort(key=taken)
-            found: list[FrameRow] = []
+            found = []
             while True:  # pages follow each other without a gap or a double
                 last = position(found[-1]) if found else None
                 page = list_frames(connection, hall.number, last, limit, wanted)
@@ -153,7 +150,7 @@ def test_every_list_is_that_of_plain_python(store, hall, mixed):
 
 
 def test_sessions_are_those_of_plain_python(store, hall, mixed):
-    expected: dict[tuple[str, str], list[FrameRow]] = {}
+    expected = {}
     for one in mixed:
         if one.state != "deleted":
             expected.setdefault((one.session or "", one.robot or ""), []).append(one)
@@ -265,7 +262,7 @@ SEARCHED = "USING COVERING INDEX ix_frames_searched"
 
 
 def test_each_list_takes_the_index_that_is_meant_for_it(store, hall, plans):
-    ways: list[tuple[dict[str, Any], str]] = [
+    ways = [
         ({}, "INDEX ix_frames_map_number_number"),
         ({"order": "desc"}, "INDEX ix_frames_map_number_number"),
         ({"state": "indexed"}, "INDEX ix_frames_map_number_number"),

@@ -1,7 +1,5 @@
 """Tests of the schema, of rejected databases, and of transactions."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import resource

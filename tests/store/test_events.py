@@ -1,7 +1,5 @@
 """Tests of the order and the removal of events."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from pathlib import Path
@@ -112,7 +110,7 @@ def test_events_are_counted_by_interval(empty):
             (1059.5, 1.0, None),
         ):
             counted = count_events(connection, KEPT, start, width, name)
-            naive: dict[tuple[int, str], int] = {}
+            naive = {}
             for one in every:
                 if one.at >= start and name in (None, one.map):
                     place = (int((one.at - start) // width), one.kind)
@@ -122,7 +120,7 @@ def test_events_are_counted_by_interval(empty):
 
 
 def test_every_kind_that_is_told_is_declared():
-    told: set[str] = set()
+    told = set()
     pattern = re.compile(r"\brecord_(?:job_)?event\(\s*connection,\s*\"([\w.]+)\"")
     declared_event = re.compile(r"\bevent=\"([\w.]+)\"")
     for folder in ("sceneprint", "service", "worker"):

@@ -1,7 +1,5 @@
 """Tests of filters in the database; tests/engine/test_filters.py compares them with Python."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import update
 

@@ -1,7 +1,5 @@
 """Tests of rows of frames, signatures and keys, and of notifications."""
 
-from __future__ import annotations
-
 import hashlib
 
 import pytest

@@ -1,7 +1,5 @@
 """Tests of the cache of decoded artifacts: content, limits and eviction."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

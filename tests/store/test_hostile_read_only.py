@@ -1,7 +1,5 @@
 """Tests of read-only databases, which are read correctly or not at all."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sqlite3

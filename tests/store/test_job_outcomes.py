@@ -1,7 +1,5 @@
 """Tests of the ends of jobs: success, retries, failure and return to the queue."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

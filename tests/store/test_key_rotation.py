@@ -1,7 +1,5 @@
 """Tests of the valid secrets of a key, and of the time of its last use."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import select
 

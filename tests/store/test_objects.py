@@ -1,7 +1,5 @@
 """Tests of object stores by URL: invalid URLs, unreachable stores and timeouts."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

@@ -1,7 +1,5 @@
 """Tests of opaque ids, which only their store can decode and which reveal nothing."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from itertools import pairwise
 

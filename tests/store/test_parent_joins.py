@@ -1,7 +1,5 @@
 """Tests of joined and separated parent frames, which finally have their original poses."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

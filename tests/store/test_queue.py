@@ -1,7 +1,5 @@
 """Tests of claims and leases of jobs."""
 
-from __future__ import annotations
-
 import time
 
 import pytest
@@ -136,7 +134,7 @@ def test_a_claim_is_looked_up_and_not_sorted(store, hall):
     """100,000 jobs wait while a map is signed again, and a claim holds all writers up."""
     queue_jobs(store, hall, "many", 50)
     with store.database.write() as connection:
-        said: list[str] = []
+        said = []
 
         def listen(_, _cursor, statement, parameters, *_more):
             if statement.startswith(("SELECT", "WITH")):

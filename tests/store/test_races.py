@@ -1,7 +1,5 @@
 """Tests of many workers at one queue, as threads and as processes."""
 
-from __future__ import annotations
-
 import threading
 
 from sceneprint.store import queue

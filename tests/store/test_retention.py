@@ -1,7 +1,5 @@
 """Tests of event retention, which is independent for each map."""
 
-from __future__ import annotations
-
 import pytest
 
 from sceneprint.store import events
@@ -43,7 +41,7 @@ def numbers_of(connection, name):
 
 def expected(connection, kept, anchors):
     """Of each map all but the newest, the one before these, and the anchors."""
-    gone: set[int] = set()
+    gone = set()
     for name, more in (("hall", 1), ("shop", 1), (None, 0)):
         numbers = numbers_of(connection, name)
         gone |= set(numbers[: max(len(numbers) - kept - more, 0)]) - set(anchors)

@@ -1,7 +1,5 @@
 """Tests of a store that a later version migrates while this version has it open."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -13,7 +11,6 @@ import pytest
 from sqlalchemy import text
 
 import migrations
-from benchmarks.postgres import Server
 from sceneprint.cli import main
 from sceneprint.store import database, open_database
 from sceneprint.store.database import SchemaRange, known_revisions, reach_database
@@ -170,7 +167,7 @@ def test_the_command_makes_the_schema_once(kind, migrate_command, tmp_path, requ
     if kind == "sqlite":
         url = f"sqlite:///{tmp_path}/data/sceneprint.db"
     else:
-        server: Server = request.getfixturevalue("postgres")
+        server = request.getfixturevalue("postgres")
         url = server.create(f"empty_{token_hex(4)}")
     head = known_revisions()[0]
     data = tmp_path / "data"

@@ -1,7 +1,5 @@
 """Tests of a database server: schema, locks, readers, and statements that SQLite does not need."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

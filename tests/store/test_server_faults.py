@@ -1,7 +1,5 @@
 """Tests of the errors for server faults, which never contain the password."""
 
-from __future__ import annotations
-
 import pytest
 from sqlalchemy import select, text
 from sqlalchemy.exc import DBAPIError

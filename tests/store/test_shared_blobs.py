@@ -1,7 +1,5 @@
 """Tests of shared blobs: ownership of a prefix, and removal beside new references."""
 
-from __future__ import annotations
-
 import errno
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Tests of connection settings, and of the guarantees of transactions."""
 
-from __future__ import annotations
-
 import threading
 from contextlib import ExitStack
 

@@ -1,7 +1,5 @@
 """Tests of wakeup by FIFOs, whose faults do not affect the sender."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import threading
@@ -28,7 +26,7 @@ def ours(tmp_path):
 
 def test_all_who_wait_are_woken(ours):
     with ours.listen() as first, ours.listen() as second:
-        rung: list[bool] = []
+        rung = []
         threads = [
             threading.Thread(target=lambda each=each: rung.append(each.wait(FOREVER)), daemon=True)
             for each in (first, second)

@@ -1,7 +1,5 @@
 """Tests of writers that are committed together, and fail separately."""
 
-from __future__ import annotations
-
 import threading
 import time
 from typing import Any
@@ -29,7 +27,7 @@ def together(database, works, *, one_by_one=False):
     """
     group, commits = Grouping(database), [0]
     event.listen(database._engine, "commit", lambda _: commits.__setitem__(0, commits[0] + 1))
-    found: list[Any] = [None] * len(works)
+    found = [None] * len(works)
 
     def run(i):
         try:

@@ -1,18 +1,12 @@
 """Tests of laser scans of ambiguous sites: reproducibility and similarity."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.types import Floats
 from sceneprint_lab.synth import synthesise_lookalike_survey
 from sceneprint_lab.synth.large_scenes import symmetric_hall
 from sceneprint_lab.synth.lookalike_surveys import (
@@ -36,8 +30,8 @@ EQUAL = Likeness(0.0, 0.0, 0.0)
 SMALL = Spinning(rings=8, azimuth_step=0.05).perfect()
 
 
-def positions(clouds: tuple[object, ...]) -> Floats:
-    return np.array([cloud.pose[:3, 3] for cloud in clouds])  # type: ignore[attr-defined]
+def positions(clouds):
+    return np.array([cloud.pose[:3, 3] for cloud in clouds])
 
 
 @pytest.mark.parametrize(
@@ -47,7 +41,7 @@ def positions(clouds: tuple[object, ...]) -> Floats:
         for kind in SURVEYED_KINDS
     ],
 )
-def test_a_site_depends_on_its_seed_and_number_alone(kind: str) -> None:
+def test_a_site_depends_on_its_seed_and_number_alone(kind):
     site, again, other = (
         synthesise_lookalike_survey(kind, seed, 2, queries=2) for seed in (SEED, SEED, SEED + 1)
     )
@@ -65,7 +59,7 @@ def test_a_site_depends_on_its_seed_and_number_alone(kind: str) -> None:
     assert len(set(names)) == len(names)
 
 
-def test_half_a_turn_maps_the_hall_onto_itself() -> None:
+def test_half_a_turn_maps_the_hall_onto_itself():
     """Every corner of the turned mesh is one of the mesh; the floor to walk on turns as well."""
     for seed in range(3):
         hall = symmetric_hall(np.random.default_rng(seed))
@@ -78,7 +72,7 @@ def test_half_a_turn_maps_the_hall_onto_itself() -> None:
 
 
 @pytest.mark.parametrize("make", [bay, block])
-def test_units_repeat_along_the_row_but_for_what_is_missing(make) -> None:  # type: ignore[no-untyped-def]
+def test_units_repeat_along_the_row_but_for_what_is_missing(make):
     unit = make(np.random.default_rng(3))
     row = row_of(unit, 3, EQUAL, np.random.default_rng(0))
     step = np.array([unit.pitch, 0.0, 0.0])
@@ -91,7 +85,7 @@ def test_units_repeat_along_the_row_but_for_what_is_missing(make) -> None:  # ty
     assert unit.things
 
 
-def test_a_scan_does_not_tell_equal_places_apart_and_tells_others() -> None:
+def test_a_scan_does_not_tell_equal_places_apart_and_tells_others():
     rng = np.random.default_rng(2)
     hall = symmetric_hall(rng)
     T = scanner_pose(3.0, 1.0, 1.2, 0.4, rng)
@@ -100,7 +94,7 @@ def test_a_scan_does_not_tell_equal_places_apart_and_tells_others() -> None:
     assert distinct_fraction(Stop(hall, T), hall, np.diag([1.0, -1.0, -1.0, 1.0]) @ T, SMALL) > 0.1
 
 
-def test_drift_is_a_random_walk_that_starts_true() -> None:
+def test_drift_is_a_random_walk_that_starts_true():
     poses = np.stack([scanner_pose(2.0 * k, 0.0, 1.0, 0.1 * k, np.random.default_rng(k))
                       for k in range(400)])  # fmt: skip
     off = with_drift(poses, np.random.default_rng(1))
@@ -114,7 +108,7 @@ def test_drift_is_a_random_walk_that_starts_true() -> None:
     assert np.abs(errors).max() < 0.3
 
 
-def test_maps_drift_and_lack_scans_and_a_query_lies_where_its_neighbours_say() -> None:
+def test_maps_drift_and_lack_scans_and_a_query_lies_where_its_neighbours_say():
     """Site 1 of each kind drifts and lacks scans; a query's points lie on its neighbour's."""
     site = synthesise_lookalike_survey("streets", SEED, 1, queries=4)
     assert 0.6 * MAP_SCANS < len(site.map) < MAP_SCANS
@@ -134,14 +128,14 @@ def test_maps_drift_and_lack_scans_and_a_query_lies_where_its_neighbours_say() -
         )
 
 
-def test_the_queries_of_a_site_are_not_in_its_map_and_some_lie_beside_its_path() -> None:
+def test_the_queries_of_a_site_are_not_in_its_map_and_some_lie_beside_its_path():
     site = synthesise_lookalike_survey("sites", SEED, 0, queries=9)
     apart = np.linalg.norm(positions(site.queries)[:, None] - positions(site.map), axis=2)
     assert apart.min() > 0.3
     assert apart.min(axis=1).max() < 8.0
 
 
-def test_a_rosette_fills_a_cone_about_x_and_never_twice_the_same() -> None:
+def test_a_rosette_fills_a_cone_about_x_and_never_twice_the_same():
     sensor = Rosette(half_angle=math.radians(35.0), firings=6_000)
     first, second = (sensor.rays(np.random.default_rng(k)) for k in range(2))
     for rays in (first, second):
@@ -159,9 +153,7 @@ def test_a_rosette_fills_a_cone_about_x_and_never_twice_the_same() -> None:
 @pytest.mark.parametrize(
     ("kind", "scenes"), [("bays", 1), pytest.param("absent", 2, marks=pytest.mark.thorough)]
 )
-def test_the_layout_is_read_back(
-    kind: str, scenes: int, tmp_path: Path, run_command: Callable[..., Any]
-) -> None:
+def test_the_layout_is_read_back(kind, scenes, tmp_path, run_command):
     out = tmp_path / "sites"
     said, _ = run_command("synth", out, "--lookalikes", kind, "--sensor", "lidar", "--rooms", 1,
                   "--views", 2, "--seed", SEED)  # fmt: skip
@@ -175,5 +167,5 @@ def test_the_layout_is_read_back(
         read = parts[part].frames
         assert len(read) == len(clouds)
         back = read[1].read()
-        np.testing.assert_allclose(back.points, clouds[1].points, atol=1e-5)  # type: ignore[union-attr]
+        np.testing.assert_allclose(back.points, clouds[1].points, atol=1e-5)
         np.testing.assert_allclose(back.pose, clouds[1].pose, atol=1e-6)

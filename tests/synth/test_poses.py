@@ -1,16 +1,14 @@
 import numpy as np
 import pytest
 
-from sceneprint.types import Floats
 from sceneprint_lab.synth import make_room, scattered_poses, trajectory
-from sceneprint_lab.synth.mesh import SyntheticMesh
-from sceneprint_lab.synth.rooms import Room, inside
+from sceneprint_lab.synth.rooms import inside
 from sceneprint_lab.synth.trajectories import CLEARANCE, HEIGHTS, clear
 
 SEEDS = (0, 1, 2)
 
 
-def winding(mesh: SyntheticMesh, point: Floats) -> float:
+def winding(mesh, point):
     """How often the mesh encloses a point: its solid angle over 4 pi."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
@@ -20,7 +18,7 @@ def winding(mesh: SyntheticMesh, point: Floats) -> float:
     return float(2 * np.arctan2(numerator, denominator).sum() / (4 * np.pi))
 
 
-def assert_good(room: Room, poses: list[Floats]) -> None:
+def assert_good(room, poses):
     for T in poses:
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1)

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import MissingDependency
-from sceneprint.types import Floats, Intrinsics
+from sceneprint.types import Intrinsics
 from sceneprint_lab.synth import Caster, cast_depth, make_room
-from sceneprint_lab.synth.mesh import SyntheticMesh, ellipsoid, face_normals, mesh_of
+from sceneprint_lab.synth.mesh import ellipsoid, face_normals, mesh_of
 from sceneprint_lab.synth.sensors import cast_faces, pixel_rays
 from sceneprint_lab.synth.trajectories import pose
 
 SMALL = Intrinsics(24, 18, 20.0, 21.0, 11.3, 8.9)
 
 
-def oracle(mesh: SyntheticMesh, T: Floats, camera: Intrinsics) -> tuple[Floats, Floats]:
+def oracle(mesh, T, camera):
     """Depth and cosine by Moeller and Trumbore against every triangle."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     normals = face_normals(mesh)

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.types import Floats, Floats32
-from sceneprint_lab.synth.mesh import SyntheticMesh, box
+from sceneprint_lab.synth.mesh import box
 from sceneprint_lab.synth.sensors import Caster, Spinning, scan
 
 HALF = np.array([6.0, 4.0, 2.0])  #: of the box scanned from within, metres
@@ -20,33 +19,33 @@ SENSOR = Spinning(
 )
 
 
-def inside_out(mesh: SyntheticMesh) -> SyntheticMesh:
+def inside_out(mesh):
     return replace(mesh, faces=mesh.faces[:, ::-1].copy())
 
 
 @pytest.fixture(scope="module")
-def shell() -> Caster:
+def shell():
     return Caster(inside_out(box(2 * HALF[0], 2 * HALF[1], 2 * HALF[2], (0.0, 0.0, -HALF[2]))))
 
 
-def pose(yaw: float, at: tuple[float, float, float]) -> Floats:
+def pose(yaw, at):
     T = np.eye(4)
     T[:2, :2] = [[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]]
     T[:3, 3] = at
     return T
 
 
-def ranges(points: Floats32) -> Floats:
+def ranges(points):
     return np.asarray(np.linalg.norm(points.astype(float), axis=1))
 
 
-def from_walls(points: Floats32, T: Floats) -> Floats:
+def from_walls(points, T):
     """Distance of each point from the nearest of the six sides."""
     world = points @ T[:3, :3].T + T[:3, 3]
     return np.asarray(np.abs(np.abs(world) - HALF).min(axis=1))
 
 
-def test_every_point_lies_on_a_wall_within_noise(shell: Caster) -> None:
+def test_every_point_lies_on_a_wall_within_noise(shell):
     T = pose(0.7, (1.0, -0.5, 0.3))
     points = scan(shell, T, SENSOR, np.random.default_rng(0))
     assert points.dtype == np.float32
@@ -57,7 +56,7 @@ def test_every_point_lies_on_a_wall_within_noise(shell: Caster) -> None:
     assert 0.003 < off.mean() < SENSOR.sigma
 
 
-def test_without_errors_nothing_is_lost_and_all_is_exact(shell: Caster) -> None:
+def test_without_errors_nothing_is_lost_and_all_is_exact(shell):
     T = pose(-2.0, (0.0, 1.0, 0.0))
     ideal = replace(SENSOR, sigma=0.0, ring_sigma=0.0, loss=0.0, grazing=0.0)
     points = scan(shell, T, ideal, np.random.default_rng(0))

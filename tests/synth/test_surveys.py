@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from sceneprint_lab.synth.dataset import Survey, premises_and_rng, synthesise_survey
+from sceneprint_lab.synth.dataset import premises_and_rng, synthesise_survey
 from sceneprint_lab.synth.sensors import Spinning
 from sceneprint_lab.synth.trajectories import STEP
 
@@ -13,7 +13,7 @@ from sceneprint_lab.synth.trajectories import STEP
 SMALL = Spinning(rings=8, azimuth_step=0.03)
 
 
-def digest(survey: Survey) -> str:
+def digest(survey):
     h = hashlib.sha256()
     for cloud in survey.clouds:
         assert cloud.pose is not None
@@ -21,7 +21,7 @@ def digest(survey: Survey) -> str:
     return h.hexdigest()
 
 
-def test_the_same_seed_gives_the_same_bytes_in_any_order() -> None:
+def test_the_same_seed_gives_the_same_bytes_in_any_order():
     first = digest(synthesise_survey(5, 0, 2, sensor=SMALL))
     assert digest(synthesise_survey(5, 2, 2, sensor=SMALL)) != first
     assert digest(synthesise_survey(6, 0, 2, sensor=SMALL)) != first
@@ -29,7 +29,7 @@ def test_the_same_seed_gives_the_same_bytes_in_any_order() -> None:
 
 
 @pytest.mark.parametrize("kind", ["hall", "storey", "block"])
-def test_a_walk_stays_where_one_can_walk(kind: str) -> None:
+def test_a_walk_stays_where_one_can_walk(kind):
     survey = synthesise_survey(7, 1, 12, along_path=True, kind=kind, sensor=SMALL)
     assert (survey.name, survey.kind, len(survey.clouds)) == ("site-001", kind, 12)
     premises, _ = premises_and_rng(7, 1, kind)
@@ -45,7 +45,7 @@ def test_a_walk_stays_where_one_can_walk(kind: str) -> None:
     assert gaps.min() > premises.floor.cell / 2
 
 
-def test_scans_of_one_walk_agree_in_world_coordinates() -> None:
+def test_scans_of_one_walk_agree_in_world_coordinates():
     """Points of one scan lie on what the next one sees: the poses are those of the scans."""
     hall = synthesise_survey(8, 0, 2, along_path=True, perfect=True)
     a, b = (c.points @ c.pose[:3, :3].T + c.pose[:3, 3] for c in hall.clouds if c.pose is not None)
@@ -56,7 +56,7 @@ def test_scans_of_one_walk_agree_in_world_coordinates() -> None:
     assert len(hall.clouds[0].points) > 10_000
 
 
-def test_the_scanner_of_each_site_is_its_own() -> None:
+def test_the_scanner_of_each_site_is_its_own():
     sensors = {synthesise_survey(9, index, 1).sensor for index in range(3)}
     assert len(sensors) == 3
     assert all(0.2 < sensor.azimuth_step * 180 / np.pi * 1.2 < 0.8 for sensor in sensors)

@@ -7,13 +7,13 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.types import Intrinsics
-from sceneprint_lab.synth import KINECT, SynthRoom, render, synthesise_room
+from sceneprint_lab.synth import KINECT, render, synthesise_room
 from sceneprint_lab.synth.dataset import room_and_rng
 
 SMALL = Intrinsics(160, 120, 146.25, 146.25, 80.0, 60.0)
 
 
-def digest(room: SynthRoom) -> str:
+def digest(room):
     h = hashlib.sha256()
     for frame in room.frames:
         assert frame.pose is not None

@@ -7,11 +7,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -31,33 +29,33 @@ class Crew:
     errors: Path
     process: subprocess.Popen[bytes]
 
-    def log(self, message: str) -> list[dict[str, Any]]:
+    def log(self, message):
         text = self.errors.read_text()
         lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
         return [line for line in lines if line["message"] == message]
 
-    def rows(self, asked: str) -> list[tuple[Any, ...]]:
+    def rows(self, asked):
         with self.engine.store.database.read() as connection:
             return [tuple(row) for row in connection.exec_driver_sql(asked)]
 
-    def change(self, statement: str) -> None:
+    def change(self, statement):
         with self.engine.store.database.write() as connection:
             connection.exec_driver_sql(statement)
 
-    def settled(self, map_name: str, count: int) -> None:
+    def settled(self, map_name, count):
         """Wait until all frames of a map are indexed."""
         until(lambda: self.engine.get_map(map_name).frames == {"indexed": count})
 
-    def job(self, job_id: str, columns: str) -> tuple[Any, ...]:
+    def job(self, job_id, columns):
         (row,) = self.rows(f"SELECT {columns} FROM jobs WHERE id = '{job_id}'")
         return row
 
-    def pid(self, job_id: str) -> int:
+    def pid(self, job_id):
         """Return the process id of the worker that holds or last held a job."""
         (worker,) = self.job(job_id, "worker")
         return int(worker.rpartition(":")[2]) if worker else 0
 
-    def signed(self, map_name: str) -> list[int]:
+    def signed(self, map_name):
         """Return the number of signatures of each frame of a map."""
         asked = (
             "SELECT count(*) FROM signatures s JOIN frames f ON f.number = s.frame_number "
@@ -65,19 +63,19 @@ class Crew:
         )
         return [count for (count,) in self.rows(asked)]
 
-    def pause(self) -> None:
+    def pause(self):
         """Stop both workers while neither is writing, since its lock would block others."""
         with self.engine.store.database.write():
             self.send(signal.SIGSTOP)
 
-    def send(self, number: int, workers: int = 2) -> None:
+    def send(self, number, workers=2):
         """Send a signal to both workers or to the first one."""
         for line in self.log("worker ready")[:workers]:
             os.kill(int(line["worker"].rpartition(":")[2]), number)
 
 
 @pytest.fixture(scope="module")
-def frames(room_frames, small_image) -> list[tuple[bytes, FrameMeta]]:
+def frames(room_frames, small_image):
     """Small frames with different content, from different offsets."""
     found = []
     for number in range(64):
@@ -87,11 +85,11 @@ def frames(room_frames, small_image) -> list[tuple[bytes, FrameMeta]]:
 
 
 @pytest.fixture(scope="session")
-def hire(tmp_path_factory) -> Callable[..., AbstractContextManager[Crew]]:
+def hire(tmp_path_factory):
     """A function that runs a command with two workers on a separate store with the map `warm`."""
 
     @contextmanager
-    def run(command: list[str], **settings: object) -> Iterator[Crew]:
+    def run(command, **settings):
         folder = tmp_path_factory.mktemp("crew")
         errors = tmp_path_factory.mktemp("errors") / "stderr"
         given = {"data_dir": folder, "workers": 2, **settings}
@@ -115,7 +113,7 @@ def hire(tmp_path_factory) -> Callable[..., AbstractContextManager[Crew]]:
 
 
 @pytest.fixture(scope="module")
-def crew(hire) -> Iterator[Crew]:
+def crew(hire):
     with hire([f"{Path(sys.executable).parent}/sceneprint", "work"], job_lease_s=LEASE_S) as crew:
         yield crew
         crew.process.terminate()
@@ -133,19 +131,19 @@ class Slow:
     pipe: Path
     data: bytes
 
-    def give(self) -> None:
+    def give(self):
         """Write all bytes for the reader of the pipe."""
         opened = until(self._opened)
         assert os.write(opened, self.data) == len(self.data)
         os.close(opened)
 
-    def _opened(self) -> int:
+    def _opened(self):
         try:
             return os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK)
         except OSError:
             return 0  # the pipe has no reader yet
 
-    def mend(self) -> None:
+    def mend(self):
         """Replace the pipe by a file for later readers."""
         other = self.path.with_suffix(".mended")
         other.write_bytes(self.data)
@@ -153,10 +151,10 @@ class Slow:
 
 
 @pytest.fixture
-def slow(crew, frames) -> Callable[[str, int], Slow]:
+def slow(crew, frames):
     """A function that uploads a frame whose blob is a pipe, before any worker claims it."""
 
-    def make(name: str, number: int) -> Slow:
+    def make(name, number):
         crew.engine.create_map(NewMap(name=name, model="depth"))
         crew.pause()
         added, _ = crew.engine.add_frame(name, *frames[number])

@@ -1,12 +1,9 @@
 """Tests of a worker's limits, its termination, and its remains."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +11,7 @@ from sceneprint.errors import LostLease
 from worker.loop import HEAD, KEPT, Trace
 
 
-def run(code: str, *arguments: str) -> str:
+def run(code, *arguments):
     done = subprocess.run(
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
     )
@@ -38,9 +35,7 @@ except MemoryError:
 
 
 @pytest.mark.parametrize(("limit", "said"), [(128 << 20, "not enough memory"), (0, "had it")])
-def test_what_is_written_is_limited_and_what_is_mapped_is_not(
-    tmp_path: Path, limit: int, said: str
-) -> None:
+def test_what_is_written_is_limited_and_what_is_mapped_is_not(tmp_path, limit, said):
     with (tmp_path / "table").open("wb") as file:
         file.truncate(512 << 20)
     assert run(MEMORY, str(limit), str(tmp_path / "table")) == said
@@ -58,11 +53,11 @@ print(stop.requested)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_wait(number: int) -> None:
+def test_a_signal_ends_the_wait(number):
     assert run(STOP, str(int(number))).split() == ["False", "True"]
 
 
-def test_a_job_that_is_done_leaves_nothing() -> None:
+def test_a_job_that_is_done_leaves_nothing():
     trace = Trace()
     assert (trace.read().job_id, trace.read().text) == (None, "")
     with trace.job("ab", 3, 600.0):
@@ -74,7 +69,7 @@ def test_a_job_that_is_done_leaves_nothing() -> None:
     trace.close()
 
 
-def test_an_error_that_ends_the_worker_leaves_its_traceback() -> None:
+def test_an_error_that_ends_the_worker_leaves_its_traceback():
     trace = Trace()
     with pytest.raises(MemoryError), trace.job("ab" * 16, 12, 600.0):
         raise MemoryError("all of it")
@@ -85,7 +80,7 @@ def test_an_error_that_ends_the_worker_leaves_its_traceback() -> None:
     trace.close()
 
 
-def test_of_a_long_traceback_the_end_is_kept() -> None:
+def test_of_a_long_traceback_the_end_is_kept():
     trace = Trace()
     with pytest.raises(ValueError, match="end"), trace.job("ab", 1, 600.0):
         raise ValueError("x" * (2 * KEPT) + "the end")
@@ -95,7 +90,7 @@ def test_of_a_long_traceback_the_end_is_kept() -> None:
     trace.close()
 
 
-def test_a_crash_of_no_job_is_not_mistaken_for_one() -> None:
+def test_a_crash_of_no_job_is_not_mistaken_for_one():
     trace = Trace()
     os.write(trace._descriptor, b"Fatal Python error: Segmentation fault\n" + b"x" * HEAD)
     assert trace.read().job_id is None
@@ -116,7 +111,7 @@ with trace.job("ab", 7, 0.3):
 """
 
 
-def test_code_that_never_gives_the_interpreter_back_is_ended() -> None:
+def test_code_that_never_gives_the_interpreter_back_is_ended():
     trace = Trace()
     own = trace._descriptor
     done = subprocess.run([sys.executable, "-c", TIMEOUT, str(own)], pass_fds=[own], check=False)

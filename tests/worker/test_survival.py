@@ -1,18 +1,13 @@
 """Tests that workers survive frames that crash, hang, or exhaust memory."""
 
-from __future__ import annotations
-
 import signal
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from benchmarks.waiting import PATIENCE_S, until
-from sceneprint_client.api import FrameMeta, NewMap
-from tests.whole_engine import Engine
+from sceneprint_client.api import NewMap
 
 #: The workers as they are, but for what they do with frames of some focal lengths. Nothing but
 #: the bell, and the time of the next try, wakes those that wait.
@@ -52,20 +47,20 @@ MARKS = {"crashing": 101, "hanging": 102, "hungry": 103, "broken": 104}
 
 
 @pytest.fixture(scope="module")
-def script(tmp_path_factory) -> list[str]:
+def script(tmp_path_factory):
     path = tmp_path_factory.mktemp("script") / "spoilt.py"
     path.write_text(SCRIPT)
     return [sys.executable, str(path)]
 
 
 @pytest.fixture(scope="module")
-def crew(hire, script) -> Iterator[Any]:
+def crew(hire, script):
     with hire(script, job_timeout_s=6, worker_memory_bytes=512 << 20) as crew:
         crew.engine.create_map(NewMap(name="hall", model="depth"))
         yield crew
 
 
-def add_marked(engine: Engine, frame: tuple[bytes, FrameMeta], what: str) -> str:
+def add_marked(engine, frame, what):
     """Upload a frame whose focal length says what becomes of its worker; id of its job."""
     data, meta = frame
     lens = meta.intrinsics.model_copy(update={"fx": float(MARKS[what])})
@@ -78,7 +73,7 @@ def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frame
     good = [crew.engine.add_frame("hall", *one)[0].job_id for one in frames[8:12]]
     ended = {"failed": 4, "indexed": 4}  # four workers later, on a machine that is busy
     until(lambda: crew.engine.get_map("hall").frames == ended, 2 * PATIENCE_S)
-    jobs: dict[str, Any] = {what: crew.engine.get_job(job) for what, job in bad.items()}
+    jobs = {what: crew.engine.get_job(job) for what, job in bad.items()}
     assert {(job.state, job.attempts) for job in jobs.values()} == {("dead", 1)}
     for what, job in jobs.items():
         assert f"in {what}" in job.traceback
@@ -121,7 +116,7 @@ def test_waiting_workers_leave_with_the_one_who_started_them(hire, script, alive
 def alive():
     """Whether a process runs."""
 
-    def look(pid: int) -> bool:
+    def look(pid):
         try:
             return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
         except OSError:

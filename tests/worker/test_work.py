@@ -1,7 +1,5 @@
 """Tests of worker processes, which sign each frame once after faults of disk and database."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Tests of lost and damaged blobs, and of unreferenced files."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import time

@@ -1,7 +1,5 @@
 """Tests that frames are checked in blocks of constant cost."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest

@@ -1,7 +1,5 @@
 """Tests of `sceneprint fsck`: output, exit codes, and use beside a service."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Tests of a damaged database file, and of missing folders."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from contextlib import closing
@@ -33,7 +31,7 @@ def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house):
     content = dump(path)
     blobs = {name for name in house.files() if name.startswith("data/blobs")}
     found = dict.fromkeys(("refused", "fatal", "rows", "nothing"), 0)
-    messages: list[str] = []
+    messages = []
     used = np.flatnonzero(np.frombuffer(sound, np.uint8))
     for _ in range(FLIPS):
         data = bytearray(sound)

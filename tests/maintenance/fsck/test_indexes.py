@@ -1,7 +1,5 @@
 """Tests of damaged indexes, and of indexes that differ from the database."""
 
-from __future__ import annotations
-
 import pytest
 
 from sceneprint_client.api import Query

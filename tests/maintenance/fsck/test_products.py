@@ -1,7 +1,5 @@
 """Tests of files of jobs, tiles, kept answers and deletions."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of damaged or contradictory rows and signatures."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

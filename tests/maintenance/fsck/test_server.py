@@ -1,7 +1,5 @@
 """Tests of the check and repair of a fleet's store on PostgreSQL."""
 
-from __future__ import annotations
-
 import psycopg
 import pytest
 from pydantic import SecretStr
