@@ -49,7 +49,7 @@ FROM python:3.11-slim-bookworm
 
 LABEL org.opencontainers.image.title="sceneprint" \
       org.opencontainers.image.description="Place recognition from pure geometry: service and workers" \
-      org.opencontainers.image.version="1.0.0rc1" \
+      org.opencontainers.image.version="1.0.0" \
       org.opencontainers.image.licenses="Apache-2.0"
 
 # OMP, OPENBLAS: our kernels want one thread each (see Makefile).

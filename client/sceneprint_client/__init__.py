@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sceneprint_client.spool import Spool
     from sceneprint_client.tracker import AsyncTracker, State, Tracker
 
-__version__ = "1.0.0rc1"
+__version__ = "1.0.0"
 __all__ = [
     "AsyncClient",
     "AsyncTracker",

@@ -75,11 +75,8 @@ def test_the_distributions_have_one_version():
     )
     versions = {one["version"] for one in (main, client, lab, viewers)}
     assert versions == {sceneprint_client.__version__}
-    version = client["version"]
-    # a bound of 1.0 would exclude 1.0.0rc1, which comes before it
-    least = version if "rc" in version else version.rpartition(".")[0]
-    major, minor = version.split(".")[:2]
-    bounds = f">={least},<{major}.{int(minor) + 1}"
+    major, minor = client["version"].split(".")[:2]
+    bounds = f">={major}.{minor},<{major}.{int(minor) + 1}"
     assert f"sceneprint-client{bounds}" in main["dependencies"]
     for one in (lab, viewers):
         assert f"sceneprint{bounds}" in one["dependencies"]

@@ -281,7 +281,6 @@ def test_the_package_names_what_it_is_made_of():
     setup = (PACKAGE / "setup.py").read_text()
     version = manifest.findtext("version")
     assert f'version="{version}"' in setup
-    # package.xml allows three numbers and no more: a release candidate has those of its release
-    assert version == sceneprint_client.__version__.partition("rc")[0]
+    assert version == sceneprint_client.__version__
     for path in [*PACKAGE.glob("launch/*"), *PACKAGE.glob("config/*")]:
         assert path.relative_to(PACKAGE).as_posix() in setup
