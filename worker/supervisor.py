@@ -136,7 +136,10 @@ class Supervisor:
 
 def _cause(code: int, left: WorkerTrace, job_s: float) -> str:
     if left.timed_out:
-        return f"its worker exceeded {job_s:g} s and was stopped"
+        return (
+            f"its worker exceeded {job_s:g} s and was stopped. If the machine is slow or busy, "
+            "raise SCENEPRINT_JOB_TIMEOUT_S and restart."
+        )
     if code == -signal.SIGKILL:
         return "its worker was killed by signal 9 (possibly out of memory)"
     if code < 0:
