@@ -210,8 +210,8 @@ def decide(
         if estimate is None or estimate.status == "found":
             return estimate
         again = [
-            None if known is None else database.search(number, known)
-            for number, known in enumerate(map(unguided_validations, of_candidates))
+            None if existing is None else database.search(number, existing)
+            for number, existing in enumerate(map(unguided_validations, of_candidates))
         ]
         if not any(again):
             return estimate

@@ -193,9 +193,9 @@ def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
 
     Returns
     -------
-    colours : (h', w', 3) uint8, pixels of `vista_of`; dark grey if unknown meaning : `near_m` and
-        `far_m`, depths or ranges at the ends of the colour map, or `low_m` and `high_m`, heights
-        relative to the mean; and a description
+    colours : (h', w', 3) uint8, pixels of `vista_of`; dark grey if unknown
+    meaning : `near_m` and `far_m`, depths or ranges at the ends of the colour map, or `low_m` and
+        `high_m`, heights relative to the mean; and a description
     """
     vista = vista_of(surface)
     z, shown = vista.of(vista.distances), vista.shown

@@ -294,7 +294,7 @@ def _collect_votes(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
     p: LocalizationParameters,
 ) -> list[_Vote]:  # fmt: skip
-    """Return the votes of accepted matches, best first, then the votes of ambiguous matches."""
+    """Return the votes of accepted matches of all frames, best first, then of ambiguous matches."""
     votes: list[_Vote] = []
     for frame in frames:
         ahead = np.array([looks_ahead(frame.geometry)])

@@ -95,8 +95,8 @@ def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -
     ------
     ValueError : If a level does not exist or the length is out of bounds
     """
-    known = [level for level in range(n_levels) if level in levels]
-    if not known or list(levels) != known or any(isinstance(level, bool) for level in levels):
+    valid = [level for level in range(n_levels) if level in levels]
+    if not valid or list(levels) != valid or any(isinstance(level, bool) for level in levels):
         raise ValueError(
             f"a whitening cannot use the levels {list(levels)} of a hierarchy of {n_levels}"
         )
