@@ -267,7 +267,7 @@ class Settings(BaseSettings):
     # Retention
     undo_window_s: float = _setting(
         "Time for which a deletion can be undone, seconds; 0 makes it final at once.",
-        "0 if deletions must be final at once; longer if mistakes are noticed late.",
+        "Longer if mistakes are noticed late.",
         default=600.0, ge=0, le=31_536_000,
     )  # fmt: skip
     purge_deadline_s: float = _setting(
@@ -277,8 +277,7 @@ class Settings(BaseSettings):
         default=3600.0, ge=1, le=31_536_000,
     )  # fmt: skip
     deleted_rows_days: float = _setting(
-        "Time for which rows of deleted and redundant frames, and of their jobs, remain in the "
-        "database, days.",
+        "Time for which rows of deleted and redundant frames and of their jobs are stored, days.",
         "Longer than the longest downtime of a host, after which its index would be rebuilt.",
         default=7.0, ge=1, le=36_500,
     )  # fmt: skip
