@@ -79,7 +79,7 @@ def index_states(connection: Connection, indexes: Path) -> list[IndexState]:
 
 
 def anchors(indexes: Path) -> frozenset[int]:
-    """Return the numbers of the events to which the indexes of this machine are anchored."""
+    """Return the event numbers to which the indexes of this machine are anchored."""
     if not indexes.is_dir():
         return frozenset()
     folders = [folder for folder in indexes.iterdir() if is_index_folder(folder.name)]
@@ -255,7 +255,7 @@ class StoreCounts:
 
     Parameters
     ----------
-    frames, jobs : number of frames and of jobs, by state
+    frames, jobs : frame counts and job counts, by state
     sizes : result of `sizes`
     at : time of the counts, seconds since 1970
     seconds : duration of counting

@@ -184,7 +184,7 @@ def _store(
 
     Raises
     ------
-    LostLease, Outdated : If the job must not store the result.
+    LostLease, Outdated : If another worker took the job, or the map has switched its model.
     DamagedBlob : If a deletion removed the artifact.
     """
     signature = result.signature

@@ -323,7 +323,7 @@ def _make_room(
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:
-    """Return the log fields of a job, and the fields `more`."""
+    """Return the log fields of a job, with the fields `more` added."""
     job = task.job
     name = None if task.map is None else task.map.name
     return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

@@ -115,7 +115,7 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
 
 
 def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
-    """Return the numbers of the frames to compare the next frame with, in ascending order.
+    """Return the frame numbers to compare the next frame with, in ascending order.
 
     These are the frames of the other session, or sufficiently earlier frames of the same session.
     """

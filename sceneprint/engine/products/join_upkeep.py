@@ -35,7 +35,7 @@ LOOK_S = 5.0
 LEAST_FRAMES = 5
 #: Factor by which two sessions must grow before they are associated again.
 GROWTH = 1.25
-#: Number of the newest associations of a map to consider.
+#: Number of newest associations to consider per map.
 _JOBS = 200
 
 

@@ -3,7 +3,7 @@
     frames  --step-->  items  --coverage_plans-->  plans, counts
 
 Each query excludes the frame itself and, depending on the request, frames of the same time or
-session. Otherwise it equals the query of a robot. The answer is not stored.
+session. Otherwise, it is the same as the query of a robot. The answer is not stored.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class _Measurement:
     plans: list[CoveragePlan]
 
 
-#: Maximum number of parent frames with a plan, selected by their number of queried frames.
+#: Maximum number of parent frames with a plan: those with the most queried frames.
 MOST_PLANS = 20
 #: A duration, in seconds, that exceeds any session.
 _FOREVER_S = 1e12
@@ -77,7 +77,7 @@ _SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, Unreada
 
 
 def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage) -> list[int]:
-    """Return the numbers of the frames that a coverage job queries, in query order.
+    """Return the frame numbers that a coverage job queries, in query order.
 
     Raises
     ------

@@ -66,7 +66,7 @@ SIDES: tuple[Side, Side] = ("before", "after")
 
 
 def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -> str:
-    """Return the parent frame to compare two sessions in: the requested, or the most common one.
+    """Return the parent frame in which to compare two sessions: the requested or most common one.
 
     Raises
     ------

@@ -92,7 +92,7 @@ _SHARE = 1 / 16
 
 @dataclass(eq=False)
 class _Waiting:
-    """A query to be written, its answer, and the size of the geometry in bytes."""
+    """A query to be written, its answer, and the size of the geometry, bytes."""
 
     row: NewQuery
     answer: StoredAnswer | None

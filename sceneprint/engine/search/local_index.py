@@ -53,8 +53,8 @@ class IndexView:
     Parameters
     ----------
     size : number of searchable frames
-    dead : numbers of deleted frames in the index or the tail
-    damaged : numbers of frames without a readable signature
+    dead : frame numbers of deleted frames in the index or the tail
+    damaged : frame numbers of frames without a readable signature
     version : version of the index; None without an index
     """
 

@@ -310,8 +310,8 @@ class MapSearch:
 
     Parameters
     ----------
-    dead : numbers of excluded frames: deleted frames, and the queried frame
-    among : numbers of the frames that pass the filter; None without a filter
+    dead : frame numbers to exclude: deleted frames, and the queried frame
+    among : frame numbers that pass the filter; None without a filter
     size : number of searchable frames
     """
 
@@ -419,7 +419,7 @@ def _part(store: Store, place: SearchedMap, prepared: PreparedQuery, query: Quer
 def _among(
     store: Store, place: SearchedMap, dead: frozenset[int], prepared: PreparedQuery, filters: Filter
 ) -> Keys:
-    """Return the numbers of the frames in a view, except `dead`, that pass a filter."""
+    """Return the frame numbers in a view that pass a filter, except `dead`."""
     view = place.view
     with store.database.read() as connection:
         numbers = passing_frames(connection, place.row.number, filters, prepared.origin)

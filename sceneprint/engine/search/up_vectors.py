@@ -51,7 +51,7 @@ def parent_up(connection: Connection, numbers: Iterable[int]) -> Floats | None:
 
     Parameters
     ----------
-    numbers : numbers of frames with poses in this parent frame
+    numbers : frame numbers of frames with poses in this parent frame
 
     Returns
     -------

@@ -174,7 +174,7 @@ PAUSE = 10.0
 
 @dataclass(frozen=True)
 class Purged:
-    """Numbers of objects that a purge removed or rebuilt.
+    """Counts of the objects that a purge removed or rebuilt.
 
     Parameters
     ----------
