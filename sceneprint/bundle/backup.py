@@ -49,9 +49,9 @@ from sceneprint_client.api import FrameState
 THREADS = 8
 #: Number of blobs per task of a thread; most of them are already in the place.
 _BATCH = 256
-#: Size in bytes above which a blob is streamed instead of read into memory.
+#: Size, in bytes, above which blobs are streamed instead of read into memory.
 LARGE = 8 << 20
-#: Callback with the number of finished rows and blobs, and their total.
+#: Callback that receives the number of finished rows and blobs, and the number of all.
 Progress = Callable[[int, int], None]
 #: Columns of a list of blobs: digest, size in bytes, and reason why the blob is not in the bundle.
 BLOB_COLUMNS = ("digest", "bytes", "lost")
@@ -113,7 +113,8 @@ def take_backup(
     settings : settings with the addresses of the database and the blobs
     place : folder, or URL of an object store; a missing folder is created
     progress : see Progress
-    keep : number of newest bundles to retain, including this one; None retains all
+    keep : number of newest bundles to retain, including this one; older bundles and parts that only
+        they need are removed. None retains all bundles
 
     Raises
     ------
@@ -159,6 +160,7 @@ class _Backup:
         self._reusable = _reusable_parts(place)
 
     def write(self, database: Database, blobs: Blobs) -> Bundle:
+        """Write all rows and blobs, and then the manifest; return the bundle."""
         started_at, parts = datetime.now(UTC), list[Part]()
         with tempfile.TemporaryFile() as digests:
             with database.read() as connection:
@@ -232,7 +234,7 @@ class _Backup:
             self._advance(len(entries))
 
     def _copy(self, blobs: Blobs, digest: str) -> tuple[ListedBlob, int]:
-        """Copy a blob if it is missing; return its list entry and the number of bytes written."""
+        """Copy a blob unless it is in the place; return its list entry and the written bytes."""
         if not is_digest(digest):  # the database was edited by hand
             return (digest, 0, "missing"), 0
         stored_size = self._place.size(digest)
@@ -302,7 +304,10 @@ def referred(connection: Connection) -> Iterator[str]:
 
 
 def listed_blobs(place: BundlePlace, manifest: BundleManifest) -> Iterator[ListedBlob]:
-    """Yield the entries of a bundle's lists of blobs."""
+    """Yield the entries of a bundle's lists of blobs.
+
+    Raise DamagedBundle if an entry is invalid.
+    """
     lists = (part for part in manifest.parts if part.kind == "blobs")
     for data in in_order(lambda part: place.get(part.digest), lists):
         for digest, size, why in read_rows(data, BLOB_COLUMNS):

@@ -4,7 +4,7 @@
     PLACE/bundles/NAME.json     a manifest, written after all of its parts
     PLACE/parts/ab/SHA256       a part, named by the SHA-256 of its bytes
 
-Parts never change, and bundles share equal parts, so a bundle adds only what changed since the
+Parts never change, and bundles share identical parts, so a bundle adds only what changed since the
 previous bundle. A killed writer leaves earlier bundles intact; a later `prune` removes its parts.
 """
 
@@ -33,9 +33,9 @@ from sceneprint.store.blobs.object_client import Objects, open_objects
 
 _MARK, _BUNDLES, _PARTS = "place.json", "bundles/", "parts/"
 _NAME = re.compile(r"bundles/(\d{8}T\d{6}-\d{6}Z)\.json")
-#: Maximum size of a manifest in bytes; it suffices for about ten million frames.
+#: Maximum size of a manifest, in bytes: enough for about ten million frames.
 LONGEST = 1 << 27
-#: Age in seconds above which unlisted parts are removed; a backup in progress may list newer parts.
+#: Age, in seconds, at which unlisted parts are removed; a backup in progress may list newer parts.
 GRACE_S = 86_400.0
 
 
@@ -63,7 +63,7 @@ class BundleManifest(StrictRecord):
     ----------
     created_at : start of the backup; the bundle contains all earlier changes
     sceneprint, schema_revision : version and schema of the store that wrote the bundle
-    maps, signatures, blobs : number of maps, of signatures, and of blobs
+    maps, signatures, blobs : numbers of maps, signatures and blobs
     frames : number of frames by state
     lost : number of blobs that were missing or damaged in the store
     blob_bytes : total size of the blobs
@@ -142,7 +142,7 @@ class BundlePlace:
         return cls(open_objects(url, "the location of the bundles"), folder)
 
     def claim(self, owner: str) -> None:
-        """Mark the place as owned by a store.
+        """Mark the place as owned by a store, and create its folders.
 
         Raises
         ------
@@ -242,7 +242,7 @@ class BundlePlace:
         return data
 
     def chunks(self, digest: str) -> Iterator[bytes]:
-        """Yield the bytes of a large part without checking its digest."""
+        """Yield the bytes of a large part, unverified. Raise DamagedBundle if it is missing."""
         try:
             yield from self._objects.chunks(_part_key(digest))
         except FileNotFoundError:
@@ -266,7 +266,7 @@ class BundlePlace:
         )
 
     def prune(self, needed: Collection[str], keep: int) -> int:
-        """Remove old bundles, then unneeded parts older than GRACE_S; return the number of parts.
+        """Remove old bundles, then unneeded parts older than GRACE_S; return the count of these.
 
         Parameters
         ----------
@@ -288,6 +288,7 @@ class BundlePlace:
         return len(unneeded)
 
     def _list_sizes(self, first: str) -> dict[str, int]:
+        """Return the sizes of all parts whose digests start with two digits, by digest."""
         folder = f"{_PARTS}{first}/"
         if self._folder is None:
             return {
@@ -309,6 +310,7 @@ def _part_key(digest: str) -> str:
 
 
 def _decode_manifest(data: bytes, place: str) -> BundleManifest:
+    """Parse a manifest. Raise BundleError for another version, DamagedBundle if it is damaged."""
     try:
         record = unseal(data)
         if record.get("format") != "sceneprint-bundle":

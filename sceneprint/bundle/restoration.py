@@ -1,8 +1,7 @@
 """Verification of bundles, and restoration into an empty store.
 
-    bundle  --verify_bundle-->  Bundle
-    bundle  --restore_to_folder-->  data folder with SQLite
-    bundle  --restore_to_server-->  empty PostgreSQL database, and its storage of blobs
+    bundle  --verify_bundle-->  Bundle bundle  --restore_to_folder-->  data folder with SQLite
+    bundle  --restore_to_server-->  empty PostgreSQL database, and its blob storage
 
 Blobs are durable before the first row is written, and one transaction writes all rows. A killed
 restore leaves no usable store, and continues when it is run again.
@@ -47,12 +46,12 @@ from sceneprint.store.opaque_ids import OpaqueIds, owner_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.tables import keys, secrets
 
-#: Names of the database, of the blobs, and of the folder for unfinished files in a data folder.
+#: Names, in a data folder, of the database, the blobs, and the folder for unfinished files.
 _DATABASE, _BLOBS, _WORK = "sceneprint.db", "blobs", ".restoring"
 #: Tables that may have rows in an unused database: secrets, samples of a service's metrics, the
 #: schema range, and the progress of a scrub.
 _INITIAL_TABLES = ("secrets", "samples", "schema_range", "scrubs")
-#: Seconds after which a server no longer lists a closed connection.
+#: Maximum seconds for which a server still lists a closed connection.
 _DISCONNECT_S = 5.0
 
 
@@ -96,6 +95,7 @@ class _Restoration:
         return tuple(lost)
 
     def _copy_blob(self, blobs: Blobs | None, digest: str, size: int) -> None:
+        """Copy a blob unless it is there, or only verify it; raise DamagedBundle if damaged."""
         place = self.place
         if blobs is None:
             condition = place.condition(digest)
@@ -113,7 +113,7 @@ class _Restoration:
                     raise place.damaged(digest, "is damaged")
 
     def rows(self, connection: Connection, *, keep_keys: bool = True) -> None:
-        """Write all rows into an empty database, in the caller's transaction.
+        """Write all rows into an empty database, in the caller's transaction, and verify them.
 
         Parameters
         ----------
@@ -343,7 +343,7 @@ def restore_to_server(
     place: str, settings: Settings, name: str | None = None, progress: Progress | None = None,
     *, keep_keys: bool = True,
 ) -> Bundle:  # fmt: skip
-    """Restore a bundle to an empty PostgreSQL database and its storage of blobs.
+    """Restore a bundle to an empty PostgreSQL database and its blob storage.
 
     Parameters
     ----------
@@ -386,9 +386,9 @@ def restore_to_server(
 
 @contextmanager
 def _owner_mark(settings: Settings, owner: str, before: str) -> Iterator[None]:
-    """Mark the storage of blobs as owned by a store while blobs are copied there.
+    """Mark blob storage as being restored for a store; then, as owned by the store.
 
-    The original store has the same secret, but must not share the storage with the restored store.
+    The original store has the same secret, but must not share its blobs with the restored store.
     """
     if isinstance(settings.blobs, Path):
         make_folder(settings.blobs)

@@ -38,11 +38,11 @@ from sqlalchemy.exc import IntegrityError
 from sceneprint.errors import BundleError, DamagedBundle, UnusableStore
 from sceneprint.store.tables import events, metadata, pending_events
 
-#: Mean number of rows in a part, and size in bytes at which a part ends in any case.
+#: Mean number of rows in a part, and size, in bytes, at which a part ends in any case.
 _ROWS, _BYTES = 1024, 8 << 20
 #: Maximum uncompressed size of a part in bytes; a row may be as large as a request.
 _MOST_BYTES = 1 << 28
-#: Number of rows to read or write at once; a signature may have 125,000 bytes.
+#: Number of rows to read or write at once; a signature may take 125,000 bytes.
 _BLOCK = 200
 #: Number of rows to hash at once.
 _BATCH = 32
@@ -176,7 +176,7 @@ def table_part(table: Table, rows: Iterable[Row]) -> bytes:
 
     Raises
     ------
-    UnusableStore : If a value does not have its column's type, after edits of the database.
+    UnusableStore : If a value does not have its column's type, for example after manual edits.
     """
     try:
         return write_part(
@@ -257,6 +257,7 @@ def decoded_rows(columns: Sequence[Column[Any]], rows: Iterable[Row]) -> Iterato
 
 @cache
 def _decoder(column: Column[Any]) -> Callable[[Any], Any]:
+    """Return the function that decodes a value of a column; it raises TypeError or ValueError."""
     if isinstance(column.type, LargeBinary):
         return lambda value: base64.b64decode(value, validate=True)
     kinds: tuple[type, ...] = (int,)

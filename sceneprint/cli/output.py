@@ -17,7 +17,7 @@ Row = TypeVar("Row", bound="BaseModel")
 
 
 def one_line(text: str) -> str:
-    """Escape a text that contains line breaks or control characters."""
+    """Replace line breaks and control characters in a text."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 

@@ -20,12 +20,12 @@ from sceneprint.types import Bytes
 if TYPE_CHECKING:
     from faiss import IndexBinaryFlat, IndexScalarQuantizer
 
-#: Minimum distance that single precision may round.
+#: Smallest distance that single precision may round.
 ROUNDED = 1 << 24
 
 
 def library() -> Any:
-    """Return the module faiss, limited to one thread: requests run concurrently."""
+    """Return the module faiss, limited to one thread, because requests run concurrently."""
     import faiss  # late, as it takes 0.3 s
 
     faiss.omp_set_num_threads(1)  # the setting applies to the calling thread
@@ -137,8 +137,8 @@ def nearest(
 
     Returns
     -------
-    (count,) rows, with the lowest numbers among equal distances, and (count,) distances; None if
-    FAISS may have rounded a distance
+    (count,) rows, among equal distances those with the lowest numbers, and (count,) distances; None
+    if FAISS may have rounded a distance
     """
     if count == 0:
         return np.empty(0, np.int64), np.empty(0, np.int64)

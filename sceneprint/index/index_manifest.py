@@ -39,7 +39,7 @@ class Recall(StrictRecord):
     ----------
     share : share of the `near` exact nearest neighbours that a search finds
     near : number of neighbours
-    sample : number of measured queries by frames of the map, excluding the frame; 0 if searches
+    sample : number of frames used as queries, each excluded from its own results; 0 if searches
         compare all frames
     probes : minimum number of frames that sketches select for a search; 0 without sketches
     frames : number of frames at the time of the measurement
@@ -87,7 +87,7 @@ class IndexManifest(StrictRecord):
 
     Parameters
     ----------
-    number : number, larger than that of the previous version
+    number : number of the version, larger than that of the previous version
     revision : revision of the map up to which the index contains its frames
     model_id : id of the model that signed the frames
     dimension : D, length of a signature in bytes
@@ -125,14 +125,14 @@ class IndexManifest(StrictRecord):
 
     @property
     def worn_keys(self) -> tuple[str, ...]:
-        """Return the names of the parts with keys, for segments with removed frames."""
+        """Return the names of the key parts of segments from which frames were removed."""
         return tuple(
             segment.files[0][0] for segment in self.segments if segment.file("gone") is not None
         )
 
     @property
     def recall(self) -> Recall:
-        """Return the recall of a search: the minimum over the segments."""
+        """Return the recall of a search: the lowest share of any segment, and the totals of all."""
         recalls = [segment.recall for segment in self.segments]
         return Recall(
             share=min((recall.share for recall in recalls), default=1.0),

@@ -87,7 +87,7 @@ class IndexVersion:
     @cached_property
     def keys(self) -> Keys:
         """Return the keys (N,) of the frames in ascending order."""
-        standing = [one.keys[one.standing_rows(one.gone)] for one in self.segments]
+        standing = [part.keys[part.standing_rows(part.gone)] for part in self.segments]
         return np.sort(np.concatenate([np.empty(0, np.int64), *standing]))
 
     def has(self, keys: Keys) -> NDArray[np.bool_]:
@@ -227,11 +227,11 @@ class Tail:
         return Places(self.keys)
 
     def rows_among(self, gone: Keys, among: Keys | None) -> NDArray[np.int64]:
-        """Return the rows of frames in `among` (None: all) but not in `gone`; both ascend."""
+        """Return the rows of frames in `among` (None: all) but not in `gone`; keys ascend."""
         free = np.full(len(self), among is None)
         if among is not None:
-            free[self.places.found(among)] = True
-        free[self.places.found(gone)] = False
+            free[self.places.matches(among)] = True
+        free[self.places.matches(gone)] = False
         return np.flatnonzero(free)
 
 
@@ -359,9 +359,9 @@ def publish(
 ) -> IndexVersion | None:
     """Publish the version that follows `previous`.
 
-    A single process builds in a folder at a time. The two newest versions remain; parts of older
-    versions are removed, while readers may still use them. Only new frames, and the segments with
-    which they are merged, are written. Memory holds the signatures of one segment at a time.
+    Only one process builds in a folder at a time. All versions except `previous` and the new one
+    are removed; readers that have mapped them can still use them. Only new frames, and the segments
+    with which they are merged, are written. Memory holds the signatures of one segment at a time.
 
     Parameters
     ----------
@@ -374,15 +374,15 @@ def publish(
     drop : keys of deleted frames
     anchor : function that returns the anchor; called after `blocks` are read
     clean : whether to remove all bytes of deleted frames, and therefore the previous version
-    flat_bytes : size of signatures in bytes above which sketches are written
+    flat_bytes : sketches are written if the signatures exceed this size, bytes
     after : number that the new version's number must exceed
     share : function that is called with the manifest before it is written; it returns False to
         cancel the publication, if another host published a version with this number
 
     Returns
     -------
-    version : open version; None if another process is building, or if `previous` is no longer the
-        newest version: open the newest version, and try again
+    version : open version; None if another process is building, if `share` returns False, or if
+        `previous` is no longer the newest version: open the newest version, and try again
 
     Raises
     ------
@@ -391,7 +391,9 @@ def publish(
     OSError : If a file cannot be written; the previous version remains.
     """
     if previous is not None and previous.model_id != model_id:
-        raise ValueError(f"frames of model {model_id} appended to those of {previous.model_id}")
+        raise ValueError(
+            f"an index of model {previous.model_id} cannot contain frames of {model_id}"
+        )
     with folder_turn(folder) as mine:
         if not mine or (previous is not None and _is_overtaken(folder, previous)):
             return None
@@ -444,7 +446,7 @@ def _is_overtaken(folder: Path, previous: IndexVersion) -> bool:
 
 
 def clear(folder: Path, but: int | None = None) -> bool:
-    """Remove all versions of an index except number `but`; return False if a process is building.
+    """Remove all versions of an index except number `but`; return False during a build.
 
     Readers may still use the removed versions.
     """
@@ -460,7 +462,7 @@ def remove_unneeded(folder: Path) -> None:
 
 
 def keep_only(folder: Path, numbers: Collection[int]) -> None:
-    """Remove all versions except some numbers; the caller holds the lock of the folder."""
+    """Remove all versions except `numbers`, and unneeded parts; the caller holds the lock."""
     needed: set[str] = set()
     for number, path in manifests(folder):
         if number not in numbers:  # remove a manifest before its parts

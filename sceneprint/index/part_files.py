@@ -37,7 +37,7 @@ Block = tuple[Keys, Bytes]
 
 
 def is_ours(name: str) -> bool:
-    """Return whether a name is that of a part or an unfinished part."""
+    """Return whether a name belongs to a part or an unfinished part."""
     return _OURS.match(name) is not None
 
 

@@ -55,20 +55,20 @@ if TYPE_CHECKING:
 RATIO = 3
 #: Maximum number of segments of a version; with more, the two smallest are merged.
 MOST_SEGMENTS = 8
-#: Share of removed frames above which a segment is written again without them.
+#: A segment is written again without its removed frames if their share exceeds this.
 GONE_SHARE = 0.25
-#: Size of signatures in bytes up to which a map has no sketches; comparing them takes 3 ms.
+#: Maximum total size, in bytes, of signatures without sketches; comparing them takes 3 ms.
 FLAT_BYTES = 1 << 24
-#: Size of segments without sketches in a larger map, as a share of FLAT_BYTES.
+#: Maximum size of a segment without sketches in a larger map, as a share of FLAT_BYTES.
 FLAT_SHARE = 1 / 8
-#: If fewer than one in FEW frames is searchable, these are compared without FAISS: it would read
-#: all frames.
+#: If fewer than one in FEW frames is searchable, FAISS is not used, because it would read all
+#: frames.
 FEW = 8
-#: Maximum size of a search by FAISS; for larger searches, sorting takes longer than comparing.
+#: Maximum number of results to request from FAISS: sorting more would take longer than comparing.
 LONGEST = 2048
 
 #: Rows or keys of frames, and their distances.
-Found = tuple[NDArray[np.int64], NDArray[np.int64]]
+Distances = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 class Places:
@@ -101,8 +101,8 @@ class Places:
         places = at if self._order is None else self._order[at]
         return np.where(self._rising[at] == keys, places, -1)
 
-    def found(self, keys: Keys) -> NDArray[np.int64]:
-        """Return the positions of those of ascending keys that are in the list."""
+    def matches(self, keys: Keys) -> NDArray[np.int64]:
+        """Return the positions of ascending keys; skip keys that are not in the list."""
         if len(self._rising) == 0 or len(keys) == 0:
             return np.empty(0, np.int64)
         # most keys of a long list belong to other segments, with frames of other times
@@ -164,17 +164,18 @@ class Segment:
 
     def standing_rows(self, gone: Keys) -> NDArray[np.int64]:
         """Return the rows of all frames except `gone`, ascending."""
-        return np.delete(np.arange(len(self.keys)), self.places.found(gone))
+        return np.delete(np.arange(len(self.keys)), self.places.matches(gone))
 
     def nearest(
         self, query: Bytes, size: int, gone: Keys, among: Keys | None, *, metric: Metric,
         exact: bool,
-    ) -> tuple[Found, bool, int]:  # fmt: skip
+    ) -> tuple[Distances, bool, int]:  # fmt: skip
         """Compare frames with a query; return candidates that include the nearest frames.
 
         Parameters
         ----------
         query : (D,) uint8
+        size : number of nearest frames to include
         gone : (g,) ascending keys of excluded frames
         among : (a,) ascending keys of searchable frames; None selects all others
         exact : whether to compare all searchable frames
@@ -202,12 +203,12 @@ class Segment:
 
     def _free_rows(self, gone: Keys, among: Keys | None) -> NDArray[np.bool_] | None:
         """Return a mask (N,) of the searchable rows; None if all are searchable."""
-        rows = self.places.found(gone)
+        rows = self.places.matches(gone)
         if among is None and len(rows) == len(self.gone) == 0:
             return None
         free = np.full(len(self.keys), among is None)
         if among is not None:
-            free[self.places.found(among)] = True
+            free[self.places.matches(among)] = True
         free[rows] = free[self.gone_rows] = False
         return free
 
@@ -286,7 +287,7 @@ def segment_sources(
     changed = np.union1d(dropped, new_keys)
     sources = []
     for segment in segments:
-        gone = np.union1d(segment.gone, segment.keys[segment.places.found(changed)])
+        gone = np.union1d(segment.gone, segment.keys[segment.places.matches(changed)])
         sources.append(
             SegmentSource(segment.keys, segment.vectors, segment.standing_rows(gone), segment, gone)
         )
@@ -335,7 +336,7 @@ def write_segment(
     Parameters
     ----------
     clean : whether to write a single segment again if any of its frames is removed
-    flat_bytes : size of signatures in bytes above which sketches are written
+    flat_bytes : sketches are written if the signatures exceed this size, bytes
     """
     only = sources[0]
     may_be_gone = 0 if clean else GONE_SHARE * len(only.keys)

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 #: Maximum number of frames from which means are computed.
 MEASURED = 1 << 16
-#: Minimum number of frames that a search selects, absolute and as a multiple of its size.
+#: Minimum number of frames that a search selects: absolute, and as a multiple of its results.
 LEAST_SELECTED, TIMES_WANTED = 256, 4
 #: Number of neighbours for which recall is measured, and the required recall.
 NEAR, ENOUGH = 10, 0.995
-#: Maximum and minimum number of measured queries, and maximum number of bytes that they compare.
+#: Maximum and minimum number of queries to measure, and maximum number of bytes to compare.
 MOST, LEAST, COMPARED_BYTES = 100, 10, 1 << 36
 
 

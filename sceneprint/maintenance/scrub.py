@@ -60,11 +60,11 @@ class Scrub:
         Parameters
         ----------
         may_go_on : function that is called after each block; the slice ends if it returns False
-        now : whether to ignore the interval of this process between slices
+        now : whether to run even if this process ran a slice less than SLICE_S ago
 
         Returns
         -------
-        row : progress of the scrub; None if no slice is due
+        row : progress of the scrub; None if no slice is due or possible, or after an error
         """
         rested = now or time.monotonic() >= self._next
         if self._budget <= 0 or self._store.database.read_only or not rested:
@@ -83,6 +83,7 @@ class Scrub:
             return None
 
     def _read(self, row: ScrubRow, may_go_on: Callable[[], bool]) -> ScrubRow:
+        """Check blocks of frames until the slice is over; record and return the progress."""
         until, folder = time.monotonic() + TURN_S, Folder(self._settings, self._store)
         damaged, finished, over = 0, False, False
         while not over:  # at least one block, so that each pass ends
@@ -110,7 +111,7 @@ class Scrub:
         return row
 
     def _report(self, finding: Finding) -> None:
-        """Log a finding, and schedule damaged derived data to be rebuilt."""
+        """Log a finding; record an event for an upload, or schedule derived data to be rebuilt."""
         about = {"map": finding.map, "frame_id": finding.frame_id, "finding": finding.kind}
         log.error("damage found", extra=about | {"means": finding.means})
         if finding.map is None or finding.frame_id is None:

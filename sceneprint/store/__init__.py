@@ -47,8 +47,8 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-#: Ratio of the memory of a cached geometry to that of its arrays. Derived samples, plane weights
-#: and symmetries need up to 20 %.
+#: Ratio between the memory of a cached geometry and that of its arrays: derived samples, plane
+#: weights and symmetries add up to 20 %.
 _OVERHEAD = 1.25
 
 
@@ -77,7 +77,9 @@ class GeometryCache:
         self._bytes = 0
 
     def read(self, digest: str) -> Geometry:
-        """Return a geometry by the digest of its artifact. Callers must not change it.
+        """Return the geometry of an artifact, from the cache if possible, else from its blob.
+
+        The geometry is then cached, so callers must not change it.
 
         Raises
         ------
@@ -202,7 +204,7 @@ def open_blobs(
 ) -> Blobs:
     """Open the blobs of a database.
 
-    This succeeds even if the object store is unreachable; requests then fail until it is reachable.
+    If the object store is unreachable, log a warning; requests fail until it is reachable.
 
     Parameters
     ----------
@@ -242,7 +244,10 @@ def open_blobs(
 
 
 def _make_folder_of(url: str) -> None:
-    """Create the folder of a SQLite file; ignore other URLs, whose errors appear later."""
+    """Create the folder of a SQLite file; ignore other and invalid URLs.
+
+    Raise UnusableStore if it cannot be created.
+    """
     with suppress(ArgumentError, ValueError):
         parsed = make_url(url)
         if parsed.get_backend_name() == "sqlite" and parsed.database:

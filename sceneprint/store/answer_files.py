@@ -1,4 +1,4 @@
-"""Files of stored answers by query id: in a folder, or in an object store of a fleet.
+"""Files of stored answers, named by query id, in a folder or an object store.
 
 The database records which files are needed (`query_rows`). Files are not synced to disk, since
 answers are not essential data.
@@ -18,7 +18,7 @@ from sceneprint.store.blobs.object_store import ObjectBlobs
 
 
 class AnswerFolder:
-    """Answers in a folder that several processes share, which the first answer creates.
+    """Answers in a folder that several processes may share; the first `put` creates the folder.
 
     Methods raise OSError or UnusableStore if the folder or the object store is not accessible.
     """
@@ -57,19 +57,19 @@ class AnswerObjects:
         self._objects = objects
 
     def put(self, query_id: str, data: bytes) -> None:
-        """See AnswerFiles."""
+        """See `AnswerFolder.put`."""
         self._objects.put(f"queries/{query_id}", data)
 
     def get(self, query_id: str) -> bytes:
-        """See AnswerFiles."""
+        """See `AnswerFolder.get`."""
         return self._objects.get(f"queries/{query_id}")
 
     def delete(self, query_ids: Sequence[str]) -> None:
-        """See AnswerFiles."""
+        """See `AnswerFolder.delete`."""
         self._objects.delete(*(f"queries/{query_id}" for query_id in query_ids))
 
     def list(self) -> Iterator[tuple[str, float]]:
-        """See AnswerFiles."""
+        """See `AnswerFolder.list`."""
         for entry in self._objects.list("queries/"):
             yield entry.key.removeprefix("queries/"), entry.changed_at
 
@@ -78,10 +78,10 @@ AnswerFiles = AnswerFolder | AnswerObjects
 
 
 def open_answers(blobs: Blobs, folder: Path) -> AnswerFiles:
-    """Return the answer files at the location of the blobs, which all processes share.
+    """Return the answer files: in the object store that contains the blobs, or else in a folder.
 
     Parameters
     ----------
-    folder : folder for the answers, if the blobs are in a folder too
+    folder : folder for the answers if the blobs are in a folder
     """
     return AnswerObjects(blobs.objects) if isinstance(blobs, ObjectBlobs) else AnswerFolder(folder)

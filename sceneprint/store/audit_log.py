@@ -4,7 +4,8 @@
     record_change                -->  a line for a change without an event
     record_refusal               -->  a line for a refused request
 
-Lines are never edited. Expired lines are removed, and the oldest lines of a tenant with too many.
+Lines are never edited. Expired lines are removed, and so are the oldest lines of a tenant that has
+too many.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def record_refusal(
     connection: Connection, actor: Actor, tenant: str, map_name: str | None, target: str | None,
     request_id: str, **data: Any,
 ) -> None:  # fmt: skip
-    """Write a line for a refused request; its unvalidated texts are cleaned and truncated."""
+    """Write a line for a refused request; clean and truncate its unvalidated map and target."""
     texts = {"map": map_name, "target": target}
     for name, text in texts.items():
         if text is not None:
@@ -100,36 +101,42 @@ def record_refusal(
 
 
 def list_lines(
-    connection: Connection, wanted: AuditFilter, limit: int, *, before: int | None = None,
+    connection: Connection, criteria: AuditFilter, limit: int, *, before: int | None = None,
     after: int | None = None,
 ) -> list[AuditRow]:  # fmt: skip
-    """Return lines, newest first; with `after`, the lines after that number, oldest first."""
+    """Return up to `limit` matching lines, newest first; with `after`, oldest first.
+
+    Parameters
+    ----------
+    before, after : return only lines with smaller, or with larger, numbers
+    """
     order = audit.c.number.desc() if after is None else audit.c.number
     statement = select(audit).order_by(order).limit(limit)
     if after is not None:
         statement = statement.where(audit.c.number > after)
     if before is not None:
         statement = statement.where(audit.c.number < before)
-    if wanted.actor is not None:
-        statement = statement.where(audit.c.actor == wanted.actor)
-    if wanted.map is not None:
-        statement = statement.where(audit.c.map == wanted.map)
-    if wanted.action is not None:
-        statement = statement.where(audit.c.action.startswith(wanted.action, autoescape=True))
-    if wanted.since is not None:
-        statement = statement.where(audit.c.at >= wanted.since)
+    if criteria.actor is not None:
+        statement = statement.where(audit.c.actor == criteria.actor)
+    if criteria.map is not None:
+        statement = statement.where(audit.c.map == criteria.map)
+    if criteria.action is not None:
+        statement = statement.where(audit.c.action.startswith(criteria.action, autoescape=True))
+    if criteria.since is not None:
+        statement = statement.where(audit.c.at >= criteria.since)
     return [AuditRow(**row) for row in connection.execute(statement).mappings()]
 
 
 def surplus_lines(
     connection: Connection, before: float, limit: int, most_lines: int = MAXIMUM_LINES
 ) -> list[int]:
-    """Return the numbers of lines to remove: old lines, and surplus lines of a tenant.
+    """Return the row numbers of lines to remove: expired lines or, without any, surplus lines.
 
     Parameters
     ----------
-    before : time before which lines are expired, seconds since 1970. Removal stops at the first
-        younger line, in case a clock was set back
+    before : lines before this time are expired, seconds since 1970. The search stops at the first
+        later line, in case a clock was set back
+    limit : maximum number of lines to return
     most_lines : maximum number of lines per tenant
     """
     oldest = connection.execute(

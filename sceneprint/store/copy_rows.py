@@ -1,4 +1,4 @@
-"""Rows of map copies: read them in the original store, and write them in that of the copy."""
+"""Rows of map copies: read from the store of the original, and written to that of the copy."""
 
 from __future__ import annotations
 
@@ -93,12 +93,12 @@ class CopiedFrame:
 
 
 def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame]) -> None:
-    """Add up to a few hundred indexed frames to a copy.
+    """Add up to a few hundred indexed frames, each with a succeeded job, to a copy.
 
     Parameters
     ----------
     connection : writing transaction
-    copies : frames that the map does not have, or only as deleted frames
+    copies : frames whose ids the map does not have, or has only for deleted frames
     """
     deleted = select(frames.c.id).where(
         frames.c.map_number == row.number, frames.c.id.in_([copy.id for copy in copies])

@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 _FOLDER = Path(migrations.__file__).parent
 #: Lines of a file in `migrations/versions` that state its revision and its predecessor.
 _REVISIONS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
-#: Connection option: whether the transaction writes to single maps, concurrently with others.
+#: Connection option: whether the transaction writes to single maps, concurrently with other
+#: writers.
 MAPS_OPTION = "sceneprint_maps"
 #: Maximum number of concurrent writers of single maps in a process.
 MAP_WRITERS = 8
@@ -243,10 +244,10 @@ def current_revision(connection: Connection) -> str | None:
     ------
     NewerSchema : If a later version of sceneprint wrote the database, and this one cannot use it.
     """
-    stored, (head, known) = schema_range_of(connection), known_revisions()
+    stored, (head, revisions) = schema_range_of(connection), known_revisions()
     if stored is None:
         return None
-    if stored.revision in known:
+    if stored.revision in revisions:
         return stored.revision
     if stored.allows(head):
         return head
@@ -261,7 +262,7 @@ class Database:
 
     Parameters
     ----------
-    sealed : database file if it is read-only, else None
+    sealed : reader of the database file if it is read-only, else None
     """
 
     def __init__(self, engine: Engine, sealed: ReadOnlyFile | None = None) -> None:
@@ -339,7 +340,10 @@ class Database:
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
-        """Run a transaction that reads a single snapshot and changes nothing."""
+        """Run a transaction that reads a single snapshot and changes nothing.
+
+        Raise UnusableStore if another process writes to a read-only file in the meantime.
+        """
         before = None if self._sealed is None else self._sealed.state()
         with self.explained(), self._readers.connect() as connection:
             yield connection
@@ -427,8 +431,8 @@ class Database:
         maps_wait_s: float | None,
     ) -> Iterator[Connection]:  # fmt: skip
         """Run a transaction of a single statement; see `SingleStatement`."""
-        known = self._schema if self._guarded else None
-        only = postgres.SingleStatement(map_numbers, wait_s, maps_wait_s, known)
+        schema = self._schema if self._guarded else None
+        only = postgres.SingleStatement(map_numbers, wait_s, maps_wait_s, schema)
         options: dict[str, Any] = {MAPS_OPTION: True, postgres.SINGLE: only}
         writing = connection.execution_options(**options)
         postgres.forget_warnings(writing)
@@ -452,8 +456,8 @@ class Database:
         tenant = current_tenant()
         if not turns.acquire(tenant, wait_s):
             raise StoreLocked(
-                f"{self.shown}: Other writers of this process took too long. Nothing was stored. "
-                "Try again later."
+                f"{self.shown}: Timed out waiting for other writers in this process. Nothing was "
+                "stored. Try again later."
             )
         try:
             with self._note_locks():
@@ -500,7 +504,7 @@ class Database:
         _check_schema(self._engine, row)
 
     def shrink_log(self) -> bool:
-        """Empty the log of SQLite, which may contain deleted data; return False if it is in use."""
+        """Empty SQLite's log, which may contain deleted data; return False if the log is in use."""
         if not self.is_sqlite or self.read_only:
             return True
         with self.explained():
@@ -517,12 +521,13 @@ class Database:
     def driver_connection(self) -> psycopg.Connection[Any]:
         """Return a new connection to PostgreSQL that commits each statement immediately.
 
-        It is for session state, such as LISTEN and session locks. The caller must close it, and
-        execute statements within `explained`.
+        The connection is for session state, such as LISTEN and session locks. The caller must close
+        it, and execute statements within `explained`.
 
         Raises
         ------
         UnusableStore : If the server cannot be reached.
+        ValueError : If the database is SQLite.
         """
         if self.is_sqlite:
             raise ValueError(f"{self.shown} has no sessions")

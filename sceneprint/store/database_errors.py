@@ -23,7 +23,7 @@ from sqlalchemy.exc import TimeoutError as AllInUse
 
 from sceneprint.errors import ReadOnlyStore, StoreAway, StoreFull, StoreLocked, UnusableStore
 
-#: Free space in bytes below which a failed write is attributed to a full disk.
+#: Free space, in bytes, below which a failed write is attributed to a full disk.
 NO_ROOM = 1 << 20
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -79,6 +79,7 @@ def _of_server(url: URL, error: DBAPIError) -> UnusableStore | None:
 
 
 def _of_sqlite(url: URL, error: DBAPIError) -> UnusableStore | None:
+    """Return the store error for an error of SQLite; None if it is a bug of the caller."""
     if not isinstance(error, OperationalError):
         if "malformed" in str(error.orig) or "not a database" in str(error.orig):
             return UnusableStore(
@@ -126,7 +127,8 @@ def _database_message(error: DBAPIError) -> str:
     return " ".join(str(error.orig).split())
 
 
-#: Error and advice for errors of PostgreSQL, by SQLSTATE, its class, or a name of this module.
+#: Store error and advice for each PostgreSQL error, by SQLSTATE, SQLSTATE class, or a name that
+#: only this module uses.
 _FAULTS: dict[str, tuple[type[UnusableStore], str]] = {
     "55P03": (
         StoreLocked,
@@ -213,7 +215,7 @@ def is_conflict(error: UnusableStore) -> bool:
 
 
 def is_of_old_plan(error: object) -> bool:
-    """Return whether an error is that of a prepared statement whose tables have changed.
+    """Return whether a prepared statement failed because its tables have changed.
 
     The SQLSTATE of this error is unspecific, and its text depends on the locale of the server.
     """
@@ -235,7 +237,7 @@ def open_patiently(
     attempt: Callable[[], T], patience_s: float = PATIENCE_S,
     may_go_on: Callable[[float], bool] | None = None,
 ) -> T:  # fmt: skip
-    """Call `attempt` until the server is reachable, and return the result.
+    """Call `attempt` until the server is reachable, and return the result; log the first failure.
 
     Parameters
     ----------
@@ -246,7 +248,7 @@ def open_patiently(
 
     Raises
     ------
-    StoreAway : If the server is still unreachable after `patience_s`.
+    StoreAway : If the server is still unreachable after `patience_s`, or `may_go_on` returns False.
     """
     until, logged = time.monotonic() + patience_s, False
     while True:

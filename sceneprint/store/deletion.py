@@ -75,14 +75,15 @@ def delete_frames(
     connection: Connection, row: MapRow, numbers: Sequence[int], reason: str | None = None,
     deletion: int | None = None,
 ) -> list[str]:  # fmt: skip
-    """Remove frames from all searches, lists and counts.
+    """Remove frames from all searches, lists and counts; cancel their jobs, and record events.
 
     Parameters
     ----------
     connection : writing transaction
     numbers : up to a few hundred frame numbers; deleted frames are ignored
     reason : reason in the events, if no user requested the deletion
-    deletion : number of the deletion for the tombstones; None purges the frames immediately
+    deletion : number of the deletion for the tombstones; None purges the frames immediately.
+        Redundant frames are always purged
 
     Returns
     -------
@@ -142,7 +143,7 @@ def purge_frames(connection: Connection, map_number: int, numbers: Sequence[int]
 
 
 def without_content(frame: FrameRow) -> FrameRow:
-    """Return a frame; if it is deleted, without the columns that a purge clears."""
+    """Return a frame; if it is a tombstone, without the metadata that a purge clears."""
     if frame.deletion is None:
         return frame
     bare: dict[str, Any] = dict.fromkeys(_PURGED)
@@ -193,7 +194,7 @@ def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = Tru
 
 
 def remove_map(connection: Connection, row: MapRow) -> list[str]:
-    """Remove a map and all its rows.
+    """Remove a map and all its rows, doom its blobs, and record the deletion and the quotas.
 
     Returns
     -------
@@ -243,7 +244,7 @@ def remove_in_blocks(
     Parameters
     ----------
     find : function that returns the numbers of rows to remove, up to a limit. It is called outside
-        of write transactions, because it usually returns none
+        of write transactions, because it usually returns no numbers
     remove : function that removes the rows
     most : maximum number of rows; the last block may exceed it
 
@@ -285,7 +286,7 @@ def _replace_time(new: Any) -> Any:
 
 
 def doom_found(connection: Connection, *statements: Select[tuple[str]]) -> None:
-    """Record all blobs that some statements select as doomed; see `doom`."""
+    """Record as doomed all blobs that the statements select; see `doom`."""
     blobs = union(*statements).subquery()
     # WHERE is necessary: otherwise, SQLite would parse ON CONFLICT as the condition of a join
     rows = select(blobs.c[0], literal(time.time(), Float)).where(true())
@@ -296,7 +297,12 @@ def doom_found(connection: Connection, *statements: Select[tuple[str]]) -> None:
 def doomed_blobs(
     connection: Connection, limit: int, before: float | None = None, after: str = ""
 ) -> list[str]:
-    """Return up to `limit` doomed blobs, sorted, after `after` and doomed before `before`."""
+    """Return up to `limit` doomed blobs after the digest `after`, sorted by digest.
+
+    Parameters
+    ----------
+    before : return only blobs doomed before this time, seconds since 1970
+    """
     statement = (
         select(doomed.c.blob).where(doomed.c.blob > after).order_by(doomed.c.blob).limit(limit)
     )
@@ -315,8 +321,8 @@ def clear_doomed(
     ----------
     connection : writing transaction of all maps
     blobs : up to a few hundred blobs
-    at : clear only records of this time
-    before : clear only records before this time
+    at : clear only records written at this time
+    before : clear only records written before this time
     """
     if not blobs:
         return
@@ -343,7 +349,7 @@ def aging_maps(connection: Connection) -> list[MapRow]:
 
 
 def old_frames(connection: Connection, map_number: int, before: float, limit: int) -> list[int]:
-    """Return up to `limit` numbers of frames of a map received before a time, oldest first."""
+    """Return the numbers of the oldest frames of a map, up to `limit`, received before a time."""
     statement = (
         select(frames.c.number).where(_old(map_number, before)).order_by(frames.c.received_at)
     )
@@ -374,10 +380,10 @@ def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
 
 
 def remove_ended(connection: Connection, map_number: int, before: float, limit: int) -> int:
-    """Remove rows and jobs of the frames of a map that were deleted or redundant before a time.
+    """Remove rows and jobs of frames deleted or redundant before a time; raise `pruned_revision`.
 
-    Rows that are still needed remain: of restorable frames, of frames in a surface, and of frames
-    with an unfinished job.
+    The rows of restorable frames, of frames in a surface, and of frames with an unfinished job
+    remain.
 
     Parameters
     ----------

@@ -94,7 +94,7 @@ def record_events(
     )  # fmt: skip
 
 
-#: Kinds of events whose cause is not the actor who reads a frame.
+#: Kinds of events without an audit line: the actor who reads a frame does not cause them.
 _DISCOVERIES = frozenset(("frame.damaged",))
 
 
@@ -217,32 +217,32 @@ def newest_number(connection: Connection) -> int:
     return int(connection.execute(select(func.max(events.c.number))).scalar() or 0)
 
 
-def newest_seen(connection: Connection, wanted: EventFilter) -> int:
+def newest_seen(connection: Connection, criteria: EventFilter) -> int:
     """Return the number of the newest event, of any kind, that the caller may read, or 0.
 
-    This number represents a position in the list, since it does not reveal hidden events.
+    It serves as a position in the list, because it does not reveal hidden events.
     """
-    if wanted.maps is not None:
-        beginnings = _beginnings(connection, wanted)
+    if criteria.maps is not None:
+        beginnings = _beginnings(connection, criteria)
         newest = select(func.max(events.c.number))
         rows = [
             connection.execute(
                 newest.where(events.c.map == name, events.c.number > beginnings.get(name, 0))
             )
-            for name in wanted.maps
+            for name in criteria.maps
         ]
         return max((int(row.scalar() or 0) for row in rows), default=0)
-    if not wanted.of_maps:
+    if not criteria.of_maps:
         return newest_number(connection)
     last = select(events.c.number).where(events.c.map.is_not(None))
     return int(connection.execute(last.order_by(events.c.number.desc()).limit(1)).scalar() or 0)
 
 
 def list_events(
-    connection: Connection, wanted: EventFilter, *, after: int = 0, before: int | None = None,
+    connection: Connection, criteria: EventFilter, *, after: int = 0, before: int | None = None,
     limit: int = 1000, newest_first: bool = False,
 ) -> list[EventRow]:  # fmt: skip
-    """Return the events between the numbers `after` and `before`, both excluded.
+    """Return up to `limit` matching events, numbered between `after` and `before`, exclusive.
 
     Call `number_events` first to include pending events.
     """
@@ -250,29 +250,29 @@ def list_events(
     statement = select(events).where(events.c.number > after).order_by(order).limit(limit)
     if before is not None:
         statement = statement.where(events.c.number < before)
-    if wanted.maps is not None:
-        statement = statement.where(_of_maps(wanted.maps, _beginnings(connection, wanted)))
-    elif wanted.of_maps:
+    if criteria.maps is not None:
+        statement = statement.where(_of_maps(criteria.maps, _beginnings(connection, criteria)))
+    elif criteria.of_maps:
         statement = statement.where(events.c.map.is_not(None))
-    if wanted.kinds:
-        matches = [events.c.kind.startswith(kind, autoescape=True) for kind in wanted.kinds]
+    if criteria.kinds:
+        matches = [events.c.kind.startswith(kind, autoescape=True) for kind in criteria.kinds]
         statement = statement.where(or_(*matches))
     return [EventRow(**row) for row in connection.execute(statement).mappings()]
 
 
-#: Maximum number of maps with a beginning in a statement, since SQLite limits the depth.
+#: Maximum number of `_beginnings` in a statement, since SQLite limits the depth of expressions.
 _MOST_BEGINNINGS = 500
 #: Condition with a literal value for the partial index; see `_LIVING` of `deletion`.
 _DELETED: ColumnElement[bool] = events.c.kind == literal_column("'map.deleted'")
 
 
-def _beginnings(connection: Connection, wanted: EventFilter) -> dict[str, int]:
-    """Return the last hidden event of each map whose name a deleted map had; see `EventFilter`."""
-    if wanted.since is None or wanted.maps is None:
+def _beginnings(connection: Connection, criteria: EventFilter) -> dict[str, int]:
+    """Return the number of the last hidden event of each reused map name; see `EventFilter`."""
+    if criteria.since is None or criteria.maps is None:
         return {}
     statement = (
         select(events.c.map, func.max(events.c.number))
-        .where(_DELETED, events.c.map.in_(sorted(wanted.maps)), events.c.at < wanted.since)
+        .where(_DELETED, events.c.map.in_(sorted(criteria.maps)), events.c.at < criteria.since)
         .group_by(events.c.map)
     )
     return {row[0]: int(row[1]) for row in connection.execute(statement)}
@@ -325,25 +325,27 @@ def removal_floors(connection: Connection, most_events: int) -> dict[str | None,
     return numbers
 
 
-def removal_floor(connection: Connection, wanted: EventFilter, most_events: int, after: int) -> int:
-    """Return the number up to which events of a filter may have been removed; 0 if none were.
+def removal_floor(
+    connection: Connection, criteria: EventFilter, most_events: int, after: int
+) -> int:
+    """Return the number up to which events that match a filter may have been removed, or 0.
 
     Parameters
     ----------
-    wanted : filter; its kinds are ignored
+    criteria : filter; its kinds are ignored
     most_events : maximum number of events per map
     after : position of the reader; results up to it may be returned as 0
     """
     if newest_number(connection) - most_events <= after:
         return 0  # too few events after that position
     numbers = removal_floors(connection, most_events)
-    if wanted.maps is None:
+    if criteria.maps is None:
         return max(numbers.values(), default=0)
     names = set(_names(connection))
-    own = [numbers.get(name, 0) for name in wanted.maps & names]
-    beginnings = _beginnings(connection, wanted)
+    own = [numbers.get(name, 0) for name in criteria.maps & names]
+    beginnings = _beginnings(connection, criteria)
     deleted = {
-        name for name in wanted.maps - names
+        name for name in criteria.maps - names
         if last_event(connection, name) > beginnings.get(name, 0)
     }  # fmt: skip
     return max([*own, *_former_floors(connection, deleted, numbers.get(None, 0))])
@@ -358,9 +360,9 @@ def _former_floors(connection: Connection, names: Collection[str], floor: int) -
     yield 0
     for name in names:
         last = last_event(connection, name)
-        left = select(events.c.number).where(events.c.map == name).limit(1)
+        remaining = select(events.c.number).where(events.c.map == name).limit(1)
         # the common floor does not apply to a map whose last event was removed
-        yield last if connection.execute(left).first() is None else min(floor, last)
+        yield last if connection.execute(remaining).first() is None else min(floor, last)
 
 
 def surplus_events(
@@ -368,9 +370,9 @@ def surplus_events(
 ) -> list[int]:
     """Return the numbers of events to remove, map by map, oldest first.
 
-    An index is valid while its anchor exists, the last event of its map at the time of the build.
-    Therefore, anchors of existing indexes are not removed, nor is the newest surplus event of each
-    map, which may become the anchor of an index under construction.
+    The anchor of an index is the last event of its map at the time of the build; without it, the
+    index is invalid. Therefore, anchors of existing indexes remain, and so does the newest surplus
+    event of each map, which may become the anchor of an index under construction.
 
     Parameters
     ----------
@@ -408,7 +410,7 @@ def _of(name: str | None) -> ColumnElement[bool]:
     return or_(events.c.map.is_(None), events.c.map.not_in(select(maps.c.name)))
 
 
-# Former maps by name, with the number of their last event, and their quota, which the next map of
+# Former maps by name, with the number of their last event, and their quotas, which the next map of
 # the same name inherits.
 
 #: Maximum number of former maps without a quota.
@@ -444,7 +446,7 @@ def record_former_map(connection: Connection, row: MapRow) -> None:
 
 
 def inherit_quota(connection: Connection, name: str) -> dict[str, float | None]:
-    """Take over the quota of the former map of a name: return it, and remove it there."""
+    """Return the quotas of the former map of a name, and remove its record; {} without one."""
     statement = select(former_maps.c.quota_frames, former_maps.c.quota_bytes)
     row = connection.execute(statement.where(former_maps.c.name == name)).mappings().first()
     connection.execute(delete(former_maps).where(former_maps.c.name == name))

@@ -86,32 +86,32 @@ class QueryOrigin:
 
 
 def passing_frames(
-    connection: Connection, map_number: int, wanted: Filter, origin: QueryOrigin
+    connection: Connection, map_number: int, criteria: Filter, origin: QueryOrigin
 ) -> NDArray[np.int64]:
     """Return the numbers of the indexed frames of a map that pass a filter, in ascending order.
 
     Parameters
     ----------
-    origin : origin of the query, with session and time if the filter excludes its surroundings
+    origin : origin of the query; `criteria.not_within_s` requires its session and time
     """
-    # one text is much faster than 100,000 rows
+    # reading one text is much faster than reading 100,000 rows
     listed = func.aggregate_strings(cast(frames.c.number, String), ",")
     numbers = connection.execute(
         select(listed).where(
             frames.c.map_number == map_number,
             frames.c.state == FrameState.INDEXED,
-            *_conditions(map_number, wanted, origin),
+            *_conditions(map_number, criteria, origin),
         )
     ).scalar()
     return np.sort(np.fromstring(numbers, np.int64, sep=",")) if numbers else _NONE
 
 
 def _common_conditions(
-    wanted: Filter | FrameListing | Run, tags: Sequence[str] = ()
+    criteria: Filter | FrameListing | Run, tags: Sequence[str] = ()
 ) -> list[ColumnElement[bool]]:
-    """Return conditions on robot, session, tags and time; they are false for unknown values."""
+    """Return conditions on robot, session, tags and time; frames with unknown values fail them."""
     c, conditions = frames.c, list[ColumnElement[bool]]()
-    for column, names in ((c.robot, wanted.robot), (c.session, wanted.session)):
+    for column, names in ((c.robot, criteria.robot), (c.session, criteria.session)):
         if isinstance(names, str):
             conditions.append(column == names)
         elif names:
@@ -120,26 +120,28 @@ def _common_conditions(
         conditions.append(
             c.number.in_(select(frame_tags.c.frame_number).where(frame_tags.c.tag == tag))
         )
-    if wanted.captured_after is not None:
-        conditions.append(c.captured_at >= wanted.captured_after.timestamp())
-    if wanted.captured_before is not None:
-        conditions.append(c.captured_at <= wanted.captured_before.timestamp())
+    if criteria.captured_after is not None:
+        conditions.append(c.captured_at >= criteria.captured_after.timestamp())
+    if criteria.captured_before is not None:
+        conditions.append(c.captured_at <= criteria.captured_before.timestamp())
     return conditions
 
 
-def _conditions(map_number: int, wanted: Filter, origin: QueryOrigin) -> list[ColumnElement[bool]]:
+def _conditions(
+    map_number: int, criteria: Filter, origin: QueryOrigin
+) -> list[ColumnElement[bool]]:
     """Return the conditions of a filter."""
-    conditions = _common_conditions(wanted, wanted.tags)
-    if wanted.not_within_s is not None:
-        conditions.append(_elsewhere(origin, wanted.not_within_s))
-    if (region := wanted.region) is not None:
+    conditions = _common_conditions(criteria, criteria.tags)
+    if criteria.not_within_s is not None:
+        conditions.append(_elsewhere(origin, criteria.not_within_s))
+    if (region := criteria.region) is not None:
         conditions.append(frames.c.pose_parent == region.parent_frame)
         for axis in "xyz":
             low, high = getattr(region.min, axis), getattr(region.max, axis)
             conditions.append(getattr(frames.c, f"pose_{axis}").between(low, high))
-    if wanted.exclude_frames:
+    if criteria.exclude_frames:
         excluded = select(frames.c.number).where(
-            frames.c.map_number == map_number, frames.c.id.in_(wanted.exclude_frames)
+            frames.c.map_number == map_number, frames.c.id.in_(criteria.exclude_frames)
         )
         conditions.append(frames.c.number.not_in(excluded.correlate(None)))
     return conditions
@@ -168,32 +170,32 @@ _LIVING = tuple(state for state in FrameState if state != FrameState.DELETED)
 
 def list_frames(
     connection: Connection, map_number: int, beyond: CapturePosition | None, limit: int,
-    wanted: FrameListing,
+    criteria: FrameListing,
 ) -> list[FrameRow]:  # fmt: skip
-    """Return frames of a map in upload order, in its reverse, or in capture order.
+    """Return frames of a map in upload order, in reverse upload order, or in capture order.
 
     Parameters
     ----------
-    beyond : position of the last frame of the previous page, of which only the number matters
-        except in capture order; None for the first page
+    beyond : position of the last frame of the previous page, None for the first page; upload orders
+        use only its number
     limit : maximum number of frames
-    wanted : conditions; deleted frames are excluded unless requested
+    criteria : conditions; deleted frames are excluded unless requested
     """
-    states = _LIVING if wanted.state is None else (wanted.state,)
+    states = _LIVING if criteria.state is None else (criteria.state,)
     # SQLite can read a page in two ways: in the order of numbers until the page is full, which is
     # best if most frames match or another index selects few frames; or by the index that covers all
     # conditions. "+ 0" rules out the first way.
-    number: ColumnElement[Any] = frames.c.number + 0 if _is_narrow(wanted) else frames.c.number
+    number: ColumnElement[Any] = frames.c.number + 0 if _is_narrow(criteria) else frames.c.number
     numbers: Select[Any] = select(frames.c.number).where(
         frames.c.map_number == map_number,
         frames.c.state.in_(states),
-        *_listing_conditions(map_number, wanted),
+        *_listing_conditions(map_number, criteria),
     )
-    if wanted.order == "taken":
+    if criteria.order == "taken":
         numbers = numbers.order_by(*CAPTURE_ORDER)
         if beyond is not None:
             numbers = numbers.where(_after_capture(beyond))
-    elif wanted.order == "desc":
+    elif criteria.order == "desc":
         numbers = numbers.order_by(number.desc())
         if beyond is not None:
             numbers = numbers.where(number < beyond.number)
@@ -206,46 +208,53 @@ def list_frames(
         return []
     selected = connection.execute(select(*FRAME_COLUMNS).where(frames.c.number.in_(chosen)))
     rows = {row.number: row for row in frame_rows(selected)}
-    return [rows[one] for one in chosen]
+    return [rows[chosen_number] for chosen_number in chosen]
 
 
-def count_listed(connection: Connection, map_number: int, wanted: FrameListing, after: int) -> int:
+def count_listed(
+    connection: Connection, map_number: int, criteria: FrameListing, after: int
+) -> int:
     """Count the frames of a list in upload order after frame number `after`."""
-    states = _LIVING if wanted.state is None else (wanted.state,)
+    states = _LIVING if criteria.state is None else (criteria.state,)
     return count_rows(
         connection, frames.c.map_number == map_number, frames.c.state.in_(states),
-        frames.c.number > after, *_listing_conditions(map_number, wanted),
+        frames.c.number > after, *_listing_conditions(map_number, criteria),
     )  # fmt: skip
 
 
-def _is_narrow(wanted: FrameListing) -> bool:
-    if wanted.tag or wanted.content_id is not None or wanted.find is not None:
+def _is_narrow(criteria: FrameListing) -> bool:
+    if criteria.tag or criteria.content_id is not None or criteria.find is not None:
         return False  # conditions with separate indexes
-    named = (wanted.captured_after, wanted.captured_before, wanted.parent_frame, wanted.has_pose)
-    rare = wanted.state not in (None, FrameState.INDEXED)
-    return bool(wanted.robot or wanted.session or wanted.name or rare) or any(
-        one is not None for one in named
+    named = (
+        criteria.captured_after,
+        criteria.captured_before,
+        criteria.parent_frame,
+        criteria.has_pose,
+    )
+    rare = criteria.state not in (None, FrameState.INDEXED)
+    return bool(criteria.robot or criteria.session or criteria.name or rare) or any(
+        value is not None for value in named
     )
 
 
-def _listing_conditions(map_number: int, wanted: FrameListing) -> list[ColumnElement[bool]]:
+def _listing_conditions(map_number: int, criteria: FrameListing) -> list[ColumnElement[bool]]:
     """Return the conditions on the frames of a list."""
-    c, conditions = frames.c, _common_conditions(wanted, wanted.tag)
-    if wanted.received_after is not None:
-        conditions.append(c.received_at >= wanted.received_after.timestamp())
-    if wanted.received_before is not None:
-        conditions.append(c.received_at <= wanted.received_before.timestamp())
-    if wanted.parent_frame is not None:
-        conditions.append(c.pose_parent == wanted.parent_frame)
-    if wanted.has_pose is not None:
-        conditions.append(c.pose_x.is_not(None) if wanted.has_pose else c.pose_x.is_(None))
-    if wanted.content_id is not None:
-        conditions.append(c.content_id == wanted.content_id)
-    if wanted.name is not None:
-        conditions += _begins(c.name, wanted.name)
-    if wanted.find is not None:
-        conditions.append(_begins_any(map_number, wanted.find))
-    if wanted.state == FrameState.DELETED and conditions:
+    c, conditions = frames.c, _common_conditions(criteria, criteria.tag)
+    if criteria.received_after is not None:
+        conditions.append(c.received_at >= criteria.received_after.timestamp())
+    if criteria.received_before is not None:
+        conditions.append(c.received_at <= criteria.received_before.timestamp())
+    if criteria.parent_frame is not None:
+        conditions.append(c.pose_parent == criteria.parent_frame)
+    if criteria.has_pose is not None:
+        conditions.append(c.pose_x.is_not(None) if criteria.has_pose else c.pose_x.is_(None))
+    if criteria.content_id is not None:
+        conditions.append(c.content_id == criteria.content_id)
+    if criteria.name is not None:
+        conditions += _begins(c.name, criteria.name)
+    if criteria.find is not None:
+        conditions.append(_begins_any(map_number, criteria.find))
+    if criteria.state == FrameState.DELETED and conditions:
         conditions.append(c.deletion.is_(None))  # do not reveal metadata of tombstones
     return conditions
 
@@ -339,8 +348,8 @@ def list_runs(
         run = runs[session, robot]
         run.states[state] += count
         run.posed += posed
-        run.first = min((one for one in (run.first, first) if one is not None), default=None)
-        run.last = max((one for one in (run.last, last) if one is not None), default=None)
+        run.first = min((at for at in (run.first, first) if at is not None), default=None)
+        run.last = max((at for at in (run.last, last) if at is not None), default=None)
         if parent is not None:
             run.parents[parent] += posed
     tagged = (
@@ -371,7 +380,7 @@ def count_run(
 def stamps_of_run(connection: Connection, map_number: int, run: Run) -> Stamp | None:
     """Return the kind of time stamps for the poses of a run: times or sequence numbers.
 
-    Return None if the frames have neither. The choice exists only for the clock `taken`.
+    Return None if the frames have neither. A clock other than `taken` is returned unchanged.
     """
     if run.clock != "taken":
         return run.clock
@@ -520,7 +529,7 @@ def numbers_of_runs(
 ) -> list[int]:
     """Return the numbers of the indexed frames of a map, or of a session or a robot.
 
-    They are sorted by run, time and upload; frames without a time are last.
+    The frames are sorted by run, capture time and upload; those without a time are last in a run.
     """
     c = frames.c
     statement = select(c.number).where(c.map_number == map_number, c.state == FrameState.INDEXED)
@@ -625,7 +634,7 @@ def sample_frames(connection: Connection, most: int) -> list[int]:
 
     Parameters
     ----------
-    most : size of the sample, which is smaller if some frames were deleted
+    most : maximum size of the sample, which is smaller if some frames were deleted
     """
     ends = select(func.min(frames.c.number), func.max(frames.c.number))
     first, last = connection.execute(ends).one()
@@ -648,12 +657,12 @@ def count_uploads(connection: Connection) -> int:
 
 
 def bytes_of_files(connection: Connection) -> int:
-    """Return the total size of the files of all jobs in bytes."""
+    """Return the total size, in bytes, of the files of all jobs."""
     return int(connection.execute(select(func.sum(job_files.c.bytes))).scalar() or 0)
 
 
 def stored_sizes(connection: Connection, numbers: Sequence[int]) -> tuple[int, int, list[str]]:
-    """Return the bytes of the uploads and signatures of frames, and the digests of artifacts."""
+    """Return the total bytes of the uploads and of the signatures, and the artifact digests."""
     sizes = rows_among(connection, select(frames.c.bytes), frames.c.number, numbers)
     uploads = sum(row.bytes for row in sizes)
     statement = select(func.length(signatures.c.vector), signatures.c.geometry)

@@ -1,4 +1,4 @@
-"""Changes of existing frames and maps, and references to blobs."""
+"""Changes to existing frames and maps, and references to blobs."""
 
 from __future__ import annotations
 
@@ -162,7 +162,9 @@ def relax_novelty(connection: Connection, number: int, novelty: float | None) ->
 def write_frame(
     connection: Connection, row: MapRow, frame: FrameRow, values: Mapping[str, Any]
 ) -> FrameRow:
-    """Change metadata columns of a frame, together with the columns and tags for searches.
+    """Change metadata of a frame, and its tags; record an event, and the edit of its surface.
+
+    If no value differs, nothing is written.
 
     Parameters
     ----------
@@ -190,7 +192,7 @@ _LIMITS = ("quota_frames", "quota_bytes", "retention_days")
 
 
 def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
-    """Change columns of a map: title, quotas, retention or up."""
+    """Change title, quotas, retention or up of a map, and record an event; ignore equal values."""
     changed = {name: new for name, new in values.items() if getattr(row, name) != new}
     if not changed:
         return row

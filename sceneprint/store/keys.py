@@ -49,7 +49,7 @@ class KeyRow:
     created_at, expires_at : times of creation and expiry; None for no expiry
     tenant : owner of the key
     previous_until : time until which the previous secret is valid; None if it is invalid
-    last_used_at : time of the last use, within an hour; None if the key was never used
+    last_used_at : time of the last use, accurate to an hour; None if the key was never used
     """
 
     id: str
@@ -68,7 +68,7 @@ def create_key(
 ) -> str:  # fmt: skip
     """Create a key, and return its secret; see KeyRow for the parameters.
 
-    Without `tenant`, the key belongs to a tenant with the name of the key.
+    Without `tenant`, the key belongs to the tenant with the name of the key, created if missing.
 
     Raises
     ------
@@ -167,7 +167,7 @@ def list_keys(
 
 
 def revoke_key(connection: Connection, name: str) -> None:
-    """Delete a key. Raise UnknownKey if it does not exist."""
+    """Delete a key, and a tenant created only for it. Raise UnknownKey if it does not exist."""
     removal = delete(keys).where(keys.c.name == name).returning(keys.c.tenant)
     tenant = connection.execute(removal).scalar()
     if tenant is None:
@@ -281,7 +281,8 @@ class IdempotentRequest:
     def store(self, connection: Connection, data: dict[str, Any]) -> None:
         """Store the result, in the transaction of the effect.
 
-        This replaces a result that is older than RESULT_S or belongs to a deleted map.
+        This replaces a result that is older than RESULT_S, or has the same fingerprint because its
+        map was deleted.
 
         Raises
         ------
@@ -304,7 +305,7 @@ class IdempotentRequest:
 
 
 class Overtaken(Exception):
-    """Error if another transaction stored the same row first; repeat the transaction."""
+    """Another transaction stored the same row first; the caller must repeat its transaction."""
 
 
 #: Number of results to remove in one transaction.

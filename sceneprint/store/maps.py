@@ -74,7 +74,7 @@ def current_map(connection: Connection, former: MapRow) -> MapRow:
 
 
 def find_maps(connection: Connection, names: Sequence[str]) -> list[MapRow]:
-    """Return maps in the order of their names. Raise UnknownMap if a map does not exist."""
+    """Return maps in the order of `names`. Raise UnknownMap if a map does not exist."""
     if len(names) == 1:
         return [find_map(connection, names[0])]
     selected = connection.execute(select(maps).where(maps.c.name.in_(names))).mappings()
@@ -109,7 +109,7 @@ def add_map(
     connection: Connection, name: str, title: str | None, model_id: str,
     limits: Mapping[str, object] | None = None,
 ) -> MapRow:  # fmt: skip
-    """Insert a map with an unused name.
+    """Insert a map with an unused name, and record an event.
 
     Parameters
     ----------
@@ -163,7 +163,8 @@ def model_names(connection: Connection) -> dict[str, str]:
 # Usage and quotas of a map. Frames count unless they are deleted or redundant. The bytes of uploads
 # count, including those of tombstones, of pending signatures computed by robots, and of archives
 # until their import ends. Signatures, artifacts and indexes of the service do not count. Two
-# columns of the map store the sums. Writers update them in their turn, so quotas are exact.
+# columns of the map store the sums. Writers update these columns during their turn, so quotas are
+# exact.
 
 #: States of frames that do not count, since they have no upload.
 ROOMLESS = (FrameState.DELETED, FrameState.REDUNDANT)
@@ -246,7 +247,7 @@ def require_room(connection: Connection, row: MapRow, size: int, *, new: bool = 
 
 
 def tombstone_bytes(connection: Connection, map_number: int) -> int:
-    """Return the total size of the uploads of tombstones of a map in bytes."""
+    """Return the total size, in bytes, of the uploads of a map's tombstones."""
     c = frames.c
     statement = select(func.coalesce(func.sum(c.bytes), 0)).where(
         c.map_number == map_number, c.deletion.is_not(None)
@@ -257,13 +258,13 @@ def tombstone_bytes(connection: Connection, map_number: int) -> int:
 def add_frame(
     connection: Connection, map_number: int, values: dict[str, Any], frame_id: str | None = None
 ) -> FrameRow:
-    """Insert a frame in the state `received`.
+    """Insert a frame in the state `received`, with its tags, and count it against the quota.
 
     Parameters
     ----------
     connection : writing transaction
     values : columns, except number, id, state and times
-    frame_id : unused id; default: a new id
+    frame_id : id that no existing frame has; default: a new id
     """
     if frame_id is None:
         frame_id = uuid.uuid4().hex
@@ -286,7 +287,7 @@ def received_values(
 
 
 def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
-    """Return the position columns of a frame, which are for searches."""
+    """Return the columns of a frame for its position, by which searches select frames."""
     return {f"pose_{axis}": None if pose is None else pose[i][3] for i, axis in enumerate("xyz")}
 
 
@@ -357,7 +358,7 @@ def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow
 
 
 def write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
-    """Insert the tags of a frame without tags."""
+    """Insert the tags of a frame that has none yet."""
     if rows := [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]:
         connection.execute(insert(frame_tags), rows)
 
@@ -375,8 +376,8 @@ def _geometry_of_numbers(dialect: str) -> Select[Any]:
     return select(signatures.c.frame_number, signatures.c.geometry).where(own, among)
 
 
-# Frames by position. A query reads hundreds of poses, mostly the same as the previous query. Parsed
-# poses are cached by their stored text, so entries (800 bytes each) are never stale.
+# Frames by position. A query reads hundreds of poses, mostly those that the previous query read.
+# Parsed poses are cached by their stored text, so entries (800 bytes each) are never stale.
 
 
 @lru_cache(8192)
@@ -402,12 +403,12 @@ def placed_frames(
     connection: Connection, map_number: int, parent: str, model_id: str,
     centre: Sequence[float], within: float, most: int,
 ) -> list[PlacedFrame]:  # fmt: skip
-    """Return indexed frames in a parent frame near a point, nearest first.
+    """Return indexed frames of a parent frame in a cube around a point, nearest first.
 
     Parameters
     ----------
     centre : x, y, z of the point, metres
-    within : half of the edge of the cube around the point, metres
+    within : half the edge length of the cube, metres
     most : maximum number of frames
     """
     values: dict[str, object] = {

@@ -67,14 +67,14 @@ from sceneprint.store.tables import (
 
 @dataclass(frozen=True, eq=False)
 class NewFrame:
-    """A frame to insert unless its map has the content.
+    """A frame to insert unless its map contains the same content.
 
     Parameters
     ----------
     row : row of the map, as last read
     values : columns, see `add_frame`
     priority : priority of the job that signs the frame
-    kept : columns of a row of `idempotency`; only on PostgreSQL
+    result : columns of a row of `idempotency`; only on PostgreSQL
     frame_id, job_id : new ids
     context : context variables of the request
     """
@@ -82,7 +82,7 @@ class NewFrame:
     row: MapRow
     values: dict[str, Any]
     priority: int = 0
-    kept: dict[str, Any] | None = None
+    result: dict[str, Any] | None = None
     frame_id: str = field(default_factory=lambda: uuid.uuid4().hex)
     job_id: str = field(default_factory=lambda: uuid.uuid4().hex)
     context: Context = field(default_factory=copy_context)
@@ -114,12 +114,12 @@ class NewFrame:
             "job": {**job, "id": self.job_id, "map_number": number},
             "event": event,
         }
-        optional = {"line": line, "kept": self.kept}
+        optional = {"line": line, "result": self.result}
         return {**rows, **{of: row for of, row in optional.items() if row is not None}}
 
 
 def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
-    """Insert frames unless their maps have the content, and queue jobs to sign them.
+    """Insert frames unless their maps contain the same content, and queue jobs to sign them.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def receive_frames(connection: Connection, new: Sequence[NewFrame]) -> set[str]:
 
 
 def _insert_on_sqlite(connection: Connection, frame: NewFrame) -> bool:
-    """Insert a frame on SQLite unless its map has the content; return whether it was inserted."""
+    """Insert a frame on SQLite unless its map contains it; return whether it was inserted."""
     if connection.execute(_count_frame(), frame.room).first() is None:
         return False
     rows = frame.rows(connection)
@@ -188,7 +188,7 @@ def _count_frame() -> ReturningUpdate[tuple[int]]:
             *_room_conditions(1, size),
             ~exists().where(*alike),
         )
-        .values(_counted(1, size))
+        .values(_usage_after(1, size))
         .returning(maps.c.number)
     )
 
@@ -201,7 +201,7 @@ def _room_conditions(n: Any, size: Any) -> tuple[ColumnElement[bool], ColumnElem
     )
 
 
-def _counted(n: Any, size: Any) -> dict[str, Any]:
+def _usage_after(n: Any, size: Any) -> dict[str, Any]:
     return {"used_frames": maps.c.used_frames + n, "used_bytes": maps.c.used_bytes + size}
 
 
@@ -222,7 +222,7 @@ _SAME = {
     "line_map": "event_map", "line_target": "frame_id", "line_data": "event_data",
 }  # fmt: skip
 #: Optional rows of a new frame, with the column that is null without the row.
-_OPTIONAL = {"line": "actor", "kept": "key"}
+_OPTIONAL = {"line": "actor", "result": "key"}
 
 
 def _keys(names: Mapping[str, Iterable[str]]) -> Iterator[tuple[str, str, str]]:
@@ -253,11 +253,11 @@ def _insert_frames(
     fixed : values that are equal for all frames, by key
     tagged : whether any frame has tags
     """
-    of = {"frame": frames, "job": jobs, "event": event_table, "line": audit, "kept": idempotency}
+    of = {"frame": frames, "job": jobs, "event": event_table, "line": audit, "result": idempotency}
     tables = {name: (of[name], names) for name, names in columns}
     constants = dict(fixed)
     records = _records(tables)
-    lacking = _lacking(records, kept="kept" in tables)
+    lacking = _lacking(records, result="result" in tables)
     room = _count_frames(lacking)
     has_room = and_(room.c.number == lacking.c.frame_map_number,
                     room.c.name == lacking.c.event_map)  # fmt: skip
@@ -304,8 +304,8 @@ def _kind(kind: TypeEngine[Any]) -> TypeEngine[Any]:
     return TEXT if isinstance(kind, String) else kind
 
 
-def _lacking(records: TableValuedAlias, *, kept: bool) -> CTE:
-    """Return the records without a stored frame of the same content or a result for the key.
+def _lacking(records: TableValuedAlias, *, result: bool) -> CTE:
+    """Return the records whose content is not stored, and whose key has no result.
 
     Each lookup reads the next entry of one index: a cached plan may date from a time when the
     tables were empty, and all indexes seemed equally good.
@@ -319,22 +319,25 @@ def _lacking(records: TableValuedAlias, *, kept: bool) -> CTE:
         .limit(1)
     )
     absent = [is_next.scalar_subquery().is_not(true())]
-    if kept:
-        same = idempotency.c.actor == records.c.kept_actor, idempotency.c.key == records.c.kept_key
+    if result:
+        same = (
+            idempotency.c.actor == records.c.result_actor,
+            idempotency.c.key == records.c.result_key,
+        )
         done = select(true()).where(*same).limit(1).scalar_subquery()
         absent.append(done.is_(None))
     return select(records).where(*absent).cte("lacking")
 
 
 def _count_frames(lacking: CTE) -> CTE:
-    """Return an UPDATE of the usage of all maps with room for their records, returning the maps."""
+    """Return an UPDATE that adds the records to the usage of the maps with room for them."""
     each = lacking.c.frame_map_number, lacking.c.event_map
     size = cast(func.sum(lacking.c.size), BigInteger)
     more = select(*each, func.count().label("n"), size.label("size")).group_by(*each).cte("more")
     own = maps.c.number == more.c.frame_map_number, maps.c.name == more.c.event_map
     counted = update(maps).where(*own, *_room_conditions(more.c.n, more.c.size))
     return (
-        counted.values(_counted(more.c.n, more.c.size))
+        counted.values(_usage_after(more.c.n, more.c.size))
         .returning(maps.c.number, maps.c.name)
         .cte("room")
     )
@@ -344,7 +347,7 @@ def _insert_rows(
     of: str, tables: _Tables, fixed: dict[str, Any], lacking: CTE, source: FromClause,
     *conditions: ColumnElement[bool], **more: ColumnElement[Any],
 ) -> Insert:  # fmt: skip
-    """Return the INSERT of a row of one table for each frame of a source, in record order."""
+    """Return the INSERT of one row into a table for each frame of a source, in record order."""
     table, names = tables[of]
 
     def value(name: str) -> ColumnElement[Any]:

@@ -71,7 +71,7 @@ class OpaqueIds:
         return number
 
     def row(self, kind: Kind, cursor: str | None) -> int | None:
-        """Return the number of the last row of the previous page from a cursor; None without one.
+        """Return the number of the last row of the previous page; None without a cursor.
 
         Raises
         ------
@@ -91,7 +91,7 @@ class OpaqueIds:
     def next_moment(
         self, kind: Kind, moments: Sequence[tuple[float, int]], limit: int
     ) -> str | None:
-        """Like `next_cursor`, for a list sorted by time and number."""
+        """Return the next cursor of a list sorted by time and number; see `next_cursor`."""
         if len(moments) <= limit:
             return None
         return self._cipher.encrypt(_MOMENT.pack(*moments[limit - 1]), [kind.encode()]).hex()

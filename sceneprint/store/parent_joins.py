@@ -35,7 +35,7 @@ class ParentJoin:
 
 @dataclass(frozen=True)
 class ParentRun:
-    """A session in one parent frame: number of indexed frames, and number of the first frame."""
+    """A session in one parent frame: count of indexed frames, and number of the first frame."""
 
     parent: str
     session: str | None
@@ -67,7 +67,7 @@ def is_joined_by(connection: Connection, map_number: int, job_id: str) -> bool:
 
 
 def undone_pairs(connection: Connection, map_number: int) -> list[set[str]]:
-    """Return the two parent frames of each undone join, as their current roots."""
+    """Return the current roots of the two parent frames of each undone join."""
     c, joins = parent_joins.c, find_joins(connection, map_number)
     undone = select(c.parent, c.towards).where(c.map_number == map_number, c.undone_at.is_not(None))
     return [{_root(joins, name) for name in row} for row in connection.execute(undone)]
@@ -99,7 +99,7 @@ def count_poses(connection: Connection, map_number: int) -> tuple[int, int]:
 
 
 def root_columns(connection: Connection, frame: FrameRow) -> dict[str, Any]:
-    """Return the pose columns of a frame after joins that have not been applied; else nothing."""
+    """Return the pose columns of a frame after joins that were not yet applied; {} without any."""
     if frame.pose is None or frame.pose_parent is None or frame.sent_parent is not None:
         return {}  # the joins have already been applied
     join = find_joins(connection, frame.map_number).get(frame.pose_parent)
@@ -115,7 +115,7 @@ def _columns(parent: str, sent: Any, join: ParentJoin | None) -> dict[str, Any]:
 
 
 def join_parent(connection: Connection, map_number: int, join: ParentJoin, job_id: str) -> bool:
-    """Move all poses that are relative to a root to another root.
+    """Record a join, and move all poses that are relative to a root to another root.
 
     Parameters
     ----------
@@ -161,7 +161,7 @@ def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
 
 
 def _move_frames(connection: Connection, map_number: int, before: Mapping[str, ParentJoin]) -> None:
-    """Recompute poses from uploaded poses, for all frames whose root has changed."""
+    """Recompute the poses of all frames whose root has changed, and note these edits."""
     now = find_joins(connection, map_number)
     changed = [name for name in {*before, *now} if _root(before, name) != _root(now, name)]
     f = frames.c

@@ -133,7 +133,7 @@ _REPORTED = ("status", "robot", "session", "cause", "support", "milliseconds")
 def add_queries(connection: Connection, new: Sequence[NewQuery]) -> None:
     """Store queries, and an event for each listed query.
 
-    Queries whose map was deleted or replaced since are ignored.
+    Queries whose map has been deleted or replaced since their arrival are ignored.
     """
     names = sorted({query.map for query in new})
     statement = select(maps.c.number, maps.c.name, maps.c.created_at).where(maps.c.name.in_(names))
@@ -162,6 +162,7 @@ def _values(query: NewQuery, map_number: int) -> dict[str, Any]:
 
 
 def _event(query: NewQuery) -> dict[str, Any]:
+    """Return the columns of the event that reports a query."""
     data: dict[str, Any] = {"query_id": query.id}
     data |= {name: getattr(query, name) for name in _REPORTED if getattr(query, name) is not None}
     if query.pose is not None:
@@ -201,7 +202,7 @@ class WantedQueries:
 
 
 def list_queries(
-    connection: Connection, wanted: WantedQueries, before: tuple[float, int] | None, limit: int
+    connection: Connection, criteria: WantedQueries, before: tuple[float, int] | None, limit: int
 ) -> list[QueryRow]:
     """Return queries, newest first.
 
@@ -210,34 +211,34 @@ def list_queries(
     before : time and number of the last row of the previous page
     limit : maximum number of queries
     """
-    statement = _ROW.where(*_conditions(wanted))
+    statement = _ROW.where(*_conditions(criteria))
     if before is not None:
         statement = statement.where(tuple_(_c.at, _c.number) < before)
     statement = statement.order_by(_c.at.desc(), _c.number.desc()).limit(limit)
     return [QueryRow(**row) for row in connection.execute(statement).mappings()]
 
 
-def _conditions(wanted: WantedQueries) -> Iterator[ColumnElement[bool]]:
-    yield _c.kept_at.is_not(None) if wanted.kept else or_(_c.listed, _c.kept_at.is_not(None))
-    numbers = wanted.map_numbers
+def _conditions(criteria: WantedQueries) -> Iterator[ColumnElement[bool]]:
+    yield _c.kept_at.is_not(None) if criteria.kept else or_(_c.listed, _c.kept_at.is_not(None))
+    numbers = criteria.map_numbers
     if numbers is not None:
         # "+ 0" rules out the indexes of maps, since the index of robots selects fewer rows
-        own = _c.map_number if wanted.robot is None else _c.map_number + 0
+        own = _c.map_number if criteria.robot is None else _c.map_number + 0
         yield own == numbers[0] if len(numbers) == 1 else own.in_(numbers)
-    if wanted.statuses:
-        yield _c.status.in_(wanted.statuses)
-    if wanted.robot is not None:
-        yield _c.robot == wanted.robot
-    if wanted.since is not None:
-        yield _c.at >= wanted.since
-    if wanted.until is not None:
-        yield _c.at < wanted.until
+    if criteria.statuses:
+        yield _c.status.in_(criteria.statuses)
+    if criteria.robot is not None:
+        yield _c.robot == criteria.robot
+    if criteria.since is not None:
+        yield _c.at >= criteria.since
+    if criteria.until is not None:
+        yield _c.at < criteria.until
 
 
 def count_statuses(
     connection: Connection, since: float, map_number: int | None = None
 ) -> dict[int, dict[str, int]]:
-    """Count the listed queries since a time by map number and status; None counts all maps."""
+    """Count the listed queries of a map, or of all maps, since a time by map number and status."""
     statement = select(_c.map_number, _c.status, func.count().label("n"))
     statement = statement.where(_c.listed, _c.at >= since).group_by(_c.map_number, _c.status)
     if map_number is not None:
@@ -299,7 +300,7 @@ def release_answer(connection: Connection, number: int) -> None:
 
 
 def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
-    """Return the number of permanent answers of a map, and the bytes of those of all maps."""
+    """Return the number of permanent answers of a map, and the total bytes of those of all maps."""
     counts = func.count(), func.coalesce(func.sum(_c.bytes), 0)
     statement = select(*counts).where(_c.kept_at.is_not(None))
     of_map = select(maps.c.number).where(maps.c.name == map_name).scalar_subquery()
@@ -311,13 +312,13 @@ def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
 
 
 def old_queries(connection: Connection, before: float, limit: int) -> list[int]:
-    """Return the numbers of the oldest queries before a time; skip permanent answers."""
+    """Return the row numbers of the oldest queries before a time, except permanent answers."""
     spent = select(_c.number).where(_c.at < before, _c.kept_at.is_(None))
     return list(connection.execute(spent.order_by(_c.at, _c.number).limit(limit)).scalars())
 
 
 def surplus_queries(connection: Connection, most: int, limit: int) -> list[int]:
-    """Return the numbers of the oldest queries of maps with more than `most` queries."""
+    """Return the row numbers of the oldest queries of maps with more than `most` queries."""
     span = connection.execute(select(func.max(_c.number) - func.min(_c.number))).scalar()
     if (span or 0) < most:  # usual case; avoids a count
         return []
@@ -331,7 +332,7 @@ def surplus_queries(connection: Connection, most: int, limit: int) -> list[int]:
 
 
 def queries_of_map(connection: Connection, map_number: int, limit: int) -> list[int]:
-    """Return the numbers of up to `limit` queries of a map."""
+    """Return the row numbers of up to `limit` queries of a map."""
     own = select(_c.number).where(_c.map_number == map_number).limit(limit)
     return list(connection.execute(own).scalars())
 
@@ -345,20 +346,20 @@ def remove_queries(connection: Connection, numbers: Sequence[int]) -> list[str]:
 
 
 def stored_bytes(connection: Connection) -> int:
-    """Return the total size of stored answers in bytes."""
+    """Return the total size, in bytes, of stored answers."""
     total = connection.execute(select(func.sum(_c.bytes)).where(_STORED)).scalar()
     return int(total or 0)
 
 
 def oldest_answers(connection: Connection, limit: int) -> list[tuple[int, int]]:
-    """Return query number and bytes of the oldest answers, except permanent answers."""
+    """Return row number and size, in bytes, of the oldest answers, except permanent answers."""
     statement = select(_c.number, _c.bytes).where(_STORED, _c.kept_at.is_(None))
     rows = connection.execute(statement.order_by(_c.at, _c.number).limit(limit))
     return [(row.number, row.bytes) for row in rows]
 
 
 def shown_frames(connection: Connection, after: int, limit: int) -> list[tuple[int, list[int]]]:
-    """Return query number and frame numbers of the next stored answers after number `after`."""
+    """Return the row number and frame numbers of the next stored answers after row `after`."""
     statement = select(_c.number, _c.shown).where(_STORED, _c.number > after)
     rows = connection.execute(statement.order_by(_c.number).limit(limit))
     return [(row.number, row.shown or []) for row in rows]
@@ -381,6 +382,6 @@ def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
 
 
 def stored_among(connection: Connection, query_ids: Sequence[str]) -> set[str]:
-    """Return those of up to a thousand query ids whose answers are stored in files."""
+    """Return the query ids, among up to a thousand, whose answers are stored in files."""
     statement = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
     return set(connection.execute(statement).scalars())

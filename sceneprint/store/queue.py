@@ -188,7 +188,7 @@ def count_jobs(
 ) -> dict[str, int]:  # fmt: skip
     """Count the jobs of a map, or of all maps, by state.
 
-    Of a retried dead job, only the latest retry counts.
+    Of a retried dead job, only the latest retry counts. With `states`, count exactly these states.
     """
     counts = select(jobs.c.state, func.count()).group_by(jobs.c.state)
     if map_number is not None:
@@ -259,7 +259,7 @@ def enqueue(
 
 
 def due_in_s(connection: Connection) -> float | None:
-    """Return the seconds until the next job is due, without a lock; None if no job is queued."""
+    """Return the seconds until a job is due or a lease expires; None without jobs. Take no lock."""
     waiting = select(func.min(jobs.c.run_after)).where(jobs.c.state == JobState.QUEUED)
     silent = select(func.min(jobs.c.leased_until)).where(jobs.c.state == JobState.RUNNING)
     scalars = [connection.execute(due).scalar() for due in (waiting, silent)]
@@ -268,7 +268,7 @@ def due_in_s(connection: Connection) -> float | None:
 
 
 def has_due(connection: Connection) -> bool:
-    """Return whether a job can be claimed or must be marked as dead, without a lock."""
+    """Return whether a job can be claimed or must be marked as dead. Take no lock."""
     at = now(connection)
     early, late = jobs.c.run_after <= at, jobs.c.run_after > at + LONGEST_PAUSE_S
     waiting = and_(jobs.c.state == JobState.QUEUED, or_(early, late))
@@ -298,7 +298,7 @@ def claim(connection: Connection, worker: str, lease_s: float) -> JobRow | None:
         place = _lock_first(connection, tenant.turn, *waiting, jobs.c.tenant == tenant.tenant)
         if place is not None:
             break
-    # prefer a job with an expired lease if it precedes; there are few such jobs
+    # prefer a job with an expired lease if it comes first; there are few such jobs
     other = _first_of_few(connection, *silent)
     if other is not None and (place is None or other < place):
         own = jobs.c.number == other.number
@@ -374,7 +374,7 @@ def _is_upkeep(tenant: str, priority: int) -> bool:
 
 
 def _turns_of(tenant: ColumnElement[str]) -> tuple[Label[int | None], Label[int | None]]:
-    """Return the latest turn among the jobs of a tenant, and among its removed jobs."""
+    """Return expressions for the latest turn of a tenant's jobs, and of its removed jobs."""
     of_jobs = select(func.max(_TURNS.c.turn)).where(_TURNS.c.tenant == tenant)
     saved = select(tenants.c.turn).where(tenants.c.name == tenant)
     return of_jobs.scalar_subquery().label("of_jobs"), saved.scalar_subquery().label("saved")
@@ -527,7 +527,7 @@ def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> Jo
 
 
 def pause_s(failures: int) -> float:
-    """Return the pause in seconds before the next attempt of a job after some failures."""
+    """Return the pause, in seconds, before the next attempt at a job after some failures."""
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
@@ -575,7 +575,7 @@ def _lost(held: JobRow) -> LostLease:
 
 
 def has_exhausted(connection: Connection) -> bool:
-    """Return whether `dead_letter` would mark a job as dead, without a lock."""
+    """Return whether `dead_letter` would mark a job as dead. Take no lock."""
     statement = select(jobs.c.number).where(*_out_of_tries(now(connection))).limit(1)
     return connection.execute(statement).first() is not None
 
@@ -599,6 +599,8 @@ def fail_dead_worker(
     connection: Connection, job_id: str, token: int, error: str, traceback: str, *, counts: bool
 ) -> JobRow | None:
     """Queue the job of a dead worker again, or mark it as dead, before the lease expires.
+
+    If another worker has claimed the job, only count the failure.
 
     Parameters
     ----------
@@ -719,7 +721,7 @@ def items_of(
 
 
 def add_files(connection: Connection, job_number: int, files: Iterable[JobFile]) -> None:
-    """Add files to a job; replace files of the same names."""
+    """Add files to a job; replace files of the same names. An archive counts against the quota."""
     for file in files:
         remove_parts(connection, job_number, items=False, files=[file.name])
         connection.execute(insert(job_files).values(job_number=job_number, **asdict(file)))
@@ -763,7 +765,7 @@ def remove_parts(
     connection: Connection, job_number: int, *, items: bool = True,
     files: Iterable[str] | None = None,
 ) -> list[str]:  # fmt: skip
-    """Remove items and files from a job.
+    """Remove items and files from a job; an archive no longer counts against the quota.
 
     Parameters
     ----------
@@ -782,10 +784,10 @@ def remove_parts(
     c = job_files.c
     removed = connection.execute(select(c.name, c.blob, c.bytes).where(own)).all()
     connection.execute(delete(job_files).where(own))
-    for one in removed:
-        if one.name == ARCHIVE:
-            _count_archive(connection, job_number, -one.bytes)
-    return [removal.blob for removal in removed]
+    for file in removed:
+        if file.name == ARCHIVE:
+            _count_archive(connection, job_number, -file.bytes)
+    return [file.blob for file in removed]
 
 
 def replace_result(connection: Connection, job: JobRow, result: dict[str, Any]) -> JobRow:

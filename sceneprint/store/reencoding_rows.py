@@ -130,7 +130,7 @@ def is_complete(connection: Connection, row: MapRow) -> bool:
 
 
 def frames_signed_by(connection: Connection, row: MapRow, revision: int) -> list[int]:
-    """Return the numbers of frames indexed up to a revision with a signature of the next model."""
+    """Return the numbers of frames indexed up to a revision that the next model has signed."""
     statement = select(frames.c.number).where(
         _indexed(row), frames.c.revision <= revision, _signed(row.next_model_id)
     )

@@ -98,7 +98,7 @@ def index_frame(connection: Connection, frame: FrameRow, signature: StoredSignat
 def index_claimed_frame(
     connection: Connection, job: JobRow, frame: FrameRow, map_name: str, signature: StoredSignature
 ) -> bool:
-    """End a job and index its frame by one statement, to save round trips to PostgreSQL.
+    """End a job, index its frame and record an event with a single statement of PostgreSQL.
 
     Parameters
     ----------
@@ -107,8 +107,8 @@ def index_claimed_frame(
     Returns
     -------
     done : False if nothing was written: on SQLite, or if the worker no longer holds the job, the
-        map has or gets another model, or the parent frame is joined. The caller determines the
-        reason
+        map has or is getting another model, or the parent frame is joined. The caller determines
+        the reason
     """
     if connection.dialect.name == "sqlite":
         return False
@@ -171,8 +171,8 @@ def _index_claimed(events_name: str) -> TextClause:
 def replace_signature(connection: Connection, frame: FrameRow, signature: StoredSignature) -> bool:
     """Replace a damaged or missing signature of an indexed frame.
 
-    If it is of the current model and changes, the frame gets the next revision of the map, so that
-    readers and indexes read it again.
+    If the signature belongs to the current model and changes, the frame gets the next revision of
+    the map, so that readers and indexes read it again.
 
     Returns
     -------
@@ -282,7 +282,7 @@ def _deletion_conditions(map_number: int, revision: int) -> tuple[ColumnElement[
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
-    """Return the signature of a frame, or None. Raise DamagedSignature if it is damaged."""
+    """Return the signature of a frame or None. Raise DamagedSignature if it is damaged."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     statement = select(signatures.c.vector, signatures.c.checksum).where(own)
     row = connection.execute(statement).first()
@@ -299,7 +299,7 @@ def stored_vector(connection: Connection, number: int, model_id: str) -> bytes |
 def patch_counts(
     connection: Connection, number: int, model_id: str
 ) -> tuple[list[int], list[int]] | None:
-    """Return the number of patches, and of ordered pairs, per level, finest first; or None."""
+    """Return the counts of patches and ordered pairs per level, finest first; None if unsigned."""
     statement = select(signatures.c.n_patches, signatures.c.n_pairs).where(
         signatures.c.frame_number == number, signatures.c.model_id == model_id
     )
@@ -336,7 +336,7 @@ def stale_signatures(connection: Connection, row: MapRow, after: int) -> list[tu
 
 
 def remove_signature(connection: Connection, number: int, model_id: str) -> list[str]:
-    """Remove the signature of a frame by a model; return the blobs that it referred to."""
+    """Remove the signature of a frame for a model; return the blobs that the row referred to."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     blobs = list(connection.execute(select(signatures.c.geometry).where(own)).scalars())
     connection.execute(delete(signatures).where(own))

@@ -107,9 +107,9 @@ class ReadOnlyFile:
         return self._path.with_name(self._path.name + end)
 
 
-#: Maximum seconds that a writer waits for others, and after another writer has timed out.
+#: Maximum seconds that a writer waits for other writers: usually, and after one has timed out.
 BUSY_S, HELD_S = 10.0, 0.1
-#: Seconds between attempts to acquire the lock, and maximum seconds in the line for it.
+#: Seconds between attempts to acquire the lock, and maximum seconds that a writer stays in line.
 LOOK_S, LINE_S = 0.0005, 1.0
 #: Maximum seconds that emptying the log waits for readers; meanwhile, writers wait.
 SHRINKING_S = 0.5
@@ -157,7 +157,7 @@ def configure_sqlite(connection: Any, _record: Any) -> None:
 
 
 def shrink_log(connection: Any) -> bool:
-    """Empty the log by a checkpoint; return False if another process prevents it.
+    """Empty the log with a checkpoint; return False if another process prevents it.
 
     Otherwise, the log contains old versions of pages until they are overwritten.
     """
@@ -175,7 +175,7 @@ def configure_read_only(connection: Any, _record: Any) -> None:
 
 
 def begin_sqlite(connection: Connection) -> None:
-    """Begin a transaction; a writer acquires the lock at once, and waits for it."""
+    """Begin a transaction; if it writes, first wait for the lock and acquire it."""
     wait_s: float | None = connection.get_execution_options().get("sceneprint_write")
     if wait_s is None:
         connection.exec_driver_sql("BEGIN")
@@ -224,9 +224,9 @@ class WriterLine:
 
     @contextmanager
     def first(self, longest_s: float) -> Iterator[None]:
-        """Hold the first place in line; without it after `longest_s`, continue anyway."""
+        """Hold the first place in line; continue without it if it stays taken for `longest_s`."""
         descriptor = self._open()
-        if descriptor is None or not _locked(descriptor, longest_s):
+        if descriptor is None or not _acquire(descriptor, longest_s):
             yield
             return
         try:
@@ -248,7 +248,7 @@ class WriterLine:
         return self._descriptor
 
 
-def _locked(descriptor: int, longest_s: float) -> bool:
+def _acquire(descriptor: int, longest_s: float) -> bool:
     until = time.monotonic() + longest_s
     while True:
         try:

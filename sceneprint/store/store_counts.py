@@ -32,7 +32,7 @@ def oldest_waiting(connection: Connection, map_number: int | None = None) -> dic
 
 
 def running_jobs(connection: Connection, now: float) -> dict[str, str]:
-    """Return the ids of running jobs by name of their worker."""
+    """Return the ids of running jobs whose lease has not expired, by worker name."""
     rows = connection.execute(
         select(jobs.c.worker, jobs.c.id).where(
             jobs.c.state == JobState.RUNNING, jobs.c.leased_until >= now
@@ -45,7 +45,7 @@ def count_events(
     connection: Connection, kinds: Sequence[str], at: float, width_s: float,
     map_name: str | None = None,
 ) -> Counter[tuple[int, str]]:  # fmt: skip
-    """Count events of some kinds in intervals since a time.
+    """Count events of some kinds in consecutive intervals.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ from sceneprint.store.tables import (
 )
 from sceneprint_client.api import FrameState
 
-#: Number of the time scale of a tile that must be published again.
+#: Value of `scale` for a tile that must be published again.
 NO_SCALE = -1
 #: Columns of a frame that affect its contribution to a surface.
 FUSED_COLUMNS = frozenset(("pose", "pose_parent", "session", "captured_at"))
@@ -114,7 +114,7 @@ def note_edit(connection: Connection, numbers: Sequence[int], map_number: int) -
 
 
 def mark_edited(connection: Connection, numbers: Sequence[int]) -> None:
-    """Mark fused frames as edited without counting it; their map has a new revision anyway."""
+    """Mark fused frames as edited without counting the edit; their map has a new revision."""
     for block in blocks(numbers):
         own = among(connection, surface_frames.c.frame_number, block)
         connection.execute(update(surface_frames).where(own).values(changed=True))
@@ -290,7 +290,7 @@ def fused_range(connection: Connection, map_number: int) -> tuple[float | None, 
 
 
 def spread_fused(connection: Connection, map_number: int, parent: str, most: int) -> list[int]:
-    """Return the numbers of up to `most` evenly spaced fused frames in a parent frame."""
+    """Return the numbers of evenly spaced fused frames in a parent frame, fewer than 2 * `most`."""
     c = surface_frames.c
     own = (c.map_number == map_number) & (c.parent == parent)
     statement = select(c.frame_number).where(own).order_by(c.frame_number)
@@ -365,7 +365,7 @@ def tile_of_number(connection: Connection, number: int) -> TileRow | None:
 
 
 def schedule_rebuild(connection: Connection, tile: TileRow) -> None:
-    """Schedule a lost tile to be rebuilt from frames or from finer tiles."""
+    """Doom the blobs of a lost tile, and schedule its rebuild from frames or from finer tiles."""
     own = surface_tiles.c.number == tile.number
     doom(connection, [blob for blob in (tile.blob, tile.draft) if blob])
     if tile.level == 0:
@@ -422,7 +422,7 @@ def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
 
 
 def tiles_to_rebuild(connection: Connection, map_number: int, most: int) -> list[TileRow]:
-    """Return up to `most` tiles to rebuild, those whose rebuild is most advanced."""
+    """Return up to `most` of the tiles to rebuild, only those whose rebuild is most advanced."""
     c = surface_tiles.c
     own = c.map_number == map_number, c.rebuilt_to.is_not(None)
     statement = select(surface_tiles).where(*own).order_by(c.rebuilt_to.desc(), c.number)
@@ -482,8 +482,8 @@ def write_tile(
         )  # fmt: skip
         return int(connection.execute(new.returning(c.number)).scalar_one()), []
     connection.execute(update(surface_tiles).where(c.number == before.number).values(**values))
-    left = {values.get(name, getattr(before, name)) for name in ("blob", "draft")}
-    return before.number, [b for b in (before.blob, before.draft) if b and b not in left]
+    current = {values.get(name, getattr(before, name)) for name in ("blob", "draft")}
+    return before.number, [b for b in (before.blob, before.draft) if b and b not in current]
 
 
 def remove_tiles(connection: Connection, tiles: Sequence[TileRow]) -> list[str]:

@@ -138,7 +138,7 @@ frames = Table(
     Column("name", _string(255)),  # name of the original file or message; never used as a path
     Column("sequence", WHOLE),  # position within the session
     Column("samples", JSON(none_as_null=True)),  # ranges of the samples, and `trust_depth`
-    Column("ended_at", Float),  # time at which the frame was deleted or redundant
+    Column("ended_at", Float),  # time at which the frame was deleted or found redundant
     # first revision of the deletion, if the frame can be restored (tombstone)
     Column("deletion", WHOLE),
     Column("deleted_from", _string(16)),  # former state; null if another frame uses the id now
@@ -310,7 +310,7 @@ tenants = Table(
     metadata,
     Column("name", _string(128), primary_key=True),
     Column("created_at", Float, nullable=False),
-    Column("turn", WHOLE, nullable=False, server_default="0"),  # latest turn of removed jobs
+    Column("turn", WHOLE, nullable=False, server_default="0"),  # highest turn of any removed job
 )
 
 
@@ -444,7 +444,7 @@ queries = Table(
     Column("title", _string(200)),  # title of a permanent answer
     Column("shown", JSON(none_as_null=True)),  # frame numbers in the answer
     Column("bytes", BigInteger, nullable=False),  # size of the answer; 0 if it is not stored
-    Column("answer", LargeBinary),  # permanent answer; others are files, see `answer_files`
+    Column("answer", LargeBinary),  # permanent answer; see `answer_files` for others
     Index(None, "at", "number"),
     Index(None, "map_number", "at", "number"),
     Index(None, "map_number", "status", "at", "number"),
@@ -500,9 +500,9 @@ surface_tiles = Table(
     Column("tile_y", WHOLE, nullable=False),
     Column("tile_z", WHOLE, nullable=False),
     Column("cells", WHOLE, nullable=False),
-    Column("blob", _string(64)),  # sums of the finest level, cells of the others; null: none yet
+    Column("blob", _string(64)),  # sums at the finest level, else cells; null: none yet
     Column("digest", _string(64), nullable=False),  # digest of the published cells
-    Column("scale", WHOLE, nullable=False),  # number of its time scale
+    Column("scale", WHOLE, nullable=False),  # `scale` of the surface at its publication
     # last frame in `draft` during a rebuild, initially 0; null if the tile is up to date
     Column("rebuilt_to", WHOLE),
     Column("draft", _string(64)),
@@ -572,8 +572,8 @@ def count_rows(connection: Connection, *conditions: ColumnElement[bool]) -> int:
 
 def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
     """Split numbers into lists of up to `MOST_ROWS`."""
-    left = iter(numbers)
-    while block := list(islice(left, MOST_ROWS)):
+    rest = iter(numbers)
+    while block := list(islice(rest, MOST_ROWS)):
         yield block
 
 
@@ -606,7 +606,7 @@ def rows_of_statement(
     Parameters
     ----------
     statement : function that returns the cached statement for a dialect, with `among_numbers`
-    numbers : numbers of any count
+    numbers : any count of numbers
     values : other parameters of the statement
     """
     cached = statement(connection.dialect.name)
@@ -757,7 +757,7 @@ def job_row(row: RowMapping) -> JobRow:
 
 
 def job_of_columns(row: Sequence[Any]) -> JobRow:
-    """Convert the first columns of a row, `JOB_COLUMNS`, to a job."""
+    """Convert the first columns of a row, which are `JOB_COLUMNS`, to a job."""
     values = list(row[: len(JOB_COLUMNS)])
     values[_JOB_STATE] = JobState(values[_JOB_STATE])
     return JobRow(*values)

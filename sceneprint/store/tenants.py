@@ -67,7 +67,7 @@ def delete_tenant(connection: Connection, name: str) -> None:
 
 
 def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> str:
-    """Return the tenant of a new key: `tenant`, or a new tenant with the name of the key.
+    """Return the tenant of a new key: `tenant`, or one of the key's name, created if missing.
 
     Raises
     ------

@@ -114,7 +114,7 @@ def successor_of(connection: Connection, frame: FrameRow) -> str | None:
 
 
 def restore_frame(connection: Connection, row: MapRow, frame: FrameRow) -> None:
-    """Restore a tombstone; queue its signing only if the map has switched its model.
+    """Restore a tombstone, and record an event; queue a job if the map's model has not signed it.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import psycopg
 
 
-#: Age in seconds at which an abandoned FIFO is removed, and interval of touching a FIFO in use.
+#: Seconds after which an abandoned FIFO is removed, and seconds between touches of a FIFO in use.
 STALE_S, ALIVE_S = 300.0, 60.0
 #: Polling interval of a worker without a FIFO, seconds.
 DEAF_S = 0.25
@@ -85,7 +85,7 @@ class Wakeup:
     def ring(self) -> None:
         """Wake waiting workers. Call this after the commit, so that they see the change."""
         try:
-            names = os.listdir(self._folder)  # noqa: PTH208  (a path for each would cost)
+            names = os.listdir(self._folder)  # noqa: PTH208  (Path objects would take time)
         except OSError:
             return
         for name in names:
@@ -165,6 +165,7 @@ class Listener:
             self._fifo = -1
 
     def _open(self) -> None:
+        """Create and open the FIFO; if this is impossible, `wait` polls."""
         self._alive = time.monotonic()
         try:
             make_folder(self._path.parent)
@@ -295,6 +296,7 @@ class NoticeListener:
         self._connection = None
 
     def _connect(self) -> None:
+        """Connect if AGAIN_S have passed since the last attempt; `wait` then reports a ring."""
         if self._connection is not None or time.monotonic() < self._again_at:
             return
         self._again_at = time.monotonic() + AGAIN_S

@@ -150,16 +150,16 @@ def test_what_was_done_under_its_key_is_not_done_again(server_store, rows):
     def kept(request):
         return request.columns({"frames": request.key})
 
-    assert receive(database, new(a, 1, kept=kept(requests[0]))) == [True]
-    given = [new(b, 2, kept=kept(one)) for one in requests[:1]]
-    given += [new(b, 3), new(a, 3, kept=kept(requests[1]))]
+    assert receive(database, new(a, 1, result=kept(requests[0]))) == [True]
+    given = [new(b, 2, result=kept(one)) for one in requests[:1]]
+    given += [new(b, 3), new(a, 3, result=kept(requests[1]))]
     assert receive(database, *given) == [False, True, True]
     with database.read() as connection:
         assert requests[1].stored_result(connection) == {"frames": "new"}
         assert len(connection.execute(select(idempotency.c.key)).all()) == 2
     both = IdempotentRequest("robot", "both", "0" * 64)
     with pytest.raises(IntegrityError, match="pk_idempotency"):
-        receive(database, new(a, 8, kept=kept(both)), new(b, 8, kept=kept(both)))
+        receive(database, new(a, 8, result=kept(both)), new(b, 8, result=kept(both)))
     assert counted(database) == [("a", 2, 6), ("b", 1, 3), ("c", 0, 0)]
 
 

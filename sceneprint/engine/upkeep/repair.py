@@ -75,11 +75,11 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
         with store.database.read() as connection:  # usually none is due: avoid a write lock
             # sample randomly, so that irreparable frames do not prevent other repairs
             sample = random.sample(list(numbers), min(MOST, len(numbers)))
-            due = _repairable(connection, sample, model_id)
+            due = _due(connection, sample, model_id)
         if not due:
             return 0
         with store.database.write() as connection:
-            due = _repairable(connection, due, model_id)
+            due = _due(connection, due, model_id)
             ids = {frame.number: frame.id for frame in frames_of(connection, due).values()}
             for number in due:
                 job = enqueue(connection, REENCODE, number, PRIORITY, model_id)
@@ -109,8 +109,7 @@ def rebuild_frame(store: Store, signer: Signer, frame: FrameRow) -> tuple[Bytes,
     return signature.vector, write_geometry(geometry)
 
 
-def _repairable(connection: Connection, numbers: Sequence[int], model_id: str) -> list[int]:
-    """Return the indexed frames without a pending or recent repair job and without a known loss."""
+def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[int]:
     frames = frames_of(connection, numbers)
     now, due = time.time(), []
     for number in dict.fromkeys(numbers):
@@ -125,7 +124,7 @@ def _repairable(connection: Connection, numbers: Sequence[int], model_id: str) -
 
 
 def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list[str]:
-    """Replace the upload of a frame if it is lost or damaged; repair its geometry if it is, too.
+    """Replace the upload of a frame if it is lost or damaged.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Checks of blobs: content against digests, and unreferenced files."""
+"""Checks of blobs: comparison with their digests, and search for unreferenced files."""
 
 from __future__ import annotations
 
@@ -115,6 +115,7 @@ def _tiles(blob: Column[str]) -> Select[Any]:
 
 
 def _note_loss(connection: Connection, reference: BlobReference, condition: Condition) -> str:
+    """Record a lost upload in the frame's reason, and set an unsigned frame to failed."""
     waiting = reference.state in _BEING_SIGNED
     state = FrameState.FAILED if waiting else reference.state
     loss = reason_of_loss(condition, found=reference.state == FrameState.INDEXED)
@@ -200,11 +201,13 @@ def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobRef
 
 
 def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Finding]:
-    """Verify the blobs of some rows, and yield the findings.
+    """Compare the blobs of some rows with their digests, count them, and yield findings.
+
+    If `folder.quick` is set, only check that the blobs exist. Skip unreadable rows.
 
     Parameters
     ----------
-    kind : key of `_KINDS`
+    kind : `upload`, `artifact`, `job-file` or `tile`
     """
     blobs = folder.store.blobs
     for row in read_rows(folder, numbers, partial(_read, kind)):
@@ -280,14 +283,14 @@ def _repair(folder: Folder, reference: BlobReference) -> str:
         return moved + _KINDS[reference.kind].repair(connection, now, condition)
 
 
-#: Age in seconds from which an unfinished file is reported.
+#: Minimum age of unfinished files that are reported, seconds.
 WRITING_S = 60.0
 #: Number of files to look up in one transaction.
 _BATCH = 200
 
 
 def check_files(folder: Folder) -> Iterator[Finding]:
-    """Yield findings of unreferenced and foreign files in the blob storage."""
+    """Yield findings for unreferenced and foreign files, unless only one map is checked."""
     if folder.map_name is not None:
         return
     now, waiting = time.time(), list[BlobEntry]()

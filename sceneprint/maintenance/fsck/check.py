@@ -2,8 +2,9 @@
 
     Settings  --fsck-->  Findings, as they are discovered
 
-Without `repair`, the check writes nothing. With `repair`, one transaction verifies each finding
-again and repairs it, since services and workers may be running.
+Without `repair`, the check writes nothing. With `repair`, each finding is verified again and
+repaired in one transaction, because running services and workers may have changed the data in the
+meantime.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ def _check_all_frames(folder: Folder) -> Iterator[Finding]:
 
 
 #: Checks in order; files precede frames, since repairs of frames doom blobs, which would be
-#: reported.
+#: reported as unreferenced.
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
     check_database, check_models, check_counts, check_files, _check_all_frames, check_products,
     check_indexes,
@@ -74,7 +75,7 @@ def fsck(
     map_name : map to check; None checks all maps, and data without a map
     repair : whether to repair the findings
     quick : whether to check only that blobs and rows exist, without reading their content
-    grace_s : age in seconds below which unreferenced files are ignored
+    grace_s : age, in seconds, below which unreferenced files are ignored
     counts : counter to which the numbers of checked objects are added
 
     Yields
@@ -113,6 +114,7 @@ def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -
 
 
 def _repaired(finding: Finding, trusted: bool) -> Finding:
+    """Repair a finding unless the database is damaged; return it with the result or the error."""
     assert finding.repair is not None
     if not trusted:
         return replace(finding, error="the database is damaged: restore a backup first")
@@ -126,6 +128,7 @@ def _repaired(finding: Finding, trusted: bool) -> Finding:
 
 @contextmanager
 def _open_store(settings: Settings, *, repair: bool) -> Iterator[Store]:
+    """Open an existing store, for writing only if `repair` is set and the blobs seem present."""
     # a disk that is not mounted would look like an empty folder
     if isinstance(settings.blobs, Path):
         require_folder(settings.blobs)

@@ -92,6 +92,7 @@ def check_database(folder: Folder) -> Iterator[Finding]:
 
 
 def _dangling(folder: Folder, key: ForeignKeyConstraint) -> Iterator[Finding]:
+    """Yield findings for up to _MOST rows whose foreign key refers to a missing row."""
     child, parent = key.table, key.referred_table
     pairs = [(element.parent, element.column) for element in key.elements]
     lost = (
@@ -112,12 +113,12 @@ def _dangling(folder: Folder, key: ForeignKeyConstraint) -> Iterator[Finding]:
 
 
 def damaged_database(message: str) -> Finding:
-    """Return the finding of an unreadable or inconsistent database."""
+    """Return the finding for an unreadable or inconsistent database."""
     return Finding("damaged-database", "the database", "damage", message, _RESTORE)
 
 
 def check_models(folder: Folder) -> Iterator[Finding]:
-    """Yield findings of models with damaged files, which can neither sign nor search."""
+    """Yield findings for models whose files are damaged."""
     with folder.store.database.read() as connection:
         stored = connection.execute(select(models.c.id)).scalars().all()
     for model_id in stored:
@@ -141,7 +142,7 @@ def _put_preset(folder: Folder, model_id: str, source: str) -> str:
 
 
 def check_counts(folder: Folder) -> Iterator[Finding]:
-    """Yield findings of maps whose stored usage, on which quotas depend, is wrong."""
+    """Yield findings for maps whose stored usage, on which quotas depend, is wrong."""
     with folder.store.database.read() as connection:
         rows = list_maps(connection)
     for row in rows:
@@ -186,7 +187,7 @@ class _CheckedFrame:
 
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Check the rows of some frames, and yield findings of inconsistent or damaged rows."""
+    """Check the rows of some frames, and yield findings for inconsistent or damaged rows."""
     for row in read_rows(folder, numbers, partial(_read_frames, folder)):
         folder.counts["frames"] += 1
         if isinstance(row, tuple):
@@ -218,6 +219,7 @@ def _repair_row(folder: Folder, number: int, fault: _Fault) -> str:
 
 
 def _read_frames(folder: Folder, connection: Connection, numbers: list[int]) -> list[_CheckedFrame]:
+    """Read some frames; if `folder.quick` is set, do not verify their signatures."""
     here = frames.c.number.in_(numbers)
     own = select(maps).where(maps.c.number.in_(select(frames.c.map_number).where(here)))
     map_rows = {row["number"]: map_row(row) for row in connection.execute(own).mappings()}
@@ -266,13 +268,13 @@ def _is_indexed(checked: _CheckedFrame) -> bool:
 
 
 def _damaged(checked: _CheckedFrame) -> set[str]:
-    """Return the models of the map by which an indexed frame has a damaged signature."""
+    """Return the models of the map for which an indexed frame has a damaged signature."""
     own = (checked.map.model_id, checked.map.next_model_id) if _is_indexed(checked) else ()
     return {model_id for model_id, sound in checked.signed.items() if not sound and model_id in own}
 
 
 def _stray(checked: _CheckedFrame) -> set[str]:
-    """Return the models by which a frame has signatures that it should not have."""
+    """Return the models for which a frame has signatures that it should not have."""
     if checked.frame.deletion is not None:
         return set()  # keep them, since the deletion may be undone
     if checked.frame.state in _GONE:

@@ -22,11 +22,11 @@ from sceneprint.store.tables import frames, models
 #: damage: stored data is lost or changed; leftover: data is superfluous; note: the finding is
 #: harmless or recorded.
 Severity = Literal["damage", "leftover", "note"]
-#: Callback with the checked subject, the number of checked objects, and their total number.
+#: Callback that receives the subject, the number of checked objects, and their total number.
 Progress = Callable[[str, int, int], None]
 #: SQLSTATE codes with which PostgreSQL reports damaged pages and indexes.
 _DAMAGED = ("XX001", "XX002")
-#: Age in seconds below which an unreferenced file may belong to an unfinished upload.
+#: Age, in seconds, below which an unreferenced file may belong to an unfinished upload.
 GRACE_S = 3600.0
 #: Number of rows to read in one transaction.
 BLOCK = 64
@@ -84,7 +84,7 @@ class Folder:
     store : database and blobs
     map_name : map to check; None checks all maps, and data without a map
     quick : whether to check only that blobs and rows exist, without reading their content
-    grace_s : age in seconds below which unreferenced files are ignored
+    grace_s : age, in seconds, below which unreferenced files are ignored
     counts : number of checked objects by subject
     """
 

@@ -21,7 +21,7 @@ from sceneprint_client.api import FrameState
 
 
 def check_indexes(folder: Folder) -> Iterator[Finding]:
-    """Yield findings of newest indexes that are damaged or differ from the database."""
+    """Yield findings for maps whose newest index is damaged or differs from the database."""
     with folder.store.database.read() as connection:
         rows = [row for row in list_maps(connection) if folder.map_name in (None, row.name)]
     for done, row in enumerate(() if folder.quick else rows):

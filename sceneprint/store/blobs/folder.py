@@ -30,7 +30,7 @@ from sceneprint.store.database_errors import unusable
 # All processes that share the blobs use one lock: shared while blobs must not be removed, exclusive
 # during removals. The kernel or the server releases the lock of a process that dies.
 
-#: Time limits of a removal, with and without a turn to write, seconds.
+#: Maximum seconds to wait for a removal during a write turn, and maximum duration of a removal.
 TURN_S, REMOVAL_S = 5.0, 25.0
 #: Seconds after which any removal has ended, even if its process died: a removal sends no request
 #: after REMOVAL_S, and each request ends within `object_client.TRIED_S` and `SMALL_S`.
@@ -40,11 +40,11 @@ _LOOK_S = 0.01
 
 
 class Locks(ABC):
-    """Lock of a blob storage; see `Blobs.block_removals` and `Blobs.removing`."""
+    """Lock on blob storage; see `Blobs.block_removals` and `Blobs.removing`."""
 
     @abstractmethod
     def block_removals(self) -> AbstractContextManager[None]:
-        """Hold the lock together with other processes that need all blobs."""
+        """Hold the lock, which other processes that need all blobs may hold too."""
 
     @abstractmethod
     def removing(self) -> AbstractContextManager[bool]:
@@ -52,18 +52,18 @@ class Locks(ABC):
 
     @property
     def outlast_turns(self) -> bool:
-        """Return whether a removal may continue after the turn in which it began."""
+        """Return whether a removal may continue after the write turn in which it began."""
         return False
 
     def removals(self) -> int | None:
-        """Return a counter of removals; None if it is unknown, or during a removal."""
+        """Return the value of the counter of removals; None if unknown, or during a removal."""
         return None
 
     def mark_uncertain(self) -> None:  # noqa: B027  (removals from a folder end at once)
         """Mark the removal by this thread as unfinished: its requests may still be executed."""
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: B027  (most have none)
-        """Wait for a removal that continues after its turn, unless its process has died.
+        """Wait for a removal that continues after its write turn, unless its process has died.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class FileLocks(Locks):
             os.close(descriptor)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
-        """See `Locks`. A removal continues after its turn if the server ended the turn early."""
+        """See `Locks`. A removal outlasts its turn if the database server ended the turn early."""
         until = time.monotonic() + seconds
         while True:
             try:
@@ -175,9 +175,9 @@ class IncomingBlob:
     def write(self, data: bytes) -> None:
         """Append bytes."""
         try:
-            left = memoryview(data)
-            while left:  # unbuffered files may write only part of the data
-                left = left[self._file.write(left) or 0 :]
+            rest = memoryview(data)
+            while rest:  # unbuffered files may write only part of the data
+                rest = rest[self._file.write(rest) or 0 :]
         except OSError as error:
             raise unusable(self._what, error) from error
         self._hashed.update(data)
@@ -195,7 +195,7 @@ class IncomingBlob:
 
 Condition = Literal["sound", "missing", "damaged"]
 DIGEST = re.compile(r"[0-9a-f]{64}")
-#: Name of the file that states the owner of the blobs; see `object_store.BucketOwner`.
+#: Name of the file that names the owner of the blobs; see `object_store.BucketOwner`.
 MARK = "sceneprint.json"
 
 
@@ -212,7 +212,7 @@ def require_digest(text: str) -> None:
 
 @dataclass(frozen=True)
 class BlobEntry:
-    """A file or object in a blob storage.
+    """A file or object in blob storage.
 
     Parameters
     ----------
@@ -284,7 +284,7 @@ class Blobs(ABC):
         """Return whether a blob exists and will exist until the transaction is committed.
 
         Call this in the transaction that writes a reference to the blob: no removal begins before
-        the commit, and the call waits for a removal that continues after its turn.
+        the commit, and the call waits for a removal that outlasted its turn.
 
         Raises
         ------
@@ -306,7 +306,7 @@ class Blobs(ABC):
 
     @abstractmethod
     def size(self, digest: str) -> int | None:
-        """Return the size of a blob in bytes, unverified; None if it is missing."""
+        """Return the size of a blob, in bytes, without verifying it; None if it is missing."""
 
     def block_removals(self) -> AbstractContextManager[None]:
         """Prevent removals of blobs during the context; first wait for a removal in progress.
@@ -383,7 +383,7 @@ class Blobs(ABC):
         return False
 
     def check(self) -> None:  # noqa: B027
-        """Check that a network storage was reachable within the last two seconds.
+        """Check that network storage was reachable within the last two seconds.
 
         Raises
         ------
@@ -395,12 +395,12 @@ class Blobs(ABC):
         self._locks.close()
 
 
-#: Pattern of the names of unfinished files, which a killed writer leaves behind.
+#: Pattern of the names of unfinished files, which killed writers leave behind.
 PART = re.compile(r"\.[0-9a-f]{12}\.part")
 
 
 class FolderBlobs(Blobs):
-    """Blobs in 256 subfolders of a folder, named by the first two digits of the digests.
+    """Blobs in 256 subfolders of a folder, named after the first two digits of the digests.
 
     Parameters
     ----------
@@ -557,7 +557,7 @@ class FolderBlobs(Blobs):
         """See `Blobs.digests`."""
         for folder in self._folder.iterdir():
             if folder.is_dir():
-                for name in os.listdir(folder):  # noqa: PTH208  (a path for each would cost)
+                for name in os.listdir(folder):  # noqa: PTH208  (Path objects would take time)
                     if DIGEST.fullmatch(name):
                         yield name
 

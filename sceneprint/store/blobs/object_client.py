@@ -2,10 +2,10 @@
 
     URL  --open_objects-->  Objects  --put | get | list | delete-->  object store
 
-Each request has a time limit, and so have all its attempts together. For AWAY_S seconds after a
-failure to reach the store, calls fail immediately. Large objects are sent in parts to limit memory.
-Error messages contain the URL and the reason, but not the text of the library, which may contain
-credentials.
+Each attempt at a request has a time limit, and so do all attempts together. For AWAY_S seconds
+after a failure to reach the store, calls fail immediately. Large objects are sent in parts to limit
+memory. Error messages contain the URL and the reason, but not the text of the library, which may
+contain credentials.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class RangeFile(io.RawIOBase):
     Parameters
     ----------
     size : size of the file, bytes
-    fetch : function that returns the bytes at an offset, by offset and length
+    fetch : function of offset and length that returns these bytes of the file
     """
 
     def __init__(self, size: int, fetch: Callable[[int, int], bytes]) -> None:
@@ -73,7 +73,7 @@ class RangeFile(io.RawIOBase):
         return self._place
 
     def readinto(self, buffer: WriteableBuffer, /) -> int:
-        """Read up to the end of the buffer or the file."""
+        """Fill the buffer, as far as the file reaches; return the number of bytes read."""
         view = memoryview(buffer).cast("B")
         length = min(len(view), self._size - self._place)
         if length <= 0:
@@ -83,13 +83,13 @@ class RangeFile(io.RawIOBase):
         return length
 
 
-#: Size of the parts of large objects, bytes, and number of concurrent parts.
+#: Size, in bytes, of the parts in which large objects are sent, and number of concurrent parts.
 PART, AT_ONCE = 8 << 20, 3
 #: Maximum number of parts of an object.
 MOST_PARTS = 9_000
 #: Maximum number of keys in one request to remove objects.
 MOST_KEYS = 500
-#: Seconds for which calls fail immediately after a store was unreachable.
+#: Seconds for which calls fail without a request after a store was unreachable.
 AWAY_S = 1.0
 _REFUSED = ("PermissionDeniedError", "UnauthenticatedError")
 _NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|bucket does not exist")
@@ -109,7 +109,7 @@ class ListedObject:
     ----------
     key : key relative to the prefix
     size : size of the object, bytes
-    changed_at : time of modification by the clock of the store, seconds since 1970
+    changed_at : time of modification according to the clock of the store, seconds since 1970
     """
 
     key: str
@@ -125,7 +125,7 @@ class Objects:
 
     Parameters
     ----------
-    small, large : clients for requests of few and of many bytes
+    small, large : clients for requests that transfer few bytes, and many bytes
     once : client for requests that must not be repeated
     variables : names of the environment variables that configure the store, for messages
     folder : path of the store if it is a folder
@@ -208,14 +208,17 @@ class Objects:
         return b"".join(self.chunks(key, size))
 
     def read_range(self, key: str, start: int, length: int) -> bytes:
-        """Return a range of an object. Raise FileNotFoundError if it does not exist.
-
-        UnusableStore is raised if the object ends before the range.
+        """Return exactly `length` bytes of an object.
 
         Parameters
         ----------
         key : key below the prefix
         start, length : range within the object, bytes; `length` must be positive
+
+        Raises
+        ------
+        FileNotFoundError : If the object does not exist.
+        UnusableStore : If the object ends before the end of the range.
         """
         import obstore
 
@@ -229,12 +232,16 @@ class Objects:
         return bytes(data)
 
     def chunks(self, key: str, size: int | None = None) -> Iterator[bytes]:
-        """Yield the content of an object in parts. Raise FileNotFoundError if it does not exist.
+        """Yield the content of an object in parts.
 
         Parameters
         ----------
         key : key below the prefix
-        size : size of the object, bytes, if known
+        size : size of the object, bytes; None if unknown
+
+        Raises
+        ------
+        FileNotFoundError : If the object does not exist.
         """
         total = self.size(key) if size is None else size
         if total is None:
@@ -261,12 +268,12 @@ class Objects:
 
         with self._explained(f"{key} cannot be inspected"):
             try:
-                one = obstore.head(self._small, key)
+                meta = obstore.head(self._small, key)
             except FileNotFoundError as error:
                 if _NO_BUCKET.search(str(error)):
                     raise
                 return None
-        return ListedObject(key, one["size"], one["last_modified"].timestamp())
+        return ListedObject(key, meta["size"], meta["last_modified"].timestamp())
 
     def size(self, key: str) -> int | None:
         """Return the size of an object, bytes; None if it does not exist."""
@@ -292,9 +299,13 @@ class Objects:
         Parameters
         ----------
         keys : keys below the prefix
-        seconds : time limit; StoreAway is raised if keys remain
+        seconds : time limit
         once : whether to send each request only once. A store may execute an unanswered request
             late, that is, after a repetition
+
+        Raises
+        ------
+        StoreAway : If keys remain at the time limit.
         """
         import obstore
 
@@ -328,6 +339,7 @@ class Objects:
 
     @contextmanager
     def _explained(self, what: str) -> Iterator[None]:
+        """Translate errors of the library; during the pause after a failure, raise StoreAway."""
         from obstore.exceptions import BaseError
 
         until, reason = self._away
@@ -343,6 +355,7 @@ class Objects:
             raise self._translate(what, error) from None  # the library's text contains whole URLs
 
     def _translate(self, what: str, error: Exception) -> UnusableStore:
+        """Return the store error for an error; if the store was unreachable, begin the pause."""
         text = str(error)
         match = _REASON.search(text)
         reason = next(filter(None, match.groups())).strip() if match else type(error).__name__
@@ -373,11 +386,11 @@ class Objects:
 
 # Access to a store. Credentials and settings come only from the environment.
 
-#: Time limits for connections, small requests, parts, and all repetitions, seconds.
+#: Time limits for connecting, small requests, parts, and all repetitions together, seconds.
 CONNECT_S, SMALL_S, PART_S, TRIED_S = 3, 10, 60, 8
 #: Maximum number of repetitions of a request.
 RETRIES = 8
-#: Prefix of the environment variables that configure a store, by scheme of its URL.
+#: Prefix of the environment variables that configure a store, by the scheme of its URL.
 VARIABLES = {
     "s3": "AWS_", "s3a": "AWS_", "gs": "GOOGLE_", "az": "AZURE_", "azure": "AZURE_",
     "abfs": "AZURE_", "abfss": "AZURE_", "file": "", "memory": "",

@@ -40,8 +40,8 @@ from sceneprint.store.blobs.folder import (
 from sceneprint.store.blobs.object_client import Objects, open_objects
 from sceneprint.store.database_errors import unusable
 
-# Owner of a prefix or of a shared folder. Two databases with the same prefix would remove the blobs
-# of each other.
+# Owner of a prefix or of a shared folder. Two databases with the same prefix would remove each
+# other's blobs.
 #
 #     PREFIX/sceneprint.json   {"store": its name, "restoring": true during a restore}
 #
@@ -50,7 +50,7 @@ from sceneprint.store.database_errors import unusable
 
 
 class BucketOwner:
-    """Mark that states the owner of a prefix.
+    """File that names the owner of a prefix.
 
     All methods raise UnusableStore if the prefix belongs to another database or is not accessible.
     """
@@ -84,7 +84,7 @@ class BucketOwner:
         return False
 
     def begin(self, owner: str, before: str) -> None:
-        """Claim the prefix for a store before its restore.
+        """Claim the prefix for a store before its restore, or continue an interrupted restore.
 
         Parameters
         ----------
@@ -232,8 +232,8 @@ class ObjectBlobs(Blobs):
     def holds(self, digest: str) -> bool:
         """See `Blobs.holds`.
 
-        If this process stored the blob, and no blob was removed since, this does not contact the
-        object store, since other writers wait meanwhile.
+        If this process stored the blob, and no blob has been removed since, this does not contact
+        the object store, because other writers are waiting.
         """
         return self._holds(digest, TURN_S)
 

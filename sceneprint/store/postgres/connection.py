@@ -26,11 +26,11 @@ from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.database_errors import database_label, is_of_old_plan
 from sceneprint.store.sqlite import BUSY_S
 
-#: First number of the advisory locks; the second is TURN or EVENTS.
+#: First key of the advisory locks; the second is TURN or EVENTS.
 LOCKS = 0x5CE7E
-#: Lock of the writers' turns.
+#: Second key of the lock for the turns of writers.
 TURN = 1
-#: Lock of the process that numbers events (see `events`).
+#: Second key of the lock for the process that numbers events (see `events`).
 EVENTS = 8
 _EVENT = "at, kind, map, frame_id, job_id, data"
 #: Functions and a trigger of the schema. `number_pending_events` holds its lock until the commit,
@@ -60,12 +60,12 @@ NUMBERING = (
     EXECUTE FUNCTION number_pending_events_first()
     """,
 )
-#: First number of the locks of single maps; the second is derived from the map number.
+#: First key of the locks of single maps; the second is derived from the map number.
 MAP_LOCKS = 0x5CE7F
 #: Mask of the bits of a map number in its lock. Maps with equal bits share a lock.
 LOCK_BITS = 0x7FFFFFFF
-#: Time limits of statements and of idle transactions, seconds; a hanging client then loses its
-#: turn.
+#: Time limits, in seconds, for statements and for idle transactions, so that a hanging client loses
+#: its turn.
 STATEMENT_S, IDLE_S = 60.0, 30.0
 #: Maximum seconds that a migration waits for its turn.
 MIGRATION_S = 600.0
@@ -195,7 +195,7 @@ def _texts() -> type[Any]:
 
 
 def allow(connection: Connection, seconds: float) -> None:
-    """Set the time limit of statements and idle times in this transaction, seconds; 0: no limit."""
+    """Set the time limit for statements and idle times of a PostgreSQL transaction; 0: none."""
     if connection.dialect.name == "postgresql":
         for name in ("statement_timeout", "idle_in_transaction_session_timeout"):
             connection.execute(
@@ -274,6 +274,7 @@ class SingleStatement:
             self._send(cursor, statement, parameters)
 
     def _send(self, cursor: Any, statement: str, parameters: Any) -> None:
+        """Send the waits for the turn and the maps, the schema check and the statement."""
         import psycopg
 
         connection = cursor.connection
@@ -336,7 +337,7 @@ class KnownSchema:
 
 
 def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool:
-    """Execute a statement that has the option `_MESSAGE` or SINGLE; return whether it has."""
+    """Execute a statement with the option `_MESSAGE` or SINGLE; return False for others."""
     if _MESSAGE in context.execution_options:
         cursor.execute(statement)
         while cursor.nextset():
@@ -350,7 +351,7 @@ def _execute(cursor: Any, statement: str, parameters: Any, context: Any) -> bool
 
 
 def _refuse_single(_cursor: Any, _statement: str, *others: Any) -> None:
-    """Raise ValueError, since SINGLE requires a statement with one set of parameters."""
+    """Raise ValueError for SINGLE, which requires a statement with one set of parameters."""
     if others[-1].execution_options.get(SINGLE) is not None:
         raise ValueError("a single-statement transaction requires one set of parameters")
 
@@ -368,7 +369,7 @@ def take_turn(
 
     Returns
     -------
-    row : row of `query`
+    row : row of `query`; None without a query
     """
     message = ["SET LOCAL statement_timeout = 0"]  # see SingleStatement
     turn = f"SELECT pg_advisory_xact_lock({LOCKS}, {TURN})"

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from sceneprint.store.database import Database
 
-#: Second number of the lock of blobs, after `LOCKS` (see `blobs/`).
+#: Second key of the blob lock, after `LOCKS` (see `blobs/`).
 BLOBS = 2
-#: First number of the locks of index builds; the second is derived from the map number.
+#: First key of the locks of index builds; the second is derived from the map number.
 INDEX_LOCKS = 0x5CE80
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ _WAIT = "SELECT set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shar
 
 
 class SessionLocks(Locks):
-    """Lock of the blobs for all hosts that share a PostgreSQL database.
+    """Lock on the blobs for all hosts that share a PostgreSQL database.
 
     It does not work with a pooler that shares connections among clients. Connect to the server
     directly, or configure the pooler for session pooling.
@@ -151,6 +151,7 @@ class SessionLocks(Locks):
                 )
 
     def _begin(self) -> bool:
+        """Acquire the lock, and count the removal; return False if either is impossible."""
         if not self._remover.query(_TAKE, LOCKS, BLOBS):
             return False
         if not self._is_over(self._remover.query(_READ, same=True)):
@@ -181,6 +182,7 @@ class SessionLocks(Locks):
         return time.monotonic() - self._odd[1] >= LONGEST_S
 
     def _end(self) -> None:
+        """Count the end of the removal, and release the lock; if uncertain, leave the count odd."""
         if self._uncertain:  # leave the number odd
             self._remover.close()
             return
@@ -225,7 +227,7 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
     try:
         with database.explained():
             values = (INDEX_LOCKS, map_number & LOCK_BITS)
-            mine = bool(_one(connection, _TAKE, values))
+            mine = bool(_scalar(connection, _TAKE, values))
         yield require if mine else None
     finally:
         connection.close()
@@ -242,7 +244,9 @@ class _Connection:
         weakref.finalize(self, _close, self._held)
 
     def query(self, statement: str, *values: int | str, same: bool = False) -> Any:
-        """Return the value of a query; None if there is no value or the query fails.
+        """Return the value of a query; None if there is no value, or the query fails (logged).
+
+        If `_COUNTER` does not exist, create it first.
 
         Parameters
         ----------
@@ -259,11 +263,11 @@ class _Connection:
                     self._held[:] = [self._database.driver_connection()]
                 connection = self._held[0]
                 try:
-                    return _one(connection, statement, values)
+                    return _scalar(connection, statement, values)
                 except psycopg.errors.UndefinedTable:
                     with suppress(psycopg.errors.UniqueViolation, psycopg.errors.DuplicateTable):
                         connection.execute(_MAKE)
-                    return _one(connection, statement, values)
+                    return _scalar(connection, statement, values)
             except (psycopg.Error, UnusableStore) as error:
                 log.info("blob lock unavailable", extra={"error": str(error)})
                 _close(self._held)
@@ -275,7 +279,9 @@ class _Connection:
             _close(self._held)
 
 
-def _one(connection: psycopg.Connection[Any], statement: str, values: tuple[int | str, ...]) -> Any:
+def _scalar(
+    connection: psycopg.Connection[Any], statement: str, values: tuple[int | str, ...]
+) -> Any:
     row = connection.execute(statement.encode(), values).fetchone()
     return None if row is None else row[0]
 
