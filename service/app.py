@@ -89,13 +89,13 @@ def openapi_of(app: FastAPI) -> dict[str, Any]:
             title=app.title, version=app.version, description=app.description, routes=app.routes
         )
         _, own = models_json_schema(
-            [*((one, "validation") for one in PARSED), (Problem, "serialization")],
+            [*((kind, "validation") for kind in PARSED), (Problem, "serialization")],
             ref_template="#/components/schemas/{model}",
         )
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
         for name, schema in own["$defs"].items():
             schemas.setdefault(name, schema)
-        for operation in (one for path in document["paths"].values() for one in path.values()):
+        for operation in (each for path in document["paths"].values() for each in path.values()):
             if "application/json" in operation["responses"].get("422", {}).get("content", {}):
                 del operation["responses"]["422"]  # FastAPI adds it for every path parameter
         for name in ("HTTPValidationError", "ValidationError"):
@@ -128,7 +128,7 @@ do.
 
 @asynccontextmanager
 async def warm_up(context: Context) -> AsyncIterator[None]:
-    """Compile or load kernels and tables in the background; the service responds meanwhile."""
+    """Compile or load kernels and tables in the background, while the service responds."""
     stop = threading.Event()
     context.signers.hold()
     task = asyncio.create_task(to_thread.run_sync(_warm, context, stop))

@@ -3,9 +3,9 @@
     request  --authenticate-->  Caller, with the Service  --may_read | may_write-->  a map
     refused request  --record_refusal-->  a line of the audit log
 
-Dependencies that do not block run in the event loop, since under load they would wait for a thread.
-For a map that the caller cannot read, the response is the same, word for word, as for a map that
-does not exist.
+Dependencies that do not block run in the event loop, since a thread may not be free under load. For
+a map that the caller cannot read, the response is the same, word for word, as for a map that does
+not exist.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def allows(grants: Mapping[str, Scope], scope: Scope, map_name: str = EVERY) -> 
     """
     least = SCOPES.index(scope)
     held = [grants[name] for name in (EVERY, map_name) if name in grants]
-    return any(SCOPES.index(one) >= least for one in held)
+    return any(SCOPES.index(grant) >= least for grant in held)
 
 
 # Query parameters of several routes.
@@ -197,8 +197,8 @@ async def authenticate(
 
 
 async def _admit(request: Request, here: Service, tenant: str) -> None:
-    """Count a request for its tenant until the response ends; raise RateLimited beyond the
-    limit.
+    """Count a request and its body for its tenant until the response ends; raise RateLimited beyond
+    a limit, and Busy without a turn.
     """
     set_tenant(tenant)
     enforce_rate_limit(request, here.request_rate, tenant, request_cost(request))
@@ -208,8 +208,8 @@ async def _admit(request: Request, here: Service, tenant: str) -> None:
     request.state.at_end.append(request.state.place)
     if not is_import(request.scope):  # bodies of imports are not spooled
         length = request.headers.get("content-length", "")
-        known = length.isascii() and length.isdigit()
-        here.spool.require_room(tenant, int(length) if known else 0)
+        is_number = length.isascii() and length.isdigit()
+        here.spool.require_room(tenant, int(length) if is_number else 0)
         request.state.body.charge(here.spool, tenant)
     endpoint = getattr(request.scope.get("route"), "endpoint", None)
     if not iscoroutinefunction(endpoint):
@@ -217,7 +217,7 @@ async def _admit(request: Request, here: Service, tenant: str) -> None:
 
 
 def release_place(request: Request) -> None:
-    """Stop counting a request as in progress, for streams, which last as long as their client."""
+    """Stop counting a request as in progress, for streams, which may last for hours."""
     place = getattr(request.state, "place", None)
     if place is not None:
         request.state.at_end.remove(place)
@@ -241,7 +241,7 @@ def v1_router(
     """Return a router for paths below /v1 whose routes authenticate the caller and call `depends`.
     `tag` is the tag of the operations in the OpenAPI document.
     """
-    dependencies = [Depends(one) for one in (authenticate, *depends)]
+    dependencies = [Depends(dependency) for dependency in (authenticate, *depends)]
     tags: list[str | Enum] | None = None if tag is None else [tag]
     return APIRouter(
         prefix=f"/v1{prefix}", tags=tags, dependencies=dependencies, route_class=ListRoute
@@ -251,7 +251,7 @@ def v1_router(
 class ListRoute(APIRoute):
     """A route that serialises a page of a list item by item, in the thread that read it.
 
-    FastAPI would serialise the page by one call in the event loop, which blocks all requests for 10
+    FastAPI would serialise the page in one call in the event loop, which blocks all requests for 10
     ms per 1000 rows.
     """
 
@@ -349,7 +349,7 @@ def _forbidden(caller: Caller, scope: Scope, what: str) -> Forbidden:
 
 #: Status codes of requests that were refused because of their caller.
 REFUSED = (401, 403)
-#: Number of refusals per caller and address to log at once, and seconds until the next one.
+#: Number of refusals per caller and address to log at once, and seconds until one more is logged.
 AT_ONCE, AGAIN_S = 10, 600.0
 #: Number of refusals of all callers to log at once, and per second. Each line is a commit.
 ALL_AT_ONCE, ALL_PER_S = 20, 1.0

@@ -117,8 +117,8 @@ def as_text(option: Mapping[str, Any]) -> dict[str, Any]:
         values = option.get("default")
         default = {} if values is None else {"default": ",".join(values)}
         return {"type": "string", **default, **texts}
-    one = next((kind for kind in kinds if kind.get("type") != "null"), None)
-    return dict(option) if one is None else {**one, **texts}
+    plain = next((kind for kind in kinds if kind.get("type") != "null"), None)
+    return dict(option) if plain is None else {**plain, **texts}
 
 
 def form_body(
@@ -190,16 +190,16 @@ def spool_error(error: OSError) -> UnusableStore:
     )
 
 
-def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
+def query_parameters(request: Request, names: Sequence[str]) -> dict[str, str]:
     """Return the query parameters of a request; raise InvalidRequest for unknown or repeated
     parameters.
     """
     values: dict[str, str] = {}
     for name, value in request.query_params.multi_items():
-        if name not in known:
+        if name not in names:
             raise InvalidRequest(
                 f"The query string has an unknown parameter {name!r:.80}. Known parameters are "
-                f"{', '.join(sorted(known))}.",
+                f"{', '.join(sorted(names))}.",
                 ((name[:80], "unknown"),),
             )
         if name in values:
@@ -211,7 +211,7 @@ def query_parameters(request: Request, known: Sequence[str]) -> dict[str, str]:
 
 
 def take_alone(values: dict[str, str], name: str) -> str | None:
-    """Remove and return a parameter that excludes others; raise InvalidRequest if there are any."""
+    """Remove and return a parameter that must be alone; raise InvalidRequest if others are set."""
     text = values.pop(name, None)
     if text is not None and values:
         raise InvalidRequest(
@@ -264,7 +264,7 @@ def add_transform(
 
     Raises
     ------
-    InvalidRequest : If the transform does not have seven numbers, or is missing beside its frame.
+    InvalidRequest : If the transform does not have seven numbers, or only its frame is present.
     """
     if name in values:
         fields[field] = _transform(name, values[name])
@@ -415,13 +415,13 @@ async def read_form(request: Request, most_files: int) -> AsyncIterator[FormData
         await form.close()
 
 
-def check_parts(form: FormData, known: Collection[str]) -> None:
+def check_parts(form: FormData, names: Collection[str]) -> None:
     """Raise InvalidRequest if a form has an unknown part."""
     for name in form:
-        if name not in known:
+        if name not in names:
             raise InvalidRequest(
                 f"The form has an unknown part {name!r:.80}. Known parts are "
-                f"{', '.join(sorted(known))}.",
+                f"{', '.join(sorted(names))}.",
                 ((name[:80], "unknown"),),
             )
 
@@ -611,9 +611,8 @@ async def read_frames(
         if not files or len(files) != len(form.getlist("frame")):
             raise InvalidRequest(
                 "The form has no file part `frame`, or a part of that name that is not a file. "
-                "Send 1 to "
-                f"{most} depth images or point clouds in parts of that name, each with "
-                "a file name.",
+                f"Send 1 to {most} depth images or point clouds in parts of that name, each with a "
+                "file name.",
                 (("frame", "not all files"),),
             )
         texts = dict(texts_of(form))

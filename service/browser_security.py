@@ -45,7 +45,7 @@ _PAGES = re.compile(r"/|/docs/?|/dashboard(/[^.]*)?")
 _HOST = re.compile(r"(?:\[(?P<v6>[^\[\]]*)\]|(?P<name>[^:\[\]]*))(?::\d*)?")
 
 
-#: Prefixes of the headers that most proxies add. Behind other proxies, set REQUIRE_KEYS.
+#: Prefixes of the headers that most proxies add. Behind other proxies, set SCENEPRINT_REQUIRE_KEYS.
 _FORWARDING = (b"forwarded", b"x-forwarded", b"x-real-ip", b"via")
 
 

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 POLL_S, TROUBLE_S = 0.1, 1.0
 #: Interval of keep-alive messages on a silent stream, seconds.
 ALIVE_S = 3.0
-#: Number of events in memory, and maximum number of events per read.
+#: Maximum number of events in memory, and per read.
 HELD, MOST = 4096, 500
 
 
@@ -97,7 +97,7 @@ class Feed:
         self._wake()
 
     async def batches(
-        self, wanted: EventFilter, after: int | None, has_access: Callable[[], bool]
+        self, criteria: EventFilter, after: int | None, has_access: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         """Yield lists of new events, each with the number of the last event that the reader may
         read.
@@ -106,58 +106,58 @@ class Feed:
 
         Parameters
         ----------
-        wanted : filter of the events
+        criteria : filter of the events
         after : number of the event to continue after; None starts with new events
         has_access : function that is called every ALIVE_S seconds in a thread; if it returns False,
             the stream ends
         """
         try:
-            async for batch in self._batches(wanted, after, has_access):
+            async for batch in self._batches(criteria, after, has_access):
                 yield batch
         except SceneprintError as error:  # the client reconnects and receives the error
             log.error("event stream failed", extra={"error": str(error)})
 
     async def _batches(
-        self, wanted: EventFilter, after: int | None, has_access: Callable[[], bool]
+        self, criteria: EventFilter, after: int | None, has_access: Callable[[], bool]
     ) -> AsyncGenerator[tuple[list[EventRow], int], None]:
         if self._poller is None or self._poller.done():
             self._poller = asyncio.create_task(self._poll())
         rewinds = self._rewinds
-        first, place, seen = await to_thread.run_sync(
-            begin, self._database, wanted, self._retained, after
+        first, place, last = await to_thread.run_sync(
+            begin, self._database, criteria, self._retained, after
         )
-        yield first, seen  # also if empty, because the reader needs its position
+        yield first, last  # also if empty, because the reader needs its position
         clock = asyncio.get_running_loop().time
         due = clock() + ALIVE_S
         while not self._closed:
             if clock() >= due:
                 if not await to_thread.run_sync(has_access) or self._poller.done():
                     return  # the poller has stopped
-                yield [], seen
+                yield [], last
                 due = clock() + ALIVE_S
             news = self._news
             if rewinds != self._rewinds:
                 rewinds = self._rewinds
-                _, place, seen = await to_thread.run_sync(
-                    begin, self._database, wanted, self._retained, None
+                _, place, last = await to_thread.run_sync(
+                    begin, self._database, criteria, self._retained, None
                 )
-                yield [missed(seen)], seen
+                yield [missed(last)], last
                 continue
             if self._since is None or place < self._since:
-                rows, place, seen = await to_thread.run_sync(
-                    next_events, self._database, wanted, place, MOST
+                rows, place, last = await to_thread.run_sync(
+                    next_events, self._database, criteria, place, MOST
                 )
                 if rows:
-                    yield rows, seen
+                    yield rows, last
                     continue
                 if self._since is not None and place < self._since:
                     continue
             if self._since is not None and place < self._newest:
                 held, place = self._after(place)
-                seen = max((event.number for event in held if wanted.sees(event)), default=seen)
-                rows = [event for event in held if wanted(event)]
+                last = max((event.number for event in held if criteria.sees(event)), default=last)
+                rows = [event for event in held if criteria(event)]
                 if rows:
-                    yield rows, seen
+                    yield rows, last
                 continue
             with suppress(TimeoutError):
                 await asyncio.wait_for(news.wait(), max(due - clock(), 0.0))
@@ -253,13 +253,13 @@ def alive(place: str) -> bytes:
 
 class EventStream(StreamingResponse):
     """A response that ends with its source or when the client disconnects, and then calls
-    `left`.
+    `on_end`.
     """
 
-    def __init__(self, source: AsyncGenerator[bytes, None], left: Callable[[], None]) -> None:
+    def __init__(self, source: AsyncGenerator[bytes, None], on_end: Callable[[], None]) -> None:
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
         super().__init__(source, 200, headers, MEDIA_TYPE)
-        self._source, self._left = source, left
+        self._source, self._on_end = source, on_end
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the response."""
@@ -267,4 +267,4 @@ class EventStream(StreamingResponse):
             async with aclosing(self._source):
                 await super().__call__(scope, receive, send)
         finally:
-            self._left()
+            self._on_end()

@@ -149,7 +149,7 @@ def _outcome(do: Callable[[], object]) -> object:
 
 
 class Gate:
-    """A limit of concurrent computations: some run, some wait, and the others are refused.
+    """A limit on concurrent computations: some run, some wait, and all others are refused.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def too_many_requests(most: int) -> RateLimited:
     )
 
 
-#: Cost of a query in requests, and number of list rows that cost one more request.
+#: Cost of a query, in requests, and number of rows of a list that cost one more request.
 QUERY_COST, ROWS_PER_COST = 5.0, 50
 #: Number of rows of a list without a limit in the request.
 _USUAL_ROWS = 100
@@ -265,8 +265,8 @@ class TokenBucket:
             return 0
         with self._lock:
             now = self._clock()
-            tokens, seen = self._buckets.pop(caller, (self._burst, now))
-            tokens = min(tokens + (now - seen) * self._per_s, self._burst)
+            tokens, at = self._buckets.pop(caller, (self._burst, now))
+            tokens = min(tokens + (now - at) * self._per_s, self._burst)
             cost = min(cost, self._burst)
             lacking = max(cost - tokens, 0.0)
             self._buckets[caller] = (tokens if lacking else tokens - cost, now)
@@ -338,7 +338,7 @@ def network_of(address: str) -> str:
     return str(ip)
 
 
-#: Maximum seconds without data in a body, for the whole body, and in addition per MiB of it.
+#: Maximum seconds without data in a body, for a whole body, and in addition for each MiB of it.
 IDLE_S, BODY_S, S_PER_MIB = 10.0, 30.0, 4.0
 _IMPORTS = re.compile(r"/v1/maps/[^/]+/imports")
 #: Number of bytes of a body in memory; the rest is spooled to disk. Tenants are charged for disk
@@ -421,7 +421,7 @@ class RequestBody:
 
     async def next(self) -> Message:
         """Return the next message. Raise Broken, with the reason in `fault`, if the body is too
-        large or too slow.
+        large or too slow, or exceeds the tenant's disk space.
         """
         if self._whole:
             return await self._receive()

@@ -1,6 +1,6 @@
 """Metrics for Prometheus.
 
-Counters (requests, answers, streams) are per process: add them over all processes. Gauges of the
+Counters (requests, answers, streams) are per process: sum them over all processes. Gauges of the
 store (frames, jobs, indexes, disk) are the same in all processes.
 """
 
@@ -117,7 +117,7 @@ METRICS = {
     "answers_total": MetricFamily("counter", "Number of queries by status.", ("status",)),
     "stage_seconds": MetricFamily("histogram", "Time of each stage of a query.", ("stage",)),
     "queries_lost_total": MetricFamily(
-        "counter", "Number of queries that could not be logged; the log says why (`queries lost`)."
+        "counter", "Number of queries that were not recorded; the log says why (`queries lost`)."
     ),
     "event_streams": MetricFamily("gauge", "Number of open event streams."),
     "frames": MetricFamily("gauge", "Number of frames in each state.", ("state",)),
@@ -130,7 +130,7 @@ METRICS = {
         "gauge", "Age of the oldest frame without a signature; 0 if there is no such frame."
     ),
     "index_version": MetricFamily(
-        "gauge", f"Newest index of each of the {MOST_MAPS} maps with the longest tails.", ("map",)
+        "gauge", f"Index version of each of the {MOST_MAPS} maps with the longest tails.", ("map",)
     ),
     "index_tail_frames": MetricFamily(
         "gauge",
@@ -138,7 +138,7 @@ METRICS = {
         ("map",),
     ),
     "workers": MetricFamily(
-        "gauge", "Number of `busy` and `idle` workers of this machine; with PostgreSQL, of all.",
+        "gauge", "Number of `busy` and `idle` workers; with SQLite, only of this machine.",
         ("state",),
     ),
     "workers_began": MetricFamily(
@@ -147,17 +147,17 @@ METRICS = {
     ),
     "newest_event": MetricFamily("gauge", "Number of the newest event; it only grows."),
     "disk_bytes": MetricFamily(
-        "gauge", "Disk space of each part of the store, estimated if it has many blobs.", ("part",)
+        "gauge", "Disk space of each part of the store, estimated for many blobs.", ("part",)
     ),
     "disk_free_bytes": MetricFamily("gauge", "Free space on the disk of the data folder."),
     "scrub_bytes": MetricFamily("gauge", "Size of the data that this scrub has read."),
-    "scrub_damaged": MetricFamily("gauge", "Number of lost and damaged objects in this scrub."),
+    "scrub_damaged": MetricFamily("gauge", "Number of lost or damaged objects this scrub found."),
     "tenant_requests_total": MetricFamily(
         "counter", f"Number of answered requests of each tenant. The first {MOST_TENANTS} tenants "
         f"of a process have their own series; all others share `{OTHERS}`.", ("tenant", "status"),
     ),
     "tenant_request_seconds_total": MetricFamily(
-        "counter", "Time of the tenant's requests, without streams.", ("tenant",)
+        "counter", "Total time of the tenant's requests, without streams.", ("tenant",)
     ),
     "tenant_requests_in_progress": MetricFamily(
         "gauge", "Number of the tenant's requests in progress.", ("tenant",)

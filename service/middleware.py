@@ -137,13 +137,13 @@ class RequestMiddleware:
     ) -> SceneprintError | Response | None:
         """Return an early response, or an error that refuses the request; None to continue."""
         origin, length = headers.get(b"origin"), headers.get(b"content-length", b"")
-        known = origin is not None and self._origins.allows(origin)
+        is_allowed = origin is not None and self._origins.allows(origin)
         if self._alone:
             refusal = foreign_request_error(scope["headers"], self._origins.allows, scope["path"])
             if refusal is not None:
                 return refusal
         preflight = scope["method"] == "OPTIONS" and b"access-control-request-method" in headers
-        if known and preflight:
+        if is_allowed and preflight:
             return Response(status_code=204, headers=PREFLIGHT_HEADERS)
         if self._at_once > _MOST_AT_ONCE:
             return Busy(
@@ -173,6 +173,7 @@ class RequestMiddleware:
     def _note(
         self, scope: Scope, request_id: str, status: int, seconds: float, received: int
     ) -> None:
+        """Count and log a request."""
         route = getattr(scope.get("route"), "path", "other")
         if scope["path"].startswith("/v1/") and not route.startswith(("/v1", "other")):
             route = f"/v1{route}"  # the pattern lacks the prefix of the mount point

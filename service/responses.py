@@ -44,7 +44,7 @@ def expected_tags(request: Request) -> Collection[str] | None:
 def is_known(request: Request, tag: str) -> bool:
     """Return whether If-None-Match contains an entity tag, so that the client has the content."""
     header = ", ".join(request.headers.getlist("if-none-match")).strip()
-    return header == "*" or any(one == tag for _, one in _TAG.findall(header))
+    return header == "*" or any(value == tag for _, value in _TAG.findall(header))
 
 
 def preferred_media_type(request: Request, offers: Sequence[str]) -> str:
@@ -216,7 +216,7 @@ def _requested_range(request: Request, tag: str, size: int) -> tuple[int, int]:
 def _chunks(file: BinaryIO, first: int, last: int) -> Iterator[bytes]:
     with file:
         file.seek(first)
-        left = last - first + 1
-        while left > 0 and (chunk := file.read(min(_CHUNK, left))):
-            left -= len(chunk)
+        remaining = last - first + 1
+        while remaining > 0 and (chunk := file.read(min(_CHUNK, remaining))):
+            remaining -= len(chunk)
             yield chunk

@@ -37,8 +37,8 @@ T = TypeVar("T")
 UPLOADS = 12
 #: Number of separate threads that look up keys.
 LOOKUPS = 4
-#: Maximum number of concurrent requests in shared threads, such as lists, and maximum of one tenant
-#: while others wait.
+#: Maximum number of concurrent requests in shared threads, such as lists: of all tenants, and of
+#: one tenant while others wait.
 READS, READS_BESIDE = 8, 1
 #: Maximum age of the result of `/readyz`, seconds.
 READY_S = 1.0
@@ -113,7 +113,7 @@ class Service:
 
     async def run(self, do: Callable[..., T], *arguments: object, patient: bool = False) -> T:
         """Wait for a turn of the tenant, and run a function in a shared thread. Do not call this
-        while holding a turn.
+        during another turn.
 
         Parameters
         ----------

@@ -158,5 +158,5 @@ def _file(name: str) -> StaticFile:
         return pack_file(".js", _START.encode())
     spec = find_spec("fastapi_offline")
     if spec is None or spec.origin is None:
-        raise HTTPException(404, "the package fastapi-offline, which has Swagger UI, is missing")
+        raise HTTPException(404, "the package fastapi-offline with Swagger UI is missing")
     return read_file(Path(spec.origin).parent / "static" / name)

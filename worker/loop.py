@@ -28,10 +28,10 @@ from sceneprint.store.wakeup import Listening, process_name
 
 log = logging.getLogger(__name__)
 
-#: Minimum and maximum pause between reads of an empty queue, seconds; wake-ups usually end it
-#: early.
+#: Minimum and maximum pause between reads of an empty queue, seconds; wake-ups usually end the
+#: pause early.
 SHORTEST_S, LONGEST_S = 0.05, 2.0
-#: Interval of housekeeping, and its pause after a lack of memory, seconds.
+#: Interval between runs of housekeeping, and pause after a lack of memory, seconds.
 UPKEEP_S, POOR_S = 5.0, 300.0
 #: Niceness of the process, since queries have precedence over signing.
 NICENESS = 5
@@ -98,11 +98,14 @@ class Worker:
         self._wakers = (stop.descriptor, -1 if starter is None else int(starter.sentinel))
 
     def turn(self) -> None:
-        """Run a job, run housekeeping if it is due, or wait for a job."""
+        """Run a job, and housekeeping if it is due; without either, wait for a job.
+
+        Log errors of the store, and pause after them.
+        """
         try:
             was_busy = self._work()
             if time.monotonic() > self._upkeep_at and not self.unsound:
-                was_busy = self._publish() or was_busy
+                was_busy = self._run_upkeep() or was_busy
             if not was_busy:
                 self._listener.wait(self._pause(), *self._wakers)
         except NewerSchema as error:
@@ -123,13 +126,13 @@ class Worker:
         held = claimed.job
         data, limit_s = held.data or {}, self._job_s
         with of_request(data.get("request_id")), self._trace.job(held.id, held.token, limit_s):
-            self._jobs.run(claimed, self._break)
+            self._jobs.run(claimed, self._mark_unsound)
         return True
 
-    def _break(self) -> None:
+    def _mark_unsound(self) -> None:
         self.unsound = True
 
-    def _publish(self) -> bool:
+    def _run_upkeep(self) -> bool:
         """Run housekeeping and the scrub until a wake-up; return whether there was one."""
         self._upkeep_at = time.monotonic() + UPKEEP_S  # before housekeeping, in case of an error
         woken = False
@@ -150,9 +153,9 @@ class Worker:
     def _pause(self) -> float:
         """Return the maximum seconds to wait for a wake-up."""
         due_s = self._jobs.due_in_s()
-        left = LONGEST_S if due_s is None else min(due_s, LONGEST_S)
-        left = min(left, self._upkeep_at - time.monotonic())
-        return max(left, SHORTEST_S * random.uniform(1, 2))  # spreads the reads of workers
+        pause_s = LONGEST_S if due_s is None else min(due_s, LONGEST_S)
+        pause_s = min(pause_s, self._upkeep_at - time.monotonic())
+        return max(pause_s, SHORTEST_S * random.uniform(1, 2))  # spreads the reads of workers
 
 
 # Traces: the current job of a worker, and the traceback of its death.
@@ -160,8 +163,8 @@ class Worker:
 # A worker that crashes, or hangs in code that never releases the interpreter lock, cannot report
 # it. The faulthandler of Python then writes tracebacks to shared memory, which the parent reads.
 
-#: Maximum number of bytes of a traceback (its end), and of the head with the current job.
-KEPT, HEAD = 20_000, 200
+#: Maximum number of bytes from the end of a traceback, and of the head, which names the job.
+TAIL, HEAD = 20_000, 200
 #: Prefix of the output of faulthandler after a timeout.
 _TIMEOUT = "Timeout ("
 
@@ -223,11 +226,11 @@ class Trace:
         """Return the trace after the worker has died."""
         size = os.fstat(self._descriptor).st_size
         head = os.pread(self._descriptor, HEAD, 0).partition(b"\n")[0]
-        start = max(len(head) + 1, size - KEPT)
-        text = os.pread(self._descriptor, KEPT, start).decode(errors="replace")
+        start = max(len(head) + 1, size - TAIL)
+        text = os.pread(self._descriptor, TAIL, start).decode(errors="replace")
         job_id, _, token = head.decode(errors="replace").partition(" ")
         if not token.isdigit():  # the worker crashed without a job
-            text = os.pread(self._descriptor, KEPT, 0).decode(errors="replace")
+            text = os.pread(self._descriptor, TAIL, 0).decode(errors="replace")
             return WorkerTrace(None, 0, text)
         return WorkerTrace(job_id, int(token), text)
 

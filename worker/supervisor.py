@@ -22,7 +22,7 @@ from worker.loop import Trace, WorkerTrace, work
 
 log = logging.getLogger(__name__)
 
-#: Seconds for the current frame after the signal to stop.
+#: Seconds that workers have to finish the current frame after the signal to stop.
 GRACE_S = 20.0
 #: Seconds before a worker that died without a job is replaced, in case it cannot start.
 RESTART_S = 1.0
@@ -43,11 +43,11 @@ class Slot:
         assert self.worker is not None
         self.worker.join()
         pid, code = self.worker.pid or 0, self.worker.exitcode or 0
-        left = self.trace.read()
+        trace = self.trace.read()
         self.worker.close()
         self.trace.close()
         self.worker, self.trace, self.free_at = None, Trace(), time.monotonic()
-        return pid, code, left
+        return pid, code, trace
 
 
 class Supervisor:
@@ -76,9 +76,9 @@ class Supervisor:
                             self._start_worker(slot)
                     free = [slot.free_at - now for slot in self._slots if slot.worker is None]
                     busy = {slot.worker.sentinel: slot for slot in self._slots if slot.worker}
-                    for one in wait([stopped, *busy], min(free, default=None)):
-                        if isinstance(one, int) and one in busy:
-                            self._replace(busy[one])
+                    for ready in wait([stopped, *busy], min(free, default=None)):
+                        if isinstance(ready, int) and ready in busy:
+                            self._replace(busy[ready])
         finally:  # also if a worker cannot start
             self.stop()
 
@@ -93,8 +93,8 @@ class Supervisor:
             if worker.is_alive():
                 log.error("worker does not stop", extra={"pid": worker.pid})
                 worker.kill()
-            _, code, left = slot.end()
-            self._report(code, left)
+            _, code, trace = slot.end()
+            self._report(code, trace)
         self._slots = []
 
     def _start_worker(self, slot: Slot) -> None:
@@ -105,41 +105,39 @@ class Supervisor:
         slot.worker = worker
 
     def _replace(self, slot: Slot) -> None:
-        pid, code, left = slot.end()
+        """Start another worker, after a pause if the ended one had no job; else release its job."""
+        pid, code, trace = slot.end()
         if code == 0:
             log.info("worker replaced", extra={"pid": pid})
         else:
-            about = {"pid": pid, "code": code, "job_id": left.job_id}
+            about = {"pid": pid, "code": code, "job_id": trace.job_id}
             log.error("worker died", extra=about)
-            if left.job_id is None:
-                if left.text:
-                    log.error("worker traceback", extra={"pid": pid, "traceback": left.text})
+            if trace.job_id is None:
+                if trace.text:
+                    log.error("worker traceback", extra={"pid": pid, "traceback": trace.text})
                 slot.free_at += RESTART_S
                 return
         self._start_worker(slot)
-        self._report(code, left)
+        self._report(code, trace)
 
-    def _report(self, code: int, left: WorkerTrace) -> None:
+    def _report(self, code: int, trace: WorkerTrace) -> None:
         """Release the job of a dead worker, instead of waiting for the end of its lease."""
-        if left.job_id is None:
+        if trace.job_id is None:
             return
-        error = _cause(code, left, self._settings.job_timeout_s)
+        error = _cause(code, trace, self._settings.job_timeout_s)
         counts = -code not in _FROM_OUTSIDE
-        text = left.text or "It left no traceback."
+        text = trace.text or "It left no traceback."
         try:
             store = open_store(self._settings.database, self._settings.blobs)
             with closing(store):
-                worker_died(store, left.job_id, left.token, error, text, counts=counts)
+                worker_died(store, trace.job_id, trace.token, error, text, counts=counts)
         except SceneprintError as trouble:  # the job waits for the end of its lease
             log.error("store unreachable", extra={"error": str(trouble)})
 
 
-def _cause(code: int, left: WorkerTrace, job_s: float) -> str:
-    if left.timed_out:
-        return (
-            f"its worker exceeded {job_s:g} s and was stopped. If the machine is slow or busy, "
-            "raise SCENEPRINT_JOB_TIMEOUT_S and restart."
-        )
+def _cause(code: int, trace: WorkerTrace, job_s: float) -> str:
+    if trace.timed_out:
+        return f"its worker exceeded {job_s:g} s and was stopped"
     if code == -signal.SIGKILL:
         return "its worker was killed by signal 9 (possibly out of memory)"
     if code < 0:

@@ -265,12 +265,12 @@ async def reencode(map_name: str, request: Request, here: Here, caller: Sender) 
     Until then, queries use the current model. The field `reencoding` of the map shows the progress.
     To retry failed frames, repeat the request.
     """
-    wanted = await read_record(request, NewModel, "The model")
+    body = await read_record(request, NewModel, "The model")
     may_read = None if caller.reads_every else partial(caller.may, "read")
     find = here.catalogue.find
     return await here.run(
         lambda: map_lifecycle.begin_reencoding(
-            here.context.store, here.context.bell, map_name, find(wanted.model, may_read)
+            here.context.store, here.context.bell, map_name, find(body.model, may_read)
         )
     )
 

@@ -30,8 +30,8 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
     JSON. It is followed by the bytes of the parts that are not in `have`, at most approximately 32
     MB. To receive the remaining parts, repeat the request.
     """
-    known = await read_record(request, CopyRequest, "The request")
-    data = await here.run(here.copies.bundle, map_name, frozenset(known.have))
+    body = await read_record(request, CopyRequest, "The request")
+    data = await here.run(here.copies.bundle, map_name, frozenset(body.have))
     return Response(data, media_type=_BYTES)
 
 

@@ -41,11 +41,11 @@ router = v1_router("/maps/{map_name}/frames", "frames")
 
 
 @router.get("", responses=refusals(404, 422), dependencies=[Depends(may_read)])
-def list_frames(map_name: str, here: Here, wanted: Annotated[FramePage, Query()]) -> Page[Frame]:
+def list_frames(map_name: str, here: Here, page: Annotated[FramePage, Query()]) -> Page[Frame]:
     """List frames in the order of their upload; deleted frames are listed only with
     `state=deleted`.
     """
-    return map_frames.list_frames(here.context.store, map_name, wanted, wanted.cursor, wanted.limit)
+    return map_frames.list_frames(here.context.store, map_name, page, page.cursor, page.limit)
 
 
 @router.get("/{frame_id}", responses=refusals(404), dependencies=[Depends(may_read)])
@@ -69,7 +69,6 @@ def delete_frame(map_name: str, frame_id: str, here: Here) -> None:
 
 
 # Uploads: one frame, one frame under an id of the caller, or a batch.
-
 
 #: Maximum seconds to wait for a worker.
 LONGEST_WAIT_S = 200.0
@@ -230,10 +229,10 @@ async def _wait_for_frame(
     """
     until, pause = time.monotonic() + wait_s, FIRST_PAUSE_S
     while added.state in (FrameState.RECEIVED, FrameState.SIGNING):
-        left = until - time.monotonic()
-        if left <= 0 or await request.is_disconnected():
+        remaining_s = until - time.monotonic()
+        if remaining_s <= 0 or await request.is_disconnected():
             break
-        await anyio.sleep(min(pause, left))
+        await anyio.sleep(min(pause, remaining_s))
         pause = min(pause * GROWTH, LONGEST_PAUSE_S)
         frame = await here.run(map_frames.get_frame, here.context.store, map_name, added.frame_id)
         added = added.model_copy(update={"state": frame.state, "reason": frame.reason})
@@ -257,7 +256,7 @@ _PARAMETERS = (
     "if_novel",
 )  # fmt: skip
 #: Descriptions of options with several values in the query string.
-_WRITTEN = {
+_VALUE_FORMATS = {
     "tags": "Separated by commas.",
     "heights": "Separated by commas.",
     "offset": "Format: x,y,z.",
@@ -280,7 +279,7 @@ def _described_import() -> dict[str, Any]:
         if name in ("units_per_metre", "depth_scale"):
             schema = {"type": "number", "exclusiveMinimum": 0}
         text = own_schema.get("description") or base.get(name, {}).get("description", "")
-        text = " ".join(filter(None, (text, _WRITTEN.get(name))))
+        text = " ".join(filter(None, (text, _VALUE_FORMATS.get(name))))
         parameters.append(bodies.query_parameter(name, schema, text))
     return {
         "parameters": parameters,

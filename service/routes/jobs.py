@@ -88,7 +88,7 @@ def retry_dead_jobs(
     else:
         caller.require_every("write")
         every = None if caller.may("admin") else get_maps(here.context.store)
-        names = None if every is None else tuple(one.name for one in every)
+        names = None if every is None else tuple(record.name for record in every)
     return lifecycle.retry_dead(here.context.store, here.context.bell, cursor, limit, names)
 
 
@@ -187,14 +187,15 @@ async def events(
 
     def read_filter() -> tuple[EventFilter, int | None]:
         seals.row("event", cursor)  # validates the cursor, although a stream has no pages
-        wanted = _wanted(here, caller, map_name, kind)
-        return wanted, None if last is None else seals.event(last, place)
+        criteria = _filter(here, caller, map_name, kind)
+        return criteria, None if last is None else seals.event(last, place)
 
-    wanted, number = await here.run(read_filter)
+    criteria, number = await here.run(read_filter)
     if MEDIA_TYPE in request.headers.get("accept", ""):
         here.feed.join(caller.tenant)
         release_place(request)
-        messages = _messages(here.feed, seals, wanted, number, _access_check(request, here, caller))
+        has_access = _access_check(request, here, caller)
+        messages = _messages(here.feed, seals, criteria, number, has_access)
         return EventStream(messages, partial(here.feed.leave, caller.tenant))
     await hold_read(request, here, caller.tenant)
     newest_first = order == "newest" or (order is None and last is None)
@@ -202,24 +203,24 @@ async def events(
     def page() -> Response:
         return page_response(
             here.events.page(
-                wanted, after=last, cursor=cursor, limit=limit, newest_first=newest_first
+                criteria, after=last, cursor=cursor, limit=limit, newest_first=newest_first
             )
         )
 
     return await to_thread.run_sync(page)
 
 
-def _wanted(here: Service, caller: Caller, map_name: str | None, kinds: list[str]) -> EventFilter:
+def _filter(here: Service, caller: Caller, map_name: str | None, kinds: list[str]) -> EventFilter:
     if map_name is not None:
         caller.require(map_name, "read")
-    wanted = here.events.wanted(map_name, kinds)
+    criteria = here.events.wanted(map_name, kinds)
     if not caller.reads_every:
-        wanted = replace(wanted, since=caller.created_at)
+        criteria = replace(criteria, since=caller.created_at)
     if map_name is not None or caller.may("admin"):
-        return wanted
+        return criteria
     if caller.named is not None:
-        return replace(wanted, maps=frozenset(caller.named))
-    return replace(wanted, of_maps=True)
+        return replace(criteria, maps=frozenset(caller.named))
+    return replace(criteria, of_maps=True)
 
 
 def _access_check(request: Request, here: Service, caller: Caller) -> Callable[[], bool]:
@@ -237,11 +238,11 @@ def _access_check(request: Request, here: Service, caller: Caller) -> Callable[[
 
 
 async def _messages(
-    feed: Feed, seals: OpaqueIds, wanted: EventFilter, after: int | None,
+    feed: Feed, seals: OpaqueIds, criteria: EventFilter, after: int | None,
     has_access: Callable[[], bool],
 ) -> AsyncGenerator[bytes, None]:  # fmt: skip
     yield BEGIN
-    async with aclosing(feed.batches(wanted, after, has_access)) as batches:
-        async for rows, seen in batches:
+    async with aclosing(feed.batches(criteria, after, has_access)) as batches:
+        async for rows, last in batches:
             messages = [message(event_record(seals, row)) for row in rows]
-            yield b"".join(messages) if rows else alive(seals.seal("event", seen))
+            yield b"".join(messages) if rows else alive(seals.seal("event", last))

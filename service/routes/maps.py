@@ -68,7 +68,6 @@ edits_router = v1_router("/maps/{map_name}")
 MERGE_PATCH = "application/merge-patch+json"
 _KINDS = (MERGE_PATCH, "application/json")
 
-
 DryRun = Annotated[
     bool,
     Query(

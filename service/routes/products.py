@@ -45,8 +45,8 @@ def product_router(
     router = v1_router(f"/maps/{{map_name}}/{path}", path, may_read)
 
     async def begin(map_name: str, request: Request, here: Here, response: Response) -> Any:
-        wanted = await read_record(request, request_type, f"The {noun}", optional=optional)
-        begun = await here.run(products_of(here).begin, map_name, wanted)
+        body = await read_record(request, request_type, f"The {noun}", optional=optional)
+        begun = await here.run(products_of(here).begin, map_name, body)
         response.headers["Location"] = f"/v1/maps/{map_name}/{path}/{begun.job_id}"
         return begun
 
@@ -91,7 +91,7 @@ def product_router(
 coverage_router = product_router(
     lambda service: service.coverage, MapCoverage,
     "Measure where in the map localisation works. A job queries each frame, or every n-th, against "
-    "the rest of the map. For each cell of a plan, it counts the frames that are found, found in a "
+    "the rest of the map. For each cell of a plan, it counts frames that are found, found in the "
     "wrong place, ambiguous or not found. The job runs when no other job is waiting for a worker, "
     "and takes as long as the same number of queries.",
     optional=True,
@@ -252,11 +252,11 @@ async def get_graph(
     `format=json`, each vertex has the id of its frame.
     """
     kinds = {media: name for name, media in MEDIA_TYPES.items()}
-    wanted: Any = kind or kinds[preferred_media_type(request, list(kinds))]
+    suffix: Any = kind or kinds[preferred_media_type(request, list(kinds))]
     text = await here.gate.enter(
         lambda: here.associations.graph(
-            map_name, job_id, wanted, min_overlap, odometry=odometry, consistent=consistent
+            map_name, job_id, suffix, min_overlap, odometry=odometry, consistent=consistent
         )
     )
-    name = f'attachment; filename="{job_id}.{wanted}"'
-    return Response(text, media_type=MEDIA_TYPES[wanted], headers={"Content-Disposition": name})
+    name = f'attachment; filename="{job_id}.{suffix}"'
+    return Response(text, media_type=MEDIA_TYPES[suffix], headers={"Content-Disposition": name})

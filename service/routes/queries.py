@@ -39,14 +39,14 @@ from service.auth import Caller, Sender, may_read, require_readable, v1_router
 from service.problems import refusals
 from service.running_service import Here, Service
 
-Asked = TypeVar("Asked", bound=Query)
+QueryType = TypeVar("QueryType", bound=Query)
 
 TEMPLATE = "#/components/schemas/{model}"
 _QUERY = "The query"
 
 
 @dataclass(frozen=True, eq=False)
-class QueryBody(Generic[Asked]):
+class QueryBody(Generic[QueryType]):
     """The content of a query request.
 
     Parameters
@@ -57,7 +57,7 @@ class QueryBody(Generic[Asked]):
     robot : name of the robot that sends the query; None if unknown
     """
 
-    query: Asked
+    query: QueryType
     upload: bodies.FormUpload | None
     named: Mapping[str, Any]
     robot: str | None = None
@@ -76,8 +76,8 @@ class _Sender(Given):
 
 @asynccontextmanager
 async def read_query(
-    request: Request, kind: type[Asked], named: str
-) -> AsyncIterator[QueryBody[Asked]]:
+    request: Request, kind: type[QueryType], named: str
+) -> AsyncIterator[QueryBody[QueryType]]:
     """Read a query from JSON or from an upload.
 
     Parameters
@@ -330,8 +330,8 @@ _SEQUENCE: dict[str, Any] = sequence_body(Query, MOST_OF_SEQUENCE)
 async def localize_sequence(
     map_name: str, request: Request, here: Here, caller: Sender
 ) -> Localization:
-    """Find the pose of a robot in a map from its most recent frames. The pose is that of the last
-    frame.
+    """Find the pose of a robot in a map from the robot's most recent frames. The pose is that of
+    the last frame.
 
     Send 2 to 10 frames in chronological order, each with its odometry as `pose`, in the same parent
     frame. Each frame is queried, and all frames vote for the pose of the last one.

@@ -33,8 +33,8 @@ async def reconstruct(
     `Location` until `state` is `succeeded`, then download mesh.ply. Requires the scope `write`.
     """
     stored = await here.run(lambda: _stored_answer(here, caller, query_id))
-    wanted = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
-    record = await here.run(lambda: here.reconstructions.begin_for(stored, wanted))
+    body = await read_record(request, NewReconstruction, "The reconstruction", optional=True)
+    record = await here.run(lambda: here.reconstructions.begin_for(stored, body))
     response.headers["Location"] = f"/v1/reconstructions/{record.job_id}"
     return record
 

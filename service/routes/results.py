@@ -235,12 +235,12 @@ def list_queries(
         caller.require(map_name, "read")
         get_map(here.context.store, map_name)
         names = (map_name,)
-    wanted = WantedQueries(
+    criteria = WantedQueries(
         statuses=tuple(status), robot=robot, kept=kept,
         since=None if since is None else since.timestamp(),
         until=None if until is None else until.timestamp(),
     )  # fmt: skip
-    return here.context.query_log.page(wanted, names, cursor, limit, partial(caller.may, "read"))
+    return here.context.query_log.page(criteria, names, cursor, limit, partial(caller.may, "read"))
 
 
 @history_router.delete("", status_code=204, responses=refusals(404, 422))

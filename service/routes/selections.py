@@ -38,9 +38,9 @@ async def delete_frames(map_name: str, request: Request, here: Here) -> FramesDe
     `remaining` is not 0. POST /v1/maps/{map_name}/deletions/{deletion_id}/restore undoes the
     deletion, by default within ten minutes.
     """
-    wanted = await read_record(request, FrameSelection, "The selection")
+    selection = await read_record(request, FrameSelection, "The selection")
     return await here.upload_gate.enter(
-        partial(delete_selection, here.context.store, map_name, wanted, here.tombstones)
+        partial(delete_selection, here.context.store, map_name, selection, here.tombstones)
     )
 
 

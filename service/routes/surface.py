@@ -101,7 +101,7 @@ def list_surface_frames(
     here: Here,
     parent: Parent = None,
     at: Annotated[
-        str | None, Query(max_length=200, description="Point x,y,z that frames saw, metres.")
+        str | None, Query(max_length=200, description="Only frames that saw point x,y,z, metres.")
     ] = None,
     radius: Annotated[
         float | None,
@@ -111,7 +111,7 @@ def list_surface_frames(
         str | None,
         Query(
             max_length=400,
-            description="Box x0,y0,z0,x1,y1,z1 that contains the viewpoints, metres.",
+            description="Only frames with a viewpoint in this box x0,y0,z0,x1,y1,z1, metres.",
         ),
     ] = None,
     cursor: Cursor = None,

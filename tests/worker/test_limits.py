@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from sceneprint.errors import LostLease
-from worker.loop import HEAD, KEPT, Trace
+from worker.loop import HEAD, TAIL, Trace
 
 
 def run(code, *arguments):
@@ -83,9 +83,9 @@ def test_an_error_that_ends_the_worker_leaves_its_traceback():
 def test_of_a_long_traceback_the_end_is_kept():
     trace = Trace()
     with pytest.raises(ValueError, match="end"), trace.job("ab", 1, 600.0):
-        raise ValueError("x" * (2 * KEPT) + "the end")
+        raise ValueError("x" * (2 * TAIL) + "the end")
     left = trace.read()
-    assert (left.job_id, left.token, len(left.text)) == ("ab", 1, KEPT)
+    assert (left.job_id, left.token, len(left.text)) == ("ab", 1, TAIL)
     assert left.text.endswith("xthe end\n")
     trace.close()
 
