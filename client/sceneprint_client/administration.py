@@ -147,7 +147,6 @@ class AdminMethods(JobMethods):
     async def _stored_events(
         self, map_name: str | None, kinds: Sequence[str], after: str | None
     ) -> AsyncIterator[Event]:
-        """Yield the events of all pages, oldest first."""
         cursor = None
         while True:
             page = await self.event_page(
@@ -163,10 +162,8 @@ class AdminMethods(JobMethods):
     async def stats(self, map_name: str | None = None, *, minutes: int = 60) -> Stats:
         """Return statistics of the service or of a map, with a history of 1 to 60 minutes.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
-        InvalidRequest : If `minutes` is out of range.
+        Raise UnknownMap if the map does not exist. Raise InvalidRequest if `minutes` is out of
+        range.
         """
         parameters = without_none(minutes=minutes, map=map_name)
         return await self._call(Stats, "GET", "/v1/stats", params=parameters)

@@ -5,7 +5,7 @@ class MapMethods(ServiceConnection):
     async def map(self, name: str) -> Map: ...
 
 AsyncClient.map  is the coroutine
-Client.map       runs it to its end; its connection uses httpx.Client, so it never suspends
+Client.map       runs the coroutine to its end; with httpx.Client, the coroutine never suspends
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Timeout of requests to a service in this process, seconds.
 _EMBEDDED_S = 60.0
-#: URL in error messages of a service in this process.
+#: URL that error messages show for a service in this process.
 _EMBEDDED_URL = "http://embedded"
 #: Timeout of a health check, seconds.
 _HEALTHY_S = 5.0

@@ -69,7 +69,7 @@ def kebab_case(name: str) -> str:
 class SceneprintError(Exception):
     """Base of every error that is raised deliberately."""
 
-    #: Seconds after which the service requests a retry (`Retry-After`); 0 if it sent none.
+    #: Delay before a retry that the service requests (`Retry-After`), seconds; 0 if unspecified.
     retry_after_s: float = 0.0
 
 

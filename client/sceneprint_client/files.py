@@ -29,13 +29,15 @@ _PIECE = 1 << 20
 def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
     """Return the content of a regular file of at most `limit` bytes.
 
-    Raise `error` if the file is missing, is not a regular file (reading a pipe could block
-    forever), is too large, or is not readable.
-
     Parameters
     ----------
     limit : maximum size of the file, bytes
     error : class of the error to raise
+
+    Raises
+    ------
+    error : If the file is missing, is not a regular file (reading a pipe could block forever), is
+        too large, or is not readable.
     """
     try:
         status = path.stat()
@@ -58,10 +60,10 @@ def read_bytes(path: Path, limit: int, error: type[SceneprintError]) -> bytes:
 
 def _read_some(file: BinaryIO, most: int) -> bytes:
     """Read at most `most` bytes in pieces; a single read would allocate `most` bytes at once."""
-    pieces, left = [], most
-    while piece := file.read(min(left, _PIECE)):
+    pieces, remaining = [], most
+    while piece := file.read(min(remaining, _PIECE)):
         pieces.append(piece)
-        left -= len(piece)
+        remaining -= len(piece)
     return b"".join(pieces)
 
 
@@ -130,8 +132,6 @@ def npy_header(
 ) -> NpyHeader:
     """Return the header of an NPY file with a two-dimensional floating-point array.
 
-    Raise `error` if the header cannot be read, or the array has another type or shape.
-
     Parameters
     ----------
     data : the file, or its first 10,016 bytes
@@ -139,6 +139,10 @@ def npy_header(
     advice : sentence for the error if the array has another type
     shapes : sentences for the error if the array has another shape
     whole : whether to accept uint16 too
+
+    Raises
+    ------
+    error : If the header cannot be read, or the array has another type or shape.
     """
     fields, start = _fields(data, error)
     dtype = _dtype(fields["descr"], error, advice, _FLOATING + _WHOLE if whole else _FLOATING)
@@ -197,7 +201,7 @@ def _dtype(
 LAS_SIGNATURE = b"LASF"
 
 
-# ROS 2 messages in the serialisation of its middleware: PointCloud2 in CDR, either byte order.
+# ROS 2 messages as the middleware serialises them: PointCloud2 in CDR, in either byte order.
 
 #: Length of the encapsulation header, bytes; alignment counts from its end.
 _HEAD = 4
@@ -282,7 +286,7 @@ def read_point_cloud(data: bytes) -> SerializedCloud:
     )
 
 
-#: Fields of a point of a CustomMsg that are read, and its length without padding, bytes.
+#: Fields that are read from a point of a CustomMsg, and length of a point without padding, bytes.
 _LIVOX_FIELDS = (
     SerializedField("offset_time", 0, 6, 1),
     SerializedField("x", 4, 7, 1),
@@ -297,12 +301,14 @@ _LIVOX_POINT = 19
 def read_livox_scan(data: bytes, *, ros1: bool = False) -> SerializedCloud:
     """Return a serialised CustomMsg of livox_ros_driver or livox_ros_driver2 as a PointCloud2.
 
-    Raise UnreadableCloud if the bytes are not such a message, are truncated, or have trailing data.
-
     Parameters
     ----------
     data : message in the serialisation of ROS 2, or of ROS 1
     ros1 : whether ROS 1 serialised the message
+
+    Raises
+    ------
+    UnreadableCloud : If the bytes are not such a message, are truncated, or have trailing data.
     """
     if not ros1 and not _is_encapsulated(data):
         raise UnreadableCloud(

@@ -38,7 +38,7 @@ class Format:
     suffixes : lower-case suffixes of file names
     content : description of the data that the reader uses, in Markdown
     signature : regular expression for the first bytes, as Latin-1, for Python and JavaScript; empty
-        if they do not determine the format. Its groups are width and height
+        if these bytes do not determine the format. The groups match width and height
     reader : MODULE:FUNCTION that accepts the bytes, or, for a capture, the path and a name; empty
         if one reader handles all formats of the kind
     size : MODULE:FUNCTION that returns width and height from the first bytes of a depth image
@@ -85,7 +85,7 @@ _SQLITE = r"SQLite format 3\x00"
 FORMATS = (
     Format(
         "png", "depth", "PNG", (".png",),
-        "16 bits, one channel, in stored units; 0 and 65535 are missing",
+        "16 bits, one channel, in stored units; 0 and 65535 mean missing",
         _PNG, "image/png", "sceneprint.formats.depth_file:decode_png",
         "sceneprint.formats.depth_file:png_size",
     ),
@@ -102,13 +102,13 @@ FORMATS = (
     ),
     Format(
         "compresseddepth", "depth", "compressedDepth of ROS", (),
-        "the data of a message: PNG after 12 bytes, of 16UC1 or 32FC1",
+        "the data of a message: a 12-byte header and a PNG, 16UC1 or 32FC1",
         r"[\s\S]{12}" + _PNG, BYTES, "sceneprint.formats.depth_file:decode_transported",
         "sceneprint.formats.depth_file:transported_size",
     ),
     Format(
         "ply", "cloud", "PLY", (".ply",),
-        "ascii, binary of either byte order; element `vertex` with single `x`, `y`, `z` of any "
+        "ascii, binary of either byte order; element `vertex` with scalar `x`, `y`, `z` of any "
         "type. Other properties, lists and elements are skipped",
         _PLY, "application/ply", "sceneprint.formats.points.ply:read_ply",
     ),
@@ -120,7 +120,7 @@ FORMATS = (
     ),
     Format(
         "las", "cloud", "LAS, LAZ", (".las", ".laz"),
-        "1.0 to 1.4, point formats 0 to 10; LAZ in chunks of one size or of several (COPC), with "
+        "1.0 to 1.4, point formats 0 to 10; LAZ in chunks of fixed or variable size (COPC), with "
         "the extra `las`. Noise points are read as points; classes, returns, time, colour and "
         "waveforms are ignored",
         "LASF", BYTES, "sceneprint.formats.points.las:read_las",
@@ -141,7 +141,7 @@ FORMATS = (
         "pointcloud2", "cloud", "PointCloud2 in CDR", (".cdr",),
         "the message of ROS 2 as `rclpy.serialization.serialize_message` or a subscription with "
         "`raw=True` returns it; for ROS 1, read the bag. Either byte order; `x`, `y`, `z` of any "
-        "type and offset, organised or not, padded rows; points exactly at the sensor are missing",
+        "type and offset, organised or not, padded rows; points at the sensor count as missing",
         _CDR, "application/x-ros-pointcloud2", "sceneprint.formats.points.cloud:read_pointcloud2",
     ),
     Format("pcd", "map", "PCD", (".pcd",), f"points. {_ESTIMATED} (usually z)", _PCD),
@@ -167,16 +167,16 @@ FORMATS = (
     ),
     Format(
         "obj", "map", "OBJ", (".obj",),
-        "a mesh; points if it has no faces. Materials are ignored. "
+        "a mesh; points if there are no faces. Materials are ignored. "
         f"{_ESTIMATED} (usually y)",
     ),
     Format(
         "glb", "map", "glTF", (".glb",),
-        "all triangles of the scene; points if it has none. Textures are ignored. Units are "
+        "all triangles of the scene; points if there are none. Textures are ignored. Units are "
         "metres, y is up", "glTF",
     ),
     Format(
-        "gltf", "map", "glTF", (".gltf",), "the same, with embedded buffers",
+        "gltf", "map", "glTF", (".gltf",), "like `.glb`, with embedded buffers",
     ),
     Format(
         "zip", "archive", "zip", (".zip",), "folders of frames",

@@ -49,9 +49,9 @@ from sceneprint_client.sidecars import (
 if TYPE_CHECKING:
     from sceneprint_client.http import FrameInput, MetaInput
 
-#: File names of depth images in the 7-Scenes layout, which has a pose file for each.
+#: Pattern of the names of depth images in the 7-Scenes layout; each image has a pose file.
 SEVEN_SCENES = re.compile(r"frame-\d+\.depth\.png", re.ASCII)
-#: Range of stamps, in seconds, that are dates (2001 to 2096); other stamps have another origin.
+#: Range of stamps that are dates (2001 to 2096), seconds since 1970; others have another origin.
 _DATES_S = (1e9, 4e9)
 
 
@@ -113,10 +113,8 @@ class FrameFile:
     def read_bytes(self) -> bytes:
         """Return the bytes of the frame as an upload sends them.
 
-        Raises
-        ------
-        UnreadableFrame, UnreadableCloud : If the file cannot be read or is too large.
-        DatasetError : If the recording that contains the frame is damaged.
+        Raise UnreadableFrame or UnreadableCloud if the file cannot be read or is too large. Raise
+        DatasetError if the recording that contains the frame is damaged.
         """
         if self.source is not None:
             return self.source.read_bytes()
@@ -159,7 +157,7 @@ def find_frame_file(file: Path) -> FrameFile:
     return FrameFile(name, file, find_camera(folder), pose_source=pose, sequence=number)
 
 
-#: Names of folders for the pose files of the frames beside them.
+#: Names of folders that contain pose files, beside the frames.
 POSE_FOLDERS = ("pose", "poses")
 NO_POSE_FILE = "there is no NAME.pose.txt beside them and no NAME.txt in a folder `pose`"
 
@@ -222,21 +220,23 @@ def meta_of(
 ) -> FrameMeta:
     """Return the metadata that an upload sends with a frame of a data set.
 
-    Raise InvalidPose if the pose file does not hold a rigid transform. Raise InvalidRequest if a
-    name is empty, too long or not printable.
-
     Parameters
     ----------
     reference : the frame
     session : name of the session; default: the name of the frame's sequence
     with_pose : whether to send the pose if it is known
-    parent_frame : parent frame of the pose; default: the session's name. Sequences of one scene
-        share it: `Sequence.parent_frame`
+    parent_frame : parent frame of the pose, such as `Sequence.parent_frame`, which all sequences of
+        a scene share; default: the session's name
     base : pose of the sensor on the robot; default: `base` of the frame
     up : unit vector in the sensor's axes; default: `up` of the sidecar file
     with_name : whether to send the original name and the index in the sequence, which queries
         ignore
     trust_depth : whether to accept an image that does not look like depth
+
+    Raises
+    ------
+    InvalidPose : If the pose file does not hold a rigid transform.
+    InvalidRequest : If a name is empty, too long or not printable.
     """
     if up is None:
         source = reference.camera or reference.cloud
@@ -300,7 +300,6 @@ def _direction(up: Sequence[float] | None) -> GivenDirection | None:
 
 
 def _depth_fields(camera: Camera) -> dict[str, Any]:
-    """Return the metadata fields for reading the samples of a depth image."""
     lens = camera.intrinsics
     return {
         "intrinsics": CameraIntrinsics(
@@ -318,7 +317,6 @@ def _depth_fields(camera: Camera) -> dict[str, Any]:
 
 
 def _cloud_fields(reference: FrameFile) -> dict[str, Any]:
-    """Return the metadata fields for reading the points of a cloud."""
     source = reference.cloud or CloudSource()
     file_format = source.file_format
     if reference.row is not None:
@@ -495,13 +493,15 @@ def camera_of(
 ) -> CameraIntrinsics:
     """Return the camera of an image.
 
-    Raise InvalidIntrinsics if `camera` has another type or is not a valid camera.
-
     Parameters
     ----------
     camera : CameraIntrinsics, Open3D's PinholeCameraIntrinsic, a (3, 3) matrix without skew, or
         (fx, fy, cx, cy), pixels
     size : width and height, pixels, for a `camera` that lacks them
+
+    Raises
+    ------
+    InvalidIntrinsics : If `camera` has another type or is not a valid camera.
     """
     if isinstance(camera, CameraIntrinsics):
         return camera

@@ -106,10 +106,10 @@ def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
 
 def frames_form(frames: Sequence[FrameInput], metas: Sequence[MetaInput | None]) -> dict[str, Any]:
     """Return the arguments of a request that sends several frames with their poses."""
-    sent = [frame_bytes(*pair, with_pose=True) for pair in zip(frames, metas, strict=True)]
+    uploads = [frame_bytes(*pair, with_pose=True) for pair in zip(frames, metas, strict=True)]
     return {
-        "files": [("frame", ("frame", data, "application/octet-stream")) for data, _ in sent],
-        "data": {"metas": json.dumps([meta_json(meta) for _, meta in sent])},
+        "files": [("frame", ("frame", data, "application/octet-stream")) for data, _ in uploads],
+        "data": {"metas": json.dumps([meta_json(meta) for _, meta in uploads])},
     }
 
 
@@ -246,9 +246,9 @@ def query_json(query: Query) -> dict[str, Any]:
 
 def query_form(data: bytes, meta: FrameMeta, query: Query) -> dict[str, Any]:
     """Return the arguments of a request that sends a frame and the options of a query."""
-    sent = frame_form(data, meta)
-    sent["data"] |= {name: form_text(value) for name, value in query_json(query).items()}
-    return sent
+    form = frame_form(data, meta)
+    form["data"] |= {name: form_text(value) for name, value in query_json(query).items()}
+    return form
 
 
 def form_text(value: object) -> str:
@@ -382,7 +382,6 @@ class ServiceConnection:
         return await self._call(kind, "POST", path, json=document)
 
     async def _bytes(self, path: str, **request: Any) -> bytes:
-        """Return the bytes of the answer to a GET."""
         return (await self._send("GET", path, **request)).content
 
     async def _delete(self, path: str) -> None:
@@ -391,7 +390,6 @@ class ServiceConnection:
     async def _pages(
         self, kind: type[Page[Item]], path: str, **parameters: Any
     ) -> AsyncIterator[Item]:
-        """Yield the items of all pages of a list."""
         cursor: str | None = None
         while True:
             query = without_none(**parameters, cursor=cursor, limit=PAGE)
@@ -403,9 +401,11 @@ class ServiceConnection:
                 return
 
     async def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
-        """Send a request with retries; return a successful response, raise the error of others."""
+        """Send a request with retries; return the response, or raise the error that it reports.
+
+        If an earlier attempt to delete was lost, a 404 counts as success.
+        """
         response, lost = await self._persist(lambda: self._http.request(method, path, **request))
-        # An attempt without a response may have deleted the object.
         deleted_before = method == "DELETE" and lost > 0 and response.status_code == 404
         if response.is_success or deleted_before:
             return response
@@ -537,7 +537,8 @@ def _checked_key(key: str) -> str:
 
 
 def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
-    """Return the certificates of SSL_CERT_FILE and SSL_CERT_DIR; True, the default, if not set.
+    """Return the certificates of SSL_CERT_FILE and SSL_CERT_DIR; True (default certificates) if
+    neither is set or the URL is not https. Raise ValueError if they contain no certificates.
 
     httpx reads these variables itself, but not if it ignores proxies.
     """
@@ -552,10 +553,10 @@ def _authorities(url: httpx.URL) -> ssl.SSLContext | bool:
         ) from error
 
 
-#: Statuses of a proxy that cannot reach the service.
+#: HTTP statuses that a proxy sends if it cannot reach the service.
 _OF_PROXY = (502, 503, 504)
-#: Statuses without a problem document that indicate a too long URL or headers, and the length above
-#: which some proxies reject these, bytes.
+#: HTTP statuses that, without a problem document, may mean that URL and headers are too long; some
+#: proxies reject more than `_LONG_HEAD` bytes.
 _OF_LONG_HEADS, _LONG_HEAD = (400, 414, 431), 8 << 10
 
 
@@ -719,6 +720,6 @@ _PAUSES_S = (0.02, 0.5)
 def growing_pauses(until: float) -> Iterator[float]:
     """Yield increasing pauses, seconds, until `until` on the clock of `time.monotonic`."""
     pause, longest = _PAUSES_S
-    while (left := until - time.monotonic()) > 0:
-        yield min(pause, left)
+    while (remaining := until - time.monotonic()) > 0:
+        yield min(pause, remaining)
         pause = min(1.4 * pause, longest)

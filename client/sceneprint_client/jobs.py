@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 
 _Product = TypeVar("_Product", bound=Product)
-#: Number of jobs that one round of `wait` checks; workers process jobs roughly in this order.
+#: Number of jobs that `wait` checks at a time, in the order in which workers usually run them.
 _WINDOW = 8
-#: Number of bytes of an archive in one piece of the request.
+#: Size of the pieces in which an archive is sent, bytes.
 _CHUNK = 1 << 20
 
 
@@ -64,10 +64,7 @@ class JobMethods(ServiceConnection):
     async def cancel_job(self, job_id: str) -> Job:
         """Cancel a job that has not ended; its frame becomes `failed`.
 
-        Raises
-        ------
-        UnknownJob : If the job does not exist.
-        JobOver : If the job has ended.
+        Raise UnknownJob if the job does not exist. Raise JobOver if the job has ended.
         """
         return await self._call(Job, "POST", f"{job_path(job_id)}/cancel")
 
@@ -132,14 +129,14 @@ class JobMethods(ServiceConnection):
         waiting = list(dict.fromkeys(order))
         total, until = len(waiting), time.monotonic() + timeout_s
         for pause in growing_pauses(until):
-            while waiting:  # without a pause while jobs of the window have ended
+            while waiting:  # do not pause as long as a job in the window has ended
                 window = waiting[:_WINDOW]
                 latest |= {job_id: await self.job(job_id) for job_id in window}
-                left = [job_id for job_id in window if not latest[job_id].state.over]
-                waiting[:_WINDOW] = left
+                unfinished = [job_id for job_id in window if not latest[job_id].state.over]
+                waiting[:_WINDOW] = unfinished
                 if progress is not None:
                     progress(total - len(waiting), total)
-                if len(left) == len(window) or time.monotonic() > until:
+                if len(unfinished) == len(window) or time.monotonic() > until:
                     break
             if not waiting:
                 break
@@ -271,12 +268,16 @@ class JobMethods(ServiceConnection):
 
     @Call
     async def product(self, kind: type[_Product], map_name: str | None, job_id: str) -> _Product:
-        """Return a product; raise UnknownMap or UnknownJob if it does not exist.
+        """Return a product.
 
         Parameters
         ----------
         kind : MapCoverage, Association, Difference or Reconstruction
         map_name, job_id : ids of the product; `map_name` is None for a Reconstruction
+
+        Raises
+        ------
+        UnknownMap, UnknownJob : If the map or job does not exist.
         """
         return await self._call(kind, "GET", product_path(kind, map_name, job_id))
 
@@ -295,10 +296,8 @@ class JobMethods(ServiceConnection):
     async def delete_product(self, kind: type[Product], map_name: str | None, job_id: str) -> None:
         """Delete a product with its results, even while a worker computes it; see `product`.
 
-        Raises
-        ------
-        UnknownMap, UnknownJob : If the map or job does not exist.
-        JoinStands : If the product is an association whose join must be undone first.
+        Raise UnknownMap or UnknownJob if the map or job does not exist. Raise JoinStands if the
+        product is an association whose join must be undone first.
         """
         await self._delete(product_path(kind, map_name, job_id))
 
@@ -336,10 +335,8 @@ class JobMethods(ServiceConnection):
         The effects of other joins on these frames remain. The sessions are not joined again
         automatically.
 
-        Raises
-        ------
-        UnknownMap, UnknownJob : If the map or job does not exist.
-        NotIndexed : If the job has not succeeded.
+        Raise UnknownMap or UnknownJob if the map or job does not exist. Raise NotIndexed if the job
+        has not succeeded.
         """
         path = f"{product_path(Association, map_name, job_id)}/join"
         return await self._call(Association, "DELETE", path)
@@ -401,9 +398,7 @@ class JobMethods(ServiceConnection):
     ) -> AsyncIterator[CoverageFrame]:
         """Yield the query frames of a coverage job, optionally only those with one outcome.
 
-        Raises
-        ------
-        UnknownMap, UnknownJob : If the map or job does not exist.
+        Raise UnknownMap or UnknownJob if the map or job does not exist.
         """
         path = f"{product_path(MapCoverage, map_name, job_id)}/frames"
         return self._pages(Page[CoverageFrame], path, outcome=outcome)
@@ -471,10 +466,7 @@ class JobMethods(ServiceConnection):
     async def reconstruction_mesh(self, job_id: str) -> bytes:
         """Return the surface of a reconstruction as a PLY file.
 
-        Raises
-        ------
-        UnknownJob : If the job does not exist.
-        NotIndexed : If the job has not succeeded.
+        Raise UnknownJob if the job does not exist. Raise NotIndexed if the job has not succeeded.
         """
         return await self._bytes(f"{product_path(Reconstruction, None, job_id)}/mesh.ply")
 

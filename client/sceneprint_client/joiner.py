@@ -22,7 +22,7 @@ from sceneprint_client.transforms import FASTEST
 JOIN_M = 2.0
 #: Edge of the voxels in which a joined cloud has one point, metres.
 VOXEL_M = 0.1
-#: Maximum number of scans in a cloud, 5 s at 10 Hz, even if the robot stands still.
+#: Maximum number of scans in a cloud, for a robot that stands still: 5 s at 10 Hz.
 MOST_SCANS = 50
 #: Longest interval between two poses of a scan, seconds. Motion is linear within an interval; at
 #: 180 degrees per second, the error at a distance of 100 m is 0.5 mm.
@@ -126,7 +126,7 @@ class Joiner:
 
 
 def window_start(positions: Floats, metres: float) -> int:
-    """Return the index of the earliest scan that is joined with the last scan.
+    """Return the index of the earliest of at most `MOST_SCANS` scans to join with the last scan.
 
     Parameters
     ----------

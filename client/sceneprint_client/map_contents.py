@@ -92,7 +92,7 @@ class MapMethods(ServiceConnection):
     ) -> Map:  # fmt: skip
         """Edit title, limits and up of a map; parameters and errors as for `edit_frame`.
 
-        Changes of quotas raise Forbidden unless the key has `admin` for `*`. `dry_run` returns
+        Changes to quotas raise Forbidden unless the key has `admin` for `*`. `dry_run` returns
         the edited map without storing it; its `overdue` is the number of frames that the new
         retention would delete immediately.
         """
@@ -128,10 +128,7 @@ class MapMethods(ServiceConnection):
     async def cancel_reencoding(self, map_name: str) -> Map:
         """Cancel a re-encoding: the map keeps its model.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
-        Conflict : If the map is not being re-encoded.
+        Raise UnknownMap if the map does not exist. Raise Conflict if no re-encoding is in progress.
         """
         return await self._call(Map, "DELETE", f"{map_path(map_name)}/reencoding")
 
@@ -324,9 +321,7 @@ class MapMethods(ServiceConnection):
     def sessions(self, map_name: str) -> AsyncIterator[Session]:
         """Yield the sessions of a map by robot, with frame counts, times and parent frames.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
+        Raise UnknownMap if the map does not exist.
         """
         return self._pages(Page[Session], f"{map_path(map_name)}/sessions")
 
@@ -401,7 +396,8 @@ class MapMethods(ServiceConnection):
         parent_frame : parent frame; required if the poses have several parent frames
         captured_after, captured_before : start and end of the capture time, with a time zone
         clock : source of the timestamps: "captured" (`captured_at`), "sequence", or "received"
-            (every frame has it); "taken": `captured_at`, or `sequence` if no frame has it
+            (which every frame has); "taken": `captured_at`, or `sequence` if no frame with a pose
+            has a capture time
         most : maximum number of poses, evenly spaced; `posed` is the number of all poses
 
         Raises
@@ -449,7 +445,7 @@ class MapMethods(ServiceConnection):
         self, map_name: str, frame_id: str, within: CloudFrame = "optical",
         limit: int = MOST_DRAWN,
     ) -> SurfacePoints:  # fmt: skip
-        """Return the points of `cloud` as arrays; the response has a third of the size.
+        """Return the points of `cloud` as arrays; the response is a third as large.
 
         Parameters
         ----------
@@ -488,10 +484,8 @@ class MapMethods(ServiceConnection):
     async def upload_of(self, map_name: str, frame_id: str) -> bytes:
         """Return the original bytes of a frame's upload.
 
-        Raises
-        ------
-        UnknownMap, UnknownFrame : If the map or frame does not exist or was deleted.
-        NotIndexed : If the service did not store the upload.
+        Raise UnknownMap or UnknownFrame if the map or frame does not exist or was deleted. Raise
+        NotIndexed if the service did not store the upload.
         """
         return await self._bytes(f"{frame_path(map_name, frame_id)}/upload")
 
@@ -499,12 +493,10 @@ class MapMethods(ServiceConnection):
     async def map_copy(
         self, map_name: str, have: Sequence[str] = ()
     ) -> tuple[MapCopy, dict[str, bytes]]:
-        """Return a map's state at one moment, and parts not in `have` that fit into one response.
+        """Return a map's state at a single moment, and the parts not in `have` that fit a response.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
-        ValueError : If the answer is not a copy of a map.
+        Raise UnknownMap if the map does not exist. Raise ValueError if the answer is not a copy of
+        a map.
         """
         body = CopyRequest(have=list(have)).model_dump()
         data = (await self._send("POST", f"{map_path(map_name)}/copy", json=body)).content
@@ -535,7 +527,6 @@ def _run(
     session: str, robot: str | None, parent_frame: str | None, after: datetime | None,
     before: datetime | None, most: int | None, clock: Clock,
 ) -> Run:  # fmt: skip
-    """Return the validated selection of a run; raise InvalidRequest if it is invalid."""
     return checked(
         Run, "The run", session=session, robot=robot, parent_frame=parent_frame,
         captured_after=after, captured_before=before, most=most, clock=clock,
@@ -550,7 +541,6 @@ def _run_request(map_name: str, run: Run, accept: str) -> dict[str, Any]:
 
 
 def _edit_request(changes: Mapping[str, Any], if_match: str | None) -> dict[str, Any]:
-    """Return the arguments of a request for an edit."""
     headers = {"Content-Type": "application/merge-patch+json"}
     if if_match is not None:
         headers["If-Match"] = f'"{if_match}"'
@@ -571,10 +561,8 @@ class SurfaceMethods(ServiceConnection):
 
         Workers do this automatically unless `SCENEPRINT_BUILD_SURFACES` is `on_request`.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
-        InvalidRequest : If the map has no indexed frame with a pose.
+        Raise UnknownMap if the map does not exist. Raise InvalidRequest if the map has no indexed
+        frame with a pose.
         """
         return await self._call(MapSurface, "POST", surface_path(map_name))
 
@@ -605,10 +593,8 @@ class SurfaceMethods(ServiceConnection):
     async def surface_tile(self, map_name: str, digest: str) -> bytes:
         """Return the cells of a tile; `sceneprint_client.surface_encoding.decode_tile` reads them.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
-        NotFound : If the tile was changed or removed; list the tiles again.
+        Raise UnknownMap if the map does not exist. Raise NotFound if the tile was changed or
+        removed; list the tiles again.
         """
         return await self._bytes(surface_tile_path(map_name, digest))
 
@@ -649,7 +635,7 @@ class SurfaceMethods(ServiceConnection):
         ----------
         parent : parent frame; default: the most common parent frame
         width : length of the longer side, pixels
-        low, high : lowest and highest surface to draw, metres along up
+        low, high : minimum and maximum height of the drawn surface, along up, metres
 
         Raises
         ------

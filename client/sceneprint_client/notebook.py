@@ -21,7 +21,7 @@ _INTERNAL = {
 _COLUMNS = ("rank", "frame", "map", "similarity", "overlap", "validation")
 #: Maximum number of entries of a list, and of characters of a text.
 _MOST, _LONGEST = 5, 160
-#: Width and height of a plan, its margin, and the length of a heading, pixels.
+#: Width and height of a plan, its margin, and length of the line that shows a heading, pixels.
 _SIDE, _MARGIN, _ARROW = 160, 20, 14
 
 

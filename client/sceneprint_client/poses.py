@@ -96,7 +96,7 @@ def interpolate(
     ----------
     stamps : M stamps in any order, seconds
     longest_gap : longest interval between two poses in which to interpolate, seconds
-    tolerance : maximum distance to a pose, seconds, that replaces a missing interpolation
+    tolerance : maximum time to a pose that is used where interpolation is impossible, seconds
 
     Returns
     -------
@@ -125,7 +125,6 @@ def interpolate(
 
 
 def _transform(position: Floats, quaternion: Floats) -> Floats:
-    """Return the pose (4, 4)."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_of(quaternion)
     pose[:3, 3] = position
@@ -144,7 +143,7 @@ def first_since(stamps_ns: array[int], span_ns: int) -> int:
 WINDOW_S = 0.5
 #: Minimum number of samples in the window.
 _FEWEST = 10
-#: Gravity, and maximum deviation of the mean acceleration from it at rest, m/s^2.
+#: Gravity, and maximum deviation of the mean acceleration from gravity at rest, m/s^2.
 _GRAVITY, _OFF = 9.81, 0.3
 #: Maximum standard deviation of the acceleration at rest, over all axes, m/s^2.
 _SPREAD = 0.25
@@ -164,7 +163,7 @@ class Accelerations:
         return len(self._stamps_ns)
 
     def add(self, stamp_ns: int, acceleration: Sequence[float], turn: Sequence[float]) -> None:
-        """Add a measurement, m/s^2 and rad/s in the IMU's axes.
+        """Add a measurement, m/s^2 and rad/s in the IMU's axes; ignore one that is not finite.
 
         Raise DatasetError if there are more than 10 million measurements.
         """
@@ -219,12 +218,17 @@ TOLERANCE = 1e-2  #: maximum error of a rotation matrix, and of the length of a 
 def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a pose whose rotation is orthonormal to machine precision.
 
-    `matrix`: (4, 4) T_parent_sensor, with a rotation that is orthonormal to 1e-2. Raise InvalidPose
-    if the matrix is not 4 x 4, not finite, or not rigid.
+    Parameters
+    ----------
+    matrix : (4, 4) T_parent_sensor, with a rotation that is orthonormal to 1e-2
 
     Returns
     -------
     T_parent_sensor : (4, 4) float64, with the nearest rotation
+
+    Raises
+    ------
+    InvalidPose : If the matrix is not 4 x 4, not finite, or not rigid.
     """
     try:
         pose = np.array(matrix, dtype=np.float64)
@@ -252,7 +256,7 @@ def rigid_transform(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         )
     if np.linalg.det(rotation) < 0.0:
         raise InvalidPose("The rotation of the pose is a reflection. Use right-handed axes.")
-    left, _, right = np.linalg.svd(rotation)
-    pose[:3, :3] = left @ right
+    U, _, V = np.linalg.svd(rotation)
+    pose[:3, :3] = U @ V
     pose[3] = (0.0, 0.0, 0.0, 1.0)
     return pose

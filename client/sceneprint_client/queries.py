@@ -129,8 +129,8 @@ class QueryMethods(ServiceConnection):
         Parameters
         ----------
         frames : 2 to 10 frames in the order of capture, as for `upload`
-        metas : metadata of each frame; their poses, in any common parent frame, are the odometry.
-            Default: metadata from sidecar files
+        metas : metadata of each frame; the poses in the metadata, in any common parent frame, are
+            the odometry. Default: metadata from sidecar files
         how : see `query`
 
         Raises
@@ -224,10 +224,8 @@ class QueryMethods(ServiceConnection):
     async def delete_queries(self, map_name: str) -> None:
         """Delete all past queries of a map with their answers, permanently.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
-        Forbidden : If the key does not have `admin` for the map.
+        Raise UnknownMap if the map does not exist. Raise Forbidden if the key does not have `admin`
+        for the map.
         """
         await self._send("DELETE", "/v1/queries", params={"map": map_name})
 
@@ -235,9 +233,7 @@ class QueryMethods(ServiceConnection):
     async def answer(self, query_id: str) -> Answer:
         """Return the answer to an earlier query while it is stored.
 
-        Raises
-        ------
-        UnknownQuery : If the query is not stored.
+        Raise UnknownQuery if the query is not stored.
         """
         return await self._call(Answer, "GET", query_path(query_id))
 
@@ -273,10 +269,8 @@ class QueryMethods(ServiceConnection):
     async def query_cloud(self, query_id: str) -> bytes:
         """Return points and normals of a query's surface as PLY, in the frame of its sensor.
 
-        Raises
-        ------
-        UnknownQuery : If the answer is not stored.
-        NotIndexed : If the query ran without validation.
+        Raise UnknownQuery if the answer is not stored. Raise NotIndexed if the query ran without
+        validation.
         """
         return await self._bytes(f"{query_path(query_id)}/cloud.ply")
 

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _MEMORY_S = 10.0
 #: Number of messages between two removals of old data.
 _SWEEP_INTERVAL = 512
-#: A frame that is older than the last one by this indicates a jump of the clock, seconds.
+#: A frame older than the previous one by more than this time means that the clock jumped, seconds.
 _JUMP_S = 1.0
 #: Maximum number of frames that wait for their transforms.
 _MOST_WAITING = 64
@@ -232,7 +232,7 @@ class Relocaliser:
         scan = None
         try:
             if stamp <= 0:
-                raise SceneprintError("A frame has no stamp. Check the clock of its driver.")
+                raise SceneprintError("A frame has no stamp. Check the clock of the sensor driver.")
             if self.parameters.join_m > 0 and hasattr(message, "point_step"):
                 scan = timed_points(message)
         except SceneprintError as error:
@@ -264,7 +264,10 @@ class Relocaliser:
         self._queried_ns, self._was_tracking = None, False
 
     def step(self) -> int:
-        """Process frames whose transforms have arrived, and return their number."""
+        """Process frames whose transforms have arrived, and return their number.
+
+        A frame whose transforms do not arrive within `wait_s` is dropped and counted.
+        """
         done = 0
         while self._waiting:
             arrival = self._waiting[0]
@@ -405,7 +408,9 @@ class Relocaliser:
     # Output.
 
     def report(self, now_ns: int) -> Report:
-        """Return the state for other nodes.
+        """Return the state for other nodes, and remember whether it has a pose, for `is_fix`.
+
+        Unless the parameters name a parent frame, that of the first fix is published from then on.
 
         Parameters
         ----------
@@ -462,10 +467,10 @@ class Relocaliser:
         sensor = (
             frame_name(self._waiting[-1].message.header.frame_id) if self._waiting else "the sensor"
         )
-        return f"no transforms from {p.odom_frame} to {sensor} and {p.base_frame} at its stamps"
+        ends = f"from {p.odom_frame} to {sensor} and {p.base_frame}"
+        return f"no transforms {ends} at the stamps of the frames"
 
     def _values(self, state: State) -> dict[str, str]:
-        """Return the values of the diagnostics."""
         values = {
             "status": state.status, "reason": state.reason,
             "parent_frame": state.parent_frame or "", "map_is": self._parent,

@@ -28,13 +28,13 @@ from sceneprint_client.poses import Floats
 
 #: Encodings of depth images: 16-bit millimetres, or metres (REP 118).
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
-#: Stored units per metre of 16-bit images.
+#: Stored units per metre in 16-bit images.
 DEPTH_SCALE = 1000.0
 #: Length of the header of a compressedDepth message, bytes: a format, and two floats a and b.
 TRANSPORT_BYTES = 12
 #: Maximum offset of the PNG, bytes.
 _MOST_BEFORE_PNG = 64
-#: Length of the head of a PNG up to bit depth and colour type, bytes.
+#: Number of first bytes of a PNG that contain its bit depth and colour type.
 _PNG_HEAD = 26
 
 
@@ -221,12 +221,15 @@ def is_calibrated(info: Any) -> bool:
 def camera_intrinsics(info: Any, *, rectified: bool) -> Intrinsics:
     """Return the intrinsics of a CameraInfo.
 
-    Raise InvalidIntrinsics if it does not describe a camera, or the lens model is not supported.
-
     Parameters
     ----------
     info : sensor_msgs CameraInfo
     rectified : whether the images are rectified, so that their camera is P without distortion
+
+    Raises
+    ------
+    InvalidIntrinsics : If `info` does not describe a camera, or has a binning or a lens model that
+        is not supported.
     """
     k, p = _numbers(info, "k", 9), _numbers(info, "p", 12)
     if k is None:
@@ -261,7 +264,10 @@ def topic_without_transport(topic: str) -> str:
 
 
 def _distortion(info: Any) -> tuple[float, ...]:
-    """Return the coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of a lens; none if all are 0."""
+    """Return the coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of a lens; none if all are 0.
+
+    Raise InvalidIntrinsics for another lens model.
+    """
     distortion = getattr(info, "d", None)
     d = [float(value) for value in (info.D if distortion is None else distortion)]
     if not any(d):
@@ -301,8 +307,8 @@ TIME_FIELDS = (
 )
 #: Longest time from the first to the last point of a scan, seconds; longer times are ignored.
 LONGEST_SCAN_S = 1.0
-#: Bits of the field `tag` of Livox from which a point is noise, as FAST-LIO reads them: a third or
-#: later return (Avia, Horizon), or low confidence (Mid-360).
+#: Bit of Livox's field `tag` that is set for noise, as FAST-LIO reads it: a third or later return
+#: (Avia, Horizon), or low confidence (Mid-360).
 _NOISE = 0x20
 #: Maximum number of points of a message.
 MOST_POINTS = 20_000_000
@@ -330,9 +336,9 @@ def cloud_points(message: Any) -> NDArray[np.float32]:
 def timed_points(message: Any) -> tuple[Floats, Floats | None]:
     """Return the valid points (N, 3) of a message, metres, and their times after its stamp (N,).
 
-    The times, seconds, are None if they are missing or span more than one scan. If they come from
-    another clock than the stamp, they count from the earliest point. The parameter and the errors
-    are those of `cloud_points`.
+    The times, seconds, are None if they are missing or span more than a second. If the sensor and
+    the stamp use different clocks, times count from the earliest point. The parameter and the
+    errors are those of `cloud_points`.
     """
     table = cloud_table(message)
     points = np.concatenate([np.empty((0, 3)), *cloud_blocks(table)])

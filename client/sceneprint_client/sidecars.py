@@ -47,14 +47,16 @@ _OPTIONAL = ("depth_scale", "distortion", "depth_along_ray", "up")
 class Camera:
     """Intrinsics of a depth camera, and its encoding of depth.
 
-    Raise InvalidIntrinsics if the depth scale is not positive, or `up` is not a unit vector.
-
     Parameters
     ----------
     intrinsics : intrinsics of the depth images, with distortion
     depth_scale : stored units per metre
     along_ray : whether depth is the range along the pixel's ray instead of z
     up : unit vector in the camera's axes if the camera is carried level; None if unknown
+
+    Raises
+    ------
+    InvalidIntrinsics : If the depth scale is not positive, or `up` is not a unit vector.
     """
 
     intrinsics: Intrinsics
@@ -122,7 +124,7 @@ def _camera(fields: dict[str, object]) -> Camera:
     distortion = fields.get("distortion", [])
     if not isinstance(distortion, list):
         raise InvalidIntrinsics(
-            "distortion is not a list. Write [k1, k2, p1, p2], and after it k3, or k3 to k6."
+            "distortion is not a list. Write [k1, k2, p1, p2], optionally with k3, or k3 to k6."
         )
     along_ray = fields.get("depth_along_ray", False)
     if not isinstance(along_ray, bool):

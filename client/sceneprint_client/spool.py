@@ -132,8 +132,8 @@ class SpoolStatus:
     uploaded : number of uploaded frames since the creation of the spool
     thinned : number of waiting frames that a full spool dropped
     discarded : number of rejected frames that a full spool dropped
-    oldest : capture time of the first waiting frame, or the time of its addition; None without
-        waiting frames
+    oldest : capture time of the first waiting frame, or else the time at which it was added; None
+        if no frame waits
     """
 
     waiting: int
@@ -422,7 +422,10 @@ class Spool:
         ]
 
     def _send(self, target: _Target, batch: list[_Waiting], report: SyncReport) -> None:
-        """Upload a batch and record the results; split the batch if it is rejected as a whole."""
+        """Upload a batch and record the results; split the batch if it is rejected as a whole.
+
+        Raise the error of an answer that is not about the frames, such as an exceeded quota.
+        """
         try:
             items = _persist(
                 target,
@@ -642,7 +645,7 @@ def _neighbour(database: sqlite3.Connection, run: str, number: int | None, side:
 
 
 def _update_novelty(database: sqlite3.Connection, number: int | None) -> None:
-    """Store the separation of a frame from its two neighbours; null at the ends of a run."""
+    """Store the sum of a frame's separations from its two neighbours; null at the ends of a run."""
     if number is None:
         return
     query = "SELECT run, stamp, pose FROM frames WHERE id = ?"

@@ -21,11 +21,11 @@ HEADER = struct.Struct("<4sHHII3f3fIf")
 POINT = np.dtype(
     [("position", "<u2", 3), ("patch", "<u2"), ("normal", "i1", 3), ("residual", "u1")]
 )
-#: Flags of the header for the attributes of its points.
+#: Header flags that state which attributes the points have.
 NORMALS, PATCHES, RESIDUALS = 1, 2, 4
-#: Index of points that lie on no validation patch.
+#: Patch index of points that lie on no validation patch.
 NO_PATCH = 65535
-#: Maximum coordinate of a point within its bounding box.
+#: Maximum value of a stored coordinate, on the far side of the bounding box.
 _STEPS = 65535.0
 
 
@@ -54,9 +54,7 @@ class SurfacePoints:
 def decode_points(data: bytes) -> SurfacePoints:
     """Return the points of an answer of type `application/vnd.sceneprint.points`.
 
-    Raises
-    ------
-    Refused : If the format version differs, or the length does not match the header.
+    Raise Refused if the format version differs, or the length does not match the header.
     """
     if len(data) < HEADER.size or data[:4] != MAGIC:
         raise _refusal("the header is wrong")

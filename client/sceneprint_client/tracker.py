@@ -135,7 +135,7 @@ class Tracker:
     def reset(self, reason: str = "it was reset") -> State:
         """Forget the pose, as after a motion that odometry does not measure, such as a lift.
 
-        Clock and odometry may start again, and answers to earlier frames are ignored.
+        The clock and the odometry may restart, and answers to earlier frames are ignored.
         """
         with self._lock:
             self.epoch += 1
@@ -147,7 +147,11 @@ class Tracker:
         self, frame: FrameInput, odom_pose: NDArray[Any], up: Sequence[float] | None,
         stamp: float, meta: MetaInput | None, epoch: int,
     ) -> State:  # fmt: skip
-        """Update like `update`, but ignore the answer if the tracker was reset after `epoch`."""
+        """Send a query, and update and return the state as `update` does.
+
+        If `epoch`, the attribute's value at the capture of the frame, has changed because of a
+        reset, the answer is ignored.
+        """
         T_odom_sensor = rigid_transform(np.asarray(odom_pose, np.float64))
         camera = self._camera if meta is None else meta
         view = _View(stamp, T_odom_sensor, *frame_bytes(frame, camera, with_pose=False, up=up))
@@ -199,13 +203,16 @@ class Tracker:
     def _localize(
         self, view: _View, earlier: list[_View], prior: PoseEvidence | None
     ) -> tuple[Localization, list[_View]]:
-        """Send a query; return its answer and the earlier frames that support it."""
+        """Send a query; return its answer and the earlier frames that support it.
+
+        If the service rejects the frames together, forget the earlier frames and send only `view`.
+        """
         expected = None if prior is None else _prior_of(prior)
         if earlier:
             back = inverse(view.T_odom_sensor)  # the query uses poses relative to this frame
-            sent = [*earlier, view]
-            metas = [_with_odometry(item.meta, back @ item.T_odom_sensor) for item in sent]
-            frames = [item.data for item in sent]
+            views = [*earlier, view]
+            metas = [_with_odometry(item.meta, back @ item.T_odom_sensor) for item in views]
+            frames = [item.data for item in views]
             try:
                 answer = self._client.localize_sequence(
                     self._map, frames, metas, keep=False, prior=expected
@@ -253,9 +260,7 @@ class AsyncTracker:
     ) -> State:  # fmt: skip
         """Pass a frame to the thread, and return the current state. See `Tracker.update`.
 
-        Raises
-        ------
-        SceneprintError : If an earlier frame or the map cannot be used.
+        Raise SceneprintError if an earlier frame or the map cannot be used.
         """
         stamp = time.time() if stamp is None else stamp
         epoch = self._tracker.epoch
@@ -379,8 +384,8 @@ def _observation_from(line: dict[str, Any]) -> Observation:
 def _prior_of(pose: PoseEvidence) -> Prior:
     if pose.covariance is None:
         raise AssertionError("the prior of a tracker has a covariance")
-    sent = GivenPose(parent_frame=pose.parent_frame, matrix=pose.T_map_sensor.tolist())
-    return Prior(pose=sent, covariance=_flat_list(pose.covariance))
+    expected = GivenPose(parent_frame=pose.parent_frame, matrix=pose.T_map_sensor.tolist())
+    return Prior(pose=expected, covariance=_flat_list(pose.covariance))
 
 
 def _with_odometry(meta: FrameMeta, T_odom_sensor: NDArray[np.float64]) -> FrameMeta:

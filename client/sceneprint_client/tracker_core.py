@@ -28,10 +28,10 @@ from sceneprint_client.poses import rigid_transform
 Array = NDArray[np.float64]
 TrackerStatus = Literal["lost", "ambiguous", "tracking"]
 
-#: Lower limits of the filter's standard deviations, and deviations to add to those of an answer.
+#: Minimum standard deviations of the filter, and deviations that are added to those of an answer.
 _LEAST_M, _LEAST_RAD = 0.01, math.radians(0.3)
 _ANSWER_M, _ANSWER_RAD = 0.03, math.radians(1.0)
-#: Factor of the deviation of an answer that the prior decided.
+#: Factor that increases the deviations of an answer if the prior decided on the pose.
 _PRIOR_FACTOR = 2.0
 #: Number of odometry poses stored; limits how late an answer can arrive.
 _MOST_MARKS = 4096
@@ -65,7 +65,7 @@ class TrackerParameters:
         lost. An answer `found` elsewhere has weight 1, an ambiguous answer without the tracked
         place 0.5
     patience_s : longest period of contradictions from one place before the robot is lost
-    most_deviation_m : deviation of the position above which the robot is lost
+    most_deviation_m : maximum standard deviation of the position; beyond it, the robot is lost
     most_undecided_m : distance after which the state is ambiguous if all answers leave several
         places possible or depend on the prior
     alone_every : interval, in queries, between queries without a prior
@@ -227,8 +227,10 @@ class _Belief:
     mark: _Mark
     T_map_sensor: Array
     covariance: Array
-    confirmed: float  #: stamp of the last answer that confirmed it without a prior
-    undecided: float | None = None  #: distance at the first later answer that did not
+    confirmed: float  #: stamp of the last answer that confirmed the pose without a prior
+    #: Travelled distance at the first later answer that left several places possible or depended on
+    #: the prior; None if there is no such answer.
+    undecided: float | None = None
 
 
 class TrackerCore:
@@ -287,7 +289,7 @@ class TrackerCore:
     def reset(self, reason: str = "it was reset") -> State:
         """Forget the pose, as after a motion that odometry does not measure, such as a lift.
 
-        Clock and odometry may start again. Do not pass answers to earlier frames afterwards.
+        The clock and the odometry may restart. Do not pass answers to earlier frames afterwards.
         """
         self._forget()
         self._votes.clear()
@@ -309,7 +311,9 @@ class TrackerCore:
         return State(status, stamp, belief.parent_frame, T_map_odom, T, P, age, reason)
 
     def prior(self, T_odom_sensor: Array) -> PoseEvidence | None:
-        """Return the prior for the next query; None for a query without a prior."""
+        """Return the prior for the next query; None for every `alone_every`-th query, and unless
+        the robot is tracked without a contradicting answer.
+        """
         alone = (self._answers + 1) % self.parameters.alone_every == 0
         if self._belief is None or self._against or alone or self._verdict[0] != "tracking":
             return None
@@ -319,7 +323,10 @@ class TrackerCore:
     # Odometry.
 
     def _mark(self, stamp: float, T: Array) -> _Mark:
-        """Return the mark at a stamp; add later stamps; raise InvalidRequest for other new ones."""
+        """Return the mark at a stamp, and add it if the stamp is after the last one.
+
+        Raise InvalidRequest if an earlier stamp has no mark, or its mark has another pose.
+        """
         if self._marks and stamp <= self._marks[-1].stamp:
             at = bisect_right([mark.stamp for mark in self._marks], stamp) - 1
             mark = self._marks[max(at, 0)]
@@ -361,7 +368,9 @@ class TrackerCore:
     # Votes, and the first fix.
 
     def _vote(self, mark: _Mark, observation: Observation) -> None:
-        """Add the poses of an answer as votes, unless the prior decided between them."""
+        """Add the poses of an answer as votes, unless the prior decided between them; remove the
+        votes of answers before the last `most_votes`.
+        """
         p, total = self.parameters, sum(pose.weight for pose in observation.poses)
         found = observation.status == "found"
         if found and observation.by_prior:
@@ -380,7 +389,6 @@ class TrackerCore:
         self._filter_votes(lambda vote: vote.number > self._answers - p.most_votes)
 
     def _filter_votes(self, condition: Callable[[_Vote], bool]) -> None:
-        """Remove all votes that do not satisfy a condition."""
         if all(map(condition, self._votes)):
             return
         remaining = [old for old, vote in enumerate(self._votes) if condition(vote)]
@@ -404,7 +412,9 @@ class TrackerCore:
     def _weight(
         self, places: Iterable[int], apart: Callable[[_Mark, _Mark], bool], *, found: bool
     ) -> float:
-        """Return the weight of votes, or only of `found` votes; views not `apart` count once."""
+        """Return the weight of votes, or only of `found` votes. Of views that are not `apart`, only
+        the one with the greatest weight counts.
+        """
         votes = [self._votes[place] for place in places]
         weighed = sorted(
             ((self._current_weight(vote), vote) for vote in votes if vote.found or not found),
@@ -433,7 +443,7 @@ class TrackerCore:
             disputed = any(len(vote.agreeing) < len(self._votes) for vote in self._votes)
             waits = "several places are possible; " if disputed else ""
             return "ambiguous" if waits else "lost", waits + observation.reason
-        apart = cache(self._are_independent)  # each vote compares the same places
+        apart = cache(self._are_independent)  # several votes compare the same marks
         totals = [self._weight(vote.agreeing, apart, found=False) for vote in self._votes]
         founds = [self._weight(vote.agreeing, apart, found=True) for vote in self._votes]
         best = max(own, key=lambda place: (founds[place], totals[place], -place))
@@ -474,7 +484,9 @@ class TrackerCore:
         return T, carried + _diagonal_covariance(drift_m, drift_rad)
 
     def _is_tracked(self, pose: PoseEvidence, T: Array, P: Array) -> bool:
-        """Return whether a pose agrees with the tracked one, within the gate and its covariance."""
+        """Return whether a pose agrees with the tracked pose T, within the gate plus twice the
+        deviations of T, whose covariance is P.
+        """
         if self._belief is None or pose.parent_frame != self._belief.parent_frame:
             return False
         step, turn = difference(T, pose.T_map_sensor)

@@ -27,7 +27,8 @@ LONGEST_GAP_S = 0.5
 TOLERANCE_S = 0.02
 #: Maximum number of samples of moving transforms: hours of odometry.
 MOST_SAMPLES = 5_000_000
-#: Maximum deviation of a quaternion's length from 1 to be used as it is, and to be normalised.
+#: Deviation of a quaternion's length from 1 from which the normalisation is reported, and from
+#: which the sample is ignored.
 _UNIT, _NEAR_UNIT = 1e-2, 0.1
 #: Longest plausible translation, metres.
 _FARTHEST_M = 1e7
@@ -37,12 +38,12 @@ BASES = ("base_link", "base_footprint", "base")
 WORLDS = ("map", "odom", "world")
 
 
-#: Speed above which two samples contradict each other, metres or radians per second.
+#: Maximum speed, metres or radians per second. Samples that imply more contradict each other.
 FASTEST = 50.0
-#: Tolerance of a distance between two samples, metres or radians.
+#: Tolerance for the distance between two samples, metres or radians.
 _JITTER = 0.1
-#: Jump, metres or radians, and acceleration, per second^2, above which samples belong to different
-#: motions; and time within which a jump and its reversal indicate two publishers, seconds.
+#: Maximum jump, metres or radians, and maximum acceleration, per second^2, within one motion; and
+#: maximum time between a jump and its reversal that indicate two publishers, seconds.
 _JUMP, _HARDEST, _BACK_S = 0.5, 10.0, 2.0
 
 
@@ -65,7 +66,8 @@ class _Edge:
 
     fixed: bool
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
-    samples: array[float] = field(default_factory=lambda: array("d"))  # rows of 7: x y z, x y z w
+    #: Rows of 7: position x y z, quaternion x y z w.
+    samples: array[float] = field(default_factory=lambda: array("d"))
 
     @property
     def is_constant(self) -> bool:
@@ -91,8 +93,6 @@ class TransformTree:
     ) -> bool:
         """Add a sample of a transform; a sample that is not rigid is ignored and recorded.
 
-        Raise DatasetError if there are more than 5 million samples; `forget` removes old samples.
-
         Parameters
         ----------
         parent, child : names of the frames; a leading slash of ROS 1 is removed
@@ -103,6 +103,10 @@ class TransformTree:
         Returns
         -------
         added : False if the sample was ignored
+
+        Raises
+        ------
+        DatasetError : If there are more than 5 million samples; `forget` removes old samples.
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)
@@ -295,9 +299,10 @@ class TransformTree:
         return still[-1] if still and still[-1] != frame_name(sensor) else None
 
     def world_of(self, sensor: str) -> str | None:
-        """Return the parent frame of a sensor's poses; None if no ancestor moves.
+        """Return the parent frame of a sensor's poses.
 
-        It is `map`, else `odom`, else `world`, else the root.
+        It is the ancestor `map`, else `odom`, else `world`, else the root. Without the former three
+        and without a moving transform, it is None.
         """
         up = self.ancestors(sensor)
         moves = [
@@ -365,7 +370,10 @@ class TransformTree:
         return transforms
 
     def _is_fixed(self, parent: str, child: str) -> bool:
-        """Return whether a transform is fixed or constant, except that of a base at rest."""
+        """Return whether a transform is fixed or constant.
+
+        A constant transform of a base is not fixed, since the robot may merely be at rest.
+        """
         edge = self._edges[child][parent]
         names = {parent.rpartition("/")[2], child.rpartition("/")[2]}
         is_of_base = not names.isdisjoint(WORLDS) or child.rpartition("/")[2] in BASES
@@ -435,8 +443,8 @@ def contradictions(
         change[k] = np.minimum(change[k], off)
     jumps = np.flatnonzero((reach > _JUMP) & (change > _JUMP + _HARDEST * gap**2)).tolist()
     for out, back in pairwise(jumps):
-        left = np.linalg.norm(steps[out] + steps[back])
-        if times[back + 1] - times[out] <= _BACK_S and left < 0.5 * min(reach[out], reach[back]):
+        rest = np.linalg.norm(steps[out] + steps[back])
+        if times[back + 1] - times[out] <= _BACK_S and rest < 0.5 * min(reach[out], reach[back]):
             disputed[out : back + 2] = True
     return too_fast, disputed
 

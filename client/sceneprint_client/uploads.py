@@ -162,13 +162,13 @@ class UploadMethods(ServiceConnection):
         wait_s: float, fields: dict[str, str], up: Sequence[float] | None,
     ) -> tuple[Added, bool]:  # fmt: skip
         """Send a frame; return the upload, and whether the frame is new to the map."""
-        sent = frame_form(*await self._run(frame_bytes, frame, meta, with_pose=True, up=up))
-        sent["data"] |= fields
+        form = frame_form(*await self._run(frame_bytes, frame, meta, with_pose=True, up=up))
+        form["data"] |= fields
         # An embedded service has no other worker that could sign the frame during the wait.
         wait = 0 if self._worker is not None else min(int(wait_s), _LONGEST_WAIT_S)
         response = await self._send(
             method, path, headers={"Prefer": f"wait={wait}"} if wait else {},
-            timeout=self._timeout_s + wait, **sent,
+            timeout=self._timeout_s + wait, **form,
         )  # fmt: skip
         return read_record(Added, response), response.status_code != 200
 

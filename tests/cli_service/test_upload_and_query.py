@@ -119,7 +119,7 @@ def test_what_is_lost_though_nobody_asked_ends_with_code_2(sceneprint, rooms, tm
         "poses of 0 of 3 frames; 3 without: groundtruth.txt has no pose within 20 ms of their "
         "time stamps (nearest: 97.5 s away); depth "
     )
-    assert "m on is unusual for a depth camera" in summary  # four times as far away
+    assert "m are unusual for a depth camera" in summary  # four times as far away
     assert "3 already there; 3 indexed" in sceneprint(*options, "--no-pose").stdout
     (tmp_path / "both").mkdir()
     folder.rename(tmp_path / "both" / "day")

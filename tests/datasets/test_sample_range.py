@@ -60,7 +60,7 @@ def test_a_summary_is_one_line():
     )
     assert summary.model_dump()["text"] == summary.text
     doubt = upload_summary(1, {}, [of(2.4, 3.6, 5.3)]).text
-    assert "a median of 3.6 m from 2.4 m on is unusual for a depth camera" in doubt
+    assert "a median of 3.6 m and a 5th percentile of 2.4 m are unusual for a depth camera" in doubt
     assert "specify the depth scale" in doubt
     assert upload_summary(0, {}, []).text == "poses of 0 of 0 frames"
     assert pooled_range([]) is None

@@ -40,7 +40,7 @@ def test_each_frame_has_the_camera_info_of_its_time(way, container, tmp_path, ro
     focal = [one.camera.intrinsics.fx for one in found.frames if one.camera]
     assert focal == [70.0] * 4 + [50.0] * 4
     assert found.note.endswith(
-        "2 cameras, because the camera info changes: each frame has that of its time"
+        "2 cameras, because the camera info changes: each frame has the camera of its time"
     )
 
 
@@ -68,7 +68,9 @@ def test_depth_in_other_units(tmp_path, ros):
         writer.image(1.0, np.full((60, 80), 12_500, np.uint16))
 
     path = ros.write(tmp_path, fill)
-    assert "a median of 15 m from 15 m on is unusual" in str(bag_outline(path, ALL).range)
+    assert "a median of 15 m and a 5th percentile of 15 m are unusual" in str(
+        bag_outline(path, ALL).range
+    )
     scaled = RecordingOptions(keyframe_s=0, depth_scale=10_000)
     (right,) = find_sequences(path, scaled)
     np.testing.assert_array_equal(right.frames[1].read_depth().depth, np.float32(1.25))

@@ -176,7 +176,10 @@ def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros):
         assert core.counts["without_transform"] == 1  # of 0.7, which waited for half a second
         told = core.report((ros.start + 10) * SECOND)
         assert (told.level, told.pose) == (Level.STALE, None)
-        assert told.message == "no transforms from odom to camera and base_link at its stamps"
+        assert (
+            told.message
+            == "no transforms from odom to camera and base_link at the stamps of the frames"
+        )
     assert len(client.asked) == 2
 
 

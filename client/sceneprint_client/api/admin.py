@@ -13,7 +13,7 @@ from sceneprint_client.api.frames import RecordingOutline
 #: Scopes of a key for a map. Each scope includes the previous ones.
 Scope = Literal["read", "write", "admin"]
 SCOPES: tuple[Scope, ...] = ("read", "write", "admin")
-#: Map name of a grant for all maps and for operations that belong to no map.
+#: Map name in a grant for all maps and for operations that belong to no map.
 EVERY = "*"
 
 
@@ -85,7 +85,7 @@ class Me(ApiRecord):
 class AuditLine(ApiRecord):
     """An entry of the audit log: a change and its author, or a refused request."""
 
-    number: int = Field(description="Number of the line. Numbers increase, possibly with gaps.")
+    number: int = Field(description="Line number. Line numbers increase, possibly with gaps.")
     at: datetime
     actor: str | None = Field(
         description="Name of the key; null if the service requires no keys. `command`: a command "
@@ -153,8 +153,8 @@ class IndexState(ApiRecord):
 
     map: str
     version: int | None = Field(
-        description="Version of the index; null if there is no index, as for small maps and models "
-        "that store psi. Without an index, queries compare every frame."
+        description="Version of the index; null if there is no index, for example because the map "
+        "is small or its model stores psi. Without an index, queries compare every frame."
     )
     tail: int = Field(
         description="Number of searchable frames that are not in this version of the index. If the "
@@ -200,7 +200,7 @@ class Counted(ApiRecord):
     requests: int | None = Field(description="Number of requests under /v1, answered or refused.")
     refused: int | None = Field(description="Number of requests under /v1 with a 4xx response.")
     busy: int | None = Field(
-        description="Number of requests under /v1 with a 503 response, which clients should retry."
+        description="Number of requests under /v1 with a 503 response. Clients should retry them."
     )
     broken: int | None = Field(
         description="Number of requests under /v1 with another 5xx response."
@@ -361,7 +361,7 @@ class Progress(ApiRecord):
 class Product(ApiRecord):
     """A job that computes a result from a map or an answer."""
 
-    #: Name of the product, last segment of the path of its list, and class of its request.
+    #: Name of the product, last path segment of the product list, and class of the request.
     noun: ClassVar[str]
     collection: ClassVar[str]
     request_type: ClassVar[type[Given]]
@@ -430,7 +430,7 @@ class RetriedJobs(ApiRecord):
 
 # Events.
 
-#: Every kind of event and its meaning. A test compares it with the code and the documentation.
+#: Meaning of every kind of event. A test compares this table with the code and the documentation.
 KINDS = {
     "map.created": "A map was created.",
     "map.edited": "The title or another property of a map was changed.",

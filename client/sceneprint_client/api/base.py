@@ -40,7 +40,7 @@ else:
 T = TypeVar("T")
 Record = TypeVar("Record", bound=BaseModel)
 
-#: Description of each name pattern; error messages contain it instead of the pattern.
+#: Description of each name pattern. Error messages show the description instead of the pattern.
 NAME_RULES = {
     (ONE_LINE := r"^[^\x00-\x1f\x7f]+$"): "characters of one line, without control characters",
     (_FILE_NAME := r"^[^\x00-\x1f\x7f\\]+$"): "characters of one line, without backslashes",
@@ -62,7 +62,7 @@ def fault_reason(fault: Mapping[str, Any]) -> str:
     return f"must be {rule}" if rule else str(fault["msg"]).removeprefix("Value error, ")
 
 
-#: Printable names of one line.
+#: Printable one-line name.
 Label = Annotated[str, StringConstraints(min_length=1, max_length=128, pattern=ONE_LINE)]
 
 
@@ -287,11 +287,10 @@ _JOB_STATES = {
 
 
 def checked(kind: type[Record], what: str, **fields: Any) -> Record:
-    """Return a validated record of type `kind`; `what` is its name in errors.
+    """Return a validated record of type `kind`; `what` is the name of the record in errors.
 
-    Raises
-    ------
-    InvalidRequest : If a field is missing, unknown or out of range. It lists the invalid fields.
+    Raise InvalidRequest if a field is missing, unknown or out of range; the error lists these
+    fields.
     """
     return record_of(kind, fields, what)
 
@@ -315,7 +314,7 @@ MOST_FIELDS, MOST_OF_FIELD = 20, 80
 
 
 def invalid_request(faults: Sequence[Mapping[str, Any]], what: str) -> InvalidRequest:
-    """Return the error for `what` that lists the first invalid fields of pydantic's faults."""
+    """Return the error for a record named `what`; it lists the first of pydantic's faults."""
     fields = tuple(
         (
             ".".join(str(part) for part in fault["loc"] if part != "query")[:MOST_OF_FIELD],
@@ -330,14 +329,15 @@ def invalid_request(faults: Sequence[Mapping[str, Any]], what: str) -> InvalidRe
     return InvalidRequest(f"{what} is not valid: {first}{more}. See /docs for its fields.", fields)
 
 
-#: Maximum number of samples of a depth image (an 8-megapixel sensor). Larger files are not read.
+#: Maximum number of samples of a depth image, enough for an 8-megapixel sensor. Larger files are
+#: not read.
 MAXIMUM_SAMPLES = 8_388_608
 
 
 # The camera.
 
 
-#: Maximum focal length and maximum distance of the principal point, pixels.
+#: Maximum focal length, and maximum absolute value of cx and cy, pixels.
 MAXIMUM_PIXELS = 1e7
 
 
@@ -355,8 +355,8 @@ class Intrinsics:
 
     Raises
     ------
-    InvalidIntrinsics : If a size is below 1, a focal length is not positive and finite, the
-        principal point is not finite, or the number of coefficients is not 0, 4, 5 or 8.
+    InvalidIntrinsics : If the image is empty or has more than `MAXIMUM_SAMPLES` samples, a value is
+        not finite or impossible for a camera, or the number of coefficients is not 0, 4, 5 or 8.
     """
 
     width: int
@@ -602,13 +602,13 @@ class FrameMeta(Given):
 
 # The option `if_novel` of an upload.
 
-#: Value of `if_novel` for true. Consecutive frames of a slow Kinect differ by less, mostly because
-#: of noise; without them, a recording answers queries equally well.
+#: Value of `if_novel` that `true` stands for. Consecutive frames of a slow Kinect differ by less,
+#: mostly because of noise; without these frames, a recording answers queries equally well.
 NOVEL = 0.25
 
 
 def novelty_of(value: bool | float | str | None) -> float | None:
-    """Return the minimum distance of a novel frame, as a share of that between unrelated frames.
+    """Return the minimum distance of a novel frame, as a share of the unrelated distance.
 
     Parameters
     ----------
@@ -627,7 +627,7 @@ def novelty_of(value: bool | float | str | None) -> float | None:
         share = float(value)
     except (TypeError, ValueError):
         share = -1.0
-    if not 0 < share <= 1:  # true for NaN
+    if not 0 < share <= 1:  # also rejects NaN
         raise InvalidRequest(
             f"`if_novel` is {value!r:.40}. Specify true, or a number above 0 and up to 1, the "
             "share of the distance between unrelated frames.",

@@ -12,7 +12,7 @@ from sceneprint_client.api.query import Cause
 
 #: Maximum number of frames that one coverage job queries.
 MOST_QUERIED = 5000
-#: Outcome of the query of a frame.
+#: Outcome of querying a frame.
 CoverageOutcome = Literal["found", "wrong", "ambiguous", "not_found", "unchecked"]
 COVERAGE_OUTCOMES: tuple[CoverageOutcome, ...] = get_args(CoverageOutcome)
 #: Source of the up axis of a plan.
@@ -23,7 +23,7 @@ CELL_TRENDS: tuple[CellTrend, ...] = ("better", "worse", "same", "new", "gone")
 
 
 class NewMapCoverage(Given):
-    """Frames of a map to query against the other frames, and tolerances of a correct pose."""
+    """Frames of a map to query against the other frames, and tolerances for a correct pose."""
 
     session: Label | None = Field(
         default=None, description="Query only frames of this session; default: all sessions."
@@ -74,7 +74,9 @@ class NewMapCoverage(Given):
         "0.5, 1, 2, 5 m and so on that gives approximately 20 cells along the longer side. Only "
         "results with the same cell width can be compared.",
     )
-    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of the queries' random choices.")
+    seed: int = Field(
+        default=0, ge=0, lt=2**32, description="Seed for the random choices of the queries."
+    )
 
     @model_validator(mode="after")
     def _reject_conflict(self) -> NewMapCoverage:
@@ -139,10 +141,12 @@ class CoveragePlan(ApiRecord):
     x_axis: list[float] = Field(
         min_length=3,
         max_length=3,
-        description="Unit vector that points to the right of the plan, in the parent frame.",
+        description="Unit vector in the parent frame that points right in the plan.",
     )
     y_axis: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector that points to the top of the plan."
+        min_length=3,
+        max_length=3,
+        description="Unit vector in the parent frame that points to the top of the plan.",
     )
     up_from: UpSource = Field(
         description="Source of the up direction. `map`: the map's `up`. `frames`: the `up` of its "

@@ -42,9 +42,9 @@ Kind = Literal["depth", "cloud"]
 
 
 #: Usual depths of depth cameras, metres: range of the median, range of the 5th percentile, and
-#: maximum of the 95th. In recordings of two Kinects, an Xtion and a RealSense, these are 1.05 to
-#: 2.8, .65 to 1.6 and 2.8 to 6.4; over nine consecutive frames .83 to 3.6, .39 to 2.24, and at most
-#: 6.9. Depth in quarters of a millimetre, read as millimetres, is four times too large.
+#: maximum of the 95th. In recordings of two Kinects, an Xtion and a RealSense, they are 1.05 to
+#: 2.8, .65 to 1.6 and 2.8 to 6.4; pooled over nine consecutive frames, .83 to 3.6, .39 to 2.24 and
+#: at most 6.9. Depth in quarters of a millimetre, read as millimetres, is four times too large.
 _MEDIAN_M, _NEAR_M, _FAR_M = (0.2, 5.0), (0.3, 2.3), 10.0
 
 
@@ -77,8 +77,9 @@ class SampleRange(ApiRecord):
         if not self.is_doubtful:
             return text
         return (
-            f"{text}; a median of {self.median:.2g} m from {self.near:.2g} m on is unusual for a "
-            "depth camera: check the unit, and specify the depth scale if it is not the millimetre"
+            f"{text}; a median of {self.median:.2g} m and a 5th percentile of {self.near:.2g} m "
+            "are unusual for a depth camera: check the unit, and specify the depth scale if the "
+            "unit is not the millimetre"
         )
 
 
@@ -88,7 +89,7 @@ def _percent(share: float) -> str:
 
 def pooled_range(ranges: Iterable[SampleRange]) -> SampleRange | None:
     """Return the range of several frames of one kind, with the medians of their percentiles and
-    their total count; None without frames.
+    their total count; None if there are no frames.
     """
     all_ranges = list(ranges)
     if not all_ranges:
@@ -276,7 +277,7 @@ class Batch(ApiRecord):
     )
 
 
-#: Axis of a file's coordinates, or the opposite direction.
+#: Coordinate axis of a file, or the opposite direction.
 Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
 #: Up direction as an axis of a file, or as a vector in the axes of a sensor.
 AxisOrUp = Annotated[
@@ -367,7 +368,8 @@ class ImportOptions(Given):
     )
     camera_info: _TopicName | None = Field(
         default=None,
-        description="For a recording: topic of the camera; default: the one beside the images.",
+        description="For a recording: topic of the camera info; default: `camera_info` beside the "
+        "images, otherwise the only topic with the coordinate frame of the images.",
     )
     pose_frame: _TopicName | None = Field(
         default=None,
@@ -377,7 +379,7 @@ class ImportOptions(Given):
     sensor_frame: _TopicName | None = Field(
         default=None,
         description="For a recording with points in a world frame: frame of the sensor; default: "
-        "the only frame at the end of the transforms.",
+        "the only descendant of the world frame without children.",
     )
     depth_scale: float | None = Field(
         default=None,
@@ -428,9 +430,7 @@ class ImportOptions(Given):
 def camera_fields(text: str) -> dict[str, float]:
     """Return the fields of a camera in the format `fx,fy,cx,cy,width,height`.
 
-    Raises
-    ------
-    InvalidRequest : If the text is not six numbers.
+    Raise InvalidRequest if the text is not six numbers.
     """
     return _number_fields("camera", text, ("fx", "fy", "cx", "cy", "width", "height"), "pixels")
 
@@ -438,9 +438,7 @@ def camera_fields(text: str) -> dict[str, float]:
 def offset_fields(text: str) -> dict[str, float]:
     """Return the fields of an offset in the format `x,y,z`.
 
-    Raises
-    ------
-    InvalidRequest : If the text is not three numbers.
+    Raise InvalidRequest if the text is not three numbers.
     """
     return _number_fields("offset", text, ("x", "y", "z"), "metres")
 
@@ -536,8 +534,8 @@ class RecordingOutline(ApiRecord):
         description="Reason why no frame can be used; null if the import adds frames."
     )
     lost: int = Field(
-        description="Number of omitted frames and poses that no option excludes, and of damaged "
-        "messages."
+        description="Number of frames and poses that were omitted although no option excludes "
+        "them, plus the number of damaged messages."
     )
 
 
@@ -574,12 +572,7 @@ def problem_of(error: SceneprintError) -> Problem:
 
 
 def check_frame_id(frame_id: str) -> None:
-    """Check the id of a frame.
-
-    Raises
-    ------
-    InvalidRequest : If the id is not safe as one part of a path.
-    """
+    """Check the id of a frame; raise InvalidRequest if the id is not safe as one part of a path."""
     if not re.fullmatch(FRAME_ID, frame_id):
         raise InvalidRequest(
             f"The frame id {frame_id!r:.80} is not valid. Use up to 64 letters, digits, dots, "

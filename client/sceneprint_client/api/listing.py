@@ -90,8 +90,8 @@ class FrameListing(Given):
     order: Literal["asc", "desc", "taken"] = Field(
         default="asc",
         description="`asc`: by upload time. `desc`: newest upload first. `taken`, only for a "
-        "single session: by `captured_at`, frames without it by `sequence`, and frames without "
-        "both by upload time.",
+        "single session: by `captured_at`; frames without it, by `sequence`; frames with neither, "
+        "by upload time.",
     )
 
     @field_validator("order")
@@ -201,9 +201,7 @@ class Trajectory(ApiRecord):
 def parsed(value: object) -> object:
     """Parse JSON text from a form; return other values unchanged.
 
-    Raises
-    ------
-    ValueError : If the text is not JSON.
+    Raise ValueError if the text is not JSON.
     """
     if not isinstance(value, str):
         return value
@@ -465,8 +463,8 @@ class FramesEdited(ApiRecord):
         default=None, description="Value for `after` in the next call, if frames remain."
     )
     inverse: list[dict[str, Any]] = Field(
-        description="Request bodies that undo the edit. Send each to the same path. They refer to "
-        "the frames by their ids."
+        description="Request bodies that undo the edit. Send each to the same path. The bodies "
+        "list the ids of the frames."
     )
 
 

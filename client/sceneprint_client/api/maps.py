@@ -11,7 +11,7 @@ from sceneprint_client.api.base import MAP_NAME, ApiRecord, Direction, Given, No
 
 #: Names of the models that the service contains, the default first.
 PRESETS = ("depth", "lidar", "paper")
-#: Name of a map, which cannot be changed.
+#: Name of a map; it cannot be changed.
 Slug = Annotated[str, StringConstraints(pattern=MAP_NAME)]
 
 
@@ -28,7 +28,7 @@ Preset = Annotated[
 ]
 
 
-#: Maximum value of a quota, the largest exact integer of JavaScript.
+#: Maximum value of a quota: the largest integer that JavaScript represents exactly.
 MOST_QUOTA = 2**53 - 1
 #: Maximum retention, days: a hundred years.
 MOST_DAYS = 36_525.0

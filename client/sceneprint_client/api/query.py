@@ -92,23 +92,23 @@ class ValidationOptions(Given):
         default=5.0, ge=0.0, le=100.0, description="Weight of `free_space_violations`."
     )
     plane_overlap: Share = Field(
-        default=0.15, description="Minimum overlap if every plane has the same weight."
+        default=0.15, description="Minimum overlap, computed with the same weight for every plane."
     )
     strong: Share = Field(
-        default=0.3, description="Evidence below which an accepted match is weak."
+        default=0.3, description="An accepted match with less evidence than this is weak."
     )
     weak: Share = Field(
-        default=0.05, description="`ambiguity` at or above which an accepted match is weak."
+        default=0.05, description="An accepted match with at least this `ambiguity` is weak."
     )
     ambiguous: Share = Field(
-        default=0.14, description="`ambiguity` at or above which a match is not accepted."
+        default=0.14, description="A match with at least this `ambiguity` is not accepted."
     )
     ambiguous_share: float = Field(
         default=0.5,
         ge=0.0,
         le=10.0,
-        description="Limit of `ambiguity` as a share of `plane_overlap`. At or above it, a match "
-        "is not accepted.",
+        description="A match is not accepted if its `ambiguity` is at least this share of its "
+        "`plane_overlap`.",
     )
 
 
@@ -143,7 +143,7 @@ class Validation(ApiRecord):
         default=None, description="Share of the points of both frames that agree."
     )
     plane_overlap: float | None = Field(
-        default=None, description="`overlap` if every plane has the same weight."
+        default=None, description="`overlap`, computed with the same weight for every plane."
     )
     free_space_violations: float | None = Field(
         default=None,
@@ -154,7 +154,8 @@ class Validation(ApiRecord):
         default=None, description="Number of distinct planes that agree (mean of both frames)."
     )
     plane_violations: float | None = Field(
-        default=None, description="`free_space_violations` if every plane has the same weight."
+        default=None,
+        description="`free_space_violations`, computed with the same weight for every plane.",
     )
     inliers: int | None = Field(
         default=None, description="Number of points of both frames that agree."
@@ -534,7 +535,10 @@ class Query(Given):
         "ranking.",
     )
     seed: int = Field(
-        default=0, ge=0, lt=2**32, description="Seed of the random choices, repeated in the answer."
+        default=0,
+        ge=0,
+        lt=2**32,
+        description="Seed for the random choices. The answer contains the same seed.",
     )
     candidates: int | None = Field(
         default=None,
@@ -545,7 +549,7 @@ class Query(Given):
         "5 frames, or `k` if it is greater, are accepted. Without validation, `k` applies instead.",
     )
     diversity: Annotated[Diversity | None, JsonText] = Field(
-        default=None, description="Scales of the selection."
+        default=None, description="Scales of the diverse selection."
     )
     validation: Annotated[ValidationOptions | None, JsonText] = Field(
         default=None, description="Requirements on accepted matches."
@@ -756,8 +760,8 @@ class Localization(ApiRecord):
 
     status: LocalizationStatus = Field(
         description="`found`: the confidence of one pose reaches the `confidence` of the query. "
-        "`ambiguous`: no pose reaches it; see `alternatives`, move, and query again. `not_found`: "
-        "the evidence supports no pose, or the deadline passed; see `cause`."
+        "`ambiguous`: no pose reaches this confidence; see `alternatives`, move, and query again. "
+        "`not_found`: the evidence supports no pose, or the deadline passed; see `cause`."
     )
     reason: str
     cause: Cause | None = Field(
@@ -771,8 +775,8 @@ class Localization(ApiRecord):
     )
     confidence: float | None = Field(
         default=None,
-        description="Probability that `pose` is right, 0 to 1; for `ambiguous`, that of the first "
-        "alternative. Null if there is no pose, or if the pose was not compared with the map.",
+        description="Probability that `pose`, or for `ambiguous` the first alternative, is right, "
+        "0 to 1. Null if there is no pose, or if the pose was not compared with the map.",
     )
     evidence: EvidenceRecord | None = Field(
         default=None,

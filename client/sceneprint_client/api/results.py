@@ -172,8 +172,8 @@ class FrameSignature(ApiRecord):
     n_patches: list[int] = Field(description="Number of patches at each level, finest first.")
     n_pairs: list[int] = Field(description="Number of ordered pairs of patches at each level.")
     base64: str = Field(
-        description="Bytes of the signature. The distance between two signatures is the sum of the "
-        "absolute differences of their bytes."
+        description="The signature in base64. The distance between two signatures is the sum of "
+        "the squared differences of their bytes, or of the absolute differences if psi is stored."
     )
 
 
@@ -286,7 +286,10 @@ class Comparison(Given):
         default=None, description="Requirements on an accepted alignment."
     )
     seed: int = Field(
-        default=0, ge=0, lt=2**32, description="Seed of the random choices, repeated in the result."
+        default=0,
+        ge=0,
+        lt=2**32,
+        description="Seed for the random choices. The result contains the same seed.",
     )
     model: Preset | None = Field(
         default=None,

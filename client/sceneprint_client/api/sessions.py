@@ -62,7 +62,7 @@ class NewAssociation(Given):
         description="For two sessions: whether to move all poses of the map into one parent frame "
         "if the join is strong.",
     )
-    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of the random choices.")
+    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed for the random choices.")
     min_overlap: float = Field(
         default=0.0, ge=0.0, le=1.0, description="Minimum overlap of an edge."
     )
@@ -129,10 +129,11 @@ class Edge(ApiRecord):
     from_name: str | None = Field(default=None, description="Name of the file of `from_frame`.")
     to_name: str | None = Field(default=None, description="Name of the file of `to_frame`.")
     consistent: bool | None = Field(
-        description="Whether other evidence supports the edge. `true`: it closes a loop with a "
-        "nearby edge from another viewpoint, or agrees with the join. `false`: it was outvoted and "
-        "is omitted from graphs and joins. Null: no edge from another viewpoint can check it, "
-        "there are no poses, or the association has not ended."
+        description="Whether other evidence supports the edge. `true`: the edge and a nearby edge "
+        "from another viewpoint form a consistent loop, or the edge agrees with the join of the "
+        "sessions. `false`: the edge was outvoted and is omitted from graphs and joins. Null: no "
+        "edge from another viewpoint can check this edge, there are no poses, or the association "
+        "has not ended."
     )
     loops: int | None = Field(
         description="Number of nearby edges that were compared with this edge."
@@ -166,7 +167,9 @@ class Join(ApiRecord):
         description="Root mean square deviation of the agreeing edges from the transform, at the "
         "positions of their frames, metres."
     )
-    spread_deg: float | None = Field(description="Root mean square angle between them, degrees.")
+    spread_deg: float | None = Field(
+        description="Root mean square angle between the agreeing edges and the transform, degrees."
+    )
     reason: str
     root: str | None = Field(
         default=None,
@@ -260,7 +263,7 @@ class Graph(ApiRecord):
 
 #: Maximum number of frames of each session in a comparison.
 MOST_COMPARED = 500
-#: Classes of the points of a difference, stored as the patch index.
+#: Classes of the points of a difference; `SurfacePoints.patches` contains them.
 SAME, GONE, NEW, UNSEEN_AFTER, UNSEEN_BEFORE = 0, 1, 2, 3, 4
 
 

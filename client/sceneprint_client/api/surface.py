@@ -20,7 +20,7 @@ PLAN_WIDTH, PLAN_WIDTHS = 1024, (16, 4096)
 
 
 class SurfaceLevel(ApiRecord):
-    """All tiles of a parent frame whose cells have the same width."""
+    """All tiles of a parent frame with the same cell width."""
 
     level: int = Field(
         description="Number of the level. Level 0 has the finest cells; on each further level, "
@@ -57,10 +57,14 @@ class SurfaceParent(ApiRecord):
         "images."
     )
     x_axis: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector that points to the right of the plan."
+        min_length=3,
+        max_length=3,
+        description="Unit vector in the parent frame that points right in the plan.",
     )
     y_axis: list[float] = Field(
-        min_length=3, max_length=3, description="Unit vector that points to the top of the plan."
+        min_length=3,
+        max_length=3,
+        description="Unit vector in the parent frame that points to the top of the plan.",
     )
     low: Vector = Field(
         description="Corner with the minimum coordinates of the box that contains all cells."
