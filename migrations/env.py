@@ -1,4 +1,4 @@
-"""Script of Alembic; it uses the connection and the transaction of the store."""
+"""Alembic script that uses the connection and the transaction of the store."""
 
 from alembic import context
 

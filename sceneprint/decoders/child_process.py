@@ -42,7 +42,7 @@ MESSAGE_BYTES, MOST_TEXT = 1 << 16, 8000
 
 #: An array, consecutive arrays, or none.
 Arrays = NDArray[Any] | tuple[NDArray[Any], ...] | None
-#: Function of an upload's bytes and a request that returns the reply and its arrays.
+#: Function that takes the bytes of an upload and a request, and returns the reply and its arrays.
 Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], Arrays]]
 
 
@@ -108,7 +108,8 @@ def _run_task(
     """Run a task on the first `request["bytes"]` bytes of `shared`; return its reply or an error.
 
     The arrays of the result replace the upload in `shared`, one after another. An error reply has
-    `error` and `text` if the upload is at fault, `memory` if memory ran out, or `broke`.
+    `error` and `text` if the upload is at fault, `memory` if memory ran out, or else `broke` with
+    the traceback.
     """
     try:
         reply, arrays = tasks[request["task"]](shared[: request["bytes"]], request)

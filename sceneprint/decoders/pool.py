@@ -53,8 +53,8 @@ PROGRAM = "sceneprint.decoders.child_process"
 _COMPILED = ("ply", "pcd")
 #: Upload errors that a decoder may report, by name.
 _ERRORS = {
-    one.__name__: one
-    for one in (
+    kind.__name__: kind
+    for kind in (
         errors.UnreadableFrame, errors.UnreadableCloud, errors.UselessFrame,
         errors.UnreadableArchive, errors.InvalidIntrinsics, errors.MissingDependency,
     )
@@ -62,7 +62,7 @@ _ERRORS = {
 #: Seconds: limit for the start of a process, including compilation; interval between checks of its
 #: processor time; and limit for the wait of an upload for a decoder.
 _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
-#: Maximum wall time of a task, as a multiple of its processor time limit: machines may be busy.
+#: Maximum wall time of a task on a busy machine, as a multiple of the limit for processor time.
 _PATIENCE = 8
 #: Maximum size of used shared memory that is overwritten after a task, bytes; more is freed.
 _ERASED_BYTES = 8 << 20
@@ -171,8 +171,10 @@ class DecoderProcess:
         data : bytes of the upload
         seconds : maximum processor time
 
-        Raise DecoderEnded if the process ends during the task. Raise DecoderFailure if the task
-        takes too long.
+        Raises
+        ------
+        DecoderEnded : If the process ends during the task.
+        DecoderFailure : If the task takes too long.
         """
         self._sent, self._used = len(data), SHARED_BYTES  # upper bound until the reply arrives
         self._shared[: len(data)] = data
@@ -198,6 +200,7 @@ class DecoderProcess:
         DecoderEnded : If the reply is invalid.
         DecoderFailure : If the task needs too much memory.
         FrameError, MissingDependency : If the decoder reports an error of the upload.
+        RuntimeError : If the task failed with another exception, which is logged.
         """
         if reply.get("memory") is True:
             raise DecoderFailure(
@@ -237,6 +240,7 @@ class DecoderProcess:
             self._shared.close()
 
     def _receive(self, longest_s: float, cpu_s: float = math.inf) -> dict[str, Any]:
+        """Wait for a reply; raise DecoderFailure after a timeout, or DecoderEnded."""
         begun, until = self._cpu_s(), time.monotonic() + longest_s
         waiting = select.poll()
         waiting.register(self._socket, select.POLLIN)
@@ -349,7 +353,7 @@ class _Slot:
         Raises
         ------
         DecoderFailure : If the task crashes twice, takes too long, or needs too much memory.
-        FrameError, MissingDependency : If the decoder reports an error of the upload.
+        FrameError, MissingDependency, RuntimeError : See `DecoderProcess.result`.
         Busy : If no process can be started.
         """
         try:

@@ -114,6 +114,8 @@ class RecordingDecoder:
         return process
 
     def _run(self, request: dict[str, Any]) -> bytes:
+        """Return the data of a reply; on failure, kill the process, raise UnreadableArchive."""
+
         def checked(process: DecoderProcess, reply: dict[str, Any]) -> bytes:
             size = int(reply["size"])
             if not 0 <= size <= MAXIMUM_CLOUD_BYTES:

@@ -98,40 +98,40 @@ def _outline(path: Path, request: dict[str, Any]) -> Reply:
     outline = bag_outline(path, choice)
     frames = [
         {
-            "name": one.name,
-            "meta": import_meta(one, sequence, options).model_dump(
+            "name": frame.name,
+            "meta": import_meta(frame, sequence, options).model_dump(
                 mode="json", exclude_defaults=True
             ),
-            "place": _place_of(one.source),
+            "place": _place_of(frame.source),
         }
         for sequence in numbered_sequences(outline.sequences, options.session)
-        for one in sequence.frames[:: options.every]
+        for frame in sequence.frames[:: options.every]
     ]  # fmt: skip
     if len(frames) > MOST_FRAMES:
         raise UnreadableArchive(
             f"The recording has {len(frames)} keyframes; the limit is {MOST_FRAMES}. Increase "
             "`keyframe_m`, or split the recording."
         )
-    shown = sorted(outline.topics, key=lambda one: not outline.use_of(one))
+    topics = sorted(outline.topics, key=lambda topic: not outline.use_of(topic))
     record = RecordingOutline(
         kind=outline.kind, seconds=outline.seconds, span=outline.span,
         topics=[
             RecordingTopic(
-                name=printable(one.name)[:200], type=printable(one.type)[:200], count=one.count,
-                use=outline.use_of(one)[:200],
+                name=printable(topic.name)[:200], type=printable(topic.type)[:200],
+                count=topic.count, use=outline.use_of(topic)[:200],
             )
-            for one in shown[:MOST_RECORDING_TOPICS]
+            for topic in topics[:MOST_RECORDING_TOPICS]
         ],
         findings=[_over_http(printable(line))[:1000] for line in outline.findings[:20]],
         problem=_over_http(outline.problem)[:4000] or None,
-        lost=sum(one.lost for one in outline.sequences if options.with_poses),
+        lost=sum(sequence.lost for sequence in outline.sequences if options.with_poses),
     )  # fmt: skip
-    topic = None if outline.chosen is None else outline.chosen.topic
+    chosen = None if outline.chosen is None else outline.chosen.topic
     document = {
         "outline": record.model_dump(mode="json"), "frames": frames,
-        "topic": None if topic is None else [topic.name, topic.type],
+        "topic": None if chosen is None else [chosen.name, chosen.type],
         "sequences": len(outline.sequences),
-        "notes": [one.note[:1000] for one in outline.sequences if one.note],
+        "notes": [sequence.note[:1000] for sequence in outline.sequences if sequence.note],
     }  # fmt: skip
     return {}, np.frombuffer(json.dumps(document).encode(), np.uint8)
 
@@ -144,7 +144,7 @@ _OPTION = re.compile("--(topic|camera-info|pose-frame|sensor-frame|depth-scale)"
 
 
 def _over_http(text: str) -> str:
-    """Replace command options in a text by request fields, and omit advice for the command line."""
+    """Replace command options in a text with request fields; omit advice for the command line."""
     text = _FOR_COMMANDS.sub("", text)
     return _OPTION.sub(lambda option: f"`{option[1].replace('-', '_')}`", text)
 

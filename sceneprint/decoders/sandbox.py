@@ -74,7 +74,7 @@ def close_process(more_bytes: int) -> Protections:
 
 # Landlock: a ruleset without rules forbids all access that it handles.
 
-_CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system calls, equal on all processors
+_CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system call numbers, the same on all processors
 _GET_VERSION = 1
 #: Number of file access rights by Landlock version.
 _FILE_BITS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
@@ -86,8 +86,8 @@ def _restrict_by_landlock() -> int:
     if version < 1:
         return 0
     files = (1 << _FILE_BITS[min(version, max(_FILE_BITS))]) - 1
-    network = 3 if version >= 4 else 0  # bind, connect
-    scoped = 3 if version >= 6 else 0  # abstract sockets, and signals to other processes
+    network = 3 if version >= 4 else 0  # binding and connecting TCP sockets
+    scoped = 3 if version >= 6 else 0  # connecting to abstract sockets, signalling other processes
     rules = struct.pack("=QQQ", files, network, scoped)
     size = 24 if version >= 6 else 16 if version >= 4 else 8
     ruleset = int(_LIBC.syscall(_CREATE_RULESET, rules, size, 0))

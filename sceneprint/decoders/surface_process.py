@@ -64,8 +64,8 @@ def _load(form: SurfaceFormat) -> None:
     thinned(points, 8)
     estimate_up(points, None, np.array([0.0, 0.0, 1.0]))
     ElementTree.fromstring("<a/>")
-    for data, one in (*array_samples(), *text_samples(), *mesh_samples()):
-        if one == form:
+    for data, sample_format in (*array_samples(), *text_samples(), *mesh_samples()):
+        if sample_format == form:
             with suppress(SceneprintError):  # an optional reader is absent, or a sample has no mesh
                 read_surface(data, "", None, form)
     end_compilation(rows, pcd, ply, ply_faces)
@@ -122,7 +122,6 @@ def _gltf(corners: list[tuple[int, int, int]]) -> bytes:
 
 
 def _glb(tree: dict[str, Any]) -> bytes:
-    """Convert a glTF file to its binary container."""
     body = base64.b64decode(tree["buffers"][0].pop("uri").partition(",")[2])
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)

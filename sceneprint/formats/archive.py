@@ -48,7 +48,7 @@ from sceneprint_client.sidecars import CLOUDS_FILE, INTRINSICS_FILE
 
 # The standard library reads the members of an archive, within limits.
 
-#: Maximum number of members: approximately a robot's files of a month.
+#: Maximum number of members, approximately as many as a robot records in a month.
 MOST_MEMBERS = 100_000
 #: Maximum length of a member's name, bytes, and maximum number of folders in it.
 LONGEST_NAME, DEEPEST = 1024, 16
@@ -95,8 +95,10 @@ def parts_of(name: str) -> tuple[str, ...]:
     -------
     parts : printable names, without empty parts, `.` and `..`
 
-    Raise UnusableName if the name is absolute, has a part `..`, is too long or too deep, or has a
-    character that is not printable.
+    Raises
+    ------
+    UnusableName : If the name is absolute, has a part `..`, is too long or too deep, or has a
+        character that is not printable.
     """
     text = name.replace("\\", "/")  # some Windows programs write backslashes
     if len(name.encode(errors="replace")) > LONGEST_NAME:
@@ -303,8 +305,8 @@ def _too_many_members() -> UnreadableArchive:
 #
 # chunks  --Inflater.pieces-->  bytes of a zip or of a plain tar
 
-#: Maximum ratio of the content's size to the archive's, and size of content that is exempt from it,
-#: bytes. Depth images are already compressed; NPY files of noisy depth shrink to a fifth.
+#: Maximum ratio of content size to archive size, and amount of content that is exempt from this
+#: limit, bytes. Depth images are already compressed; NPY files of noisy depth shrink to a fifth.
 MOST_RATIO, FREE = 50, 64 << 20
 #: Maximum number of concatenated streams; parallel compressors write many streams.
 _MAXIMUM_STREAMS = 65_536
@@ -343,7 +345,7 @@ class Inflater:
         self._stream: _Stream | None = None
         self._streams = 0
         self._start = b""  # first bytes of the tar
-        #: Numbers of received bytes and of returned bytes
+        #: Number of received bytes, and number of returned bytes
         self.bytes_in, self.bytes_out = 0, 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
@@ -399,6 +401,7 @@ class Inflater:
             yield piece
 
     def _inflate(self, chunk: bytes) -> Iterator[bytes]:
+        """Yield the decompressed pieces of a chunk; the archive may consist of several streams."""
         data = chunk
         while True:
             if self._stream is None:  # between two streams, or after the last stream
@@ -445,7 +448,8 @@ _TEXTS = (INTRINSICS_FILE, CLOUDS_FILE, "TrainSplit.txt", "TestSplit.txt")
 #: Maximum size of a list, of any other text file, and of all text files together, bytes.
 _MAXIMUM_LIST, _MAXIMUM_TEXT, _MAXIMUM_TEXTS = 1 << 26, 1 << 16, 1 << 27
 _HEAD_BYTES = 1024  #: number of first bytes that contain the size of an image
-_PARENTS = ("0", "1", "2", "3", "4")  #: private folders, since camera files are searched in parents
+#: Nested private folders, because camera files are also searched for in parent folders.
+_PARENTS = ("0", "1", "2", "3", "4")
 
 #: Error codes for an invalid name, or for a file and a folder with the same name.
 _CLASHES = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.EINVAL)
@@ -512,9 +516,11 @@ class Archive:
             raise UnreadableArchive(f"{name}: {error}. Pack it again.") from error
 
     def lay_out(self, name: str) -> None:
-        """Create the files of the private folder, and find the sequences in it.
+        """Create the files of the private folder, find the sequences in it, and set `sequences`,
+        `refused`, `ignored` and `is_record3d`.
 
-        `name`: name of the scene if the archive has no folder for it.
+        `name`: name of the scene if the archive has no folder for it. Raise UnreadableArchive if
+        the content is too large or damaged, or two scenes have the same name.
         """
         members = self._sequence_members()
         tops = {parts[0] for parts, _, _ in members}
@@ -529,7 +535,7 @@ class Archive:
                 "the size of the archive. Depth images do not compress this well. Pack them with "
                 "less compression."
             )
-        left = _MAXIMUM_TEXTS
+        budget = _MAXIMUM_TEXTS
         # camera files of exports describe colour images, so the sizes of depth images are needed
         of_exports = any(_is_export_file(parts) for parts, _, _ in members)
         for parts, member, role in members:
@@ -551,7 +557,7 @@ class Archive:
             if role == "text" and member.trouble is not None:
                 self._refuse(member, member.trouble)
             elif role == "text":
-                left -= self._unpack(path, member, left)
+                budget -= self._unpack(path, member, budget)
         for parts in self._omitted:
             with suppress(FileExistsError, NotADirectoryError):  # a member has the name
                 above.joinpath(*parts).mkdir(parents=True, exist_ok=True)
@@ -576,9 +582,12 @@ class Archive:
         except _MALFORMED:
             return b""
 
-    def _unpack(self, path: Path, member: ArchiveEntry, left: int) -> int:
-        """Unpack a text file, and return its size; an unreadable file remains empty."""
-        limit = min(_MAXIMUM_LIST if path.name in _LISTS else _MAXIMUM_TEXT, left)
+    def _unpack(self, path: Path, member: ArchiveEntry, budget: int) -> int:
+        """Unpack a text file of at most `budget` bytes, and return its size.
+
+        An unreadable file remains empty, and is added to `refused`.
+        """
+        limit = min(_MAXIMUM_LIST if path.name in _LISTS else _MAXIMUM_TEXT, budget)
         try:
             data = self._read(member, limit)
         except UnreadableArchive as error:
@@ -588,7 +597,10 @@ class Archive:
         return len(data)
 
     def _sequence_members(self) -> list[tuple[tuple[str, ...], ArchiveEntry, Role]]:
-        """Return (name parts, entry, role) of each member that may belong to a sequence."""
+        """Return (name parts, entry, role) of each member that may belong to a sequence.
+
+        Count the other members in `ignored`, and add unusable ones to `refused`.
+        """
         members: list[tuple[tuple[str, ...], ArchiveEntry, Role]] = []
         for count, member in enumerate(_read_entries(self._file), start=1):
             if count > MOST_MEMBERS:
@@ -601,7 +613,7 @@ class Archive:
             role = _select_role(parts)
             if role is not None:
                 members.append((parts, member, role))
-            elif member.trouble is not None and not member.size:  # a link, or damage of the tar
+            elif member.trouble is not None and not member.size:  # a link, or a damaged tar
                 self._refuse(member, member.trouble)
             else:
                 self.ignored += 1
@@ -627,8 +639,11 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
     folder : parent of the private folder, which is removed at the end
     name : name of the scene if the archive has no folder for it; a single part of a path
 
-    Raise UnreadableArchive if the file is not an archive, is damaged, exceeds a limit, has no
-    depth, or has two scenes with the same name. Raise OSError if the folder cannot be written.
+    Raises
+    ------
+    UnreadableArchive : If the file is not an archive, is damaged, exceeds a limit, has no depth, or
+        has two scenes with the same name.
+    OSError : If the folder cannot be written.
     """
     with tempfile.TemporaryDirectory(prefix="archive-", dir=folder) as private:
         archive = Archive(file, Path(private).joinpath(*_PARENTS).absolute())
@@ -641,8 +656,8 @@ def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iter
         archive.lay_out(own)
         if not archive.sequences and archive.is_record3d:
             raise UnreadableArchive(
-                "This is a capture of Record3D, and the service cannot decompress its depth. "
-                "Upload it with `sceneprint upload MAP FILE.r3d`."
+                "This is a Record3D capture, and the service cannot decompress the depth of such "
+                "captures. Upload it with `sceneprint upload MAP FILE.r3d`."
             )
         if not archive.sequences and not archive.refused:
             raise UnreadableArchive(

@@ -3,10 +3,10 @@
     Surface  --pack_image | pack_points-->  (h, w, 3) or (N, 5) uint16
     uint16  --unpack_image | unpack_points-->  Surface
 
-A pixel of a pinhole camera is an inverse depth, in steps far below a sensor's noise. A pixel of a
-sphere is a range, and an unordered point is an offset in a cube. A normal has 2 x 16 bits on an
-octahedron, or 2 x 8 for scans with spread points. Steps of ranges and offsets are powers of two, so
-packing an unpacked surface reproduces the same bytes.
+A pixel of a pinhole camera stores an inverse depth, in steps far below a sensor's noise. A pixel of
+a sphere stores a range, and an unordered point stores an offset in a cube. A normal takes 2 x 16
+bits on an octahedron, or 2 x 8 in scans with spread points. Steps of ranges and offsets are powers
+of two, so packing an unpacked surface reproduces the same bytes.
 """
 
 from __future__ import annotations
@@ -205,8 +205,8 @@ def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
         z = surface.points[..., 2][surface.valid]
         scale = 1.0 / (float(z.min()) * MOST) if z.size else 1.0
     else:
-        seen = surface.points[surface.valid].astype(float)
-        scale = _step(float(np.linalg.norm(seen, axis=1).max(initial=0.0)))
+        points = surface.points[surface.valid].astype(float)
+        scale = _step(float(np.linalg.norm(points, axis=1).max(initial=0.0)))
     packed = np.zeros((*surface.valid.shape, 3), np.uint16)
     _pack_image(surface.points, surface.normals, pinhole, scale, float(most), packed)
     return packed, scale
@@ -263,7 +263,7 @@ def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST)
     )
 
 
-# Artifacts as bytes: with them, a frame is validated without its upload.
+# Artifacts as bytes, with which a frame can be validated without its upload.
 #
 #     Geometry  --write_geometry-->  bytes  --read_geometry-->  Geometry
 #
@@ -286,16 +286,16 @@ _CLOUD = struct.Struct("<HHHHBB4d32s")
 _SPHERE, _POINTS = 1, 2
 #: Scan, after the fields of a cloud: number of spread points, their corner, and their step.
 _SPREAD = struct.Struct("<H4d")
-#: Maximum number of a normal in scans with spread points; the error is at most half a degree.
+#: Maximum value of a packed normal in scans with spread points; the error is at most half a degree.
 _COARSE = 255
 #: Maximum number of unordered points, about the number of pixels in the surface of a depth image.
 MAXIMUM_POINTS = 20_000
 #: Maximum number of patches, and of bytes per descriptor. Validation compares all pairs of patches;
 #: no model exceeds these numbers.
 MAXIMUM_PATCHES, MAXIMUM_DESCRIPTOR = 4096, 1024
-#: Limits of the minimum depth, metres. Within them, points and areas are finite in float32.
+#: Bounds of the smallest depth, metres, within which points and areas are finite in float32.
 NEAREST = (1e-6, 1e6)
-#: Limits of a step of range or offset, metres.
+#: Minimum and maximum step of ranges and offsets, metres.
 STEPS = (2.0**-40, 16.0)
 #: Maximum distance, metres, and maximum area, square metres, of a patch.
 FARTHEST, LARGEST = 1e9, 1e18
@@ -428,7 +428,6 @@ def _read_depth(
 def _read_scan(
     packed: Packed, points: memoryview, projection: list[Any], spread: tuple[Any, ...]
 ) -> Surface:
-    """Return the surface of a range image with its spread points."""
     count, *corner, step = spread
     near = all(abs(x) <= NEAREST[1] for x in corner)
     if not (projection[0] == _SPHERE and 0 < count <= SPREAD_POINTS and near):

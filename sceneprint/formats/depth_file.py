@@ -40,7 +40,7 @@ from sceneprint_client.ros_messages import TRANSPORT_BYTES, inverse_depth
 #: Samples of a depth image: uint16 in stored units, or float32 metres.
 Samples = NDArray[np.uint16] | Floats32
 
-#: Maximum number of chunks, for 16 megapixels in chunks of 1 KB. Even empty chunks take time.
+#: Maximum number of chunks: 16 megapixels in chunks of 1 KB. Even empty chunks take time.
 _MAXIMUM_CHUNKS = 65_536
 _COLOURS = {2: "colour (RGB)", 3: "palette", 4: "greyscale with alpha", 6: "colour with alpha"}
 #: First column, first row, column step and row step of each pass of Adam7 interlacing.
@@ -56,8 +56,10 @@ def decode_png(data: bytes) -> NDArray[np.uint16]:
     -------
     samples : (H, W) uint16
 
-    Raise UnreadableFrame if the file is empty, damaged, truncated, animated or too large, or has
-    another pixel format.
+    Raises
+    ------
+    UnreadableFrame : If the file is empty, damaged, truncated, animated or too large, or has
+        another pixel format.
     """
     check_length(data)
     if not data.startswith(PNG_SIGNATURE):
@@ -219,7 +221,6 @@ def encode_png(samples: NDArray[np.uint16]) -> bytes:
 
 
 def _build_png(header: bytes, pixels: bytes) -> bytes:
-    """Return a PNG with a header and compressed rows."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         check = crc32(content, crc32(kind))
@@ -230,9 +231,9 @@ def _build_png(header: bytes, pixels: bytes) -> bytes:
     )  # fmt: skip
 
 
-# Images of ROS's compressed_depth_image_transport are PNGs after a header of 12 bytes.
+# An image of ROS's compressed_depth_image_transport is a PNG preceded by a 12-byte header.
 
-#: Limits of the parameter a of 32FC1 images: q (q + 1) for the quantisation q, by default 100.
+#: Limits of the parameter a of a 32FC1 image; a = q (q + 1) for the quantisation q, by default 100.
 _A = (1.0, 1e8)
 #: Limits of the depth that the value 1 encodes, metres: the transport's depth_max, by default 10.
 _DEEPEST_M = (0.1, 1e3)
@@ -244,7 +245,10 @@ def transported_size(head: bytes) -> tuple[int, int]:
 
 
 def decode_transported(data: bytes) -> Samples:
-    """Decode the samples of a compressedDepth message: stored units (16UC1) or metres (32FC1)."""
+    """Decode the samples of a compressedDepth message: stored units (16UC1) or metres (32FC1).
+
+    Raise UnreadableFrame as `decode_png` does, or if the header fits neither encoding.
+    """
     samples = decode_png(data[TRANSPORT_BYTES:])
     a, b = struct.unpack_from("<ff", data, 4)
     # for 16UC1 images, the transport does not set these numbers; they are mostly zero or tiny
@@ -280,8 +284,10 @@ def decode_npy(data: bytes) -> Samples:
     samples : (H, W); float32 metres for a floating-point array, including NaN and infinities;
         uint16 stored units for a uint16 array
 
-    Raise UnreadableFrame if the file is empty, too large or not NPY, has another type or shape,
-    contains Python objects, or its size contradicts its header.
+    Raises
+    ------
+    UnreadableFrame : If the file is empty, too large or not NPY, has another type or shape,
+        contains Python objects, or its size contradicts its header.
     """
     check_length(data)
     if not data.startswith(NPY_SIGNATURE):
@@ -348,10 +354,12 @@ def make_frame(
     -------
     frame : depth (H, W) float32, metres, where 0 is missing
 
-    Raise UnreadableFrame if the samples have another type or are not two-dimensional. Raise
-    InvalidIntrinsics if the intrinsics do not fit the image, or the depth scale is not positive.
-    Raise InvalidPose if the pose is not a rigid transform. Raise UselessFrame if no valid sample
-    remains.
+    Raises
+    ------
+    UnreadableFrame : If the samples have another type or are not two-dimensional.
+    InvalidIntrinsics : If the intrinsics do not fit the image, or the depth scale is not positive.
+    InvalidPose : If the pose is not a rigid transform.
+    UselessFrame : If no valid sample remains.
     """
     with naming(name):
         if not (math.isfinite(depth_scale) and depth_scale > 0):
@@ -396,8 +404,8 @@ def read_frame(
 ) -> DepthFrame:
     """Read a depth image file as a frame; for the other parameters, see `make_frame`.
 
-    Raise UnreadableFrame if the file is missing or too large, or `decode_frame` raises the error.
-    The message names the file.
+    Raise UnreadableFrame if the file is missing or too large; for further errors, see
+    `decode_frame`. The message names the file.
     """
     data = read_bytes(path, MAXIMUM_IMAGE_BYTES, UnreadableFrame)
     with naming(str(path)):
@@ -425,7 +433,10 @@ def decode_frame(
     samples_of : decoder of the file; None selects `decode_samples`
     trust_depth : whether to accept samples that do not look like depth
 
-    Raise UnreadableFrame if `decode_samples`, `check_depth` or `make_frame` raises the error.
+    Raises
+    ------
+    UnreadableFrame : See `decode_samples`, `check_depth` and `make_frame`.
+    InvalidIntrinsics, InvalidPose, UselessFrame : See `make_frame`.
     """
     with naming(name):
         samples = (samples_of or decode_samples)(data)
@@ -440,7 +451,7 @@ def decode_frame(
 def decode_samples(data: bytes) -> Samples:
     """Decode the samples (H, W) of a depth image: uint16 in stored units, or float32 metres.
 
-    Raise UnreadableFrame if the first bytes match no depth format, or the reader raises the error.
+    Raise UnreadableFrame if the first bytes match no depth format, or the file is damaged.
     """
     check_length(data)
     file_format = format_at(data, "depth")

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from sceneprint.errors import UnreadableFrame
 
 _ROWS = 40  #: number of checked rows
-_PAIRS, _BENDS = 500, 4000  #: minimum numbers of pairs and of triples for a decision
+_PAIRS, _BENDS = 500, 4000  #: minimum number of pairs, and of triples, for a decision
 _LEAST_SHARE = 0.1  #: minimum share of samples with two valid neighbours
 _LEAST_VARYING = 0.25  #: minimum share of varying triples; with fewer, edges would dominate
 _SWAPPED = 0.9  #: maximum share of differing neighbours that are closer with their bytes swapped
@@ -49,7 +49,9 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
     samples : (H, W) uint16 in stored units, or floating-point metres
     depth_scale : stored units per metre
 
-    Raise UnreadableFrame if they are not; the message contains the remedy.
+    Raises
+    ------
+    UnreadableFrame : If the samples are not; the message contains the remedy.
     """
     rows = samples[:: max(1, len(samples) // _ROWS)]
     is_whole = rows.dtype == np.uint16
@@ -83,7 +85,7 @@ def check_depth(samples: NDArray[Any], depth_scale: float) -> None:
 def _find_rotation(rows: Rows) -> int | None:
     """Return the left rotation, in bits, that makes the samples smooth; None if there is none.
 
-    Further rotations double the depth, and may be smooth too: the smallest samples are right.
+    Further rotations double the depth and may be smooth too, so the smallest depth is chosen.
     """
     turned = [(bits, rows << bits | rows >> 16 - bits) for bits in range(1, 16)]
     smooth = [
@@ -112,7 +114,9 @@ def _is_shifted(rows: Rows) -> bool:
 
 
 def _bend(rows: Rows) -> float:
-    """Return the median of |a - 2 b + c| / min(a, b, c) over triples of differing neighbours."""
+    """Return the median of |a - 2 b + c| / min(a, b, c) over triples of differing neighbours; 0 if
+    there are too few triples for a decision.
+    """
     valid = _valid(rows)
     whole = valid[:, :-2] & valid[:, 1:-1] & valid[:, 2:]
     with np.errstate(all="ignore"):  # damaged floats may overflow
@@ -126,7 +130,6 @@ def _bend(rows: Rows) -> float:
 
 
 def _valid(rows: Rows) -> NDArray[np.bool_]:
-    """Return a mask of the samples that are not missing."""
     if rows.dtype == np.uint16:
         return (rows > 0) & (rows < 65_535)
     with np.errstate(invalid="ignore"):

@@ -79,7 +79,9 @@ def write_ply(
     edges : (E, 2) lines, as indices of points
     comments : header lines, such as the coordinate frame; escaped to printable ASCII
 
-    Raise ValueError if an array has another shape, or an index is out of range.
+    Raises
+    ------
+    ValueError : If an array has another shape, or an index is out of range.
     """
     n = len(points)
     kinds = [(name, "<f4") for name in "xyz"]

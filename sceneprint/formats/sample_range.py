@@ -10,7 +10,7 @@ import numpy as np
 from sceneprint.types import AnyFrame, Cloud, Floats32
 from sceneprint_client.api.frames import SampleRange
 
-#: Minimum number of samples for the percentiles of a larger frame; they take a millisecond.
+#: Approximate number of samples that estimate the percentiles of a larger frame in a millisecond.
 _SAMPLES = 20_000
 
 
@@ -22,8 +22,8 @@ def sample_range(frame: AnyFrame) -> SampleRange:
     depth = frame.depth
     step = max(1, int((depth.size / _SAMPLES) ** 0.5))
     subset, count = depth[::step, ::step], int(np.count_nonzero(depth))
-    seen = subset[subset > 0]
-    return _range_of(seen if len(seen) else depth[depth > 0], count, count / depth.size)
+    valid = subset[subset > 0]
+    return _range_of(valid if len(valid) else depth[depth > 0], count, count / depth.size)
 
 
 def _range_of(distances: Floats32, count: int, valid: float | None) -> SampleRange:

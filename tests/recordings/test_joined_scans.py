@@ -100,7 +100,7 @@ def test_scans_are_joined_without_their_motion(kind, container, tmp_path, ros):
     assert sequence.note == (
         f"{len(sequence.frames)} of 30 frames of /livox/lidar taken, poses of 30 of 30 frames in "
         f"odom; skipped: {30 - len(sequence.frames)} between keyframes; each frame joins the scans "
-        f"of 2.05 m ({median:g} of them in the median), corrected for motion"
+        f"of 2.05 m (a median of {median:g} scans), corrected for motion"
     )
     check_walls(sequence, 1e-3)
     travelled = pickle.loads(pickle.dumps(sequence.frames[-1]))

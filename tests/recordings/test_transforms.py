@@ -55,7 +55,7 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
     assert found[0].note == (
         "10 of 13 frames of /camera/depth/image_raw taken, poses of 10 of 13 frames in odom; 3 "
         "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); skipped: 3 without "
-        "a pose; split into 3 parts, because stamps go back"
+        "a pose; split into 3 parts, because stamps jump back"
     )
 
 

@@ -66,7 +66,7 @@ from sceneprint_viewers.scene import (
     sensor_outline,
 )
 
-#: Pattern of ids that the service generates, and number of their digits in labels.
+#: Pattern of ids that the service generates, and number of digits that labels show.
 _GENERATED_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
 SHORT_ID = 8
 #: Path of the text about an answer, which is not a space.
@@ -116,15 +116,17 @@ class AnswerScene:
         self, answer: Answer, name: str, text: str, camera: CameraIntrinsics | None,
         index: int = 0, stamp_ns: int | None = None,
     ) -> None:  # fmt: skip
-        """Add an answer as the next moment.
-
-        Raise UnknownQuery if the service does not store the answer.
+        """Add an answer as the next moment; first draw its maps that are not drawn yet.
 
         Parameters
         ----------
         answer : stored answer with the stage `validate`
         text : description of the answer
         camera : camera of the query; None for a cloud
+
+        Raises
+        ------
+        UnknownQuery : If the service does not store the answer.
         """
         named = dict.fromkeys(match.map for match in placed(answer.matches))
         for map_name in answer.maps if len(answer.maps) == 1 else named:
@@ -202,7 +204,7 @@ class _Drawing:
         return space_name(map_name or "", parent_frame, several=self._several)
 
     def _query_space(self) -> tuple[str, Transform | None]:
-        """Return the space of the query and its pose there; None if the space is its own."""
+        """Return the space of the query, and its pose there; None if it has a separate space."""
         location = self._answer.location
         if location is not None:
             return self._space(location.map, location.pose.parent_frame), location.pose
@@ -221,7 +223,6 @@ class _Drawing:
         return [SceneEntity(path, Placement(np.array(pose.matrix), pose.child_frame)), *entities]
 
     def _alternatives(self) -> list[SceneEntity]:
-        """Return the alternative poses of an ambiguous answer."""
         entities: list[SceneEntity] = []
         some = self._points[:: max(len(self._points) // self._limits.match, 1)]
         for number, place in enumerate(self._answer.alternatives, start=1):

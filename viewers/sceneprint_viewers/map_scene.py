@@ -131,7 +131,6 @@ def _run_name(robot: str | None, session: str | None) -> str:
 
 
 def _pose_of_row(row: Sequence[float]) -> Floats:
-    """Return the pose (4, 4) of a row (t, x, y, z, qx, qy, qz, qw)."""
     T = np.eye(4)
     T[:3, 3] = row[1:4]
     T[:3, :3] = rotation_of(np.array(row[4:8]))
@@ -197,7 +196,9 @@ def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Fl
 
 
 def placed_points(client: Client, map_name: str, frame_id: str, T: Floats, limit: int) -> Floats:
-    """Return at most `limit` points (N, 3) of a frame, transformed by T; none if not indexed."""
+    """Return at most `limit` points (N, 3) of a frame, transformed by T; none if the frame was
+    deleted or is not indexed.
+    """
     try:
         return transform_points(T, client.frame_points(map_name, frame_id, limit=limit).points)
     except (NotFound, NotIndexed):
@@ -231,7 +232,7 @@ def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
 
 
 def frame_scene(client: Client, frame: Frame) -> Moment:
-    """Return permanent entities of a frame, in its parent frame or else in its sensor's frame.
+    """Return permanent entities of a frame, in the parent frame of its pose or in sensor axes.
 
     Raise NotIndexed if the frame is not indexed.
     """

@@ -210,7 +210,6 @@ class McapWriter:
     def _drawn(
         self, path: EntityPath, content: LineSet | TextLabel, now: Timestamp
     ) -> FoxgloveEntity:
-        """Return lines or a label as a Foxglove entity."""
         m = self._messages
         lines, texts = [], []
         if isinstance(content, LineSet):

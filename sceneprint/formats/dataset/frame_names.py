@@ -9,7 +9,7 @@ import re
 
 from sceneprint_client.formats import format_named
 
-#: Names with colour or infrared that denote depth: aligned depth, and RGB-D data sets.
+#: Parts of names that mention colour or infrared but denote aligned depth or RGB-D data sets.
 _OF_DEPTH = re.compile(
     r"rgbd|rgb[-_]d(?![a-z])|(colou?r|rgb)_?aligned_?depth|depth_?(colou?r|rgb)_?aligned"
     r"|depth_?(image_?)?(aligned|registered|mapped)?_?(to|2|in|on)_?(colou?r|rgb|infra(red)?|n?ir(?![a-z]))"

@@ -73,8 +73,10 @@ def read_cloud(
     -------
     scan : cloud, and the parameters with which the file was read
 
-    Raise UnreadableCloud if the file is missing or too large, or `decode_scan` raises the error.
-    The message names the file.
+    Raises
+    ------
+    UnreadableCloud : If the file is missing or too large; for further errors, see `decode_scan`.
+        The message names the file.
     """
     data = read_bytes(path, MAXIMUM_CLOUD_BYTES, UnreadableCloud)
     file_format = source.file_format or ("kitti" if is_kitti(path) else None)
@@ -184,7 +186,8 @@ class FrameSequence:
     split : use of the sequence according to the authors of the scene; None if unknown
     frames : at least one frame
     note : description of omitted data for users; empty if all data is used
-    unposed : reason why frames have no pose, for users; empty if all have poses or `note` gives it
+    unposed : reason why frames have no pose, for users; empty if all frames have poses, or if
+        `note` states the reason
     lost : number of frames that are unexpectedly omitted, or used without their pose
     """
 
@@ -239,14 +242,14 @@ def import_meta(
 
 
 def session_of(sequence: FrameSequence) -> str:
-    """Return the session of a sequence, whether the user specifies its folder or its scene's."""
+    """Return the session of a sequence, the same for a search from its folder or its scene's."""
     if sequence.layout.is_export or sequence.parent_frame == sequence.name:
         return sequence.name
     return f"{sequence.parent_frame}/{sequence.folder.name}"
 
 
 def parent_frame_of(sequence: FrameSequence, robot: str | None) -> str:
-    """Return the parent frame of the poses; a prefix distinguishes frames of different robots."""
+    """Return the parent frame of the poses; the robot, if specified, is its prefix."""
     own = sequence.parent_frame
     return own if robot is None else f"{robot}/{own}"
 

@@ -99,7 +99,8 @@ def natural(name: str) -> tuple[list[tuple[int, str]], str]:
 def layout_of(files: list[str]) -> Layout | None:
     """Return the layout of a folder with these files; None if no file has depth or points.
 
-    If a folder has depth images and point clouds, the images count unless it has a clouds.json.
+    If a folder has depth images and point clouds, a clouds.json selects the clouds; otherwise, the
+    images are selected.
     """
     if any(SEVEN_SCENES.fullmatch(file) for file in files):
         return Layout.SEVEN_SCENES
@@ -124,17 +125,20 @@ def references(
     name : name of the sequence, a prefix of the frames' names
     camera : camera of a 7-Scenes sequence without an intrinsics.json
 
-    Raise DatasetError if intrinsics.json is missing, depth.txt or clouds.json is invalid, or two
-    frames would have the same name. Raise InvalidIntrinsics if intrinsics.json does not describe a
-    camera. Raise InvalidPose if a line of groundtruth.txt is not a pose.
+    Raises
+    ------
+    DatasetError : If intrinsics.json is missing, depth.txt or clouds.json is invalid, or two frames
+        would have the same name.
+    InvalidIntrinsics : If intrinsics.json does not describe a camera.
+    InvalidPose : If a line of groundtruth.txt is not a pose.
     """
     unposed = NO_POSE_FILE
     if layout is Layout.TUM:
         frames, unposed = _tum(folder, files, name)
     elif layout is Layout.CLOUDS:
         # a clouds.json says that the .npy files beside it are points
-        wanted = filter(_may_be_cloud if CLOUDS_FILE in files else is_cloud, files)
-        frames = _posed_files(folder, wanted, name, cloud=find_cloud_source(folder))
+        selected = filter(_may_be_cloud if CLOUDS_FILE in files else is_cloud, files)
+        frames = _posed_files(folder, selected, name, cloud=find_cloud_source(folder))
     else:
         is_scene = layout is Layout.SEVEN_SCENES
         try:
@@ -142,8 +146,8 @@ def references(
         except DatasetError:
             if camera is None or not is_scene:
                 raise
-        wanted = filter(SEVEN_SCENES.fullmatch if is_scene else is_depth, files)
-        frames = _posed_files(folder, wanted, name, camera)
+        selected = filter(SEVEN_SCENES.fullmatch if is_scene else is_depth, files)
+        frames = _posed_files(folder, selected, name, camera)
     first: dict[str, Path] = {}
     for frame in frames:
         if frame.name in first:
@@ -171,7 +175,6 @@ def _posed_files(
     folder: Path, files: Iterable[str], name: str, camera: Camera | None = None,
     cloud: CloudSource | None = None,
 ) -> tuple[FrameReference, ...]:  # fmt: skip
-    """Return the frames of files, with the pose files beside them."""
     frames = []
     for file in files:
         stem = file.removesuffix(".depth.png") if SEVEN_SCENES.fullmatch(file) else Path(file).stem
@@ -183,6 +186,7 @@ def _posed_files(
 
 
 def _tum(folder: Path, files: list[str], name: str) -> tuple[tuple[FrameReference, ...], str]:
+    """Return the frames of a TUM RGB-D folder, and the reason why some have no pose."""
     camera = find_camera(folder)
     listed = sorted(_depth_list(folder / _DEPTH_LIST))
     stamps = [stamp for stamp, _ in listed]
@@ -289,13 +293,15 @@ def find_sequences(
     -------
     sequences : at least one sequence, in natural order of the names
 
-    Raise DatasetError if there are no frames, an intrinsics.json or a listed file is missing, two
-    scenes or recordings have the same name, or recordings are mixed with other frames. Raise
-    InvalidIntrinsics if an intrinsics.json does not describe a camera. Raise InvalidPose if a line
-    of a groundtruth.txt is not a pose. Raise MissingDependency if the path is a recording and
-    rosbags is not installed.
+    Raises
+    ------
+    DatasetError : If there are no frames, an intrinsics.json or a listed file is missing, two
+        scenes or recordings have the same name, or recordings are mixed with other frames.
+    InvalidIntrinsics : If an intrinsics.json does not describe a camera.
+    InvalidPose : If a line of a groundtruth.txt is not a pose.
+    MissingDependency : If the path is a recording and rosbags is not installed.
     """
-    # `..` is resolved to get a name, but a symbolic link is named by itself
+    # `..` must be resolved to get a name; a symbolic link keeps its own name
     path = Path(path)
     root = path.resolve() if ".." in path.parts else path.absolute()
     from sceneprint.formats import exports
@@ -355,7 +361,6 @@ def find_recordings(path: Path) -> list[Path]:
 
 
 def _bags(walked: Iterable[tuple[Path, list[str], Layout]]) -> list[Path]:
-    """Return the paths of the ROS recordings in results of `_walk`."""
     return [folder / name for folder, names, layout in walked
             if layout is Layout.RECORDING for name in names]  # fmt: skip
 
@@ -365,8 +370,8 @@ def _recordings(
 ) -> tuple[FrameSequence, ...]:
     """Return the sequences of several recordings, named by their paths relative to `root`.
 
-    Raise DatasetError if there are other frames too, two recordings have the same name, or
-    `recording_sequences` raises the error.
+    Raise DatasetError if there are other frames too, or two recordings have the same name; for
+    further errors, see `recording_sequences`.
     """
     from sceneprint.formats.recording.selection import recording_name, recording_sequences
 
@@ -401,13 +406,18 @@ def find_each(
 
     ROS recordings are skipped; see `find_sequences` for the other layouts.
 
-    `root`: absolute path of a folder. Raise DatasetError if there are too many folders, or two
-    scenes have the same name.
+    Parameters
+    ----------
+    root : absolute path of a folder
 
     Returns
     -------
     sequences : readable sequences; may be empty
     refused : name and error of each unreadable sequence
+
+    Raises
+    ------
+    DatasetError : If there are too many folders, or two scenes have the same name.
     """
     sequences: list[FrameSequence] = []
     refused = []
@@ -430,14 +440,14 @@ def _walk(
 ) -> Iterator[tuple[Path, list[str], Layout]]:
     """Yield the path, file names and layout of each sequence, depth first in natural order.
 
-    For ROS recordings, these are their folder and the names of the recordings. For a single file
-    of another system, the list of names is empty. Images and folders that are omitted because of
-    their names are added to `left_out`.
+    For ROS recordings, the path is that of their folder, and the names are those of the recordings.
+    For a single file of another system, the list of names is empty. Images and folders that are
+    omitted because of their names are added to `left_out`.
     """
     beside = [] if left_out is None else left_out
     from sceneprint.formats import exports
 
-    seen: set[Path] = set()  # resolved paths, to end cycles of symbolic links
+    visited: set[Path] = set()  # resolved paths, to end cycles of symbolic links
     waiting = [(root, 0)]
     while waiting:
         folder, depth = waiting.pop()
@@ -445,10 +455,10 @@ def _walk(
             resolved = folder.resolve()
         except (OSError, RuntimeError):  # a cycle of symbolic links
             continue
-        if resolved in seen:
+        if resolved in visited:
             continue
-        seen.add(resolved)
-        if len(seen) > _MAXIMUM_FOLDERS:
+        visited.add(resolved)
+        if len(visited) > _MAXIMUM_FOLDERS:
             raise DatasetError(
                 f"{root}: There are more than {_MAXIMUM_FOLDERS} folders here. "
                 "Specify the folder of the data set."
@@ -471,12 +481,12 @@ def _walk(
             and ("depth" in folders or _is_above_images(folder, files, folders, depth))
         )
         if layout in (Layout.PLAIN, None):
-            beside += [folder / one for one in files if is_image(one) and is_beside_depth(one)]
+            beside += [folder / file for file in files if is_image(file) and is_beside_depth(file)]
         if layout is not None and not (layout in (Layout.PLAIN, Layout.CLOUDS) and scene):
             yield folder, files, layout
         elif depth < _DEPTH:
             beside += [folder / name for name in folders if is_beside_depth(name)]
-            exported = [folder / one for one in files if exports.is_export(folder / one)]
+            exported = [folder / file for file in files if exports.is_export(folder / file)]
             yield from ((path, [], Layout.E57) for path in exported)
             entered = [name for name in reversed(folders) if not is_beside_depth(name)]
             waiting += [(folder / name, depth + 1) for name in entered]
@@ -501,7 +511,7 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
             if layout_of(files_below) not in (None, Layout.CLOUDS):
                 find_camera(below)
                 return True
-        except DatasetError:  # no camera: they may be colour images
+        except DatasetError:  # without a camera, the images may be colour images
             continue
         except SceneprintError:  # an invalid camera; the reader of the images reports it
             return True
@@ -650,8 +660,9 @@ def write_depth_png(path: Path, depth: Floats32, depth_scale: float) -> None:
         are written as 0 (missing)
     depth_scale : stored units per metre
 
-    Raise ValueError if the depth is empty or not two-dimensional, or the scale is not a positive
-    number.
+    Raises
+    ------
+    ValueError : If the depth is empty or not two-dimensional, or the scale is not positive.
     """
     from PIL import Image
 

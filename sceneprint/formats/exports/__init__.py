@@ -38,7 +38,9 @@ def file_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, 
     path : absolute path of a file for which `is_export` returns True
     name : name of the sequences; None selects the name of the file
 
-    Raise DatasetError if the file is damaged, has an unsupported version, or has no frames.
+    Raises
+    ------
+    DatasetError : If the file is damaged, has an unsupported version, or has no frames.
     """
     name = name or path.stem
     file_format = format_named(path.name, "capture")
@@ -54,7 +56,7 @@ def folder_layout(folder: Path, files: list[str], folders: list[str]) -> Layout 
     Parameters
     ----------
     folder : path of the folder
-    files, folders : names of its files and of its subfolders
+    files, folders : names of the files and the subfolders in the folder
     """
     if is_polycam(folder, folders):
         return Layout.POLYCAM
@@ -67,7 +69,7 @@ def folder_layout(folder: Path, files: list[str], folders: list[str]) -> Layout 
 
 
 def folder_sequence(folder: Path, layout: Layout, name: str) -> FrameSequence:
-    """Return the sequence of a folder with a layout of `folder_layout`.
+    """Return the sequence of a folder; `layout` is the result of `folder_layout`.
 
     Raise DatasetError if the folder is damaged, or no frame has depth.
     """

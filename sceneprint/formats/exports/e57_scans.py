@@ -86,7 +86,9 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
     -------
     sequence : sequence whose `note` lists the omitted scans
 
-    Raise DatasetError if the file is damaged, or has only merged clouds.
+    Raises
+    ------
+    DatasetError : If the file is damaged, or has only merged clouds.
     """
     try:
         with _open_scans(path) as scans:

@@ -80,7 +80,9 @@ def nerfstudio_sequence(folder: Path, name: str) -> FrameSequence:
     -------
     sequence : sequence whose `note` lists the omitted frames
 
-    Raise DatasetError if the JSON file is invalid, or no frame has depth.
+    Raises
+    ------
+    DatasetError : If the JSON file is invalid, or no frame has depth.
     """
     file = folder / TRANSFORMS
     fields = read_object(file, _MAXIMUM_BYTES, DatasetError, _EXAMPLE)

@@ -73,8 +73,10 @@ def depth_camera(
     depth_scale : stored units per metre
     up : unit vector that points up, in optical axes; None if unknown
 
-    Raise DatasetError if the images have different aspect ratios. Raise InvalidIntrinsics if the
-    camera is invalid.
+    Raises
+    ------
+    DatasetError : If the images have different aspect ratios.
+    InvalidIntrinsics : If the camera is invalid.
     """
     across, down = size[0] / lens.width, size[1] / lens.height
     if not math.isclose(across, down, rel_tol=0.02):
@@ -155,7 +157,9 @@ def sequence_of(
     left_out : number of omitted frames by reason
     remedy : advice for users if there are no frames
 
-    Raise DatasetError if there are no frames.
+    Raises
+    ------
+    DatasetError : If there are no frames.
     """
     reasons = [f"{count} {printable(reason)}" for reason, count in left_out.most_common(5)]
     if not frames:

@@ -38,21 +38,26 @@ _REMEDY = (
 
 
 def is_polycam(folder: Path, folders: list[str]) -> bool:
-    """Return whether a folder with the subfolders `folders` is an export of Polycam."""
+    """Return whether a folder with the subfolders `folders` is a Polycam export."""
     if folder.name == KEYFRAMES:
         return any(name in folders for name in CAMERAS)
     return KEYFRAMES in folders and any((folder / KEYFRAMES / name).is_dir() for name in CAMERAS)
 
 
 def polycam_sequence(folder: Path, name: str) -> FrameSequence:
-    """Return the frames of an export of Polycam, as a sequence.
+    """Return the frames of a Polycam export, as a sequence.
 
-    `folder`: folder `keyframes` or its parent. Raise DatasetError if no frame has depth and a
-    camera, or the folder cannot be read.
+    Parameters
+    ----------
+    folder : folder `keyframes` or its parent
 
     Returns
     -------
     sequence : sequence whose `note` lists the omitted frames
+
+    Raises
+    ------
+    DatasetError : If no frame has depth and a camera, or the folder cannot be read.
     """
     from sceneprint.formats.dataset.sequences import list_folder
 

@@ -98,7 +98,7 @@ def _decompress(packed: bytes, size: int) -> bytes:
         import lzfse
     except ImportError as cause:
         raise MissingDependency(
-            "Depth of Record3D is compressed with LZFSE, but the package lzfse is not installed. "
+            "Record3D compresses depth with LZFSE, but the package lzfse is not installed. "
             "Run: pip install 'lzfse>=0.4.2,<0.5'"
         ) from cause
     try:
@@ -165,22 +165,27 @@ def _parts_of_zip(capture: Path, _changed_ns: int, _size: int) -> dict[str, tupl
 def record3d_sequence(capture: Path, name: str) -> FrameSequence:
     """Return the frames of a capture, as a sequence.
 
-    `capture`: .r3d file, or folder with `metadata` and `rgbd`. Raise DatasetError if the capture is
-    damaged or exported in another format, or no frame has depth.
+    Parameters
+    ----------
+    capture : .r3d file, or folder with `metadata` and `rgbd`
 
     Returns
     -------
     sequence : sequence whose `note` lists the omitted frames
+
+    Raises
+    ------
+    DatasetError : If the capture is damaged or exported in another format, or no frame has depth.
     """
     if capture.is_dir() and not (capture / METADATA).is_file():
         raise DatasetError(
-            f"{capture}: This export of Record3D stores depth as OpenEXR, which is not supported. "
+            f"{capture}: This Record3D export stores depth as OpenEXR, which is not supported. "
             f"{_REMEDY}"
         )
     try:
         fields = json.loads(_read_part(capture, METADATA, _MAXIMUM_METADATA_BYTES))
         if not isinstance(fields, dict) or not isinstance(fields.get("poses"), list):
-            raise DatasetError("They do not contain a list of poses.")
+            raise DatasetError("there is no list of poses")
         width, height = (pixels(fields.get(key), key) for key in ("w", "h"))
         portrait = _LIDAR if width < height else _LIDAR[::-1]
         size = (
@@ -188,7 +193,7 @@ def record3d_sequence(capture: Path, name: str) -> FrameSequence:
             pixels(fields.get("dh", portrait[1]), "dh"),
         )
         if size[0] * size[1] > MAXIMUM_SAMPLES:
-            raise DatasetError(f"They declare {size[0]} x {size[1]} pixels of depth.")
+            raise DatasetError(f"depth images of {size[0]} x {size[1]} pixels are too large")
     except (ValueError, RecursionError, SceneprintError) as cause:
         reason = printable(f"{cause!s:.200}")
         raise DatasetError(

@@ -146,18 +146,24 @@ class RtabmapScan:
 
 
 def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
-    """Return the frames of a database: one sequence per camera, or the laser scans.
+    """Return the frames of a database: a sequence per parent frame and camera, or, if no node has
+    depth, per parent frame, with the laser scans.
 
     The poses are the optimised poses that rtabmap stores when it closes a database. If they are
     missing, odometry provides the poses, and each session has a separate parent frame.
 
-    `name`: name of the sequences; default: name of the file. Raise DatasetError if the file is not
-    a database of RTAB-Map, has an unsupported version, is in use or damaged, or no node has depth
-    or a three-dimensional laser scan.
+    Parameters
+    ----------
+    name : name of the sequences; default: name of the file
 
     Returns
     -------
     sequences : at least one sequence; the `note` of each lists the omitted nodes
+
+    Raises
+    ------
+    DatasetError : If the file is not an RTAB-Map database, has an unsupported version, is in use or
+        damaged, or no node has depth or a three-dimensional laser scan.
     """
     name = name or path.stem
     with _open_database(path) as database:
@@ -187,7 +193,10 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
 
 @contextmanager
 def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open an untrusted database with restrictions; raise DatasetError for errors of SQLite."""
+    """Open an untrusted database with restrictions.
+
+    Raise DatasetError if the database has an unfinished journal, or SQLite raises an error.
+    """
     for suffix in ("-wal", "-journal"):
         beside = path.with_name(path.name + suffix)
         if beside.is_file() and beside.stat().st_size:
@@ -226,7 +235,7 @@ def _read_version(path: Path, database: sqlite3.Connection) -> Version:
     if "Node" not in names or "Link" not in names:
         raise DatasetError(
             f"{path}: This SQLite database has no tables Node and Link, so RTAB-Map did not write "
-            "it. Specify a database of RTAB-Map."
+            "it. Specify an RTAB-Map database."
         )
     text = ""
     if "Admin" in names:
@@ -310,9 +319,7 @@ def _read_nodes(
 def _parse_node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) -> _Node:
     """Convert a row to a node with its odometry pose; count missing data in `left_out`.
 
-    Raises
-    ------
-    BrokenBlob, TypeError, ValueError, OverflowError : If a column has an invalid value.
+    Raise BrokenBlob, TypeError, ValueError or OverflowError if a column has an invalid value.
     """
     number, session, stamp, odometry, head, calibration, scan_tail, scan_info = row
     node = _Node(int(number), int(session), float(stamp or 0.0), None)
@@ -345,7 +352,7 @@ def _scale_camera(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
     down = height / lens.height if lens.height else 1.0
     if not math.isclose(across, down, rel_tol=0.02):
         raise BrokenBlob(
-            f"depth has {width} x {height} pixels, but its camera {lens.width} x {lens.height}"
+            f"depth has {width} x {height} pixels, but the camera has {lens.width} x {lens.height}"
         )
     try:
         # rtabmap scales about (0, 0), and its pixel centres have integer coordinates

@@ -119,8 +119,8 @@ def matrix(blob: bytes) -> NDArray[Any]:
 def cameras(blob: bytes, version: Version) -> tuple[RtabmapCamera, ...]:
     """Decode the cameras of a node, from left to right in its images; empty for a stereo camera.
 
-    `blob`: calibration. Since 0.18, it has one record per camera. Before, it had the float32
-    numbers fx, fy, cx, cy, (since 0.11.2) width, height, and the local transform of each camera.
+    `blob`: calibration. Since 0.18, it has one record per camera. Earlier versions stored float32
+    numbers for each camera: fx, fy, cx, cy, (since 0.11.2) width, height, and the local transform.
     Raise BrokenBlob if the calibration is damaged.
     """
     if version >= (0, 18, 0):
@@ -175,7 +175,8 @@ def _read_records(blob: bytes) -> tuple[RtabmapCamera, ...]:
     return tuple(cameras)
 
 
-# Depth images are PNGs of 16-bit millimetres or of float metres in four colour channels, or RVL.
+# A depth image is RVL data, a PNG of 16-bit millimetres, or a PNG whose four 8-bit channels form
+# float32 metres.
 
 DepthKind = Literal["millimetres", "metres", "rvl"]
 
@@ -229,8 +230,8 @@ def _decode_metres(blob: bytes) -> Floats32:
     return np.ascontiguousarray(colours[:, :, [2, 1, 0, 3]]).view("<f4")[:, :, 0]
 
 
-#: Formats of three-dimensional scans, and numbers of values per point that denote them before
-#: 0.16.1.
+#: Format numbers of 3D scans; and, for databases of RTAB-Map before 0.16.1, which lack the format,
+#: possible numbers of values per point of a 3D scan.
 _SOLID_FORMATS, _SOLID_CHANNELS = range(5, 12), (3, 4, 6, 7)
 
 

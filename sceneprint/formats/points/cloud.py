@@ -77,8 +77,8 @@ def _row_length(data: bytes) -> int | None:
 
     With a wrong length, columns mix all fields and have similar means. Therefore, the variance of
     the column means, relative to the variance of all values, is maximal for the correct length. In
-    57 scans of three sensors, written in rows of 3 to 8, the value for length four was at least .99
-    of the maximum if four was correct, and at most .87 otherwise.
+    57 scans of three sensors, written in rows of 3 to 8 numbers, the value for length four was at
+    least .99 of the maximum if four was correct, and at most .87 otherwise.
     """
     values = np.frombuffer(data, "<f4", len(data) // 4)
     if len(values) < _FEWEST_ROWS * _KITTI_ROW // 4:
@@ -91,13 +91,15 @@ def _row_length(data: bytes) -> int | None:
 
 
 def _column_spread(values: Floats32, length: int) -> float:
-    """Return the ratio of variances, of column means to all values, after range compression."""
+    """Return the ratio of the variance of column means to that of all values, after compression of
+    the range; of values and of absolute values, the greater ratio counts.
+    """
     rows = len(values) // length
     chosen = np.linspace(0, rows - 1, min(rows, 20_000 // length)).astype(np.int64)
     table = values[: rows * length].reshape(rows, length)[chosen].astype(np.float64)
     table = np.arcsinh(np.where(np.isfinite(table), table, 0.0))
     return max(
-        float(one.mean(axis=0).var() / max(one.var(), 1e-12)) for one in (table, np.abs(table))
+        float(part.mean(axis=0).var() / max(part.var(), 1e-12)) for part in (table, np.abs(table))
     )
 
 
@@ -212,10 +214,10 @@ FEWEST_POINTS, MOST_POINTS = 10, 5_000_000
 #: Maximum distance of a point from the viewpoint along an axis, metres.
 FARTHEST_M = 10_000.0
 
-#: Maximum distance of a viewpoint from the origin of its file, metres: half of Earth's perimeter.
+#: Maximum coordinate of a viewpoint, metres: half of Earth's circumference.
 _FARTHEST_VIEWPOINT_M = 2e7
 
-_READERS = {one.name: one.reader for one in formats_of("cloud")}
+_READERS = {entry.name: entry.reader for entry in formats_of("cloud")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,12 +304,15 @@ def decode_scan(
     Returns
     -------
     scan : points in the file's axes, with the viewpoint at the origin, without missing (NaN or
-        infinite) points
+        infinite) points; more than 5 million points are thinned
 
-    Raise UnreadableCloud if the bytes have another format or are damaged, there are more than 20
-    million points, or a point is more than 10 km from the viewpoint. Raise UselessFrame if there
-    are fewer than 10 points. Raise InvalidPose if the pose is not a rigid transform. Raise
-    MissingDependency if the file is LAZ and lazrs is not installed.
+    Raises
+    ------
+    UnreadableCloud : If the bytes have another format or are damaged, there are more than 20
+        million points, or a point is more than 10 km from the viewpoint.
+    UselessFrame : If there are fewer than 10 points.
+    InvalidPose : If the pose is not a rigid transform.
+    MissingDependency : If the file is LAZ and lazrs is not installed.
     """
     with naming(name):
         _check_units(units_per_metre)
@@ -321,8 +326,8 @@ def decode_scan(
         points, missing = raw.points, raw.file_points - len(raw.points)
         if len(points) < FEWEST_POINTS:
             raise UselessFrame(
-                f"{missing} of {raw.file_points} points are missing, and the {len(points)} valid "
-                f"points are fewer than {FEWEST_POINTS}. Check that the sensor saw surfaces."
+                f"{missing} of {raw.file_points} points are missing. {len(points)} valid points "
+                f"remain, but {FEWEST_POINTS} are required. Check that the sensor saw surfaces."
             )
         note = f"{missing} missing points skipped" if missing else ""
         if len(points) > MOST_POINTS:
@@ -332,8 +337,8 @@ def decode_scan(
             note = f"{note}; {thinning}" if note else thinning
             if len(points) < FEWEST_POINTS:
                 raise UselessFrame(
-                    f"The {before} points occupy {len(points)} voxels of {100 * edge:.1f} cm, "
-                    f"fewer than {FEWEST_POINTS}. Check that the sensor saw surfaces."
+                    f"The {before} points occupy {len(points)} voxels of {100 * edge:.1f} cm, but "
+                    f"{FEWEST_POINTS} are required. Check that the sensor saw surfaces."
                 )
         cloud = Cloud(
             points,
@@ -360,6 +365,7 @@ def read_points(
 
 
 def _select_format(data: bytes, stated: CloudFormat | None) -> CloudFormat:
+    """Return the stated or the recognised format; raise UnreadableCloud if neither is valid."""
     recognised = format_of(data)
     if stated == "kitti" and recognised is not None:
         raise UnreadableCloud(

@@ -106,12 +106,12 @@ class E57Scan:
     def _blocks(self) -> Iterator[Floats]:
         names = _SPHERICAL if self.is_spherical else _CARTESIAN
         state = "sphericalInvalidState" if self.is_spherical else "cartesianInvalidState"
-        by_name = {one.name: place for place, one in enumerate(self._fields)}
+        by_name = {entry.name: place for place, entry in enumerate(self._fields)}
         columns = [by_name[name] for name in (*names, state) if name in by_name]
         streams = [_Stream(self._fields[place]) for place in columns]
         packets = _read_packets(self._pages, self._start, len(self._fields))
         for first, n in steps(self.count):
-            while not all(one.holds(n) for one in streams):
+            while not all(stream.holds(n) for stream in streams):
                 packet = next(packets, None)
                 if packet is None:
                     raise UnreadableCloud(
@@ -120,7 +120,7 @@ class E57Scan:
                     )
                 for stream, place in zip(streams, columns, strict=True):
                     stream.add(packet[place])
-            values = [one.take(n) for one in streams]
+            values = [stream.take(n) for stream in streams]
             block = _from_angles(*values[:3]) if self.is_spherical else np.stack(values[:3], axis=1)
             if len(values) > len(names):
                 block[values[3] != 0] = np.nan
@@ -139,13 +139,18 @@ def _from_angles(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats
 def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
     """Return the scans of an E57 file in order, without decoding their points.
 
-    `data`: the whole file, which must not change while points are decoded. Raise UnreadableCloud if
-    the file is not E57, is damaged, has a later version or no scan, a scan has no coordinates or
-    more than 200 million points, or a pose is not rigid.
+    Parameters
+    ----------
+    data : the whole file, which must not change while points are decoded
 
     Returns
     -------
     scans : at least one scan
+
+    Raises
+    ------
+    UnreadableCloud : If the file is not E57, is damaged, has a later version or no scan, a scan has
+        no coordinates or more than 200 million points, or a pose is not rigid.
     """
     if len(data) < _HEADER.size or bytes(data[:8]) != E57_SIGNATURE:
         raise UnreadableCloud(f"This is not an E57 file. {_AGAIN}")
@@ -158,7 +163,7 @@ def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
         raise UnreadableCloud(f"The header of the file declares pages of {page} bytes. {_AGAIN}")
     if length > len(data) or length % page:
         raise UnreadableCloud(
-            f"The header of the file declares {length} bytes, but it has {len(data)}. {_AGAIN}"
+            f"The header declares {length} bytes, but the file has {len(data)}. {_AGAIN}"
         )
     if xml_bytes > _MAXIMUM_XML_BYTES:
         raise UnreadableCloud(
@@ -283,6 +288,7 @@ def _parse_description(text: bytes) -> Element:
 
 
 def _parse_scan(pages: _Pages, node: Element, number: int) -> E57Scan:
+    """Return a scan from its description; raise UnreadableCloud if it is not supported."""
     name = (node.findtext(f"{_NAMESPACE}name") or "").strip()
     place = printable(f"Scan {number} ({name:.60})" if name else f"Scan {number}")
     points = node.find(f"{_NAMESPACE}points")
@@ -299,7 +305,7 @@ def _parse_scan(pages: _Pages, node: Element, number: int) -> E57Scan:
             "scan, or export it in parts."
         )
     fields = tuple(_parse_fields(prototype, place))
-    bits = {one.name: one.bits for one in fields}
+    bits = {entry.name: entry.bits for entry in fields}
     spherical = not all(name in bits for name in _CARTESIAN)
     coordinates = _SPHERICAL if spherical else _CARTESIAN
     if not all(name in bits for name in coordinates):
@@ -418,7 +424,7 @@ def _read_packets(pages: _Pages, start: int, fields: int) -> Iterator[list[bytes
 
 
 def _field_sizes(content: bytes, size: int, fields: int) -> tuple[int, ...]:
-    """Return the size of each field in a packet, bytes; raise UnreadableCloud if they exceed it."""
+    """Return the size of each field in a packet, bytes; raise UnreadableCloud if it is damaged."""
     head = 6 + 2 * fields
     if len(content) == size >= head and struct.unpack_from("<H", content, 4)[0] == fields:
         sizes: tuple[int, ...] = struct.unpack_from(f"<{fields}H", content, 6)

@@ -58,8 +58,10 @@ def inflated_records(
     count : number of points
     row : dtype of a record
 
-    Raise MissingDependency if lazrs is not installed. Raise UnreadableCloud if the compressed
-    points are damaged or contradict the header.
+    Raises
+    ------
+    MissingDependency : If lazrs is not installed.
+    UnreadableCloud : If the compressed points are damaged or contradict the header.
     """
     lazrs = _import_lazrs()
     vlr = _laszip_vlr(data)
@@ -137,7 +139,7 @@ def _laszip_vlr(data: FileBytes) -> bytes:
     for user, number, content in las_records(data):
         if (user, number) == (b"laszip encoded", 22204):
             return content
-    raise UnreadableCloud(f"The LAZ file does not say how its points are packed. {_AGAIN}")
+    raise UnreadableCloud(f"The LAZ file does not state how its points are compressed. {_AGAIN}")
 
 
 def _parse_vlr(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
@@ -149,7 +151,7 @@ def _parse_vlr(vlr: bytes) -> tuple[int, int, int, list[tuple[int, int]]]:
         if chunk and len(vlr) >= 34 + 6 * items:
             kinds = [struct.unpack_from("<HH", vlr, 34 + 6 * i) for i in range(items)]
             return compressor, coder, chunk, kinds
-    raise UnreadableCloud(f"The LAZ file does not say how its points are packed. {_AGAIN}")
+    raise UnreadableCloud(f"The LAZ file does not state how its points are compressed. {_AGAIN}")
 
 
 def _is_record(kinds: list[tuple[int, int]], layered: bool, length: int) -> bool:

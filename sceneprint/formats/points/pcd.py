@@ -50,7 +50,9 @@ def inflate(packed: Bytes, size: int) -> Bytes:
     packed : (n,) compressed bytes
     size : exact size of the result, bytes; the caller has limited it
 
-    Raise UnreadableCloud if the result has another size, or the compressed bytes are damaged.
+    Raises
+    ------
+    UnreadableCloud : If the result has another size, or the compressed bytes are damaged.
     """
     if size > MOST_RATIO * len(packed):  # this check must precede the allocation
         raise UnreadableCloud(
@@ -68,7 +70,7 @@ def inflate(packed: Bytes, size: int) -> Bytes:
 
 @kernel
 def _inflate(packed: Bytes, out: Bytes) -> int:
-    """Fill `out`; return the number of bytes, or -1 if they do not fit or are damaged."""
+    """Decompress to `out`; return the number of bytes, or -1 if they are damaged or do not fit."""
     i, o, size, room = 0, 0, len(packed), len(out)
     while i < size:
         control = int(packed[i])

@@ -201,12 +201,12 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
 
 
 def element_end(data: FileBytes, start: int, element: Element, order: str) -> int:
-    """Return the offset after a binary element."""
-    left = len(data) - start
-    if element.count * element.least > left:
+    """Return the offset after a binary element; raise UnreadableCloud if it exceeds the file."""
+    remaining = len(data) - start
+    if element.count * element.least > remaining:
         raise UnreadableCloud(
             f"The PLY header declares {element.count} rows of {element.name}, at least "
-            f"{element.count * element.least} bytes, but {left} bytes remain. {_AGAIN}"
+            f"{element.count * element.least} bytes, but {remaining} bytes remain. {_AGAIN}"
         )
     if not element.has_lists:
         return start + element.count * element.least

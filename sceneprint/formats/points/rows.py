@@ -41,7 +41,7 @@ class FilePoints:
 
     Parameters
     ----------
-    count : number of points; it does not exceed what the length of the file allows
+    count : number of points; at most as many as the file is long enough for
     blocks : coordinates in order, in blocks (n, 3) of float64; missing points are NaN or infinite,
         and may cause numpy warnings
     viewpoint : viewpoint that the file states; None if it states none
@@ -225,7 +225,7 @@ def word(text: Bytes, start: int) -> tuple[int, int]:
 def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
     """Parse a word; return its value, exact except for the last bit, and whether it is a number.
 
-    All spellings of NaN and infinity by printf give NaN.
+    Every spelling of NaN or infinity that printf writes gives NaN.
     """
     i = start
     negative = i < end and text[i] == 45
@@ -273,11 +273,11 @@ def number(text: Bytes, start: int, end: int) -> tuple[float, bool]:
         return 0.0, False
     value = float(mantissa)
     if mantissa > 0:
-        left = min(max(exponent, -400), 400)
-        while left > 0:
-            value *= _TENS[min(left, 22)]
-            left -= min(left, 22)
-        while left < 0:
-            value /= _TENS[min(-left, 22)]
-            left += min(-left, 22)
+        tens = min(max(exponent, -400), 400)
+        while tens > 0:
+            value *= _TENS[min(tens, 22)]
+            tens -= min(tens, 22)
+        while tens < 0:
+            value /= _TENS[min(-tens, 22)]
+            tens += min(-tens, 22)
     return (-value if negative else value), True

@@ -142,7 +142,9 @@ class Bag:
         topics : names of the topics
         start_ns, stop_ns : bounds, start <= time of recording < stop, nanoseconds; None for none
 
-        Raise DatasetError if the file is damaged.
+        Raises
+        ------
+        DatasetError : If the file is damaged, or a message is too large.
         """
         connections = [connection for connection in self._connections if connection.topic in topics]
         if not connections:

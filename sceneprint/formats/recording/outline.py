@@ -38,7 +38,7 @@ class BagOutline:
     chosen : selected topic of frames; None if there is none
     camera : name of the camera topic of `chosen`; None if there is none
     sequences : sequences of the selected frames; may be empty
-    problem : reason why no frames are selected; empty if there are some
+    problem : reason why no frames are selected; empty if frames are selected
     """
 
     kind: str
@@ -89,8 +89,8 @@ class BagOutline:
 def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
     """Read the content of a bag, and the frames that an upload with these options would select.
 
-    Raise DatasetError if the bag cannot be read. Raise MissingDependency if rosbags is not
-    installed.
+    `problem` contains the error if no frames can be selected. Raise DatasetError if the bag cannot
+    be read. Raise MissingDependency if rosbags is not installed.
     """
     bag = Bag(path)
     try:
@@ -132,6 +132,7 @@ def sampled_range(
 
 
 def _describe_frames(sequence: FrameSequence) -> list[str]:
+    """Return the note of a sequence, and lines on its camera, poses, mounting and up directions."""
     first = sequence.frames[0]
     lines = [sequence.note] if sequence.note else []
     if first.camera is not None:

@@ -43,14 +43,14 @@ from sceneprint_client.transforms import (
 
 #: Callback with the number of messages that have been read, and the number of all messages.
 Progress = Callable[[int, int], None]
-#: Maximum number of messages of a topic of frames.
+#: Maximum number of messages in the topic of the frames.
 MOST_FRAMES = 2_000_000
 
 
 #: Maximum decrease between stamps of a source, seconds. After a larger decrease, the clock counts
 #: as set back.
 _OUT_OF_ORDER_S = 0.1
-#: Number of decreases with a following increase after which a source's stamps are ignored: it has
+#: Number of jumps back and forth after which the stamps of a source are ignored, because it has
 #: several publishers with different delays.
 _MOST_FLIPS = 8
 #: Maximum number of parts of a recording, and of distinct CameraInfo messages.
@@ -82,8 +82,8 @@ class BagPart:
     def info_at(self, stamps_ns: Sequence[int]) -> list[int]:
         """Return the index of the CameraInfo for each stamp.
 
-        In order of preference, it has the same stamp, is the nearest within 20 ms, the last before
-        the stamp, or the first.
+        It is the last CameraInfo up to the stamp, or else the first. A later CameraInfo that is
+        nearer and within 20 ms takes precedence.
         """
         times = np.frombuffer(self.info_stamps_ns, np.int64)
         order = np.argsort(times, kind="stable")
@@ -190,7 +190,9 @@ def scan_bag(
     camera : topic of the frames' CameraInfo; None reads no cameras
     progress : callback every 64 messages; None for no callback
 
-    Raise DatasetError if the bag is damaged or too long.
+    Raises
+    ------
+    DatasetError : If the bag is damaged or too long.
     """
     ignored = set[str]()
     while True:
@@ -242,8 +244,8 @@ class _Scanner:
         if self._clocks.goes_back(source, stamp_ns):
             if len(parts) == MOST_PARTS:
                 raise DatasetError(
-                    f"The stamps go back more than {MOST_PARTS} times, last in {source}. Split the "
-                    "bag."
+                    f"The stamps jump back more than {MOST_PARTS} times, most recently in "
+                    f"{source}. Split the bag."
                 )
             parts.append(BagPart(len(self._scan.stamps_ns)))
         return parts[-1]
@@ -259,7 +261,7 @@ class _Scanner:
             raise DatasetError(f"There are more than {MOST_FRAMES} frames. Split the bag.")
 
     def _record_message(self, message: RawMessage, kind: str) -> None:
-        """Record the content of a message other than a frame."""
+        """Record transforms, odometry, a CameraInfo or IMU data; count damaged messages."""
         scan, bag = self._scan, self._bag
         if kind == CAMERA and message.data[12:] in self._info_numbers:
             self._record_info(message, self._info_numbers[message.data[12:]])
@@ -291,9 +293,9 @@ class _Scanner:
         elif kind == ODOMETRY:
             parent, child = frame_name(fields.header.frame_id), frame_name(fields.child_frame_id)
             stamp = bag.stamp_ns(message)
-            known = self._part_at(message.topic, stamp).odometry.setdefault(message.topic, [])
-            if parent and child and len(known) < MOST_SAMPLES:
-                known.append(_Odometry(parent, child, stamp, pose_row(fields.pose.pose)))
+            poses = self._part_at(message.topic, stamp).odometry.setdefault(message.topic, [])
+            if parent and child and len(poses) < MOST_SAMPLES:
+                poses.append(_Odometry(parent, child, stamp, pose_row(fields.pose.pose)))
         else:
             self._record_transforms(message, fields)
 

@@ -66,8 +66,8 @@ class ScanWindow:
             is_newest_joined = self._add_scan(joiner, tree, stamp_ns, bag, topic, message)
         if not is_newest_joined:
             raise UnreadableCloud(
-                "The scan is damaged, or its odometry has a gap or a jump. Upload it without "
-                "--join-m, or leave it out."
+                "The scan is damaged, or the odometry has a gap or a jump at the time of the scan. "
+                "Upload the scan without --join-m, or omit it."
             )
         return joiner.cloud()
 

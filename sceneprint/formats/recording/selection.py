@@ -124,9 +124,11 @@ def recording_sequences(
     sequences : one sequence, or several if stamps jump back; the `note` of the first sequence
         describes the selected frames, and the omitted frames with reasons
 
-    Raise DatasetError if the recording cannot be read, has no suitable topic, or has several. Raise
-    InvalidIntrinsics if the camera is invalid, or its lens is not supported. Raise
-    MissingDependency if rosbags is not installed.
+    Raises
+    ------
+    DatasetError : If the recording cannot be read, has no suitable topic, or has several.
+    InvalidIntrinsics : If the camera is invalid, or its lens is not supported.
+    MissingDependency : If rosbags is not installed.
     """
     bag = Bag(path)
     frames = choose_topic(bag, options.topic)
@@ -162,16 +164,16 @@ def sequences_of(
     note = _describe_selection(frames, scan, motions)
     counts = [len(window.scans) for motion in motions for window in motion.windows.values()]
     if counts:
-        note += f"; each frame joins the scans of {options.join_m:g} m ({np.median(counts):g} "
-        note += "of them in the median), "
+        note += f"; each frame joins the scans of {options.join_m:g} m (a median of "
+        note += f"{np.median(counts):g} scans), "
         note += "without correction for motion" if seconds is None else "corrected for motion"
     if sensor != frames.frame:
         note += f"; points are transformed from {frames.frame} to their sensor, {sensor}"
     lenses = {camera.intrinsics for camera in cameras.values()}
     if len(lenses) > 1:
         note += (
-            f"; {len(lenses)} cameras, because the camera info changes: each frame has that of its "
-            "time"
+            f"; {len(lenses)} cameras, because the camera info changes: each frame has the camera "
+            "of its time"
         )
     if not any(motion.keyframes for motion in motions):
         raise DatasetError(
@@ -221,7 +223,7 @@ def _select_sensor(bag: Bag, scan: BagScan, frames: FrameTopic, options: Recordi
     if stated is not None and any(tree.path(frame, stated) is not None for tree in trees):
         return str(frame_name(stated))
     below = ", ".join(leaves[:20])
-    what = "its sensor is unknown" if stated is None else f"{stated!r:.100} is not below it"
+    what = "the sensor is unknown" if stated is None else f"{stated!r:.100} is not below this frame"
     remedy = f"Select one of {below} with --sensor-frame" if below else "Record /tf or odometry"
     raise DatasetError(
         f"{bag.path}: The points of {frames.topic.name} are in {frame or 'no frame'}, and {what}. "
@@ -299,7 +301,7 @@ def _compute_motions(
         above = dict.fromkeys(frame for tree in trees for frame in tree.ancestors(sensor)[1:])
         raise DatasetError(
             f"{bag.path}: There are no transforms from {sensor or 'the sensor'} to "
-            f"{world!r:.100}. Frames above it are {', '.join(above) or 'none'}."
+            f"{world!r:.100}. Frames above the sensor are {', '.join(above) or 'none'}."
         )
     motions = [
         _compute_motion(part, places, scan, (sensor, frames.frame), world, scan_s)
@@ -488,7 +490,6 @@ def _find_camera(bag: Bag, frames: FrameTopic, topic: BagTopic | None) -> Camera
 
 
 def _describe_selection(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
-    """Describe the selected and the omitted frames for users."""
     total, selected = len(scan.stamps_ns), sum(len(motion.keyframes) for motion in motions)
     poses = sum(len(motion.poses) for motion in motions)
     worlds = sorted({motion.world for motion in motions if motion.poses and motion.world})
@@ -499,7 +500,7 @@ def _describe_selection(frames: FrameTopic, scan: BagScan, motions: list[_Motion
     if poses < total:
         text += f"; {total - poses} without: {_describe_unknown(frames, motions)}"
     without = _count_without_pose(scan, motions)
-    left = [
+    skipped = [
         f"{count} {reason}"
         for count, reason in (
             (total - selected - without, "between keyframes"),
@@ -508,10 +509,10 @@ def _describe_selection(frames: FrameTopic, scan: BagScan, motions: list[_Motion
         )
         if count
     ]
-    if left:
-        text += f"; skipped: {', '.join(left)}"
+    if skipped:
+        text += f"; skipped: {', '.join(skipped)}"
     if len(motions) > 1:
-        text += f"; split into {len(motions)} parts, because stamps go back"
+        text += f"; split into {len(motions)} parts, because stamps jump back"
     remarks = dict.fromkeys(remark for motion in motions for remark in motion.remarks)
     return printable("; ".join([text, *list(remarks)[:5]]))
 
@@ -532,7 +533,6 @@ def _count_without_pose(scan: BagScan, motions: list[_Motion]) -> int:
 
 
 def _describe_unknown(frames: FrameTopic, motions: list[_Motion]) -> str:
-    """Describe why frames have no poses, most frequent reason first."""
     whys = [why for motion in motions for why in motion.unknown.values()]
     reasons = []
     for (transform, disputed), count in Counter(

@@ -56,7 +56,9 @@ def depth_file(message: Any, *, compressed: bool) -> bytes:
     -------
     data : 16-bit PNG of millimetres, or NPY file of float32 metres
 
-    Raise UnreadableFrame if the message has another encoding, or its sizes contradict each other.
+    Raises
+    ------
+    UnreadableFrame : If the message has another encoding, or its sizes contradict each other.
     """
     if compressed:
         image = compressed_depth(message)
@@ -140,10 +142,8 @@ class BagSource:
     def read_bytes(self) -> bytes:
         """Return the message as the bytes of a PNG or NPY file.
 
-        Raises
-        ------
-        UnreadableFrame, UnreadableCloud : If the message has no depth, or is damaged.
-        DatasetError : If the bag is damaged.
+        Raise UnreadableFrame or UnreadableCloud if the message has no depth, or is damaged. Raise
+        DatasetError if the bag is damaged.
         """
         if self.window is not None:
             with naming(f"{self.bag.path}, {self.topic.name} at {self.log_ns} ns"):
@@ -208,8 +208,9 @@ def _describe_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
 def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
     """Select the topic of the frames.
 
-    `name`: name that the user specifies, or None. Raise DatasetError if no topic fits, or several
-    topics fit and `name` is None. Infrared and the like must be named.
+    `name`: name that the user specifies, or None; images other than depth, such as infrared, are
+    selected only by name. Raise DatasetError if no topic fits, or several topics fit and `name` is
+    None.
     """
     candidates = frame_topics(bag)
     if name is not None:
@@ -273,7 +274,9 @@ def camera_topic(bag: Bag, frames: FrameTopic, name: str | None) -> BagTopic | N
     frames : topic of depth images
     name : name that the user specifies; None selects automatically
 
-    Raise DatasetError if `name` is not a topic of CameraInfo, or several topics have the frame.
+    Raises
+    ------
+    DatasetError : If `name` is not a topic of CameraInfo, or several topics have the frame.
     """
     topics = bag.of_type(CAMERA)
     if name is not None:

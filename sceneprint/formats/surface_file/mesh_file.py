@@ -99,7 +99,10 @@ def _import_trimesh() -> ModuleType:
 
 
 def _join_parts(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
-    """Join all triangles of a scene; join all points if it has no triangles."""
+    """Join all triangles of a scene; join all points if it has no triangles.
+
+    Raise UnreadableCloud if the scene has neither, or exceeds the limits.
+    """
     parts = []
     for node in scene.graph.nodes_geometry:
         T, key = scene.graph[node]
@@ -142,6 +145,7 @@ def _join_parts(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
 
 
 def _read_gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
+    """Return the JSON object of a glTF file; raise UnreadableCloud if it is damaged."""
     length = 0
     if file_format == "glb":
         if len(data) < _GLB_HEADER:
@@ -166,7 +170,9 @@ def _read_gltf_json(data: FileBytes, file_format: str) -> dict[str, Any]:
 
 
 def _check_gltf(fields: dict[str, Any]) -> None:
-    """Raise UnreadableCloud for geometry in other files, compression, or arrays without bytes."""
+    """Raise UnreadableCloud if a buffer is in another file, a required extension may affect
+    positions, or an accessor is sparse or has no buffer view.
+    """
     for buffer in _list_objects(fields, "buffers"):
         uri = buffer.get("uri")
         if uri is not None and not str(uri)[:100].startswith("data:"):
@@ -184,8 +190,8 @@ def _check_gltf(fields: dict[str, Any]) -> None:
     for accessor in _list_objects(fields, "accessors"):
         if "sparse" in accessor or "bufferView" not in accessor:
             raise UnreadableCloud(
-                "The glTF file has sparse arrays, or arrays without bytes, which are not "
-                "supported. Export the file again without them."
+                "The glTF file has sparse accessors, or accessors without a buffer view, which are "
+                "not supported. Export the file again without them."
             )
 
 

@@ -39,12 +39,13 @@ _AGAIN = "Copy or write the file again."
 
 
 def read_faces(data: FileBytes) -> Ints32 | None:
-    """Read the triangles (M, 3) of the element `face`; return None if the file has no faces.
+    """Read the faces of an ascii or binary file as triangles (M, 3); polygons become fans.
 
-    Indices are not compared with the number of vertices; those below 0 or beyond int32 become -1.
+    Return None if the element `face` is missing or has no rows. Indices are not compared with the
+    number of vertices; those below 0 or beyond int32 become -1.
 
-    Raise UnreadableCloud if the faces have no list of vertices, or fewer or more bytes than
-    declared, a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.
+    Raise UnreadableCloud if the faces do not have exactly one list of vertices, or contradict the
+    header, a polygon has fewer than 3 or more than 1024 corners, or there are too many triangles.
     """
     order, elements, start = ply_header(data)
     names = [element.name for element in elements]
@@ -105,7 +106,7 @@ def _numbers(view: Bytes, begins: Indices, kind: np.dtype[np.integer], count: in
 
 
 def _fans(polygons: Indices) -> Indices:
-    """Split polygons (n, c) into triangles (n (c - 2), 3)."""
+    """Split polygons (n, c) into fans of triangles (n (c - 2), 3)."""
     c = polygons.shape[1]
     fan = np.array([(0, k, k + 1) for k in range(1, c - 1)])
     return polygons[:, fan].reshape(-1, 3)

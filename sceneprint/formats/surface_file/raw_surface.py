@@ -83,8 +83,10 @@ def gather(
     origin : (3,) float64 with integer values; zero unless the points are far from the file's origin
     voxel : edge of the voxels of the thinned cloud, units; None if it is not thinned
 
-    Raise UnreadableCloud if there are more points than declared, or a point is too far from the
-    others.
+    Raises
+    ------
+    UnreadableCloud : If a mesh has more vertices than declared, or a point of a cloud that is
+        thinned is too far from the others.
     """
     cloud = _Cloud(count, units_of, most)
     for block in blocks:
@@ -132,6 +134,7 @@ class _Cloud:
         return points if self._n == len(self._points) else points.copy(), origin, self._voxel
 
     def _thin(self) -> None:
+        """Thin the points to make room; raise UnreadableCloud for the vertices of a mesh."""
         if self._units_of is None:
             raise UnreadableCloud(
                 f"The file declares {len(self._points)} vertices, but more follow. Copy or write "

@@ -46,11 +46,11 @@ AXES: dict[str, Floats] = {
     f"{sign}{name}": value * np.eye(3)[k]
     for k, name in enumerate("xyz") for sign, value in (("", 1.0), ("-", -1.0))
 }  # fmt: skip
-#: Distance from the origin of the file beyond which coordinates get an offset, metres.
+#: Surfaces whose middle is farther than this from the origin of the file get an offset, metres.
 FAR_M = 1000.0
 _STL_HEADER, _STL_TRIANGLE = 84, 50  #: bytes
 _BLOCK = 1 << 18
-#: Coordinate beyond all places on Earth, in all supported units; its products are finite.
+#: Coordinate larger than any on Earth in all supported units; products of coordinates are finite.
 _MOST_UNITS = 1e15
 #: Minimum and maximum usual extent of a place, metres; other extents cause a note.
 _SMALL_M, _LARGE_M = 1.0, 5000.0
@@ -65,7 +65,9 @@ class SurfaceOptions:
     units_per_metre : units of the file's coordinates per metre, such as 1000 for millimetres
     up : axis of the file that points up
 
-    Raise UnreadableCloud if the units or the axis are invalid.
+    Raises
+    ------
+    UnreadableCloud : If the units or the axis are invalid.
     """
 
     units_per_metre: float | None = None
@@ -116,7 +118,9 @@ def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
     name : name of the file; its suffix identifies OBJ and ascii STL
     size : size of the file, bytes
 
-    Raise UnreadableCloud if the file is empty or has an unknown format.
+    Raises
+    ------
+    UnreadableCloud : If the file is empty or has an unknown format.
     """
     if not size:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
@@ -156,10 +160,12 @@ def read_surface(
     read : surface without missing points, and without triangles that lack an area or a vertex; a
         cloud of more than 10 million points is thinned to the first point of each voxel
 
-    Raise UnreadableCloud if the bytes have an unknown format, are damaged, have coordinates in
-    degrees or exceed a limit, a triangle refers to a missing vertex, or the surface exceeds 20 km.
-    Raise UselessFrame if there are fewer than 10 points. Raise MissingDependency if lazrs or
-    trimesh is needed and not installed.
+    Raises
+    ------
+    UnreadableCloud : If the bytes have an unknown format, are damaged, have coordinates in degrees
+        or exceed a limit, a triangle refers to a missing vertex, or the surface exceeds 20 km.
+    UselessFrame : If there are fewer than 10 points, or no triangle has an area.
+    MissingDependency : If lazrs or trimesh is needed and not installed.
     """
     stated = options or SurfaceOptions()
     with naming(name):
@@ -168,6 +174,7 @@ def read_surface(
 
 
 def _read_raw(data: FileBytes, form: SurfaceFormat, options: SurfaceOptions) -> RawSurface:
+    """Read the surface of a file, with the units and the up direction that the file states."""
     if form in ("obj", "stl", "glb", "gltf"):
         mesh = read_mesh(data, form)
         is_gltf = form in ("glb", "gltf")
@@ -193,7 +200,6 @@ def _read_raw(data: FileBytes, form: SurfaceFormat, options: SurfaceOptions) -> 
 
 
 def _join_scans(scans: tuple[E57Scan, ...]) -> FilePoints:
-    """Return the points of all scans in the frame of the file."""
     count = sum(scan.count for scan in scans)
     check_count(count, MOST_FILE_POINTS)
 
@@ -339,7 +345,8 @@ def _remove_flat(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]
 def _to_metres(points: Floats32, origin: Floats, units: float) -> Floats:
     """Convert points in place to metres relative to an offset; return the offset (3,), metres.
 
-    The offset is the middle of the points in whole metres if it is farther away than `FAR_M`, or 0.
+    The offset is the middle of the points in whole metres if the middle is farther than `FAR_M`
+    from the origin of the file, otherwise 0.
 
     Parameters
     ----------
@@ -347,7 +354,9 @@ def _to_metres(points: Floats32, origin: Floats, units: float) -> Floats:
     origin : (3,) in units of the file
     units : number of units per metre
 
-    Raise UnreadableCloud if the points are more than `2 * FARTHEST_M` apart along an axis.
+    Raises
+    ------
+    UnreadableCloud : If the points are more than `2 * FARTHEST_M` apart along an axis.
     """
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     widest = float((high - low).max()) / units
