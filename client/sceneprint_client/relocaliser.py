@@ -237,7 +237,7 @@ class Relocaliser:
                 scan = timed_points(message)
         except SceneprintError as error:
             self.counts["unreadable"] += 1
-            self._note(error)
+            self._record_error(error)
             return
         if self._newest_ns - stamp > _JUMP_S * 1e9:
             self._restart("the clock jumped back")
@@ -254,7 +254,7 @@ class Relocaliser:
         except SceneprintError as error:
             self.counts["frames"] += 1
             self.counts["unreadable"] += 1
-            self._note(error)
+            self._record_error(error)
         else:
             self.take_frame(message)
 
@@ -348,14 +348,14 @@ class Relocaliser:
             frame, camera = self._frame(message)
         except SceneprintError as error:
             self.counts["unreadable"] += 1
-            self._note(error)
+            self._record_error(error)
             self._tracker.move(place.T_odom_sensor, stamp)
             return
         try:
             up = self._up(message, place.stamp_ns)
             self._questions.submit(frame, place.T_odom_sensor, up, stamp, meta=camera)
         except SceneprintError as error:  # raised by the previous query
-            self._note(error)
+            self._record_error(error)
         else:
             self._queried_ns = place.stamp_ns
             self.counts["queried"] += 1
@@ -402,7 +402,7 @@ class Relocaliser:
         x, y, z = T_sensor_imu[:3, :3] @ up
         return float(x), float(y), float(z)
 
-    def _note(self, error: SceneprintError) -> None:
+    def _record_error(self, error: SceneprintError) -> None:
         self._error, self._error_at = str(error), self._questions.answered
 
     # Output.

@@ -359,14 +359,14 @@ class _Slot:
         try:
             return self._run(request, data, checked, compiled=compiled)
         except DecoderEnded as first:
-            self._pool.note(self, str(first))
+            self._pool.drop_process(self, str(first))
             try:
                 return self._run(request, data, checked, compiled=compiled)
             except DecoderEnded as again:
-                self._pool.note(self, str(again))
+                self._pool.drop_process(self, str(again))
                 raise DecoderFailure(f"it crashes the decoder ({again})") from again
         except DecoderFailure as error:
-            self._pool.note(self, str(error))
+            self._pool.drop_process(self, str(error))
             raise
 
     def end(self) -> None:
@@ -482,7 +482,7 @@ class DecoderPool:
         self.protections = process.protections
         return process
 
-    def note(self, slot: _Slot, reason: str) -> None:
+    def drop_process(self, slot: _Slot, reason: str) -> None:
         """Log the failure of a decoder, and kill its process."""
         process = slot.process
         about = {"pid": None if process is None else process.pid, "error": reason}

@@ -28,7 +28,7 @@ from sceneprint_client.api.sessions import Association, Edge, Graph, Vertex
 from sceneprint_viewers.map_scene import (
     MAP_FRAMES,
     PosedRun,
-    evenly_taken,
+    evenly_spaced,
     map_entities,
     map_runs,
     placed_points,
@@ -370,7 +370,7 @@ def _run_entities(
     client: Client, run: PosedRun, up: Floats, colour: Colour, most: int, *, alone: bool
 ) -> list[SceneEntity]:
     """Return points and track of a session; a single session (`alone`) is coloured by height."""
-    chosen = evenly_taken([run], most)
+    chosen = evenly_spaced([run], most)
     path = (run.parent_frame, "sessions", run.name)
     entities = []
     if chosen:

@@ -151,7 +151,7 @@ def map_entities(
     if up is None:
         up = up_of_runs(runs)
     entities = [SceneEntity((space,), UpAxis(up))]
-    chosen = evenly_taken(runs, most)
+    chosen = evenly_spaced(runs, most)
     if chosen:
         limit = points_of_each(len(chosen))
         clouds = [placed_points(client, *place, limit) for place in chosen]
@@ -183,7 +183,7 @@ def up_of_map(client: Client, map_name: str) -> Floats | None:
     return None if up is None else np.array([up.x, up.y, up.z])
 
 
-def evenly_taken(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Floats]]:
+def evenly_spaced(runs: Sequence[PosedRun], most: int) -> list[tuple[str, str, Floats]]:
     """Return map, frame id and pose of at most `most` frames, evenly spaced over all runs."""
     every = [
         (run.map_name, frame_id, T)
@@ -220,7 +220,7 @@ def frames_scene(client: Client, frames: Sequence[Frame], most: int) -> Moment:
     for parent in parents:
         of_parent = [run for run in runs if run.parent_frame == parent]
         entities += map_entities(client, of_parent, parent, up, most // len(parents))
-    chosen = {frame_id for _, frame_id, _ in evenly_taken(runs, most)}
+    chosen = {frame_id for _, frame_id, _ in evenly_spaced(runs, most)}
     for frame in frames:
         if frame.pose is not None and frame.frame_id in chosen:
             path = (frame.pose.parent_frame, "frames", frame.frame_id)
