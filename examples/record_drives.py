@@ -4,7 +4,7 @@
 
 `drives/mapping` has poses in `map`, as a SLAM system publishes them. `drives/later` has only
 odometry with another origin and a drift of 1 %. `drives/later.tum` holds the true poses of
-its camera in `map` for comparison. The room is synthetic. Needs `pip install rosbags`.
+its camera in `map` for comparison. The room is synthetic. Needs rosbags (README.md).
 """
 
 from __future__ import annotations

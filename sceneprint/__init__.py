@@ -10,7 +10,7 @@
 
     answer = sceneprint.Client("http://robot-server:8008").query("warehouse", path)  # all steps
 
-The package imports a module when one of its names is first used.
+A module is imported when one of its names is first used.
 """
 
 from __future__ import annotations

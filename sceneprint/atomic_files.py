@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 #: Permissions of the store's folders and files, regardless of the umask: frames show private rooms,
-#: and the database contains the hashes of keys.
+#: and the database contains hashes of keys.
 PRIVATE_FOLDER, PRIVATE_FILE = 0o700, 0o600
 
 
@@ -32,7 +32,7 @@ def create_private(path: Path) -> int:
 
 
 def public_mode(folder: Path) -> int | None:
-    """Return a folder's permissions if users outside its group may read or enter it, else None."""
+    """Return a folder's mode if users outside its group may access it, else None."""
     try:
         mode = stat.S_IMODE(folder.stat().st_mode)
     except OSError:
@@ -41,7 +41,7 @@ def public_mode(folder: Path) -> int | None:
 
 
 def nearest_folder(folder: Path) -> Path:
-    """Return the folder or its nearest existing parent, which is on the same disk.
+    """Return the folder or its nearest existing parent, on whose disk it will be.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def warn_if_public(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Check that `write_whole` can write a file, before a long computation.
+    """Check, before a long computation, that `write_whole` will be able to write a file.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def check_writable(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes, *, private: bool = False) -> None:
-    """Write a file atomically: if the process is killed, the previous file, if any, is unchanged.
+    """Write a file atomically: if the process is killed, any previous file is unchanged.
 
     Parameters
     ----------
@@ -96,9 +96,9 @@ def write_whole(path: Path, data: bytes, *, private: bool = False) -> None:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path for a library that writes files itself; then move the file to `path`.
+    """Yield a temporary path for a library that writes files itself; then move its file to `path`.
 
-    If the block writes no file or raises an exception, the previous file remains.
+    If the block writes no file or raises an exception, any previous file is unchanged.
 
     Raises
     ------
@@ -115,13 +115,13 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_durable(path: Path, data: bytes, *, folder_is_new: bool = True) -> None:
-    """Write a private file atomically and durably: after the return, it survives a loss of power.
+    """Write a private file atomically and durably: once this returns, it survives a loss of power.
 
     Parameters
     ----------
     path : path of the file; its folder must exist
     data : content of the file
-    folder_is_new : whether the folder's parent must be synced, because the folder may be new
+    folder_is_new : whether the folder may be new, so that its parent must be synced too
 
     Raises
     ------
@@ -154,7 +154,7 @@ def make_folder(folder: Path) -> None:
 
 
 def put_new(part: Path, path: Path) -> None:
-    """Move a file to a path that must not exist, durably.
+    """Move a file, durably, to a path that must not exist.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def put_new(part: Path, path: Path) -> None:
         os.link(part, path)
     except FileExistsError:
         raise
-    except OSError as error:  # the file system has no links
+    except OSError as error:  # the file system has no hard links
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from error
         part.rename(path)
@@ -175,9 +175,9 @@ def put_new(part: Path, path: Path) -> None:
 
 @contextmanager
 def folder_turn(folder: Path) -> Iterator[bool]:
-    """Create a folder if it is missing, and lock it; yield False if it is locked already."""
+    """Lock a folder, created if missing, during the block; yield False if it is already locked."""
     make_folder(folder)
-    # flock on a new descriptor excludes other threads of this process too
+    # flock on a new descriptor also excludes other threads of this process
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC
     descriptor = os.open(folder / ".lock", flags, PRIVATE_FILE)
     try:
@@ -227,4 +227,4 @@ def sync_folder(folder: Path) -> None:
 def _temporary_path(path: Path) -> Path:
     return path.with_name(
         f".{secrets.token_hex(6)}.part"
-    )  # the name of `path` may be too long for a suffix
+    )  # a suffix could make the name of `path` too long

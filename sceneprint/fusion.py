@@ -1,8 +1,8 @@
-"""Fusion of depth images of a place to a mesh, by a truncated signed distance function (TSDF).
+"""Fusion of depth images of a place into a mesh, by a truncated signed distance function (TSDF).
 
 views (V)  --fuse-->  TriangleMesh, voxel
 
-Only this module imports Open3D; it does so at the first fusion.
+Only this module imports Open3D, at the first fusion.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sceneprint.geometry.surface.coverage import TriangleMesh
 from sceneprint.geometry.surface.depth_image import halve_camera
 from sceneprint.types import DepthFrame, Floats, Floats32
 
-#: Debian packages with the system libraries that Open3D loads.
+#: Debian packages that contain the system libraries that Open3D loads.
 PACKAGES = "libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1"
 
 
@@ -43,16 +43,16 @@ def open3d(feature: str) -> Any:
             f"{feature} requires Open3D, which cannot be imported ({error}). Install it (pip "
             f"install open3d) and, on Debian or Ubuntu, its libraries: apt-get install {PACKAGES}"
         ) from error
-    module.utility.set_max_threads(1)  # several threads would sum in a random order
+    module.utility.set_max_threads(1)  # several threads would sum in random order
     module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
     return module
 
 
 #: Number of voxels along the edge of a block.
 _SIDE = 8
-#: Half width of the band around a surface, along the ray, in voxels: the truncation distance.
-#: Surfaces at less than asin(1 / 6), 10 degrees, to the ray get holes; a wider band would merge
-#: the two sides of thin objects.
+#: Truncation distance: half the width of the band around a surface, along the ray, in voxels.
+#: Surfaces at less than asin(1 / 6), 10 degrees, to the ray get holes; a wider band would merge the
+#: two sides of thin objects.
 BAND = 6.0
 
 
@@ -60,12 +60,12 @@ BAND = 6.0
 class FusionParameters:
     """Parameters of a fusion."""
 
-    voxel_m: float | None = None  #: edge of a voxel; None selects the finest possible edge
+    voxel_m: float | None = None  #: edge of a voxel; None selects the smallest possible edge
     nearest_m: float = 0.3  #: minimum depth of a fused sample
-    farthest_m: float = 6.0  #: maximum depth of a fused sample; farther samples are inaccurate
-    finest_m: float = 0.01  #: minimum edge if `voxel_m` is None; finer voxels store noise
-    #: Maximum number of blocks. A block of 512 voxels has 4 KiB and gives about 50 points, so the
-    #: maximum needs 64 MiB and gives a mesh file of about 50 MB.
+    farthest_m: float = 6.0  #: maximum depth of a fused sample; more distant samples are inaccurate
+    finest_m: float = 0.01  #: minimum edge if `voxel_m` is None; smaller voxels would store noise
+    #: Maximum number of blocks. A block of 512 voxels takes 4 KiB and gives about 50 points, so the
+    #: maximum takes 64 MiB and gives a mesh file of about 50 MB.
     most_blocks: int = 16_384
     most_samples: int = 640 * 480  #: maximum number of samples per view; larger images are thinned
 
@@ -73,7 +73,7 @@ class FusionParameters:
 def fuse(
     views: Sequence[DepthFrame], p: FusionParameters | None = None
 ) -> tuple[TriangleMesh, float]:
-    """Fuse several depth images to one mesh, deterministically.
+    """Fuse several depth images into one mesh, deterministically.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def fuse(
     ------
     MissingDependency : If Open3D or a system library that it requires is missing
     UselessFrame : If no sample of the views lies within the range
-    InvalidRequest : If voxels of the requested size need too many blocks
+    InvalidRequest : If voxels of the requested size would need too many blocks
     """
     p = p or FusionParameters()
     o3d = open3d("A reconstruction")
@@ -106,12 +106,13 @@ def fuse(
 def prepare_view(view: DepthFrame, p: FusionParameters) -> DepthFrame:
     """Return a view with at most `most_samples` samples, all within the depth range.
 
-    Large images are subsampled, not averaged: a mean across an edge would be a false surface.
+    Large images are subsampled, not averaged, because a mean across an edge would be a false
+    surface.
     """
     depth, camera = np.asarray(view.depth, np.float32), view.intrinsics
     while depth.size > p.most_samples:
         camera = halve_camera(camera)
-        # the retained sample is a quarter pixel to the top left of the new pixel's centre
+        # the retained sample is a quarter pixel above and to the left of the new pixel's centre
         depth = depth[: 2 * camera.height : 2, : 2 * camera.width : 2]
         camera = replace(camera, cx=camera.cx + 0.25, cy=camera.cy + 0.25)
     with np.errstate(invalid="ignore"):
@@ -133,8 +134,8 @@ def _select_voxel(
 ) -> float:
     """Return the edge of the voxels, metres: `p.voxel_m`, or a small edge without gaps.
 
-    An edge that the caller does not specify grows until `p.most_blocks` suffice. Raise
-    InvalidRequest if a specified edge needs more blocks.
+    If `p.voxel_m` is None, the edge grows until `p.most_blocks` suffice. Raise InvalidRequest if
+    `p.voxel_m` needs more blocks.
     """
     if p.voxel_m is not None:
         count = _count_blocks(views, points, p.voxel_m)
@@ -167,7 +168,7 @@ def _count_blocks(views: Sequence[DepthFrame], points: Sequence[Floats], voxel: 
 
 
 def _band_blocks(T: Floats, points: Floats, voxel: float) -> NDArray[np.int32]:
-    """Return the indices (B, 3) of the blocks within the band of a view; T is T_parent_view."""
+    """Return the indices (B, 3) of the blocks that a view's band touches; T is T_parent_view."""
     if not len(points):
         return np.zeros((0, 3), np.int32)
     band, edge = BAND * voxel, _SIDE * voxel
@@ -205,7 +206,7 @@ def _extract_mesh(
             core.Tensor(inverse(T)), 1.0, p.farthest_m, BAND,
         )  # fmt: skip
     try:
-        # the threshold accepts surfaces that only one view observed
+        # this threshold accepts surfaces that only one view observed
         mesh = grid.extract_triangle_mesh(0.5)
     except RuntimeError as error:  # Open3D raises this for a mesh without points
         raise UselessFrame(
@@ -220,7 +221,7 @@ def _extract_mesh(
 
 
 def _sort_mesh(points: Floats, normals: Floats, triangles: NDArray[np.int32]) -> TriangleMesh:
-    """Return a mesh with sorted points and triangles; Open3D's hash table has a random order."""
+    """Sort the points and triangles of a mesh, because Open3D's hash table has a random order."""
     order = np.lexsort(points.T[::-1])
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
@@ -240,7 +241,7 @@ def _require_pose(view: DepthFrame) -> Floats:
     return view.pose
 
 
-#: Colours of the views, the query's grey first. They repeat if there are more views.
+#: Colours of the views, starting with the query's grey; if there are more views, they repeat.
 PALETTE = np.array(
     [
         (150, 154, 160), (49, 112, 184), (222, 126, 46), (52, 160, 105), (158, 84, 172),

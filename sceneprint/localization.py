@@ -1,4 +1,4 @@
-"""Localization of a query: its pose from validated matches and the frames of the map.
+"""Localization: the pose of a query, from its validated matches and the map's frames.
 
 matches, poses, MapViews  --localize-->  PoseEstimate
 
@@ -61,7 +61,7 @@ class AlternativePose:
     T : (4, 4) T_parent_query
     support : number of different viewpoints of the matches that vote for the pose
     confidence : probability that the pose is right; None without a map
-    evidence : evidence for the confidence; None without a map
+    evidence : evidence for and against the pose; None without a map
     """
 
     T: Floats
@@ -84,9 +84,9 @@ class PoseEstimate:
         covariance
     strength : strength of the matches that vote for the answer; None unless found
     verified_by : evidence that confirmed the answer; None unless found
-    alternatives : plausible poses, best first; if found, only the answer
+    alternatives : plausible poses, best first; if found, the answer only
     votes : number of accepted matches with a pose in the parent frame
-    members : rows of the matches that vote for the answer
+    members : database rows of the matches that vote for the answer
     guided : number of guided matches among `members`
     places : all evaluated places
     """
@@ -129,10 +129,10 @@ def localize(
     Parameters
     ----------
     frames : one or more frames of the query
-    poses : T_parent_sensor (4, 4) of all rows of the database, or of the matches by row
-    parents : parent frames of the rows; None for a single parent frame. Poses are compared only
-        within the parent frame of the prior or of most matches
-    views_of : see ViewsOf; None decides by the matches only, without the map
+    poses : T_parent_sensor (4, 4) of all rows of the database, or of the matches' rows, by row
+    parents : parent frame of each row; None for a single parent frame. Poses are compared only
+        within one parent frame, that of the prior or of most matches
+    views_of : see ViewsOf; with None, only the matches decide, without the map
     prior : pose that the robot expects; None if it has no expectation
     p : parameters; None selects the parameters of the artifacts' model
 
@@ -152,7 +152,7 @@ def localize(
 
 
 class QueryDatabase(Protocol):
-    """The frames that a query searches, in the store of a service or in an evaluation."""
+    """The frames that a query searches: those in the store of a service or of an evaluation."""
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         """Return the pose of the last frame, estimated from all frames' matches; see `localize`."""
@@ -163,7 +163,7 @@ class QueryDatabase(Protocol):
         Parameters
         ----------
         frame : index of the frame
-        known : validations of candidates by row, which are not repeated
+        known : existing validations of candidates, by row; they are not repeated
 
         Returns
         -------
@@ -171,7 +171,7 @@ class QueryDatabase(Protocol):
         """
 
     def posed(self, rows: Sequence[int]) -> Mapping[int, PosedFrame]:
-        """Return the rows that have a pose."""
+        """Return the frames of those rows that have a pose, by row."""
 
     def compare(self, rows: Sequence[int]) -> Sequence[PairMatch]:
         """Validate the last frame against `rows`, without guidance by other matches."""
@@ -181,10 +181,11 @@ def decide(
     frames: Sequence[QueryFrame], ranking: Ranking, database: QueryDatabase,
     p: LocalizationParameters,
 ) -> PoseEstimate | None:  # fmt: skip
-    """Estimate the pose of a query's last frame, after all validations that may change it.
+    """Estimate the pose of a query's last frame, with all validations that may change it.
 
-    If no pose is found and some matches are guided, their transforms are searched without guidance.
-    Before a pose counts as found, similar frames of other places are compared; see `rival_rows`.
+    If no pose is found and some matches were guided, their transforms are searched without
+    guidance. Before a pose counts as found, similar frames of other places are compared; see
+    `rival_rows`.
 
     Parameters
     ----------
@@ -209,8 +210,8 @@ def decide(
         if estimate is None or estimate.status == "found":
             return estimate
         again = [
-            None if known is None else database.search(number, known)
-            for number, known in enumerate(map(unguided_validations, of_candidates))
+            None if existing is None else database.search(number, existing)
+            for number, existing in enumerate(map(unguided_validations, of_candidates))
         ]
         if not any(again):
             return estimate
@@ -240,12 +241,12 @@ def views_of_rows(
 
     Parameters
     ----------
-    matches : matches of the query; poses are compared with their rows first
+    matches : matches of the query; poses are first compared with the rows of these matches
     poses : T_parent_sensor (4, 4) of every row
     open_geometry : function that returns the artifact of a row, or None
     parents : parent frames of all rows; None for a single parent frame
-    ahead : whether the sensor of each row looks along z; None means that all do
-    rendered : whether each row is a view rendered from a surface; None means that none is
+    ahead : whether the sensor of each row looks along z; None if all do
+    rendered : whether each row is a view rendered from a surface; None if none is
     """
 
     def views_of(parent: str, at: Floats) -> MapViews:  # noqa: ARG001
@@ -266,7 +267,7 @@ def views_of_rows(
 
 @dataclass(frozen=True, eq=False)
 class PosedFrame:
-    """A frame of the map: its pose T_parent_sensor (4, 4), and whether its sensor looks along z."""
+    """A frame of the map, its pose T_parent_sensor (4, 4), and whether its sensor looks along z."""
 
     parent: str
     T: Floats
@@ -281,7 +282,7 @@ def rival_rows(
     query_ahead: bool,
     p: LocalizationParameters | None = None,
 ) -> list[int]:
-    """Return database rows of similar frames whose places differ from the estimate's.
+    """Return database rows of similar frames whose places differ from that of the estimate.
 
     If two identical rooms were mapped from the same viewpoints, each signature is in the database
     twice, and all members of C may show the wrong room. Therefore, frames of other places whose
@@ -292,13 +293,13 @@ def rival_rows(
     estimate : result of `localize`
     ranking : R
     tried : rows that were validated
-    posed : function that returns those of the rows that have a pose
+    posed : function that returns the frames of the rows that have a pose, by row
     query_ahead : whether the query's sensor looks along z
 
     Returns
     -------
-    rows : first such rows of R, at most `p.rivals`; empty unless matches or the map confirmed
-        `estimate`
+    rows : the first such rows of R, at most `p.rivals`; empty unless `estimate` was found by
+        matches or the map
     """
     p = p or LocalizationParameters()
     if estimate is None or estimate.average is None or estimate.verified_by == "prior":
@@ -322,7 +323,7 @@ def rival_rows(
 
 
 def mark_unconfirmed(estimate: PoseEstimate) -> PoseEstimate:
-    """Return a found estimate as ambiguous: similar frames of other places were not compared."""
+    """Return a found estimate as ambiguous because similar frames elsewhere were not compared."""
     if estimate.average is None:
         return estimate
     return replace(
@@ -337,11 +338,11 @@ def _estimate_from_places(
     parent: str, places: Sequence[Place], prior: PosePrior | None, p: LocalizationParameters, *,
     blind: bool = False,
 ) -> PoseEstimate:  # fmt: skip
-    """Return the estimate from evaluated places.
+    """Return the estimate that the evidence for all places gives.
 
     Parameters
     ----------
-    parent, prior, places : results of `judge_places`, with at least one place
+    parent, prior, places : result of `judge_places`, with at least one place
     blind : whether the free space of all query frames is unknown
     """
     if all(place.evidence is None for place in places):
@@ -382,7 +383,7 @@ def _place_confidences(places: Sequence[Place], p: LocalizationParameters) -> li
     ]
 
 
-#: Minimum number of suggesting viewpoints of a pose that the prior expects.
+#: Minimum number of viewpoints that count as suggesting a pose that the prior expects.
 _SUGGESTED_BY_PRIOR = 2
 
 
@@ -391,8 +392,8 @@ def _confirm_by_prior(
 ) -> tuple[Place, float] | None:
     """Return the place that the prior confirms, and its confidence; None if there is none.
 
-    Only places that the prior expects are rivals. The confirmed place must also have at least
-    `p.prior_share` of the best score of all places.
+    Only places that the prior expects are rivals. The score of the confirmed place must also be at
+    least `p.prior_share` of the best score of all places.
     """
     inside = [place for place in places if prior.expects(place.T)]
     most = max(place.score for place in places)
@@ -418,7 +419,7 @@ def _confirm_by_prior(
 def _estimate_by_votes(
     parent: str, places: Sequence[Place], blind: bool, p: LocalizationParameters
 ) -> PoseEstimate:
-    """Return the estimate from the votes for places, without a map."""
+    """Return the estimate that the votes for places give, without a map."""
     order = sorted(places, key=lambda place: (not place.accepted, -place.weight))
     best, heaviest = order[0], max((place.weight for place in order[1:]), default=0.0)
     against = None
@@ -466,7 +467,7 @@ def _found_reason(
     average: PoseAverage, agreeing: int, guided: int, accepted: int, support: int,
     verified_by: Verifier,
 ) -> str:  # fmt: skip
-    """Return a clause that describes the evidence for the answer."""
+    """Return a clause that describes the evidence for a found pose."""
     if verified_by == "map":
         return "the map's frames confirm this pose, and all other poses fit much worse"
     if verified_by == "prior":

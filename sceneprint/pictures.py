@@ -27,12 +27,12 @@ from sceneprint.types import (
 )
 from sceneprint_client.api.results import WIDTHS
 
-#: Colour of unknown pixels, a dark grey that represents no normal and no depth.
+#: Colour of unknown pixels: a dark grey that stands for no normal and no depth.
 UNKNOWN = 40
 
 
 def normal_colours(normals: Floats32, valid: NDArray[np.bool_]) -> Bytes:
-    """Return normals as colours like the paper's Fig. 1: red, green, blue for x, y, z.
+    """Return normals as colours as in the paper's Fig. 1: red, green, blue for x, y, z.
 
     Parameters
     ----------
@@ -57,14 +57,15 @@ _AXES = "x, y and z in the axes of the cloud"
 
 @dataclass(frozen=True, eq=False)
 class Vista:
-    """The pixels of a picture of a surface, as indices of its points.
+    """A picture of a surface: the index of the point that each pixel shows.
 
     Parameters
     ----------
     pixels : (h, w) int32, index of each pixel's point; -1 for pixels without a point
     distances : (N,) float64, distances of the points, metres
-    what : kind of `distances`: "depth" along a camera's axis, "range" from a viewpoint, or "height"
-    axes : description of the axes of normals
+    what : meaning of `distances`: "depth" along a camera's axis, "range" from a viewpoint, or
+        "height"
+    axes : description of the axes in which normals are given
     """
 
     pixels: Ints32
@@ -73,7 +74,7 @@ class Vista:
     axes: str
 
     def of(self, values: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Return the values (h, w, ...) of the pixels' points; arbitrary for empty pixels."""
+        """Return the value (h, w, ...) of each pixel's point; for an empty pixel, any value."""
         chosen: NDArray[Scalar] = values[self.pixels]
         return chosen
 
@@ -85,8 +86,8 @@ class Vista:
 
 def vista_of(surface: Surface) -> Vista:
     """Return the picture of a surface from its camera or around its viewpoint.
-    Unordered points are viewed along the axis of their minimum extent, which is vertical in most
-    buildings.
+    Unordered points are viewed along the axis in which their extent is smallest, which is vertical
+    in most buildings.
 
     Parameters
     ----------
@@ -98,7 +99,8 @@ def vista_of(surface: Surface) -> Vista:
     if isinstance(surface.camera, Intrinsics):
         return Vista(pixels, points[:, 2], "depth", _OPTICAL)
     if isinstance(surface.camera, Sphere):
-        # azimuth increases to the left if the pole is up; an optical frame's y axis points down
+        # if the pole is up, azimuth increases to the left; the y axis of an optical frame points
+        # down
         flipped = pixels[::-1] if surface.camera.pole == 1 else pixels[:, ::-1]
         return Vista(flipped, np.linalg.norm(points, axis=1), "range", _AXES)
     return _along_least_extent(points, surface.valid.ravel())
@@ -127,7 +129,7 @@ def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Int
 
 
 def _along_least_extent(points: Floats, valid: NDArray[np.bool_]) -> Vista:
-    """Return a view of points (N, 3) along the axis of their least extent.
+    """Return a view of points (N, 3) along the axis in which their extent is smallest.
     This axis is vertical for a room, and horizontal for a single wall. Each pixel shows the point
     that is farthest along it.
     """
@@ -155,9 +157,9 @@ def _along_least_extent(points: Floats, valid: NDArray[np.bool_]) -> Vista:
 #: Maximum number of rows of a picture; larger pictures are scaled down.
 MOST_ROWS = 2560
 
-#: Percentiles of depth at the ends of the colour map: stray samples must not compress the rest.
+#: Percentiles of depth at the ends of the colour map, so that stray samples do not compress it.
 _RANGE = (1.0, 99.0)
-#: Equally spaced colours of viridis; the error of linear interpolation is at most 6 of 255.
+#: Equally spaced colours of viridis; linear interpolation errs by at most 6 of 255.
 _VIRIDIS = np.array(
     [
         (68, 1, 84), (72, 24, 106), (71, 45, 123), (66, 64, 134), (59, 82, 139), (51, 99, 141),
@@ -167,9 +169,9 @@ _VIRIDIS = np.array(
     ],
     np.float64,
 )  # fmt: skip
-#: Number of additional colours, so that the last patches can choose from several colours too.
+#: Number of additional colours, so that the last patches can also choose from several colours.
 _SPARE = 64
-#: Matrices from Oklab to cube roots of cone responses, and from cone responses to linear sRGB.
+#: Matrices from Oklab to the cube roots of cone responses, and from cone responses to linear sRGB.
 _TO_CONES = np.array(
     [(1, 0.3963377774, 0.2158037573), (1, -0.1055613458, -0.0638541728),
      (1, -0.0894841775, -1.2914855480)]
@@ -183,7 +185,7 @@ _TO_PRIMARIES = np.array(
 def depth_view(surface: Surface) -> tuple[Bytes, dict[str, str]]:
     """Return depths in a perceptually uniform colour map: near is yellow, far is violet.
 
-    A cloud with a viewpoint shows ranges, a cloud without one shows heights: high is yellow.
+    Return the ranges of a cloud with a viewpoint, and the heights of another cloud: high is yellow.
 
     Parameters
     ----------
@@ -261,13 +263,13 @@ def patches_view(labels: Ints32) -> tuple[Bytes, dict[str, str]]:
 
 
 def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
-    """Encode colours as a PNG file. Scaling repeats or omits pixels, but does not mix them.
+    """Encode colours as a PNG file, scaled to `width`; scaling does not mix pixels.
 
     Parameters
     ----------
     colours : (h, w, 3) uint8
-    width : number of columns; reduced if the picture would have more than MOST_ROWS rows
-    text : values of the file's tEXt chunks by keyword
+    width : number of columns, reduced if the picture would have more than MOST_ROWS rows
+    text : values of the file's tEXt chunks, by keyword
 
     Raises
     ------
@@ -290,12 +292,12 @@ def picture(colours: Bytes, width: int, text: Mapping[str, str]) -> bytes:
 
 #: Colours (red, green, blue) of the query and of the match, as on the dashboard.
 QUERY_COLOUR, MATCH_COLOUR = (217, 119, 43), (43, 108, 176)
-#: Number of pixels along the longer side of a panel, and number of points for a saturated pixel.
+#: Number of pixels along the longer side of a panel, and number of points that saturate a pixel.
 _PANEL, _FULL = 480, 1.5
 
 
 def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title: str) -> bytes:
-    """Draw two frames from above, before and after the transform; return two panels as a PNG file.
+    """Draw two frames from above, before and after the transform: two panels, as a PNG file.
 
     Parameters
     ----------
@@ -305,7 +307,7 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
     """
     from PIL import Image, ImageDraw
 
-    # x of the match's camera points right in the picture, z (its optical axis) points up
+    # in the picture, the match's camera has x to the right, and z (its optical axis) up
     ours, theirs = (surface.points[surface.valid].astype(np.float64) for surface in (query, match))
     aligned = transform_points(T_match_query, ours)
     everything = np.concatenate([theirs, ours, aligned])[:, [0, 2]]
@@ -335,9 +337,9 @@ def overlay_picture(query: Surface, match: Surface, T_match_query: Floats, title
     return buffer.getvalue()
 
 
-def _sample_indices(n: int, wanted: int) -> NDArray[np.intp]:
-    """Return the indices of the source pixels, of `n`, at the centres of `wanted` target pixels."""
-    return ((np.arange(wanted) + 0.5) * n / wanted).astype(np.intp)
+def _sample_indices(n: int, size: int) -> NDArray[np.intp]:
+    """Return the indices of the source pixels (of `n`) at the centres of `size` target pixels."""
+    return ((np.arange(size) + 0.5) * n / size).astype(np.intp)
 
 
 def _assign_colours(labels: Ints32, count: int) -> Bytes:
@@ -360,7 +362,7 @@ def _assign_colours(labels: Ints32, count: int) -> Bytes:
 
 
 def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
-    """Return, for each patch, the patches that adjoin it by a pixel edge."""
+    """Return, for each patch, the patches that share a pixel edge with it."""
     across = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
     down = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
     pairs = np.concatenate([across, down])
@@ -373,7 +375,7 @@ def _neighbours(labels: Ints32, count: int) -> list[NDArray[np.intp]]:
 def _palette(count: int) -> Floats:
     """Return colours (count, 3) in Oklab, evenly distributed over hue and lightness."""
     n = np.arange(1, count + 1)
-    # powers of the plastic number distribute points evenly over the square (Roberts 2018)
+    # powers of the plastic number distribute points evenly over a square (Roberts 2018)
     plastic = 1.32471795724474602596
     lightness = 0.48 + 0.4 * ((0.5 + n / plastic) % 1.0)
     hue = 2.0 * math.pi * ((0.5 + n / plastic**2) % 1.0)

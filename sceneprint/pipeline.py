@@ -1,4 +1,4 @@
-"""Functions for the stages of the paper's Fig. 1.
+"""The stages of the paper's Fig. 1, as functions.
 
 frame --prepare--> signature, geometry
 signature, database --retrieve--> R --diversify--> C --associate--> C_vld --localize--> pose
@@ -88,7 +88,7 @@ def sign(frame: AnyFrame, signer: Signer) -> Signature:
 
 
 def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
-    """Compute the signature and the geometry artifact of a frame; the surface is computed once.
+    """Compute the signature and the geometry artifact of a frame, from one surface.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def prepare(frame: AnyFrame, signer: Signer) -> tuple[Signature, Geometry]:
 
 
 def geometry_of(seen: Surface, model: Model) -> Geometry:
-    """Compute the geometry artifact of a surface, which validation requires: Sec. III-E.
+    """Compute a surface's geometry artifact, which validation requires: Sec. III-E.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def retrieve(
     ----------
     database : N signatures
     model : model of all signatures
-    size : number of members of R; None selects it from N, see `ranking_size`
+    size : number of members of R; None derives it from N, see `ranking_size`
 
     Raises
     ------
@@ -203,7 +203,7 @@ def validate(
     ups: Ups = NO_UPS,
     other_axes: bool = False,
 ) -> PairValidation:
-    """Decide whether two frames see one place, and estimate their transform: Sec. III-E.
+    """Decide whether two frames show the same place, and estimate their transform: Sec. III-E.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def validate(
     mode : "full", or "paper" to apply only the paper's test
     matching : "histograms", or "sequence" for the paper's slower matching
     ups : (3,) unit vectors, up in the query's and in the match's coordinates; None if unknown
-    other_axes : whether to consider that the scanners were not upright
+    other_axes : whether to try hypotheses for scanners that were not upright
 
     Raises
     ------
@@ -231,7 +231,7 @@ def validate_guided(
 ) -> PairValidation | None:  # fmt: skip
     """Check a predicted transform T_match_query (4, 4): Sec. III-E.
 
-    Other matches and the map's poses predict it; for the result, see
+    The transform is predicted by other matches and the map's poses; for the result, see
     `sceneprint.geometry.validation.validation.validate_guided`.
 
     Raises
@@ -247,7 +247,7 @@ def validate_guided(
 def validate_without_up(
     query: Geometry, match: Geometry, seed: int, p: ValidationParameters | None, ups: Ups
 ) -> PairValidation | None:
-    """Validate by the surfaces only, for a query without a match that fits `up`: Sec. III-E.
+    """Validate by the surfaces only, if no match of a query fits `up`: Sec. III-E.
 
     For the result, see `sceneprint.geometry.validation.validation.validate_without_up`.
 
@@ -275,7 +275,7 @@ def _validation_parameters(geometry: Geometry) -> ValidationParameters:
 
 
 def answer_parameters(geometry: Geometry) -> AnswerParameters:
-    """Return the answer parameters of an artifact's model; defaults if the model is unknown."""
+    """Return the answer parameters of an artifact's model, or the defaults if it is unknown."""
     _learn_presets(geometry.model_id)
     parameters = _PARAMETERS.get(geometry.model_id)
     return AnswerParameters() if parameters is None else parameters[1]
@@ -303,17 +303,17 @@ def _require_same_model(a: Signature | Geometry, b: Signature | Geometry | Model
         )
 
 
-#: Default number of accepted matches per query. Confidences are fitted to this number.
+#: Default number of accepted matches per query, to which confidences are fitted.
 VERDICT_MATCHES = 5
 
-#: Function of a database row that returns its parent frame and T_parent_sensor (4, 4); None for a
-#: row without a pose.
+#: Function that returns the parent frame and T_parent_sensor (4, 4) of a database row; None if the
+#: row has no pose.
 PoseOf = Callable[[int], tuple[str, Floats] | None]
 
 
 @dataclass(frozen=True, eq=False)
 class PairMatch:
-    """A database frame with its validation against a query.
+    """A database frame, with its validation against a query.
 
     Parameters
     ----------
@@ -348,29 +348,29 @@ def associate(
     """Validate candidates in the order of R until `k` matches are accepted: Sec. III-E.
 
     If two strong matches from different viewpoints agree on the query's pose, the map's poses
-    predict the transforms of later candidates. A predicted transform is refined and checked; the
-    transform is searched only if the check fails. If no match is accepted, the first candidates are
-    validated again without `up`, and scans with other axes.
+    predict the transforms of later candidates. A predicted transform is refined and checked; only
+    if the check fails is the transform searched for. If no match is accepted, the first candidates
+    are validated again: without `up`, if it is known, and then scans with other axes.
 
     Parameters
     ----------
     query : geometry artifact
     ranking : R
     among : ascending positions in R to validate: C, or the first members of R
-    open_geometry : function that returns the artifact of a row; None skips the row
-    k : number of accepted matches at which to stop, at least 1
+    open_geometry : function that returns the artifact of a row, or None to skip the row
+    k : number of accepted matches at which to stop; at least 1
     seed, p, mode, matching : arguments of `validate`
     go_on : function that is called before each candidate; False ends the search
     up : (3,) unit vector that points up in the query's sensor frame; None if unknown
     up_of : function that returns `up` of a database row
-    pose_of : see PoseOf; by default no row has a pose, and every transform is searched
+    pose_of : see PoseOf; by default, no row has a pose, and every transform is searched for
     known : existing validations by row, which are reused
     retry : whether to validate the first candidates again if no match is accepted
 
     Returns
     -------
-    matches : all validated candidates: C_vld first (`rank_accepted`), then transforms that fit but
-        tilt against `up`, then the remaining candidates
+    matches : all validated candidates: C_vld first (`rank_accepted`), then candidates whose
+        transforms fit but tilt against `up`, then the others
 
     Raises
     ------
@@ -418,22 +418,22 @@ def associate(
 
 
 def unguided_validations(matches: Sequence[PairMatch]) -> dict[int, PairValidation] | None:
-    """Return the unguided validations by row; None if no match was guided."""
+    """Return the unguided validations, by row; None if no match was guided."""
     if not any(match.validation.guided for match in matches):
         return None
     return {m.index: m.validation for m in matches if not m.validation.guided}
 
 
-#: Number of strong matches from different viewpoints that are required to guide other matches.
+#: Minimum number of strong matches, from different viewpoints, that guide other matches.
 _GUIDES = 2
 
 
 def _predict_transform(
     tried: Sequence[PairMatch], index: int, pose_of: PoseOf, p: MapParameters
 ) -> Floats | None:
-    """Return T_match_query of a candidate, predicted from its pose and the previous matches.
+    """Predict T_match_query of a candidate from its pose and the previous matches.
 
-    The result is None if the candidate has no pose, too few of these matches are strong, or an
+    Return None if the candidate has no pose, if too few of these matches are strong, or if an
     accepted or ambiguous match supports another pose.
     """
     own = pose_of(index)
@@ -461,7 +461,8 @@ def _predict_transform(
     return inverse(own[1]) @ T_parent_query
 
 
-#: Number of candidates to validate again in case a scanner was not upright or `up` is wrong.
+#: Number of candidates to validate again if a scanner may not have been upright or `up` may be
+#: wrong.
 _TILTED_TRIES = 3
 
 
@@ -469,7 +470,7 @@ def _retry_tilted(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Validate the first candidates again, in case a scanner was on its side or upside down.
+    """Validate the first candidates again, as if a scanner was on its side or upside down.
 
     Accepted results replace earlier ones in `tried`.
     """
@@ -492,7 +493,7 @@ def _retry_without_up(
     query: Geometry, tried: list[PairMatch], open_geometry: Callable[[int], Geometry | None],
     seed: int, p: ValidationParameters | None, go_on: Callable[[], bool],
 ) -> None:  # fmt: skip
-    """Validate the first candidates again, in case `up` is wrong; update `tried`."""
+    """Validate the first candidates again without `up`, which may be wrong; update `tried`."""
     for place, before in enumerate(tried[:_TILTED_TRIES]):
         geometry, ups = open_geometry(before.index), before.validation.ups
         if geometry is None or not go_on():

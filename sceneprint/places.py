@@ -1,4 +1,4 @@
-"""Evidence for the places where a query may have been taken, from matches, map and prior.
+"""Evidence for the places at which a query may have been taken, from matches, map and prior.
 
 matches, poses, MapViews  --judge_places-->  Place, ...
 
@@ -45,13 +45,13 @@ class LocalizationParameters:
     confidence: float = 0.99  #: minimum confidence of a pose that is found
     worth: float = 0.05  #: minimum confidence of an alternative
     views: int = 5  #: maximum number of averaged votes, and of alternatives
-    half_weight: float = 1 / 30  #: separation of views that halves the weight of a vote
+    half_weight: float = 1 / 30  #: separation of two views that halves the weight of a vote
     weak: float = 0.4  #: weight of a weak or ambiguous match; a strong match has weight 1
-    outweigh: float = 2.0  #: minimum ratio of the weights of the best two places, without a map
-    voted_only: bool = False  #: whether a pose requires the vote of a match
+    outweigh: float = 2.0  #: minimum ratio of the weights of the best two places if there is no map
+    voted_only: bool = False  #: whether a pose requires a vote from a match
     prior_odds: float = 20.0  #: factor by which a prior raises the odds of an expected pose
-    prior_share: float = 0.9  #: minimum score of a pose that a prior confirms, share of the best
-    most_noise: float = 0.2  #: maximum share of violations that the map's noise may explain
+    prior_share: float = 0.9  #: minimum score of a pose that a prior confirms, share of best score
+    most_noise: float = 0.2  #: maximum share of violations that is attributed to the map's noise
     rivals: int = 2  #: maximum number of frames of other places that are compared
     rival_distance: float = 1.2  #: their maximum distance, relative to the farthest voting match
     map: MapParameters = field(default_factory=MapParameters)
@@ -59,19 +59,19 @@ class LocalizationParameters:
 
     @classmethod
     def of(cls, answer: AnswerParameters) -> LocalizationParameters:
-        """Return parameters with a model's answer parameters."""
+        """Return the defaults, with the answer parameters of a model."""
         return cls(map=answer.map, judgement=answer.confidence)
 
 
 @dataclass(frozen=True, eq=False)
 class QueryFrame:
-    """A frame of a query with the matches of its candidates.
+    """A frame of a query, with the matches of its candidates.
 
     Parameters
     ----------
     geometry : artifact of the frame
     matches : results of `associate`, accepted or not
-    T : (4, 4) T_query_sensor by odometry; the identity for the localized frame
+    T : (4, 4) T_query_sensor from odometry; the identity for the frame that is localized
     """
 
     geometry: Geometry
@@ -81,13 +81,14 @@ class QueryFrame:
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
-    """The pose that a robot expects, with its uncertainty.
+    """The pose that a robot expects, and its uncertainty.
 
     Parameters
     ----------
     parent : parent frame of the pose
     T : (4, 4) T_parent_query
-    covariance : (6, 6) of the error (x, y, z, rx, ry, rz) in the parent's axes, metres and radians
+    covariance : (6, 6) covariance of the error (x, y, z, rx, ry, rz) along the parent's axes,
+        metres and radians
     """
 
     parent: str
@@ -104,7 +105,7 @@ class PosePrior:
         return apart <= p.same_surfaces + 3 * deviation
 
     def expects(self, T: Floats) -> bool:
-        """Return whether T_parent_query (4, 4) lies in the prior's 99.9 % confidence region."""
+        """Return whether T_parent_query (4, 4) lies within the prior's 99.9 % confidence region."""
         error = pose_error(self.T, T)
         return float(error @ np.linalg.solve(self.covariance, error)) <= _CHI_SQUARE_6
 
@@ -115,9 +116,9 @@ _CHI_SQUARE_6 = 22.458
 
 @dataclass(frozen=True, eq=False)
 class _Vote:
-    """A match's vote for a pose T of the query; T and `viewpoint` are (4, 4) in the parent frame.
+    """A match's vote for a pose T of the query; T and `viewpoint` are (4, 4), in the parent frame.
 
-    `separation` is the separation of the query's and the match's views; see `view_separations`.
+    `separation` is that between the views of the query and of the match; see `view_separations`.
     """
 
     match: PairMatch
@@ -134,12 +135,12 @@ class _Vote:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A place where the query may have been taken.
+    """A place at which the query may have been taken.
 
     Parameters
     ----------
     T : (4, 4) T_parent_query
-    votes : votes for the place, the most reliable first
+    votes : votes for the place, most reliable first
     support : number of different viewpoints of the voting matches
     weight : total weight of the votes: 1 for a strong match, less for a weak or ambiguous match
     evidence : evidence for the pose; None without a map
@@ -167,8 +168,8 @@ class Place:
         return 0.0 if self.evidence is None else self.evidence.score
 
 
-#: Function of a parent frame and poses (n, 4, 4) that returns the map's frames that may see the
-#: same surfaces.
+#: Function that, for a parent frame and poses (n, 4, 4) in it, returns the map's frames that may
+#: see the same surfaces.
 ViewsOf = Callable[[str, Floats], MapViews]
 
 _NONE = np.empty((0, 4, 4))
@@ -184,7 +185,7 @@ def judge_places(
     parents: Sequence[str] | Mapping[int, str] | None, views_of: ViewsOf | None,
     prior: PosePrior | None, p: LocalizationParameters, overlap_p: OverlapParameters,
 ) -> tuple[str, PosePrior | None, list[Place]]:  # fmt: skip
-    """Return all places that a match, the map or the prior suggests, with their evidence.
+    """Return all places that a match, the map or the prior suggests, with the evidence for each.
 
     Parameters
     ----------
@@ -193,7 +194,7 @@ def judge_places(
     Returns
     -------
     parent : parent frame in which poses are compared
-    prior : the argument; None if it has another parent frame
+    prior : the argument, or None if it is in another parent frame
     places : places with votes first, then by score
     """
     parent = _select_parent(frames, parents)
@@ -201,7 +202,7 @@ def judge_places(
         if _has_accepted(frames, parents, parent) and not _has_accepted(
             frames, parents, prior.parent
         ):
-            prior = None  # it has no meaning in another parent frame
+            prior = None  # a prior has no meaning in another parent frame
         else:
             parent = prior.parent
     own = [
@@ -225,7 +226,7 @@ def judge_places(
 def _select_parent(
     frames: Sequence[QueryFrame], parents: Sequence[str] | Mapping[int, str] | None
 ) -> str:
-    """Return the parent frame with the most strong, then accepted, then validated matches."""
+    """Return the parent frame with the most strong (then accepted, then validated) matches."""
     counts: dict[str, tuple[int, int, int]] = {}
     for frame in frames:
         for match in frame.matches:
@@ -251,7 +252,7 @@ def _has_accepted(
 
 @dataclass(frozen=True, eq=False)
 class _Suggestions:
-    """Poses that candidates suggest: the best pose of each candidate, then the next best.
+    """Poses that candidates suggest: each candidate's best pose first, then the next best poses.
 
     Parameters
     ----------
@@ -272,7 +273,7 @@ def _suggest_poses(
         (match, poses[match.index] @ match.validation.hypotheses @ inverse(frame.T))
         for frame in frames
         for match in frame.matches
-        # a transform that contradicts `up` suggests no pose
+        # a transform that contradicts `up` does not suggest a pose
         if len(match.validation.hypotheses) and not match.validation.contradicts_up
     ]
     most = max((len(hypotheses) for _, hypotheses in of_match), default=0)
@@ -293,7 +294,7 @@ def _collect_votes(
     frames: Sequence[QueryFrame], poses: Sequence[Floats] | Mapping[int, Floats],
     p: LocalizationParameters,
 ) -> list[_Vote]:  # fmt: skip
-    """Return the votes of accepted matches, best first, then the votes of ambiguous matches."""
+    """Return the votes of accepted matches of all frames, best first, then of ambiguous matches."""
     votes: list[_Vote] = []
     for frame in frames:
         ahead = np.array([looks_ahead(frame.geometry)])
@@ -321,7 +322,7 @@ def _collect_votes(
 def _group_votes(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], p: LocalizationParameters
 ) -> list[list[_Vote]]:
-    """Group votes by place: one list per scored pose, in order, then one per other place."""
+    """Group votes by place: return one list per scored pose, in order, then one per other place."""
     groups: list[list[_Vote]] = [[] for _ in scored]
     others: list[list[_Vote]] = []
     for vote in votes:
@@ -339,7 +340,7 @@ def _combine_places(
     votes: Sequence[_Vote], scored: Sequence[ScoredPose], suggested: _Suggestions,
     views: MapViews, p: LocalizationParameters,
 ) -> list[Place]:  # fmt: skip
-    """Return the places of votes and scored poses, with their evidence."""
+    """Return the places of all votes and scored poses, with the evidence for each."""
     groups = _group_votes(votes, scored, p)
     weights = [_count_votes(group, p)[1] for group in groups]
     scores = [pose.score for pose in scored]
@@ -359,7 +360,7 @@ def _make_place(
     group: list[_Vote], pose: ScoredPose | None, p: LocalizationParameters,
     evidence: PlaceEvidence | None = None,
 ) -> Place:  # fmt: skip
-    """Return the place of votes, a scored pose, or both."""
+    """Return the place of a group of votes, of a scored pose, or of both."""
     accepted = any(vote.accepted for vote in group)
     T = group[0].T if pose is None or accepted else pose.T
     support, weight = _count_votes(group, p)
@@ -367,9 +368,9 @@ def _make_place(
 
 
 def _count_votes(group: Sequence[_Vote], p: LocalizationParameters) -> tuple[int, float]:
-    """Return the number of voting viewpoints, and the total weight of their first votes.
+    """Return the number of voting viewpoints, and the total weight of the first vote from each.
 
-    Guided matches and further votes from the same viewpoint do not count.
+    Guided matches do not count.
     """
     voting = [vote for vote in group if not vote.match.validation.guided]
     viewpoints = np.array([vote.viewpoint for vote in voting]).reshape(-1, 4, 4)
@@ -389,7 +390,7 @@ def _place_evidence(
     pose : scored pose of the place; None if no pose was scored there
     suggested : result of `_suggest_poses`
     views : the map's frames
-    rival, rival_weight : maximum score and maximum weight of the other places
+    rival, rival_weight : maximum score of another place, and maximum weight of another place
     """
     weight = _count_votes(group, p)[1]
     strong = _count_votes([v for v in group if v.match.validation.strength == "strong"], p)[0]

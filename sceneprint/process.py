@@ -1,8 +1,8 @@
 """Process set-up: logs, limits, stop signals, secrets, context variables and latency histograms.
 
-A log line is one JSON object on standard error. Secrets may be passed in files instead of the
-environment. The id, tenant and actor of the current request are context variables that threads
-inherit. Latency histograms of several processes can be added.
+A log line is one JSON object on standard error. Secrets may be in files instead of the environment.
+The id, tenant and actor of the current request are context variables, which threads inherit.
+Latency histograms of several processes can be added.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from types import FrameType
 
 from sceneprint.errors import InvalidRequest
 
-#: Attributes of every log record. Other attributes come from `extra` and are written unchanged.
+#: Attributes that every log record has. Others come from `extra` and are written as they are.
 _OWN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
 
 
@@ -55,7 +55,7 @@ def request_id() -> str | None:
 
 
 class JsonFormatter(logging.Formatter):
-    """A formatter of log records as JSON: time, level, logger, message, request, and `extra`."""
+    """Formats log records as JSON: time, level, logger, message, request, and `extra`."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return a record as a line of JSON."""
@@ -83,13 +83,14 @@ def log_as_json(level: int = logging.INFO) -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
 
 
-#: Highest limit of open files that is set; it suffices for any number of maps. Some systems allow a
-#: billion, but then programs that close all descriptors one by one would start slowly.
+#: Maximum limit of open files that a process sets for itself; it suffices for any number of maps.
+#: Some systems allow a billion, but then programs that close all descriptors one by one start
+#: slowly.
 MOST = 1 << 20
 
 
 def raise_descriptors() -> int:
-    """Raise the limit of open files to the system's maximum, at most MOST; return it."""
+    """Raise the limit of open files to the system's maximum, but at most to MOST; return it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MOST if hard == resource.RLIM_INFINITY else min(hard, MOST)
     if soft != resource.RLIM_INFINITY and soft < wanted:
@@ -99,10 +100,10 @@ def raise_descriptors() -> int:
 
 
 def limit_memory(more: int) -> None:
-    """Limit the memory that this process may allocate from now on; beyond it, MemoryError occurs.
+    """Limit the memory that this process may allocate from now on; exceeding it raises MemoryError.
 
-    The limit covers private writable memory, but not files that are mapped into memory, such as
-    tables and indexes.
+    The limit applies to private writable memory, but not to files that are mapped into memory, such
+    as tables and indexes.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ def limit_memory(more: int) -> None:
 
 
 class StopSignal:
-    """A handler of SIGTERM and SIGINT; create a single instance, in the main thread.
+    """A handler for SIGTERM and SIGINT; create a single instance, in the main thread.
 
     Attributes
     ----------
@@ -137,32 +138,33 @@ class StopSignal:
             signal.signal(number, self._request)
 
     def wait(self, seconds: float) -> None:
-        """Wait until a signal arrives or the time has passed."""
+        """Wait until a signal arrives or `seconds` have passed."""
         select.select([self.descriptor], [], [], seconds)
 
     def _request(self, _number: int, _frame: FrameType | None) -> None:
         self.requested = True
 
 
-#: Variables with secrets. `NAME_FILE` may contain the path of a file with the secret instead.
+#: Variables that contain secrets. Instead, `NAME_FILE` may contain the path of a file with the
+#: secret.
 SECRETS = (
     "SCENEPRINT_DATABASE_URL", "PGPASSWORD", "AWS_ACCESS_KEY_ID",
     "AWS_SECRET_ACCESS_KEY", "AZURE_STORAGE_ACCOUNT_KEY",
 )  # fmt: skip
-#: Maximum size of a file with a secret.
+#: Maximum size of a file with a secret, bytes.
 MOST_BYTES = 16 << 10
 
 
 def read_secret_files(environment: MutableMapping[str, str]) -> None:
     """Replace each `NAME_FILE` variable with `NAME`, the content of the file without line ends.
 
-    With secrets in files, the initial environment of a process contains no secret. Other users may
-    see it (`docker inspect`, `/proc`).
+    With secrets in files, the initial environment of a process, which other users may see (`docker
+    inspect`, `/proc`), contains no secret.
 
     Raises
     ------
-    InvalidRequest : If a file cannot be read or contains no secret, or if both a secret and its
-        file are set.
+    InvalidRequest : If a file cannot be read or contains no secret, or if both `NAME` and
+        `NAME_FILE` are set.
     """
     for name in SECRETS:
         path = environment.get(f"{name}_FILE")
@@ -186,16 +188,16 @@ def read_secret_files(environment: MutableMapping[str, str]) -> None:
                 "the file."
             )
         environment[name] = text
-        del environment[f"{name}_FILE"]  # child processes inherit the secret instead
+        del environment[f"{name}_FILE"]  # child processes inherit the secret itself
 
 
-# A histogram of times has the same bins in all processes, so that histograms can be added. Bin i
-# counts times from FIRST_S * STEP^i to FIRST_S * STEP^(i + 1). The maximum error of a quantile is
-# 9 %, half the width of a bin.
+# Histograms of times have the same bins in all processes, so that they can be added. Bin i
+# counts times from FIRST_S * STEP^i to FIRST_S * STEP^(i + 1). The error of a quantile is at most 9
+# %, half the width of a bin.
 
 #: Lower bound of bin 0, seconds, and ratio of successive bounds.
 FIRST_S, STEP = 1e-4, 2.0**0.25
-#: Number of bins. The last bin counts all times above FIRST_S STEP^91, 12 minutes.
+#: Number of bins. The last bin counts all times above FIRST_S * STEP^91, 12 minutes.
 BINS = 92
 
 
@@ -212,11 +214,12 @@ def quantile(histogram: Mapping[int, int], share: float) -> float | None:
     Parameters
     ----------
     histogram : number of times by bin; empty bins may be missing
-    share : share of the times that do not exceed the result, from 0 to 1
+    share : order of the quantile: share of the times that do not exceed it, from 0 to 1
 
     Returns
     -------
-    seconds : geometric mean of the bounds of the quantile's bin; None for an empty histogram
+    seconds : geometric mean of the bounds of the bin that contains the quantile; None if the
+        histogram is empty
     """
     total = sum(histogram.values())
     if total == 0:
@@ -226,7 +229,7 @@ def quantile(histogram: Mapping[int, int], share: float) -> float | None:
         seen += histogram[place]
         if seen >= rank:
             return float(FIRST_S * STEP ** (place + 0.5))
-    raise AssertionError("the ranks of all bins are their sum")
+    raise AssertionError("not reached: the sum of all bins reaches every rank")
 
 
 class Latencies:
@@ -253,9 +256,9 @@ def merged(parts: list[Mapping[str, int]]) -> dict[int, int]:
     return dict(total)
 
 
-# Each entry of the audit log contains the actor of the request or command.
+# Each entry of the audit log names the actor of the request or command.
 
-#: Actor of commands that run on the data folder. No key may have this name.
+#: Actor of commands that work directly on the data folder. No key may have this name.
 COMMAND = "command"
 
 
@@ -296,9 +299,9 @@ def current_actor() -> Actor | None:
     return _actor.get()
 
 
-# The work of a request or job counts towards the limits of its tenant.
+# The work of a request or job counts towards the limits of a tenant.
 
-#: Tenant of work without a key: commands, upkeep, or a service that requires no keys.
+#: Tenant of work without a key: commands, upkeep, and requests to a service that requires no keys.
 NOBODY = ""
 
 _current: ContextVar[str] = ContextVar("tenant", default=NOBODY)

@@ -1,4 +1,4 @@
-"""Storage of records, such as manifests, as JSON with a checksum.
+"""Serialization of records, such as manifests, as JSON with a checksum.
 
 record  --seal-->  bytes  --unseal-->  JSON values, which the record's class validates
 """
@@ -29,7 +29,7 @@ def unseal(data: bytes) -> dict[str, Any]:
 
     Raises
     ------
-    ValueError : If the bytes are not a sealed record or were changed.
+    ValueError : If the bytes are not a sealed record or have changed.
     """
     values = json.loads(data)
     if not isinstance(values, dict) or values.pop("sha256", None) != _checksum(values):

@@ -27,13 +27,13 @@ OBJECT_SCHEMES = ("s3", "gs", "az", "file", "memory")
 
 
 def _setting(help_text: str, change: str = "", *, shown: str = "", **field: Any) -> Any:
-    """Return a pydantic field with the texts that docs/settings.md shows.
+    """Return a pydantic field that has the texts that docs/settings.md shows.
 
     Parameters
     ----------
     help_text : description of the value, with its unit
     change : advice on when to change the value
-    shown : description of a computed default
+    shown : description of a default that is computed
     **field : arguments of `pydantic.Field`
     """
     extra: dict[str, Any] = {"change": change, "shown": shown}
@@ -41,11 +41,11 @@ def _setting(help_text: str, change: str = "", *, shown: str = "", **field: Any)
 
 
 class Settings(BaseSettings):
-    """The settings, read from environment variables SCENEPRINT_<FIELD>; all have defaults."""
+    """The settings, read from environment variables SCENEPRINT_<FIELD>; each has a default."""
 
     model_config = SettingsConfigDict(
         env_prefix="SCENEPRINT_", frozen=True,
-        hide_input_in_errors=True,  # a value may be a URL with a password
+        hide_input_in_errors=True,  # a value may be a URL that contains a password
     )  # fmt: skip
 
     # Places
@@ -162,8 +162,8 @@ class Settings(BaseSettings):
         default=5.0, gt=0, le=3600,
     )  # fmt: skip
     max_upload_bytes: int = _setting(
-        "Maximum size of a request body, bytes. The default fits a cloud of 6 million points of "
-        "three float32.",
+        "Maximum size of a request body, bytes. The default suffices for 6 million points of "
+        "three float32 each.",
         "Higher for larger clouds; lower if all sensors are small.",
         default=72 << 20, ge=1024, le=512 << 20,
     )  # fmt: skip
@@ -200,7 +200,7 @@ class Settings(BaseSettings):
     )  # fmt: skip
     worker_memory_bytes: int = _setting(
         "Maximum memory that a worker may allocate after its start, bytes; 0 sets no limit. A job "
-        "that needs more fails, without effect on other processes.",
+        "that needs more fails; other processes are not affected.",
         "Lower on small machines; higher for very large maps.",
         default=2 << 30, ge=0,
     )  # fmt: skip
@@ -236,8 +236,7 @@ class Settings(BaseSettings):
 
     # Upkeep
     unindexed_frames: int = _setting(
-        "Number of frames and deletions since the last index after which a worker publishes a new "
-        "index.",
+        "Number of new frames and deletions after which a worker publishes a new index.",
         "Rarely, since queries read these frames from memory.",
         default=1000, ge=1, le=100_000,
     )  # fmt: skip
@@ -249,7 +248,7 @@ class Settings(BaseSettings):
     blob_check_mb_per_s: float = _setting(
         "Rate at which workers verify stored blobs, MB per second; 0 disables verification.",
         "Higher for more than 86 GB, which take a day; 0 if an object store charges for reads "
-        "and verifies its bytes itself.",
+        "and verifies its objects itself.",
         default=1.0, ge=0, le=10_000,
     )  # fmt: skip
     build_surfaces: Literal["auto", "on_request"] = _setting(
@@ -268,7 +267,7 @@ class Settings(BaseSettings):
     # Retention
     undo_window_s: float = _setting(
         "Time for which a deletion can be undone, seconds; 0 makes it final at once.",
-        "0 if deletions must be final at once; longer if mistakes are noticed late.",
+        "Longer if mistakes are noticed late.",
         default=600.0, ge=0, le=31_536_000,
     )  # fmt: skip
     purge_deadline_s: float = _setting(
@@ -278,9 +277,8 @@ class Settings(BaseSettings):
         default=3600.0, ge=1, le=31_536_000,
     )  # fmt: skip
     deleted_rows_days: float = _setting(
-        "Time for which rows of deleted and redundant frames, and of their jobs, remain in the "
-        "database, days.",
-        "Longer than the longest downtime of a host: an older index must be rebuilt.",
+        "Time for which rows of deleted and redundant frames and of their jobs are stored, days.",
+        "Longer than the longest downtime of a host, after which its index would be rebuilt.",
         default=7.0, ge=1, le=36_500,
     )  # fmt: skip
     query_log_days: float = _setting(
@@ -290,13 +288,13 @@ class Settings(BaseSettings):
         default=30.0, ge=0, le=36_500,
     )  # fmt: skip
     query_log_bytes: int = _setting(
-        "Maximum size of all stored answers, bytes, about 200 kB each. The oldest are removed "
+        "Maximum total size of stored answers (about 200 kB each), bytes. The oldest are removed "
         "first; 0 stores no answers.",
         "According to the rate of queries.",
         default=256 << 20, ge=0,
     )  # fmt: skip
     events_per_map: int = _setting(
-        "Maximum number of stored events per map, about 200 bytes each.",
+        "Maximum number of stored events (about 200 bytes each) per map.",
         "According to the longest time for which a robot may be offline.",
         default=1_000_000, ge=1000,
     )  # fmt: skip
@@ -361,7 +359,7 @@ class Settings(BaseSettings):
 
     @property
     def blobs(self) -> Path | str:
-        """Return the folder or URL of uploads and geometry artifacts."""
+        """Return the folder or URL that contains uploads and geometry artifacts."""
         value = "" if self.blob_url is None else self.blob_url.get_secret_value()
         return value if value and not value.startswith("file:") else self.blob_dir
 
@@ -382,7 +380,7 @@ class Settings(BaseSettings):
 
     @property
     def blob_dir(self) -> Path:
-        """Return the folder of uploads and geometry artifacts, if BLOB_URL is a folder."""
+        """Return the folder of uploads and geometry artifacts; None if BLOB_URL is not a folder."""
         return self._blob_root / "blobs"
 
     @property
@@ -392,7 +390,7 @@ class Settings(BaseSettings):
 
     @property
     def query_dir(self) -> Path:
-        """Return the folder of stored answers; deleting it affects nothing else."""
+        """Return the folder of stored answers; deleting it does not affect anything else."""
         return self._blob_root / "queries"
 
     @property
@@ -414,9 +412,9 @@ class Settings(BaseSettings):
 
 
 def _require_object_store(url: str) -> None:
-    """Raise ValueError if a URL does not name an object store, or contains credentials.
+    """Raise ValueError if a URL does not name an object store or if it contains credentials.
 
-    Messages do not contain the URL.
+    The message does not contain the URL.
     """
     scheme, _, rest = url.partition("://")
     if scheme not in OBJECT_SCHEMES or "://" not in url:

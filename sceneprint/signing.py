@@ -86,15 +86,16 @@ def open_signer(
 ) -> Signer:
     """Load a model, and load or build its pair table.
 
-    The first call on a machine builds the table, which takes seconds, and caches it. Further calls
+    The first call on a machine builds the table, which takes seconds, and caches it. Later calls
     map the cached table into memory.
 
     Parameters
     ----------
     model : "depth", "lidar", "paper", the path of a model file, or a model
     cache_dir : folder of cached tables; None selects the user's cache folder
-    progress : callback with the numbers of finished bins and of all bins, while the table is built
-    cached : whether to use the cache; pass False for a model that is used once
+    progress : callback that takes the number of finished bins and the total, while the table is
+        built
+    cached : whether to use the cache; pass False for a model that is used only once
 
     Raises
     ------
@@ -107,7 +108,7 @@ def open_signer(
 
 
 def see(frame: AnyFrame, p: ModelParameters) -> Surface:
-    """Compute the points and normals of a frame's surface, the input of Sec. III.
+    """Compute the points and normals of a frame's surface, the input to Sec. III.
 
     Returns
     -------
@@ -138,7 +139,7 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
 
     Raises
     ------
-    UselessFrame : If the samples are too scattered for any patch
+    UselessFrame : If the samples are too scattered to form a patch
     """
     if isinstance(seen, Voxels):
         finest = supervoxels(seen, p.cloud.seed_px, p.cloud.maximum_patches, p.segmentation)
@@ -173,7 +174,7 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
 
     Parameters
     ----------
-    patches : hierarchy with all levels of the model's signature
+    patches : hierarchy that has all levels of the model's signature
     signer : result of `open_signer`
     name : name of the frame, for errors
 
@@ -195,7 +196,7 @@ def encode(patches: Hierarchy, signer: Signer, name: str = "") -> Signature:
 
 
 def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
-    """Compute the pair statistics of one level with the 4-D table."""
+    """Compute the pair statistics of a level with the 4-D table."""
     p = signer.model.parameters
     weights = patch_weights(level, p.weights)
     counts = count_pairs(level.means, level.normals, weights, p.table, p.properties)
@@ -203,7 +204,7 @@ def table_statistics(level: Patches, signer: Signer) -> LevelStatistics:
 
 
 def exact_statistics(level: Patches, model: Model) -> LevelStatistics:
-    """Compute the pair statistics of one level without the table: slow, for tests of the table."""
+    """Compute the pair statistics of a level without the table, slowly, for tests of the table."""
     p = model.parameters.properties
     pairs = neighbour_pairs(level, p)
     weights = patch_weights(level, model.parameters.weights)[pairs].prod(axis=1)

@@ -3,7 +3,7 @@
     enter  -->  waiting  --admit-->  holding  --release-->      TurnOrder
     ThreadTurns.acquire, release                                for threads
 
-The next turn goes to the tenant that holds the fewest turns; ties go to the tenant whose latest
+The next turn goes to the tenant that holds the fewest turns; among equals, to the one whose latest
 turn is the oldest.
 """
 
@@ -17,15 +17,16 @@ from typing import Generic, TypeVar
 
 Waiter = TypeVar("Waiter")
 
-#: Seconds after its latest request during which a tenant counts as present: others leave it turns.
+#: Seconds after its latest request for which a tenant counts as present, so that others leave turns
+#: for it.
 PRESENT_S = 60.0
-#: Seconds after its latest request during which a tenant counts as active: others rest for it.
-#: Also the maximum duration of a rest.
+#: Seconds after its latest request for which a tenant counts as active, so that others rest. A rest
+#: is never longer.
 ACTIVE_S = 1.0
 
 
 class TurnOrder(Generic[Waiter]):
-    """The tenants that wait for turns or hold turns, and the order of admission; not thread-safe.
+    """The tenants that wait for turns or hold turns, and the order of admission. Not thread-safe.
 
     If several tenants are present, each may hold at most `beside` turns, so that turns remain for
     the others. A single tenant may hold all turns.
@@ -33,10 +34,11 @@ class TurnOrder(Generic[Waiter]):
     Parameters
     ----------
     count : total number of turns
-    beside : maximum number of turns per tenant if several are present; None selects half of `count`
+    beside : maximum number of turns per tenant if several tenants are present; None selects half of
+        `count`
     clock : monotonic clock, seconds
-    rests : whether a tenant, after its turns, waits for as long as they took (at most ACTIVE_S)
-        while another tenant is active; it then uses at most half of the processors' time
+    rests : whether a tenant, after its turns, rests for as long as they took (at most ACTIVE_S)
+        while another tenant is active, so that it uses at most half of the processor time
     """
 
     def __init__(
@@ -56,14 +58,14 @@ class TurnOrder(Generic[Waiter]):
         self._rested_at: float | None = None
 
     def enter(self, tenant: str, waiter: Waiter, weight: int = 1) -> int:
-        """Add a waiter for `weight` turns at once, but at most half of all; return their number."""
+        """Add a waiter for `weight` turns (at most half of all) at once; return their number."""
         weight = min(weight, max(self._count // 2, 1))
         self._record_request(tenant)
         self._waiting.setdefault(tenant, deque()).append((weight, waiter))
         return weight
 
     def leave(self, tenant: str, waiter: Waiter) -> bool:
-        """Remove a waiter; return False if it was admitted already."""
+        """Remove a waiter; return False if it has already been admitted."""
         for entry in self._waiting.get(tenant, ()):
             if entry[1] is waiter:
                 self._waiting[tenant].remove(entry)
@@ -109,7 +111,7 @@ class TurnOrder(Generic[Waiter]):
                 self._resting[tenant] = now + min(now - began, ACTIVE_S)
 
     def rest_s(self) -> float | None:
-        """Return the seconds until a waiting tenant's rest ends; None if none of them rests."""
+        """Return the seconds until the first rest of a waiting tenant ends; None if none rests."""
         return None if self._rested_at is None else max(self._rested_at - self._clock(), 0.0)
 
     def waiters(self) -> list[Waiter]:
@@ -153,9 +155,9 @@ class ThreadTurns:
         self._closed = False
 
     def acquire(self, tenant: str, longest_s: float) -> bool:
-        """Wait at most `longest_s` seconds for a turn; return whether the thread holds a turn.
+        """Wait at most `longest_s` seconds for a turn; return whether the thread now holds one.
 
-        After `close`, the result is False.
+        Return False after `close`.
         """
         mine = threading.Lock()  # released when this thread is admitted
         mine.acquire()
@@ -179,7 +181,7 @@ class ThreadTurns:
             self._admit()
 
     def close(self) -> None:
-        """Admit no more threads, and wake all waiting threads."""
+        """Wake all waiting threads, and admit no more threads."""
         with self._lock:
             self._closed = True
             for waiter in self._order.waiters():
@@ -189,7 +191,7 @@ class ThreadTurns:
         with self._lock:
             if not self._order.leave(tenant, mine):
                 return False
-            self._admit()  # the waiter may have blocked others
+            self._admit()  # this waiter may have blocked others
             return True
 
     def _admit(self) -> None:

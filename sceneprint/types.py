@@ -1,7 +1,7 @@
-"""Records that modules exchange: frames and what is computed from them.
+"""Records that modules exchange: frames, and what is computed from frames.
 
 Lengths are metres, angles radians, times seconds; other units are in the name. Camera frames are
-optical: x right, y down, z forward. Clouds have their sensor's axes.
+optical: x right, y down, z forward. Clouds use their sensor's axes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ __all__ = [
 class Sphere:
     """The camera of a range image around a viewpoint, with equal steps in azimuth and elevation.
 
-    Let (a, b, c) be the sensor's axes in cyclic order such that c is the pole. A direction has
+    Let (a, b, c) be the sensor's axes in cyclic order, with c as the pole. A direction has
     azimuth = atan2(b, a) and elevation = asin(c); column = (azimuth - left) / step, with the
     azimuth relative to column 0, and row = (top - elevation) / step. Pixel centres are at integers.
 
@@ -73,7 +73,7 @@ class Sphere:
                 f"A range image of {self.width} x {self.height} exceeds the limit of "
                 f"{MAXIMUM_SAMPLES} samples. Sign the cloud with a coarser model."
             )
-        # rounding errors can exceed the sphere by half a pixel
+        # rounding errors can extend the image beyond the sphere by half a pixel
         if not (0 < (self.width - 1) * self.step < 2 * math.pi) or not (
             0 <= (self.height - 1) * self.step <= math.pi + self.step
         ):
@@ -90,7 +90,7 @@ class Sphere:
         return self.width * self.step > 1.5 * math.pi
 
 
-#: Camera of a surface.
+#: The camera of a surface.
 Camera = Intrinsics | Sphere
 
 
@@ -130,7 +130,7 @@ class Cloud:
         free space is unknown
     name : name of the frame in messages
     pose : (4, 4) T_parent_sensor; None if unknown. The signature does not depend on it
-    note : displayed description of earlier changes to the points; may be empty
+    note : description of earlier changes to the points, for display; may be empty
     """
 
     points: Floats32
@@ -149,7 +149,7 @@ class ReferenceSurface:
     points : (N, 3) float32, metres, relative to `offset`; finite
     triangles : (M, 3) int32 indices of points, counterclockwise as seen from the front; None for a
         cloud
-    offset : (3,) float64, metres; points + offset are the coordinates of the file. It is zero
+    offset : (3,) float64, metres; points + offset are the coordinates in the file. It is zero
         unless the points are more than a kilometre from the origin
     up : (3,) float64, unit vector that points up, against gravity
     """
@@ -168,7 +168,7 @@ AnyFrame = DepthFrame | Cloud
 class Surface:
     """The observed surface, as an image of points and normals.
 
-    Unordered points, such as a cloud, form an image of one row without a camera.
+    Unordered points, such as a fused cloud, form an image of one row without a camera.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ class Surface:
 
     @property
     def fitted(self) -> Surface:
-        """Return the surface for fine alignment: the spread points of a scan, or this surface."""
+        """Return the surface for fine alignment: the spread points of a scan, else this surface."""
         return self if self.spread is None else self.spread
 
 
@@ -204,7 +204,7 @@ class Patches:
     normals : (P, 3) float64 unit vectors towards the sensor; n of Eq. (1)
     areas : (P,) float64, square metres
     sizes : (P,) int32, number of pixels
-    coherences : (P,) float64 in (0, 1], length of the mean normal of the pixels; 1 if flat
+    coherences : (P,) float64 in (0, 1], length of the mean of the pixels' normals; 1 if flat
     """
 
     means: Floats
@@ -238,7 +238,7 @@ class Geometry:
     Parameters
     ----------
     surface : (h, w) points and normals
-    patches : P patches of one metric size, for correspondences
+    patches : P patches of the same metric size, for correspondences
     descriptors : (P, d) uint8, descriptors of the patches' macro-scale surroundings
     model_id : id of the model; artifacts of different models cannot be compared
     """
@@ -249,12 +249,12 @@ class Geometry:
     model_id: str
 
 
-#: Kinds of cameras; NOWHERE stands for unordered points.
+#: Kinds of cameras; NOWHERE stands for unordered points, which have none.
 PINHOLE, SPHERE, NOWHERE = 0, 1, 2
 
 
 def camera_of(camera: Camera | None, nearest: float) -> Floats:
-    """Return a camera as an array (7,) for kernels: its kind, `nearest`, and five parameters.
+    """Return a camera as an array (7,) for kernels: its kind, `nearest` and five parameters.
 
     Parameters
     ----------

@@ -137,7 +137,10 @@ class Supervisor:
 
 def _cause(code: int, trace: WorkerTrace, job_s: float) -> str:
     if trace.timed_out:
-        return f"its worker exceeded {job_s:g} s and was stopped"
+        return (
+            f"its worker exceeded {job_s:g} s and was stopped. If the machine is slow or busy, "
+            "raise SCENEPRINT_JOB_TIMEOUT_S and restart."
+        )
     if code == -signal.SIGKILL:
         return "its worker was killed by signal 9 (possibly out of memory)"
     if code < 0:

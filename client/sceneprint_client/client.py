@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,13 +124,14 @@ class Client(ServiceMethods, Blocking):
         UnusableStore, NewerSchema : If the folder cannot be opened.
         MissingDependency : If only the client is installed, not sceneprint.
         """
-        if find_spec("sceneprint") is None:
+        try:  # the package of the service is not a dependency of the client
+            module = import_module("service.embedded")
+        except ImportError as cause:
             raise MissingDependency(
                 "Client.embedded runs the service in this process, and its package is not "
-                "installed. In a clone, run: pip install ."
-            )
-        # The package of the service is not a dependency of the client.
-        service = import_module("service.embedded").LocalService(Path(path))
+                f"installed ({cause}). In a clone, run: pip install ."
+            ) from cause
+        service = module.LocalService(Path(path))
         client = cls.__new__(cls)
         ServiceConnection.__init__(client, _EMBEDDED_URL, None, _EMBEDDED_S, service, service)
         return client

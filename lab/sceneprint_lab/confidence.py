@@ -1,4 +1,4 @@
-"""Fit of the confidence parameters to answers at synthetic sites.
+"""Fitting of the confidence parameters to answers at synthetic sites.
 
 answers at sites  --judged_queries-->  JudgedQuery, ...  --fit-->  ConfidenceParameters
 """
@@ -24,11 +24,11 @@ from sceneprint_lab.evaluation.sites import SiteAnswer
 
 @dataclass(frozen=True)
 class JudgedQuery:
-    """A query with its candidate poses.
+    """A query, with its candidate poses.
 
     Parameters
     ----------
-    site, kind, query : name and kind of the site, and number of the query
+    site, kind, query : name and kind of the site, and index of the query
     right : whether each pose is right
     """
 
@@ -40,7 +40,7 @@ class JudgedQuery:
 
 
 def judged_queries(answers: Iterable[SiteAnswer]) -> list[JudgedQuery]:
-    """Return the candidate poses of answers from `ask_site`, without answers that have none."""
+    """Return the candidate poses of answers from `ask_site`; skip answers without candidates."""
     return [
         JudgedQuery(
             query.site, query.kind, query.query,
@@ -53,10 +53,11 @@ def judged_queries(answers: Iterable[SiteAnswer]) -> list[JudgedQuery]:
 
 
 def steps_of(evidence: Sequence[PlaceEvidence]) -> Floats:
-    """Return positions (n, 3 kinds) in the three intervals between the knots of each kind.
+    """Return the positions (n, 3 kinds) of evidence in the intervals between each kind's knots.
 
-    A position increases from 0 to 1 as the evidence becomes worse. The penalty of a kind is the sum
-    of its steps multiplied by the positions, so it never decreases if no step is negative.
+    In each interval, the position increases from 0 to 1 as the evidence becomes worse. The penalty
+    of a kind is the sum of step times position over its intervals, so it never decreases if no step
+    is negative.
     """
     columns = []
     for name, (worst, poor, fair, best) in KNOTS.items():
@@ -66,7 +67,7 @@ def steps_of(evidence: Sequence[PlaceEvidence]) -> Floats:
     return np.stack(columns, axis=1)
 
 
-#: Step of a penalty in intervals without samples.
+#: Step of a penalty over an interval that contains no samples.
 USUAL_STEP = 0.3
 
 
@@ -79,14 +80,15 @@ def fit(
     Parameters
     ----------
     samples : queries with their candidate poses
-    shares : share of queries at each kind of place; confidences are probabilities for this
-        mixture, regardless of the numbers of samples
-    ridge : weight of the squared differences of steps from `USUAL_STEP`
-    lone : minimum step between the penalties of two suggesting views and of one
+    shares : share of queries at each kind of place; confidences are probabilities for this mixture,
+        however many samples there are of each kind
+    ridge : weight of the squared differences between the steps and `USUAL_STEP`
+    lone : minimum amount by which the penalty for one view that suggests a pose exceeds that for
+        two
 
     Returns
     -------
-    parameters : parameters with the minimum mean logarithmic loss
+    parameters : parameters with the minimum weighted mean logarithmic loss
     """
     X = steps_of([e for sample in samples for e in sample.evidence])
     right = np.array([y for sample in samples for y in sample.right], bool)
@@ -103,7 +105,8 @@ def fit(
         whole = 1.0 + np.add.reduceat(odds, first)
         good = np.where(none, 1.0, np.add.reduceat(np.where(right, odds, 0.0), first))
         value = w @ np.log(whole / good) + ridge * (off @ off)
-        # derivative for each logit: share of all odds minus share of the odds of right poses
+        # derivative by each logit: its share of all odds, minus its share of the odds of right
+        # poses
         residuals = odds / np.repeat(whole, counts)
         residuals -= np.where(right, odds / np.repeat(good, counts), 0.0)
         residuals *= np.repeat(w, counts)
@@ -111,7 +114,7 @@ def fit(
         return float(value), slope
 
     bounds = [(None, None), *[(0.0, None)] * X.shape[1]]
-    bounds[1 + 3 * list(KNOTS).index("suggested") + 1] = (lone, None)  # from two views to one
+    bounds[1 + 3 * list(KNOTS).index("suggested") + 1] = (lone, None)  # the step from two to one
     result = minimize(
         loss, np.full(1 + X.shape[1], max(0.5, lone)), jac=True, bounds=bounds, method="L-BFGS-B",
         options={"maxiter": 2000},

@@ -2,8 +2,8 @@
 
     rooms or sites, frames  --train-->  Model
 
-The fits of projection, mixture and whitening are in `geometry`, in the modules of their stages.
-This module runs them, and derives the quantiser step and d0 from the resulting signatures.
+The functions that fit projection, mixture and whitening are in `geometry`, in the modules of these
+stages. This module calls them, and derives the quantiser step and d0 from the resulting signatures.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ from sceneprint.signing import (
 from sceneprint.types import AnyFrame, Bytes, Floats, Floats32, Patches
 from sceneprint_lab.synth import synthesise_room, synthesise_survey
 
-# The presets: sizes, lengths, and training scenes.
+# The presets: sizes, lengths and training scenes.
 #
 # name  --preset_parameters-->  ModelParameters, MixtureParameters
 
 #: Kinds of synthetic scenes: rooms for a depth camera, or sites for a laser scanner.
 Scenes = Literal["rooms", "sites"]
 
-#: Sizes of the presets: G components, H levels.
+#: Sizes of the presets: G components and H levels.
 PRESET_SIZES = {"depth": (256, 2), "lidar": (256, 4), "paper": (1250, 4)}
-#: Levels of psi in stored signatures, parameters of the whitening, and number of scenes for its
-#: fit. `paper` stores psi.
+#: Levels of psi in stored signatures, parameters of the whitening, and number of scenes to which it
+#: is fitted. `paper` stores psi.
 PRESET_WHITENINGS = {
     "depth": ((1,), WhiteningParameters(448, exponent=0.75), 500),
     "lidar": ((1, 2, 3), WhiteningParameters(448, exponent=0.75), 400),
@@ -90,7 +90,7 @@ def preset_parameters(preset: str) -> tuple[ModelParameters, MixtureParameters]:
 
 
 def preset_whitening(preset: str) -> tuple[tuple[int, ...], WhiteningParameters, int]:
-    """Return the levels of psi in signatures, and parameters and number of scenes of the whitening.
+    """Return the levels of psi in signatures, and the whitening's parameters and number of scenes.
 
     The number of scenes is 0 if psi is stored without whitening.
     """
@@ -104,11 +104,11 @@ def preset_scenes(preset: str) -> tuple[Scenes, int]:
     return ("sites", 3) if preset == "lidar" else ("rooms", 6)
 
 
-#: Maximum plane violations of an accepted transform of scans, and of a rival that counts.
+#: Maximum plane violations of an accepted transform between scans, and of a rival that counts.
 _MOST_VIOLATIONS = 0.08
-#: Acceptance for scans. Planes and free space decide, because two scans may share little surface.
-#: Corridors look similar, so six distinct planes must agree, with few violations of free space. In
-#: streets, many small planes agree, although two scans share little surface.
+#: Acceptance for scans. Planes and free space decide, because two scans may have little surface in
+#: common. Corridors look similar, so six distinct planes must agree, with few violations of free
+#: space. In streets, many small planes agree although two scans have little surface in common.
 _SCAN_ACCEPTANCE = AcceptanceParameters(
     residual_m=0.2, residual_rad=math.radians(3.0), violation_weight=0.0, evidence=0.0,
     plane_overlap=0.0, strong=0.0, net_strong=0.15, planes=6.0, many_planes=10.0,
@@ -116,17 +116,17 @@ _SCAN_ACCEPTANCE = AcceptanceParameters(
 )  # fmt: skip
 #: Ratio of the lengths for a scanner to those for a depth camera.
 _FACTOR = 5.0
-#: Parameters of refinements for the noise of a laser.
+#: Parameters that adapt refinements to the noise of a laser.
 _SCAN_NOISE: dict[str, Any] = {"reference_depth": 10.0, "growth": 1, "weight_depth": 1e6}
 
 
 def _lidar() -> ModelParameters:
-    """Return the default parameters with five-fold lengths, and adapted to scanners.
+    """Return the default parameters with lengths multiplied by five, adapted to scanners.
 
     The neighbourhood radius and the equal weights of large and small patches were tuned on
     synthetic halls that are not in the training data (docs/evaluation.md). The noise of a laser
     does not grow with range, so distant points have full weights; only the distance between samples
-    grows, linearly.
+    grows, linearly with range.
     """
     p = scale_lengths(ModelParameters(), _FACTOR)
     noise = _SCAN_NOISE
@@ -180,22 +180,22 @@ def preset_answer(preset: str) -> AnswerParameters:
     return AnswerParameters(replace(lengths, refinement=refinement), confidence)
 
 
-#: Callback with the name of the stage, the number of finished steps and the total number.
+#: Callback that takes the name of the stage, the number of finished steps and the total.
 Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
 class TrainingParameters:
-    """Parameters of the training; all of them affect the model."""
+    """Parameters of the training, all of which affect the model."""
 
     rooms: int = 100  #: number of synthetic rooms or sites
     views: int = 6  #: number of frames per room or site
     seed: int = 0  #: seed of rooms, sampled pairs and fits
     pairs: int = 240_000  #: number of pairs to which projection and mixture are fitted
     projection: Literal["pca", "ica"] = "pca"
-    descriptors: int = 128  #: number of bytes of a descriptor
+    descriptors: int = 128  #: number of bytes per descriptor
     histograms: int = 40_000  #: number of histograms to which the compression is fitted
-    clipped_share: float = 0.0005  #: share of signature components beyond the quantiser's range
+    clipped_share: float = 0.0005  #: share of signature components outside the quantiser's range
     scenes: Scenes = "rooms"  #: kind of synthetic scenes
     whitening_rooms: int = 0  #: number of rooms for the whitening; 0 stores psi
     levels: tuple[int, ...] = (0,)  #: levels in whitened signatures
@@ -214,7 +214,7 @@ class Lesson:
 
 @dataclass(frozen=True)
 class Draw:
-    """The number of samples per frame."""
+    """The number of samples to draw from each frame."""
 
     pairs: int  #: number of pairs per level
     histograms: int
@@ -227,15 +227,17 @@ def train(
 ) -> Model:  # fmt: skip
     """Train a model; the result depends on the arguments, but not on the number of processes.
 
-    Raise TrainingError if there is too little data, the frames show fewer than two places, or a
-    level does not exist.
-
     Parameters
     ----------
     model_p, mixture_p : parameters of the model, such as the results of `preset_parameters`
-    references : the user's frames, each with the name of its place, in addition to the rooms
+    references : the user's frames, in addition to the rooms, each with the name of its place
     jobs : number of processes that create and segment frames; 1 uses this process
     report : callback for progress
+
+    Raises
+    ------
+    TrainingError : If there is too little data, the frames show fewer than two places, or a level
+        does not exist
     """
     from threadpoolctl import threadpool_limits
 
@@ -263,7 +265,7 @@ def train(
             f"{len(histograms)} patches are too few to fit the compression of "
             f"{model_p.surroundings.dimension} bins. Add --rooms or your own frames."
         )
-    with threadpool_limits(1):  # the order of sums must not depend on the processors
+    with threadpool_limits(1):  # the order of summation must not depend on the processors
         compression = fit_compression(histograms, p.descriptors)
         projection = fit_projection(properties, p.projection, p.seed)
         features = project(properties, projection)
@@ -284,7 +286,7 @@ def train(
 
 
 def _written(p: TrainingParameters) -> dict[str, Any]:
-    """Return the parameters for provenance, without unused parameters of scenes and whitening."""
+    """Return the parameters for the provenance, without unused ones of scenes and whitening."""
     written = asdict(p)
     if p.scenes == "rooms":
         del written["scenes"]
@@ -321,12 +323,14 @@ def whitened(
 ) -> Model:  # fmt: skip
     """Return the model with a whitening, fitted to `p.whitening_rooms` and the user's frames.
 
-    Raise TrainingError if there are too few frames for the dimension of the whitening.
-
     Parameters
     ----------
     model : result of `calibrated`
     p, references, jobs, report : arguments of `train`
+
+    Raises
+    ------
+    TrainingError : If there are too few frames for the dimension of the whitening
     """
     from threadpoolctl import threadpool_limits
 
@@ -350,12 +354,12 @@ def whitened(
     first = {place: i for i, place in reversed(list(enumerate(places)))}
     stored = np.stack([whiten(psi[i] / UNITS, fit) for _, i in sorted(first.items())])
     own = replace(fit, unrelated_distance=_median_distance(stored, "l2"))
-    # Coarser levels were needed only for the mixture.
+    # Coarser levels were needed for the mixture only.
     h = replace(model.parameters.hierarchy, n_levels=max(p.levels) + 1)
     return replace(model, parameters=replace(model.parameters, hierarchy=h), whitening=own)
 
 
-#: Signer of this process for the fit of the whitening, and levels of psi.
+#: Signer with which this process fits the whitening, and levels of psi.
 _signing: list[tuple[Signer, tuple[int, ...]]] = []
 
 
@@ -394,7 +398,7 @@ def _median_distance(stored: Bytes, metric: Metric) -> float:
 
 
 def _helpers(jobs: int, begin: Callable[..., None] | None = None, *arguments: Any) -> Executor:
-    """Return a pool of `jobs` processes that first call `begin`; for one job, a thread instead."""
+    """Return a pool of `jobs` processes that first call `begin`; a thread if `jobs` is 1."""
     if jobs == 1:
         return ThreadPoolExecutor(1, "training", begin, arguments)
     return ProcessPoolExecutor(jobs, get_context("spawn"), begin, arguments)
@@ -451,24 +455,24 @@ def _own_lesson(
 def _lesson(
     frame: AnyFrame, place: str, seed: tuple[int, ...], model_p: ModelParameters, draw: Draw
 ) -> list[Lesson]:
-    """Return the training data of a frame in a list, which is empty if the frame is unusable."""
+    """Return a list of the training data of a frame; it is empty if the frame is unusable."""
     rng = np.random.default_rng(seed)
     try:
-        seen = see(frame, model_p)
-        patches = hierarchy_of(seen, model_p)
+        surface = see(frame, model_p)
+        patches = hierarchy_of(surface, model_p)
     except FrameError:
         return []
     drawn = []
     for level in patches.levels:
         pairs = neighbour_pairs(level, model_p.properties)
         if len(pairs):
-            # Sample in proportion to the weights in the statistics, with replacement.
+            # Sample with replacement, in proportion to the weights that the statistics use.
             share = patch_weights(level, model_p.weights)[pairs].prod(axis=1).cumsum()
             some = np.searchsorted(share, np.sort(rng.random(draw.pairs)) * share[-1], "right")
             drawn.append(pair_properties(level, pairs[some], model_p.properties))
     if not drawn:
         return []
-    own = patches_for_validation(seen, model_p)
+    own = patches_for_validation(surface, model_p)
     some = rng.permutation(len(own))[: draw.histograms]
     histograms = patch_descriptors(own, model_p.surroundings)[some]
     return [Lesson(place, np.concatenate(drawn), histograms, patches.levels)]

@@ -44,7 +44,7 @@ COMMANDS = {
     "jobs": ("inventory", "list, retry or cancel the jobs of a service"),
     "bag": ("bag", "show the contents of a ROS recording"),
     "doctor": ("doctor", "check this machine, the data folder and the service"),
-    "migrate": ("storage", "create the database's schema, or upgrade it to this version's"),
+    "migrate": ("storage", "create the database schema, or upgrade it to that of this version"),
     "fsck": ("storage", "check and repair database, blobs and indexes, or erase deleted frames"),
     "reencode": ("storage", "switch a map to another model"),
     "snapshot": ("storage", "back up database and blobs as a bundle, while the service runs"),
@@ -96,8 +96,8 @@ def parser(name: str | None = None) -> argparse.ArgumentParser:
     top.add_argument("--version", action="version", version=f"sceneprint {__version__}")
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     # Search for entry points only if necessary, since this doubles the time of a small parser.
-    found = {name: own_command(name)} if name in COMMANDS else all_commands()
-    for each, (function, line) in found.items():
+    choices = {name: own_command(name)} if name in COMMANDS else all_commands()
+    for each, (function, line) in choices.items():
         command = commands.add_parser(each, help=line)
         if name in (None, each):
             resolve_name(function)(command)
@@ -106,7 +106,10 @@ def parser(name: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; print errors in one line on standard error, and return 2 for them."""
+    """Run a command, and return its exit code; print an error as one line on standard error.
+
+    The exit code is 2 after an error, 130 after Ctrl-C, and 0 if the output was closed early.
+    """
     for stream in (sys.stdout, sys.stderr):  # escape unprintable characters in file names
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sceneprint.store.audit_log import AuditFilter
     from sceneprint_client.api.admin import AuditLine, Key, MadeKey, Scope
 
-#: Remaining validity below which the list of keys warns about an expiry.
+#: The list of keys warns about keys that expire within this time.
 SOON = timedelta(days=7)
 
 
@@ -44,7 +44,7 @@ def add_keys(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     what.add_argument(
         "--rotate", metavar="NAME",
-        help="give a key a new secret and print it; the old one works for a while longer",
+        help="replace the secret of a key and print it; the old secret still works for --overlap",
     )  # fmt: skip
     what.add_argument("--revoke", metavar="NAME", help="revoke a key")
     what.add_argument("--create-tenant", metavar="NAME", help="create a tenant without keys")
@@ -219,27 +219,27 @@ def run_audit(options: argparse.Namespace) -> int:
     if options.output is not None and options.format is None:
         raise InvalidRequest("--output requires --format. Specify jsonl or syslog.")
     since = None if options.since is None else time.time() - options.since.total_seconds()
-    wanted = AuditFilter(options.actor, options.map, options.action, since)
+    audit_filter = AuditFilter(options.actor, options.map, options.action, since)
     settings = existing_store(options)
     with open_command_store(settings) as store:
         audit = Audit(store, settings.audit_log_days)
         if options.format is None:
-            for one in _newest(audit, wanted, options.limit):
-                print(_audit_line(one))
+            for line in _newest(audit, audit_filter, options.limit):
+                print(_audit_line(line))
             return 0
         target = options.output
         with nullcontext(sys.stdout) if target is None else target.open("a") as file:
-            for line in audit.lines(wanted):
+            for line in audit.lines(audit_filter):
                 print(_FORMATS[options.format](line), file=file)
     return 0
 
 
-def _newest(audit: Audit, wanted: AuditFilter, left: int) -> Iterator[AuditLine]:
+def _newest(audit: Audit, audit_filter: AuditFilter, limit: int) -> Iterator[AuditLine]:
     cursor = None
-    while left > 0:
-        page = audit.page(wanted, cursor, min(left, 1000))
+    while limit > 0:
+        page = audit.page(audit_filter, cursor, min(limit, 1000))
         yield from page.items
-        cursor, left = page.next_cursor, left - len(page.items)
+        cursor, limit = page.next_cursor, limit - len(page.items)
         if cursor is None:
             return
 
@@ -253,7 +253,7 @@ def _audit_line(line: AuditLine) -> str:
 
 
 def _syslog_message(line: AuditLine) -> str:
-    """Return a syslog message (RFC 5424) with the line as JSON."""
+    """Convert an audit line to a syslog message (RFC 5424), which contains the line as JSON."""
     at = line.at.astimezone(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     host = socket.gethostname() or "-"
     return f"<{_PRIORITY}>1 {at} {host} sceneprint - audit - {line.model_dump_json()}"

@@ -34,14 +34,14 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
         ("--pose-frame", "FRAME",
          "parent frame of poses (default: map, else odom, else the topmost frame)"),
         ("--sensor-frame", "FRAME",
-         "frame of the sensor, for points in the world frame (default: the only leaf of the "
-         "transforms below it)"),
+         "frame of the sensor, for points in the world frame (default: the only leaf frame below "
+         "the world frame)"),
     ):  # fmt: skip
         group.add_argument(option, metavar=metavar, help=text)
     group.add_argument(
         "--depth-scale", type=positive_number, metavar="UNITS",
-        help="stored units per metre of 16-bit depth images, also in folders (default: as in "
-        "intrinsics.json, else 1000, millimetres)",
+        help="depth units per metre in 16-bit images, also in folders (default: that of "
+        "intrinsics.json, else 1000, for millimetres)",
     )  # fmt: skip
     for option, default, metavar, text in (
         ("--keyframe-m", _DEFAULT.keyframe_m, "METRES",
@@ -51,7 +51,7 @@ def add_recording_options(command: argparse.ArgumentParser) -> None:
         ("--keyframe-s", _DEFAULT.keyframe_s, "SECONDS",
          "minimum time between frames without poses (default: 0.5)"),
         ("--join-m", _DEFAULT.join_m, "METRES",
-         "join the scans of this way by odometry, corrected for motion, such as 2 for a Livox "
+         "join the scans of this distance by odometry, corrected for motion, such as 2 for a Livox "
          "(default: 0, each scan alone)"),
     ):  # fmt: skip
         group.add_argument(option, type=_from_zero, default=default, metavar=metavar, help=text)
@@ -63,7 +63,7 @@ def _from_zero(text: str) -> float:
 
 @contextmanager
 def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]:
-    """Yield the options for recordings; meanwhile, show a progress bar while a file is read."""
+    """Yield the options for recordings; show a progress bar while a recording is read."""
     names = (
         "topic", "camera_info", "pose_frame", "keyframe_m", "keyframe_deg", "keyframe_s",
         "join_m", "sensor_frame", "depth_scale",
@@ -74,7 +74,7 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
 
 
 def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSequence:
-    """Return a sequence with a depth scale; None returns it unchanged.
+    """Set the depth scale of a sequence; return recordings unchanged, and any sequence for None.
 
     Raises
     ------
@@ -125,7 +125,8 @@ def add_bag(command: argparse.ArgumentParser) -> None:
 
 def run_bag(options: argparse.Namespace) -> int:
     """List the topics of a ROS recording (an MCAP file, a rosbag2 folder or database, or a ROS 1
-    bag), and the frames, camera and poses that an upload would use. The exit code is 1 without any.
+    bag), and the frames, camera and poses that an upload would use. The exit code is 1 if a
+    recording has no usable frame.
     """
     outlines: list[BagOutline] = []
     for path in find_recordings(options.path) or [options.path]:

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 Verdict = Literal["ok", "note", "WRONG"]
 
-#: Free space in bytes below which a check fails, and below which it warns.
+#: Minimum free space, bytes; with less than the first, a check fails, and with less than the
+#: second, it warns.
 LEAST_FREE, LITTLE_FREE = 100 << 20, 5 << 30
-#: Difference between clocks above which a check warns, seconds.
+#: Maximum difference between clocks, seconds; a check warns about a larger one.
 APART_S = 2.0
 
 
@@ -50,7 +51,7 @@ def disk_check(subject: str, free: int) -> Check:
 
 
 def seconds_apart(before: float, there: float, after: float) -> float:
-    """Return the minimum possible difference between two clocks in seconds.
+    """Return the minimum possible difference between two clocks, seconds.
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def seconds_apart(before: float, there: float, after: float) -> float:
 
 # Checks of the responses of a running service.
 
-#: Age of a waiting job in seconds above which missing workers are an error.
+#: Maximum age of a waiting job, seconds; if no worker is running, an older job is an error.
 LONGEST_S = 60.0
 #: Maximum number of names per line.
 _MOST_NAMES = 5
@@ -140,16 +141,16 @@ def store_check(stats: Stats) -> Check:
 
 def scrub_check(stats: Stats) -> Check:
     """Report the progress of the scrub: a note if nothing was verified, or data is damaged."""
-    seen = stats.scrub
-    if seen is None:
+    scrub = stats.scrub
+    if scrub is None:
         return Check("note", "scrub", "no stored data has been verified yet")
     ended = "the first pass is running"
-    if seen.finished_at is not None:
-        ended = f"the last pass ended {seen.finished_at:%Y-%m-%dT%H:%M:%SZ}"
-    text = f"{seen.blobs} blobs of {seen.bytes / 1e6:.1f} MB read, {ended}"
-    if seen.damaged:
+    if scrub.finished_at is not None:
+        ended = f"the last pass ended {scrub.finished_at:%Y-%m-%dT%H:%M:%SZ}"
+    text = f"{scrub.blobs} blobs of {scrub.bytes / 1e6:.1f} MB read, {ended}"
+    if scrub.damaged:
         text += (
-            f"; {seen.damaged} lost or damaged: derived data is rebuilt, and `sceneprint fsck` "
+            f"; {scrub.damaged} lost or damaged: derived data is rebuilt, and `sceneprint fsck` "
             "lists uploads to send again"
         )
         return Check("note", "scrub", text)

@@ -47,7 +47,7 @@ _CHECK = "Check SCENEPRINT_DATABASE_URL, or the data folder."
 
 
 def database(settings: Settings) -> Check:
-    """Check the URL and the schema of the database, and the file of SQLite."""
+    """Check the URL and the schema of the database, and the file of a SQLite database."""
     from sqlalchemy import make_url
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -133,9 +133,9 @@ def _schema_check(schema: SchemaRange | None, place: str) -> Check:
     """Compare the schema of a database with that of this version."""
     from sceneprint.store.database import known_revisions
 
-    head, known = known_revisions()
+    head, revisions = known_revisions()
     shown = f"{place}, schema {None if schema is None else schema.revision}"
-    if schema is None or (schema.revision in known and schema.revision != head):
+    if schema is None or (schema.revision in revisions and schema.revision != head):
         return Check("note", "database", f"{shown}; the next use migrates it to {head}")
     if schema.revision == head:
         return Check("ok", "database", shown)
@@ -156,7 +156,7 @@ def _wrong(text: str) -> Check:
 
 
 def object_stores(settings: Settings) -> Iterator[Check]:
-    """Yield a check of each configured object store; it writes, reads and deletes an object."""
+    """Yield a check of each configured object store, which writes, reads and deletes an object."""
     from sceneprint.store.blobs.object_client import VARIABLES, check_objects, open_objects
 
     blobs = None if settings.blob_url is None else settings.blob_url.get_secret_value()
@@ -267,16 +267,16 @@ def _connections(values: Mapping[str, object], settings: Settings) -> Check:
     # A worker uses one connection for work, one for its lease, one for wake-ups, and three for
     # locks of blobs and indexes. A service uses one per concurrent request, and three permanent
     # ones.
-    wanted = (
+    needed = (
         6 * settings.workers
         + min(settings.concurrent_requests + settings.queued_requests, MOST)
         + 3
     )
     text = (
         f"{most} connections allowed (max_connections), {in_use} in use; a service and "
-        f"{settings.workers} workers may use {wanted}"
+        f"{settings.workers} workers may use {needed}"
     )
-    if in_use + wanted > most:
+    if in_use + needed > most:
         return Check("note", "connections", f"{text}. Raise max_connections, or run fewer workers.")
     return Check("ok", "connections", text)
 

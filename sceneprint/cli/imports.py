@@ -56,7 +56,7 @@ class TimeLimit:
 
     @property
     def left_s(self) -> float:
-        """Seconds until the limit, without further progress."""
+        """Seconds until the limit is reached if there is no further progress."""
         until = self._moved + STALL_S if self._until is None else self._until
         return max(until - time.monotonic(), 0.0)
 
@@ -79,7 +79,7 @@ def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
     from sceneprint_client.api import JobState
 
     if is_starting(client):
-        return "They are signed when it is ready."
+        return "They are signed when the service is ready."
     try:
         stats = client.stats(minutes=1)
         own = sum(job.state is JobState.QUEUED for job in client.wait(jobs, timeout_s=0.0))
@@ -89,11 +89,14 @@ def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
 
 
 def is_starting(client: Client) -> bool:
-    """Return whether the service is still compiling kernels, before any worker runs."""
+    """Return whether the service is still compiling kernels, before any worker runs.
+
+    If so, print a message.
+    """
     try:
         client.status()
     except Busy:
-        print_error("the service is compiling its kernels, once after an installation")
+        print_error("the service is compiling its kernels, as it does once after an installation")
         return True
     return False
 
@@ -169,15 +172,15 @@ def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job
     """Wait until an import has ended or the time limit is reached; return its job."""
     from sceneprint_client.api import JobState
 
-    limit, seen = TimeLimit(options.timeout), job.progress
+    limit, last_progress = TimeLimit(options.timeout), job.progress
     with tqdm(desc=name, unit="frame", disable=None) as bar:
         while not job.state.over:
             client.wait([job.job_id], timeout_s=_PAUSE_S)
             job = client.job(job.job_id)
             if job.progress is not None:
                 _show_progress(bar, name, job.progress)
-            if job.progress != seen or job.state == JobState.RUNNING:
-                seen = job.progress
+            if job.progress != last_progress or job.state == JobState.RUNNING:
+                last_progress = job.progress
                 limit.note_progress()
             if not job.state.over and limit.is_over(client):
                 break
@@ -185,7 +188,7 @@ def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job
 
 
 def _show_progress(bar: tqdm[Any], name: str, progress: Progress) -> None:
-    """Update a bar with the progress of an import; for a map, with that of its phase."""
+    """Update a bar with the progress of an import or, for a map, of its phase."""
     done, total = progress.done, progress.total
     if progress.phase is not None:
         steps = {"render": progress.rendered, "sign": progress.signed, "test": progress.tested}
@@ -218,9 +221,9 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
 
 #: Number of units per metre, by name of the unit.
 _UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "ft": 1 / 0.3048}
-#: Size of a point file in bytes above which it is probably not a single scan.
+#: Maximum size of a point file, bytes; a larger one is probably not a single scan.
 _SCAN_BYTES = 24 << 20
-#: Maximum number of printed weak areas.
+#: Maximum number of weak areas to print.
 _MOST_WEAK = 5
 
 
@@ -231,7 +234,7 @@ def axis_or_up(text: str) -> Axis | list[float]:
 
 
 def _fields(read: Callable[[str], dict[str, float]]) -> Callable[[str], dict[str, float]]:
-    """Convert a parser of comma-separated numbers to a type of argparse."""
+    """Convert a parser of comma-separated numbers to an argparse type."""
 
     def fields(text: str) -> dict[str, float]:
         try:
@@ -259,12 +262,12 @@ def add_map_options(command: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--units", type=lambda text: _UNITS.get(text) or positive_number(text), metavar="N",
         help="unit of the file: m, cm, mm, ft, or the number of units per metre (default: the "
-        "file's own, else an estimate)",
+        "unit that the file states, else an estimate)",
     )  # fmt: skip
     group.add_argument(
         "--offset", type=_fields(offset_fields), metavar="X,Y,Z",
-        help="metres to subtract from the coordinates of the file (default: none, but the centre "
-        "of a file that is more than a kilometre from its origin)",
+        help="metres to subtract from the coordinates of the file (default: none, or the centre "
+        "of the file if it is more than a kilometre from the origin)",
     )  # fmt: skip
     group.add_argument(
         "--camera", type=_fields(camera_fields), metavar="FX,FY,CX,CY,WIDTH,HEIGHT",
@@ -379,7 +382,7 @@ def _numbers(x: float, y: float, z: float) -> str:
 
 
 def hint_at_maps(paths: list[Path]) -> None:
-    """Print a hint for files of points that are too large for one scan."""
+    """Print a hint for point files that are too large for one scan."""
     for path in paths:
         if path.is_file() and is_cloud(path.name) and path.stat().st_size > _SCAN_BYTES:
             print_error(

@@ -93,9 +93,9 @@ def _add_files(group: Any) -> None:
 
 
 def run_frames(options: argparse.Namespace) -> int:
-    """List the frames of a map in the order of their upload (of one session, in the order of
-    capture), or write the trajectory of a session. With FRAME, show that frame, download its files,
-    or edit its metadata.
+    """List the frames of a map in the order of upload (for one session, in the order of capture),
+    or write the trajectory of a session. With FRAME, show that frame, download its files, or edit
+    its metadata.
     """
     of_one = [name for name in (*_FILES, "edit") if getattr(options, name) is not None]
     if options.frame_id is None and of_one:
@@ -116,14 +116,14 @@ def run_frames(options: argparse.Namespace) -> int:
         elif options.trajectory is not None:
             _write_trajectory(client, options)
         else:
-            found = client.frames(
+            matching_frames = client.frames(
                 options.map, None if options.state is None else FrameState(options.state),
                 robot=options.robot or (), session=options.session or (), tags=options.tag or (),
                 parent_frame=options.parent_frame, captured_after=options.after,
                 captured_before=options.before, name=options.name, find=options.find,
                 order="desc" if options.newest else "taken" if one_session else "asc",
             )  # fmt: skip
-            frames = islice(found, options.limit)
+            frames = islice(matching_frames, options.limit)
             listed = frames if scene is None else list(frames)
             print_rows(
                 listed, _frame_line, as_json=options.json, none="no frames match",
@@ -282,7 +282,7 @@ def _query_line(query: QueryRecord) -> str:
 def add_jobs(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint jobs`."""
     choice = command.add_mutually_exclusive_group()
-    choice.add_argument("--retry", metavar="ID", help="retry a dead or cancelled job")
+    choice.add_argument("--retry", metavar="ID", help="retry a failed, dead or cancelled job")
     choice.add_argument(
         "--retry-dead", action="store_true", help="retry all dead jobs that were not retried yet"
     )
@@ -358,7 +358,7 @@ def add_maps(command: argparse.ArgumentParser) -> None:
     )
     for option, metavar, kind, text in (
         ("--quota-frames", "N", int, "maximum number of frames in the map"),
-        ("--quota-bytes", "N", int, "maximum size of its uploads in bytes"),
+        ("--quota-bytes", "N", int, "maximum total size of its uploads, bytes"),
         ("--retention-days", "DAYS", float, "delete frames this many days after their upload"),
     ):
         command.add_argument(
@@ -398,12 +398,12 @@ def run_maps(options: argparse.Namespace) -> int:
             return 0
         if options.edit is not None:
             title = {"title": options.title or None} if "title" in fields else {}
-            one = _edit(client, options.edit, title | limits, confirmed=options.yes)
+            record = _edit(client, options.edit, title | limits, confirmed=options.yes)
         else:
             model = options.model or PRESETS[0]
-            one = client.create_map(options.create, options.title, model, **limits)
-        notes = ", ".join([f"map {one.name}", one.model, *_notes(one)])
-        print(one.model_dump_json() if options.json else notes)
+            record = client.create_map(options.create, options.title, model, **limits)
+        notes = ", ".join([f"map {record.name}", record.model, *_notes(record)])
+        print(record.model_dump_json() if options.json else notes)
     return 0
 
 

@@ -31,7 +31,7 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
     """Add `--robot` and the other options of a filter."""
     group = command.add_argument_group(
         "filter",
-        "search only frames that match all of these; frames without the value are excluded",
+        "search only frames that match all of these options; a frame without the value is excluded",
     )
     group.add_argument("--robot", action="append", metavar="NAME", help="repeatable: matches any")
     group.add_argument("--session", action="append", metavar="NAME", help="repeatable: matches any")
@@ -43,7 +43,8 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
     group.add_argument("--tag", action="append", metavar="TAG", help="repeatable: matches all")
     group.add_argument(
         "--not-within", type=float, metavar="SECONDS",
-        help="for loop closure: exclude frames of the query's session within this time of it",
+        help="for loop closure: exclude frames of the query's session that were captured within "
+        "this time of it",
     )  # fmt: skip
     group.add_argument(
         "--region", type=_box, metavar="X0,Y0,Z0,X1,Y1,Z1",
@@ -130,8 +131,8 @@ def add_up_option(command: argparse.ArgumentParser, read: Callable[[str], object
     """Add `--up`; `read` parses its value."""
     command.add_argument(
         "--up", type=read, metavar="X,Y,Z",
-        help="unit vector up in the sensor's axes, such as 0,-1,0 for a level camera (write "
-        "--up=-1,0,0 if the first number is negative)",
+        help="unit vector that points up, in the sensor's axes, such as 0,-1,0 for a level camera "
+        "(write --up=-1,0,0 if the first number is negative)",
     )  # fmt: skip
 
 
@@ -180,8 +181,8 @@ def add_signing_options(command: argparse._ActionsContainer) -> None:
     )  # fmt: skip
     command.add_argument(
         "--if-novel", nargs="?", type=_share, const=True, metavar="D",
-        help="keep a frame only if its place is new to the map, that is if the nearest frame is "
-        "farther than D, a share of the distance of unrelated frames (D without a value: "
+        help="store a frame only if its place is new to the map: the distance from the nearest "
+        "frame exceeds D, a share of the distance between unrelated frames (without a value: "
         f"{NOVEL:g})",
     )  # fmt: skip
 
@@ -260,7 +261,7 @@ def existing_store(options: argparse.Namespace) -> Settings:
 
 
 def open_command_store(settings: Settings) -> AbstractContextManager[Store]:
-    """Open the store of some settings; create it if it is missing."""
+    """Open the store of the settings; create it, or migrate its schema, if necessary."""
     from sceneprint.store import open_store
 
     return closing(open_store(settings.database, settings.blobs))
@@ -286,7 +287,7 @@ def open_client(options: argparse.Namespace) -> Client:
 
 
 def add_seed_option(command: argparse.ArgumentParser) -> None:
-    """Add `--seed`, the seed of the random choices of a validation."""
+    """Add `--seed`, the seed for the random choices of a validation."""
     command.add_argument(
         "--seed", type=whole_number, default=0, metavar="S", help="random seed (default: 0)"
     )
@@ -319,7 +320,7 @@ def add_query_options(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--deadline-ms", type=positive, metavar="MS",
-        help="skip candidates that would finish after this time",
+        help="skip candidates whose validation would end after this time",
     )  # fmt: skip
     command.add_argument(
         "--explain", action="store_true", help="explain at which stage each frame was dropped"
@@ -333,7 +334,7 @@ def add_query_options(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--prior", type=prior_of, metavar="FILE|JSON",
-        help="expected pose: JSON, or a file with JSON, with `pose` (including `parent_frame`) and "
+        help="expected pose, as JSON or the path of a JSON file: `pose` (with `parent_frame`) and "
         "`covariance` (36 numbers) or `deviation_m` and `deviation_deg` (default: 0.3 m, 10 deg)",
     )  # fmt: skip
     add_up_option(command)
@@ -379,7 +380,7 @@ def ended_by_signals() -> Iterator[None]:
             signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    # Leave SIGHUP ignored by `nohup`.
+    # Do not handle a SIGHUP that `nohup` ignores.
     caught = [number for number in _ENDING if signal.getsignal(number) is signal.SIG_DFL]
     for number in caught:
         signal.signal(number, end)

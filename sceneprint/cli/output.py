@@ -17,7 +17,7 @@ Row = TypeVar("Row", bound="BaseModel")
 
 
 def one_line(text: str) -> str:
-    """Replace line breaks and control characters in a text."""
+    """Escape a text that contains line breaks or control characters."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 

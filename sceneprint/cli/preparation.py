@@ -54,7 +54,7 @@ def prepare_presets(
 
     Parameters
     ----------
-    say : function that receives lines of progress; default: print them on standard error
+    say : function that receives progress messages; None prints them on standard error
     clouds : whether to include kernels of clouds; otherwise the first cloud waits for them
     stop : event that cancels the preparation
     """

@@ -64,7 +64,7 @@ def _add_association(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     which.add_argument(
         "--undo", metavar="ID",
-        help="undo the join of this association, so that poses return to the uploaded ones",
+        help="undo the join of this association; the poses return to those of the uploads",
     )  # fmt: skip
     command.add_argument(
         "--robot", action="append", metavar="NAME",
@@ -79,18 +79,18 @@ def _add_association(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--apart", type=positive, metavar="N",
-        help="loop closure: minimum number of frames between the two (default: 100)",
+        help="loop closure: minimum number of frames between two matched frames (default: 100)",
     )  # fmt: skip
     command.add_argument(
         "--not-within", type=float, metavar="SECONDS",
-        help="loop closure: minimum time between the two",
+        help="loop closure: minimum time between two matched frames",
     )  # fmt: skip
     command.add_argument(
         "--k", type=positive, default=3, metavar="K", help="number of edges per frame (default: 3)"
     )
     command.add_argument(
         "--candidates", type=positive, default=10, metavar="N",
-        help="candidates to try per frame until it has K edges (default: 10)",
+        help="number of candidates to try per frame, until the frame has K edges (default: 10)",
     )  # fmt: skip
     add_seed_option(command)
     command.add_argument(
@@ -138,9 +138,9 @@ def _associate(options: argparse.Namespace) -> int:
         check_writable(options.out)
     check_scene(options)
     times = {"captured_after": options.after, "captured_before": options.before}
-    wanted = {name: value for name, value in times.items() if value is not None}
+    time_filter = {name: value for name, value in times.items() if value is not None}
     fields: dict[str, Any] = {
-        "sessions": options.session, "robots": options.robot, "filter": wanted or None,
+        "sessions": options.session, "robots": options.robot, "filter": time_filter or None,
         "apart": options.apart, "not_within_s": options.not_within, "k": options.k,
         "candidates": options.candidates, "seed": options.seed,
         "min_overlap": options.min_overlap, "join": options.join,

@@ -73,8 +73,8 @@ def add_query(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--by", choices=TRANSFORMS, default="aligned",
-        help="transform of the overlay: that of the match, its best rival, or none (default: "
-        "aligned)",
+        help="transform of the query: that of the match (`aligned`), that of its best rival, or "
+        "none (default: aligned)",
     )  # fmt: skip
     _add_frame_options(command)
     command.set_defaults(run=run_query)
@@ -100,8 +100,8 @@ def _add_frame_options(command: argparse.ArgumentParser) -> None:
 def run_query(options: argparse.Namespace) -> int:
     """Query a map with depth frames or point clouds from a file, from a folder (7-Scenes, TUM
     RGB-D, depth images with an intrinsics.json beside them or in a folder above, or clouds), or
-    from the keyframes of a ROS recording. They are not added to the map. The exit code is 2 if the
-    query of a frame failed.
+    from the keyframes of a ROS recording. The frames are not added to the map. The exit code is 2
+    if the query of a frame failed.
     """
     _check_scene(options)
     references = _wanted_frames(options, _frames_at(options))
@@ -141,7 +141,10 @@ def _results(
     references: Sequence[FrameReference],
     ask: Callable[[FrameReference], tuple[Any, str]],
 ) -> Iterator[tuple[FrameReference, tuple[Any, str] | None]]:
-    """Query frames; print each result, and yield it with its text, or None after an error."""
+    """Query frames, and print each result; yield the frame, and the result with its text.
+
+    After an error, print the error and yield None instead of the result.
+    """
     for reference in references:
         try:
             record, text = ask(reference)
@@ -185,7 +188,7 @@ def _save_overlay(client: Client, answer: Answer, options: argparse.Namespace) -
 def _answer_scene(
     scene: Scene | None, references: Sequence[FrameReference]
 ) -> Callable[[FrameReference, Answer, str], None]:
-    """Return a function that adds an answer and its text to the scene; no-op without a scene."""
+    """Return a function that adds an answer and its text to the scene, if there is a scene."""
     places = {reference.path: place for place, reference in enumerate(references)}
     stamps = stamps_of(references)
 
@@ -212,13 +215,13 @@ def _frames_at(options: argparse.Namespace) -> list[FrameReference]:
 def _wanted_frames(
     options: argparse.Namespace, references: list[FrameReference]
 ) -> list[FrameReference]:
-    """Return all frames, or the frame of `--frame`; raise DatasetError if it does not exist."""
-    path, wanted = options.path, options.frame
-    if wanted is None:
+    """Return all frames, or that of `--frame`; raise DatasetError if it is missing or ambiguous."""
+    path, selection = options.path, options.frame
+    if selection is None:
         return references
-    if wanted.isascii() and wanted.isdigit():
-        if int(wanted) < len(references):
-            return [references[int(wanted)]]
+    if selection.isascii() and selection.isdigit():
+        if int(selection) < len(references):
+            return [references[int(selection)]]
         raise DatasetError(
             f"{path} has {len(references)} frames. Set --frame to an index from 0 to "
             f"{len(references) - 1}."
@@ -226,14 +229,14 @@ def _wanted_frames(
     named = [
         frame
         for frame in references
-        if wanted in (frame.name, frame.name.rpartition("/")[2], frame.path.name)
-        or Path(wanted).absolute() == frame.path
+        if selection in (frame.name, frame.name.rpartition("/")[2], frame.path.name)
+        or Path(selection).absolute() == frame.path
     ]
     if len(named) == 1:
         return named
     count = f"{len(named)} frames are named" if named else "no frame is named"
     raise DatasetError(
-        f"{path}: {count} {wanted}. Set --frame to an index from 0, or to a name such as "
+        f"{path}: {count} {selection}. Set --frame to an index from 0, or to a name such as "
         f"{references[0].name}."
     )
 
@@ -341,8 +344,10 @@ def _alternative_lines(alternatives: Sequence[Alternative]) -> list[str]:
 
 def _label(match: Match, several: bool) -> str:
     """Return a label of a match: map (if several), robot, session and file, and frame id."""
-    seen = "/".join(one_line(who) for who in (match.robot, match.session, match.name) if who)
-    return "  ".join(part for part in (match.map if several else "", seen, match.frame_id) if part)
+    source = "/".join(one_line(who) for who in (match.robot, match.session, match.name) if who)
+    return "  ".join(
+        part for part in (match.map if several else "", source, match.frame_id) if part
+    )
 
 
 def _metres(transform: Transform | None) -> str:
@@ -368,12 +373,14 @@ def _explanation_lines(answer: Answer) -> list[str]:
         f"{e.stage}: {e.outcome.replace('_', ' ')}; {one_line(e.reason)}"
         for e in answer.explanations or []
     ]
-    one = answer.explained_frame
-    if one is not None:
-        place = "not searched" if one.rank is None else f"rank {one.rank} of {one.of}"
-        lost = "a match" if one.lost_at is None else f"dropped at {one.lost_at}"
-        label = frame_label(one.frame_id, one.name)
-        lines.append(f"  {label}: {place}; {lost}: {one_line(one.reason)}")
+    explained = answer.explained_frame
+    if explained is not None:
+        place = (
+            "not searched" if explained.rank is None else f"rank {explained.rank} of {explained.of}"
+        )
+        lost = "a match" if explained.lost_at is None else f"dropped at {explained.lost_at}"
+        label = frame_label(explained.frame_id, explained.name)
+        lines.append(f"  {label}: {place}; {lost}: {one_line(explained.reason)}")
     return lines
 
 
@@ -387,18 +394,18 @@ def add_localize(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint localize`."""
     command.add_argument(
         "--last", type=positive, metavar="K",
-        help="query each frame together with earlier frames, 1 to 10 in total, that are 0.1 m or 6 "
-        "degrees apart, with their poses in the folder as odometry (default: 3 if frames have "
-        "poses and --up is absent; 1: each frame alone)",
+        help="number of frames per query, 1 to 10: each frame and earlier frames, 0.1 m or 6 "
+        "degrees apart, whose poses in the folder serve as odometry (default: 3 if the frames "
+        "have poses and --up is absent, else 1)",
     )  # fmt: skip
     _add_frame_options(command)
     command.set_defaults(run=run_localize)
 
 
 def run_localize(options: argparse.Namespace) -> int:
-    """Find the poses in a map at which depth frames or clouds were taken. They are not added to the
-    map. The exit code is 0 if all poses are found, 1 if one is ambiguous or not found, and 2 if a
-    query failed.
+    """Find the poses in a map at which depth frames or clouds were taken. The frames are not
+    added to the map. The exit code is 0 if all poses are found, 1 if one is ambiguous or not found,
+    and 2 if a query failed.
     """
     _check_scene(options)
     every = _frames_at(options)
@@ -465,11 +472,14 @@ def _localize(
 def _frames_before(
     options: argparse.Namespace, every: list[FrameReference], reference: FrameReference
 ) -> list[FrameReference]:
-    """Return the earlier frames to query together with a frame, in chronological order.
+    """Return up to K - 1 earlier frames of the same folder to query together with a frame.
+
+    K is --last; the default is 3, or 1 with --up. The frames have poses, are spaced as in
+    `spaced_views`, and are in chronological order. Without --last, a frame without a pose has none.
 
     Raises
     ------
-    DatasetError : If --last requires earlier frames, but the frame has no pose.
+    DatasetError : If --last exceeds 1, but the frame has no pose.
     """
     most = options.last or (_LAST if options.up is None else 1)
     if most == 1:

@@ -57,8 +57,8 @@ class Scene(Protocol):
         """Add an association with a description."""
 
 
-#: Function that opens a scene file, with the client and the maximum number of frames of the map to
-#: include. The file appears only if the context ends without an error.
+#: Function that opens a scene file; its arguments are the path, the client, and the maximum number
+#: of frames of the map to include. The file appears only if the context ends without an error.
 SceneOpener: TypeAlias = "Callable[[Path, Client, int], AbstractContextManager[Scene]]"
 
 
@@ -113,10 +113,13 @@ def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | 
 
 
 def stamps_of(references: Sequence[FrameFile]) -> list[int | None]:
-    """Return the capture times of frames, nanoseconds since 1970; all None unless increasing."""
+    """Return the capture times of frames, nanoseconds since 1970.
+
+    All are None if a time is unknown, or the times do not increase.
+    """
     stamps = [reference.timestamp for reference in references]
-    known = [t for t in stamps if t is not None and 0 <= t < 2**63 * 1e-9]
-    rising = all(a < b for a, b in itertools.pairwise(known))
-    if len(known) < len(stamps) or not rising:
+    times = [t for t in stamps if t is not None and 0 <= t < 2**63 * 1e-9]
+    rising = all(a < b for a, b in itertools.pairwise(times))
+    if len(times) < len(stamps) or not rising:
         return [None] * len(stamps)
-    return [round(t * 1e9) for t in known]
+    return [round(t * 1e9) for t in times]

@@ -70,7 +70,7 @@ def run_serve(options: argparse.Namespace) -> int:
         threads[0].start()
         print(f"sceneprint: serving {url}\nsceneprint: dashboard {url}/dashboard", flush=True)
 
-    # uvicorn handles both signals while it runs; this handles them before and after.
+    # uvicorn handles SIGINT and SIGTERM while it runs; this handles SIGTERM before and after.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         serve(settings, ready)

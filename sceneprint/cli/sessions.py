@@ -31,7 +31,7 @@ def add_sessions(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--deletions", action="store_true", help="list deletions of frames that can be undone"
     )
-    command.add_argument("--undo", metavar="ID", help="undo one of these deletions")
+    command.add_argument("--undo", metavar="ID", help="undo the deletion with this id")
     command.add_argument("--json", action="store_true", help="print JSON")
     add_service_options(command)
     command.set_defaults(run=run_sessions)
@@ -73,8 +73,8 @@ def run_sessions(options: argparse.Namespace) -> int:
         else:
             sessions = client.sessions(options.map)
             names = {"session": options.session, "robot": options.robot}
-            wanted = {name: value for name, value in names.items() if value is not None}
-            rows = (s for s in sessions if all(getattr(s, n) == v for n, v in wanted.items()))
+            conditions = {name: value for name, value in names.items() if value is not None}
+            rows = (s for s in sessions if all(getattr(s, n) == v for n, v in conditions.items()))
             print_rows(
                 rows, _session_line, as_json=options.json, none="no sessions yet",
                 header="frames  indexed  poses  first captured       last captured        "

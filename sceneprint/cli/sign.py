@@ -80,7 +80,7 @@ def run_sign(options: argparse.Namespace) -> int:
 
 
 def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
-    """Return all frames below the paths by unique names.
+    """Return all frames under the paths, by unique name.
 
     Raises
     ------
@@ -106,16 +106,16 @@ def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
 
 
 def _prepare_folder(folder: Path, signer: Signer) -> None:
-    """Create a folder, or raise an error if it has signatures of another model."""
+    """Create a folder; raise DatasetError if it contains signatures of another model."""
     folder.mkdir(parents=True, exist_ok=True)
     index = folder / "signatures.json"
     try:
-        known = json.loads(index.read_text())["model"]["id"] if index.exists() else None
+        model_id = json.loads(index.read_text())["model"]["id"] if index.exists() else None
     except (ValueError, KeyError, TypeError):
-        known = "no readable model id"
-    if known not in (None, signer.model.id):
+        model_id = "no readable model id"
+    if model_id not in (None, signer.model.id):
         raise DatasetError(
-            f"{folder}: contains signatures of another model ({known[:12]}, not "
+            f"{folder}: contains signatures of another model ({model_id[:12]}, not "
             f"{signer.model.id[:12]}), and models must not be mixed. Use a new folder, or empty "
             "this one."
         )
@@ -124,7 +124,10 @@ def _prepare_folder(folder: Path, signer: Signer) -> None:
 def _sign(
     name: str, reference: FrameReference, signer: Signer, out: Path | None
 ) -> tuple[dict[str, Any], str]:
-    """Sign a frame and write its signature; return its entry in the index, and its output line."""
+    """Sign a frame and write its signature; return its entry in the index, and its output line.
+
+    If the frame cannot be signed, both state the reason, and the file of an earlier run is removed.
+    """
     entry: dict[str, Any] = {"name": name, "path": str(reference.path)}
     file = None if out is None else out / f"{name}.sig"
     try:

@@ -21,7 +21,7 @@ from sceneprint_client.spool import MOST_BYTES, Spool, SyncReport
 
 def add_spool(command: argparse.ArgumentParser) -> None:
     """Add the options of `sceneprint spool`."""
-    command.add_argument("spool", type=Path, metavar="FILE", help="file of the spool")
+    command.add_argument("spool", type=Path, metavar="FILE", help="path of the spool file")
     command.add_argument(
         "paths", nargs="*", type=Path, metavar="PATH",
         help="frames to add to the spool, which is created if missing",
@@ -90,10 +90,10 @@ def _add(options: argparse.Namespace) -> int:
                     errors.append(f"{one_line(frame.name)}: {one_line(str(error))}")
         finally:  # report the added frames even after an error
             now = spool.status()
-            left = len(frames) - new - there - len(errors)
+            skipped = len(frames) - new - there - len(errors)
             print(
                 f"{len(frames)} frames: {new} added, {there} already there, {len(errors)} refused"
-                f"{f', {left} not added' if left else ''}; "
+                f"{f', {skipped} not added' if skipped else ''}; "
                 f"{now.waiting} wait, {now.thinned - before.thinned} thinned"
             )
             for sequence in sequences:

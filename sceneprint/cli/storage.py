@@ -100,7 +100,7 @@ def add_fsck(command: argparse.ArgumentParser) -> None:
     how.add_argument(
         "--purge", action="store_true",
         help="do not check anything; erase all data of deleted frames on this node now, without "
-        "waiting for SCENEPRINT_PURGE_DEADLINE_S; their deletion can then not be undone",
+        "waiting for SCENEPRINT_PURGE_DEADLINE_S; their deletion can no longer be undone",
     )  # fmt: skip
     command.add_argument(
         "--grace", type=whole_number, metavar="SECONDS",
@@ -169,12 +169,16 @@ def _line(finding: Finding) -> str:
 
 def _summary(findings: list[Finding], *, repair: bool) -> str:
     kinds = Counter(each.severity for each in findings)
-    damaged, unneeded, left = kinds["damage"], kinds["leftover"], sum(o.left for o in findings)
+    damaged, unneeded, unrepaired = (
+        kinds["damage"],
+        kinds["leftover"],
+        sum(o.left for o in findings),
+    )
     if not damaged and not unneeded:
         return "no problems found"
     counts = f"{damaged} damaged, {unneeded} left over"
     if repair:
-        done = f"{damaged + unneeded - left} repaired, {left} not"
+        done = f"{damaged + unneeded - unrepaired} repaired, {unrepaired} not"
         return f"{counts}: {done}. Run it again once workers have signed the queued frames."
     possible = sum(each.repair is not None for each in findings)
     return f"{counts}; nothing was changed: `sceneprint fsck --repair` can repair {possible}"
@@ -258,7 +262,8 @@ def _named_database(options: argparse.Namespace) -> Settings:
 
     Raises
     ------
-    InvalidRequest : If the URL contains a password, which all users of the machine could see.
+    InvalidRequest : If the URL is not valid, or contains a password, which all users of the machine
+        could see.
     """
     from pydantic import SecretStr
     from sqlalchemy import make_url
@@ -377,7 +382,10 @@ def run_restore(options: argparse.Namespace) -> int:
 
 
 def _keep_keys(choice: str | None, keys: list[str]) -> bool:
-    """Return whether restored keys remain valid: by the option, or by a question in a terminal."""
+    """Return whether to keep restored keys, as the option states.
+
+    Without the option, ask in a terminal; elsewhere, keep the keys.
+    """
     if choice is not None or not keys or not sys.stdin.isatty():
         return choice != "revoke"
     print(
@@ -529,7 +537,10 @@ def _print_reencoding(record: Map) -> None:
 
 
 def _wait(context: Context, record: Map) -> int:
-    """Wait until a map has switched its model; return 2 if there is no progress."""
+    """Wait until a map has switched its model, and print its state; return 2 if it did not switch.
+
+    Stop after STALL_S seconds without progress, or if only jobs that failed permanently remain.
+    """
     from sceneprint.engine.admin.statistics import Statistics
     from sceneprint.engine.maps.map_lifecycle import get_map
 

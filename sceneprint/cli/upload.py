@@ -204,7 +204,7 @@ def add_frame_options(
     command.add_argument(
         "--parent-frame", metavar="NAME",
         help="parent frame of all poses; uploads with the same parent frame share coordinates "
-        "(default: the name of the scene's folder, with --robot ROBOT/SCENE)",
+        "(default: SCENE, the name of the scene's folder; with --robot, ROBOT/SCENE)",
     )  # fmt: skip
     command.add_argument("--no-pose", action="store_true", help="do not upload poses")
     command.add_argument(
@@ -359,10 +359,10 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
         lines.append(f"map {now.name} has no poses, so answers have frames but no coordinates")
     if now.parent_frames > 1:
         first: dict[str, Session] = {}
-        for one in client.sessions(now.name):
-            if one.session is not None:
-                for parent in one.parent_frames:
-                    first.setdefault(parent, one)
+        for session in client.sessions(now.name):
+            if session.session is not None:
+                for parent in session.parent_frames:
+                    first.setdefault(parent, session)
         two = list(first.values())[:2]
         line = (
             f"the poses of map {now.name} are in {now.parent_frames} parent frames, and an answer "
@@ -413,17 +413,17 @@ def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSe
     sequences = []
     for path in paths:
         with recording_options(options) as recording:
-            found = find_sequences(path, recording)
-        for sequence in found:
+            sequences_here = find_sequences(path, recording)
+        for sequence in sequences_here:
             if options.row is not None:
                 sequence = _with_row(sequence, options.row)
             sequence = with_depth_scale(sequence, options.depth_scale)
             place = sequence.place.resolve()
-            known = places.setdefault(sequence.parent_frame, place)
-            if known != place and options.parent_frame is None:
+            first_place = places.setdefault(sequence.parent_frame, place)
+            if first_place != place and options.parent_frame is None:
                 raise DatasetError(
-                    f"{path}: {known} also has the parent frame {sequence.parent_frame}, so the "
-                    "poses of both would be mixed. Upload a folder above both, rename one, "
+                    f"{path}: {first_place} also has the parent frame {sequence.parent_frame}, so "
+                    "the poses of both would be mixed. Upload a folder above both, rename one, "
                     "or, if their poses share one parent frame, specify it with --parent-frame."
                 )
             sequences.append(sequence)
@@ -439,7 +439,10 @@ def row_option(text: str) -> tuple[str, ...]:
 
 
 def _with_row(sequence: FrameSequence, row: tuple[str, ...]) -> FrameSequence:
-    """Return a sequence of .bin files with the names of the values in a row."""
+    """Return a sequence of .bin files with the names of the values in a row.
+
+    Raise InvalidRequest if the sequence has other files.
+    """
     frames = tuple(
         replace(frame, cloud=replace(frame.cloud, row=row))
         for frame in sequence.frames

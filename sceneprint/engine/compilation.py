@@ -1,8 +1,8 @@
 """Ahead-of-time compilation of numba kernels by separate processes.
 
 Compilation would block requests, so other processes compile the kernels and cache their machine
-code on disk: one process compiles the kernels of signing, another those of validation. Kernels of
-clouds and of rendered views are compiled when the first cloud or surface arrives.
+code on disk: one process compiles the kernels of signing, another those of validation. The kernels
+for clouds and for rendered views are compiled when the first cloud or surface arrives.
 
     python -m sceneprint.engine.compilation signing|validation|clouds FOLDER_OF_TABLES
 """
@@ -34,7 +34,7 @@ DEPTH, ALL = ("signing", "validation"), ("signing", "validation", "clouds")
 _LOOK_S = 0.05
 #: Seconds between reports of progress.
 _REPORT_S = 5.0
-#: Lock during compilation, for which other threads wait.
+#: Lock that is held during compilation; other threads wait for it.
 _compiling = threading.Lock()
 
 
@@ -56,8 +56,8 @@ def compile_kernels(
 
     Parameters
     ----------
-    cache_dir : folder of pair tables, in which a table is created
-    say : function that receives lines of progress
+    cache_dir : folder of pair tables, where a table is created
+    say : function that receives progress messages
     stop : event that cancels the compilation
     """
     with _compiling:
@@ -72,8 +72,8 @@ def compile_kernels(
         environment = dict(os.environ)
         if not environment.get("NUMBA_CPU_NAME") and runs_here():
             environment |= {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES}
-        # compile clouds last, since they reuse kernels of the other parts; each process writes one
-        # byte per compiled kernel to the file
+        # compile kernels for clouds last, since they reuse kernels of the other parts; each process
+        # writes one byte per compiled kernel to the file
         with os.fdopen(os.memfd_create("compiled kernels"), "wb") as compiled:
             for group in ([part for part in absent if part != "clouds"], ["clouds"]):
                 commands = {part: (part, str(cache_dir)) for part in group if part in absent}

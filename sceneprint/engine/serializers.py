@@ -137,7 +137,7 @@ def map_records(connection: Connection, rows: Sequence[MapRow]) -> list[Map]:
 
 
 def map_record(connection: Connection, row: MapRow, recent: Mapping[str, int] | None = None) -> Map:
-    """Return the API record of a map; `recent` is its number of recent queries by status."""
+    """Return the API record of a map; `recent` contains its recent query counts by status."""
     if recent is None:
         since = time.time() - RECENT_S
         recent = count_statuses(connection, since, row.number).get(row.number, {})

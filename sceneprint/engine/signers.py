@@ -88,7 +88,7 @@ class Signers:
             return self._open[model.id]
 
     def warm(self) -> None:
-        """Load the kernels and the tables of all models in use."""
+        """Load the kernels and the tables of all models in use; log unusable models."""
         with self.database.read() as connection:
             used = {model_id for row in list_maps(connection) for model_id in models_of(row)}
         for model_id in used:
@@ -121,13 +121,13 @@ def warm(signer: Signer, *, clouds: bool = False) -> bool:
 
 def warm_signing(signer: Signer) -> bytes:
     """Sign and search the image of a corner; return its artifact."""
-    signature, seen = prepare(_corner(), signer)
+    signature, geometry = prepare(_corner(), signer)
     metric, rows = signer.model.metric, signature.vector[None].copy()
     search(signature.vector, None, Tail(np.zeros(1, np.int64), rows), 1, metric=metric)
     pairwise_distances(rows, metric)
     rows.flags.writeable = False  # kernels are compiled separately for read-only arrays
     distances(signature.vector.copy(), rows, metric)
-    return write_geometry(seen)
+    return write_geometry(geometry)
 
 
 def warm_validation(geometry: Geometry, p: ValidationParameters) -> bool:

@@ -111,17 +111,17 @@ def robot_path(poses: Floats, parents: Ints64) -> RobotPath:
     poses : (m, 4, 4) T_parent_sensor in chronological order; NaN if unknown
     parents : (m,) identifiers of the parent frames; odometry has a gap at each change
     """
-    known = np.isfinite(poses).all(axis=(1, 2))
+    posed = np.isfinite(poses).all(axis=(1, 2))
     metres, radians = np.zeros(len(poses)), np.zeros(len(poses))
     last, far_m, far_rad = -1, 0.0, 0.0
-    for i in np.flatnonzero(known).tolist():
+    for i in np.flatnonzero(posed).tolist():
         if last >= 0 and parents[i] == parents[last]:
             far_m += float(np.linalg.norm(poses[i, :3, 3] - poses[last, :3, 3]))
             far_rad += rotation_angle(poses[i, :3, :3] @ poses[last, :3, :3].T)
         elif last >= 0:
             far_m += _GAP_M
         metres[i], radians[i], last = far_m, far_rad, i
-    metres[~known] = np.nan
+    metres[~posed] = np.nan
     return RobotPath(poses, metres, radians)
 
 
@@ -234,7 +234,8 @@ def _loops(
     edges: LoopEdges, source: RobotPath, target: RobotPath, p: CycleParameters
 ) -> tuple[Ints64, Ints64, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return pairs (i, j) of edges that form loops, a mask of the pairs whose loop closes, and a
-    mask of the pairs whose viewpoints differ on either run.
+    mask of the pairs whose viewpoints differ in at least one run. Edges form a loop if they are
+    within the reach of `p`, which is halved until there are at most `p.most_loops`.
     """
     ways = np.stack(
         [

@@ -1,4 +1,4 @@
-"""A model: all data that determine signatures and artifacts. A digest identifies it.
+"""A model: all data that determine signatures and artifacts, identified by a digest.
 
 `scale_lengths` returns parameters for a larger or smaller world. If a cloud and the lengths of the
 parameters are multiplied by s, the signature is unchanged, and translations are multiplied by s.
@@ -45,12 +45,12 @@ from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.types import Floats32
 
-#: Versions of the file and its semantics, for models with and without a whitening. A model's id
-#: depends on its version. Raise a version if code changes the signatures of its models.
+#: Versions of the file format and its semantics, for models with and without a whitening. A model's
+#: id depends on its version. Raise a version if a change of code changes signatures of such models.
 SCHEMA_VERSION, PSI_SCHEMA_VERSION = 3, 2
 
-#: Groups whose default parameters are omitted from files and ids. Therefore, new parameters
-#: preserve the ids of existing models, but defaults must not change.
+#: Groups of which files and ids omit parameters that have the default value. Therefore, new
+#: parameters preserve the ids of existing models, but defaults must not change.
 SPARSE = ("cloud", "validation")
 
 T = TypeVar("T")
@@ -87,17 +87,17 @@ class AnswerParameters:
 class Model:
     """Projection, mixture, quantiser, compression, whitening, and the parameters of each stage.
 
-    A whitened signature has a few hundred bytes and is compared by L2. Without a whitening,
-    signatures are psi and are compared by L1, as in Sec. III-C.
+    A whitened signature has a few hundred bytes and is compared by L2. Without a whitening, the
+    signature is psi and is compared by L1, as in Sec. III-C.
 
     Parameters
     ----------
     name : display name; not part of the id
-    quantiser_step : difference of psi per unit of a quantised byte
+    quantiser_step : difference in psi per unit of a quantised byte
     psi_unrelated_distance : median L1 distance between quantised psi of unrelated training frames
     provenance : data and settings of the training; not part of the id
     whitening : see Whitening; None if signatures are psi
-    answer : see AnswerParameters; not part of the id, so that changes need no new signatures
+    answer : see AnswerParameters; not part of the id, so that a change requires no new signatures
     """
 
     name: str
@@ -125,7 +125,7 @@ class Model:
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """Return the ascending levels of the hierarchy in a signature; 0 is the finest level."""
+        """Return the hierarchy levels that a signature contains, ascending; 0 is the finest."""
         if self.whitening is None:
             return tuple(range(self.parameters.hierarchy.n_levels))
         return self.whitening.levels
@@ -158,7 +158,7 @@ class Model:
 
     @property
     def header(self) -> dict[str, Any]:
-        """Return all values, except arrays, on which signatures or artifacts depend."""
+        """Return all values on which signatures or artifacts depend, except arrays."""
         header = {
             "schema_version": PSI_SCHEMA_VERSION,
             "parameters": to_mapping(self.parameters),
@@ -238,13 +238,13 @@ def parse_parameters(values: Any) -> ModelParameters:
 
 
 def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
-    """Convert parsed JSON with exactly the fields of a parameter record to the record.
+    """Convert parsed JSON that has exactly the fields of a parameter record to the record.
 
     Parameters
     ----------
     kind : class of the record
     where : path of the record, for errors
-    groups : further fields of the record, not in `values`
+    groups : further fields of the record, which are not in `values`
 
     Raises
     ------
@@ -268,11 +268,11 @@ def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
 
 
 def differences(record: Any, default: Any = None) -> dict[str, Any]:
-    """Return the values of a record that differ from another record, by group.
+    """Return the values of a record that differ from those of another record, by group.
 
     Parameters
     ----------
-    record : frozen record of numbers and of other records
+    record : frozen record of numbers and of further records
     default : record of the same class; None selects the defaults of the class
     """
     default = type(record)() if default is None else default
@@ -292,7 +292,7 @@ def apply_changes(default: T, values: Any, where: str) -> T:
     Parameters
     ----------
     default : frozen record
-    values : parsed JSON of the result of `differences`
+    values : result of `differences`, parsed from JSON
     where : path of the record, for errors
 
     Raises
@@ -316,7 +316,7 @@ def apply_changes(default: T, values: Any, where: str) -> T:
 
 
 def _convert_number(kind: Any, value: Any, where: str) -> Any:
-    """Convert a number or Boolean to the type of its field; raise UnreadableModel for others."""
+    """Convert a number or Boolean to its field's type; raise UnreadableModel if it is neither."""
     if isinstance(value, bool) is not (kind is bool) or not isinstance(value, bool | int | float):
         raise UnreadableModel(
             f"The model's {where} is {value!r}, not a number: the file is damaged. Download the "
@@ -325,7 +325,7 @@ def _convert_number(kind: Any, value: Any, where: str) -> Any:
     return kind(value)
 
 
-#: Exponent of the metre in the units of the parameters, by class and field.
+#: Exponent of the metre in the unit of each parameter, by class and field.
 POWERS: dict[type, dict[str, int]] = {
     DepthParameters: {"minimum_depth": 1, "maximum_depth": 1},
     CloudParameters: {
@@ -390,7 +390,7 @@ def scale_lengths(parameters: T, factor: float) -> T:
     Parameters
     ----------
     parameters : frozen record, such as ModelParameters
-    factor : positive factor of lengths; other powers of a length are scaled accordingly
+    factor : positive factor for lengths; powers of lengths are scaled by powers of it
     """
     powers = POWERS.get(type(parameters), {})
     changes: dict[str, Any] = {}

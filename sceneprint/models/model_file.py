@@ -1,7 +1,7 @@
-"""Model files, and the cache of the pair tables that are computed from models.
+"""Model files, and the cache of the pair tables computed from models.
 
-A model's file is safetensors with a JSON header, without pickle or code. Its pair table is built
-once per machine; all processes then map it into memory.
+A model file is a safetensors file with a JSON header; it contains no pickle or code. Its pair table
+is built once per machine; all processes then map it into memory.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from sceneprint_client.api.maps import PRESETS
 
 #: Maximum number of components, because the pair table stores 16-bit indices.
 MAXIMUM_COMPONENTS = 2**15 - 1
-#: Minimum and maximum of the parameters that determine the memory and time per frame.
+#: Minimum and maximum of each number that determines the memory and time per frame.
 BOUNDS = {
-    "bins of the table": (1, 4_000_000),
+    "pair-table bins": (1, 4_000_000),
     "levels": (1, 16),
     "patches": (1, 10_000),
     "pixels": (64, 1 << 20),
@@ -57,30 +57,30 @@ BOUNDS = {
     "window": (1, 16),
     "patches for validation": (1, 2_000),
     "iterations for validation": (0, 1000),
-    "bins of the surroundings": (1, 10_000),
-    "bytes of a descriptor": (1, 1024),
-    "pixels of a cloud": (64, 1 << 20),
-    "fewest points of a cloud": (1, 1_000_000),
-    "window of a cloud": (1, 16),
-    "patches of a cloud": (1, 10_000),
-    "patches of a cloud for validation": (1, 2_000),
-    "gap of a cloud": (0, 1000),
-    "neighbours in a cloud": (1, 1 << 27),
+    "bins per descriptor histogram": (1, 10_000),
+    "bytes per descriptor": (1, 1024),
+    "pixels per cloud": (64, 1 << 20),
+    "minimum points per cloud": (1, 1_000_000),
+    "window for clouds": (1, 16),
+    "patches per cloud": (1, 10_000),
+    "patches per cloud for validation": (1, 2_000),
+    "gap for clouds": (0, 1000),
+    "neighbours per cloud": (1, 1 << 27),
     "hypotheses": (1, 1000),
     "correspondences": (1, 10_000),
     "rivals": (0, 100),
-    "iterations of a refinement": (0, 1000),
+    "iterations per refinement": (0, 1000),
     "stride": (1, 1000),
-    "pixels about an edge": (0, 100),
-    "rounds of a hypothesis": (0, 1000),
-    "neighbours in a sequence": (1, 1000),
-    "correspondences of sequences": (1, 10_000),
-    "cells along a plan": (16, 512),
-    "yaws of a plan": (1, 720),
-    "heights of a plan": (1, 10_000),
-    "hypotheses of plans": (1, 1000),
-    "views of a pose": (1, 100),
-    "poses that are compared": (1, 1000),
+    "edge pixels": (0, 100),
+    "rounds per hypothesis": (0, 1000),
+    "neighbours per sequence": (1, 1000),
+    "correspondences from sequences": (1, 10_000),
+    "cells per side of a plan": (16, 512),
+    "yaws per plan": (1, 720),
+    "heights per plan": (1, 10_000),
+    "hypotheses from plans": (1, 1000),
+    "views per pose": (1, 100),
+    "compared poses": (1, 1000),
 }
 
 
@@ -95,8 +95,8 @@ def check_whitening(levels: tuple[object, ...], n_levels: int, dimension: int) -
     ------
     ValueError : If a level does not exist or the length is out of bounds
     """
-    known = [level for level in range(n_levels) if level in levels]
-    if not known or list(levels) != known or any(isinstance(level, bool) for level in levels):
+    valid = [level for level in range(n_levels) if level in levels]
+    if not valid or list(levels) != valid or any(isinstance(level, bool) for level in levels):
         raise ValueError(
             f"a whitening cannot use the levels {list(levels)} of a hierarchy of {n_levels}"
         )
@@ -121,9 +121,9 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         raise ValueError(f"{n_components} components exceed the maximum of {MAXIMUM_COMPONENTS}")
     t = p.table
     if min(t.distance_bins, t.angle_bins, t.dihedral_bins) < 1:
-        raise ValueError("every axis of the table must have bins")
+        raise ValueError("every axis of the pair table must have bins")
     if not (p.surroundings.scales >= 1e-3).all():
-        raise ValueError("every scale of the surroundings must have a radius and bins")
+        raise ValueError("every scale of the descriptor histograms must have a radius and bins")
     _check_cloud(p.cloud)
     alignment, rivals = p.validation.alignment, p.validation.rivals
     sequence = alignment.sequence
@@ -134,7 +134,7 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
     if not (plan.cell > 0 and plan.voxel > 0 and 0 < plan.height_step <= plan.height_range < 1e6):
         raise ValueError("cells, voxels and heights of a plan must have a positive size")
     counts = {
-        "bins of the table": t.n_bins,
+        "pair-table bins": t.n_bins,
         "levels": p.hierarchy.n_levels,
         "patches": p.segmentation.n_patches,
         "pixels": p.depth.maximum_pixels,
@@ -142,28 +142,28 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
         "window": p.normals.radius_px,
         "patches for validation": p.validation_segmentation.n_patches,
         "iterations for validation": p.validation_segmentation.iterations,
-        "bins of the surroundings": p.surroundings.dimension,
-        "bytes of a descriptor": n_compressed,
-        "pixels of a cloud": p.cloud.maximum_pixels,
-        "fewest points of a cloud": p.cloud.minimum_points,
-        "window of a cloud": max(p.cloud.radius_px, p.cloud.image_radius_px),
-        "patches of a cloud": p.cloud.maximum_patches,
-        "patches of a cloud for validation": p.cloud.maximum_validation_patches,
-        "gap of a cloud": p.cloud.gap_px,
-        "neighbours in a cloud": p.cloud.maximum_pixels * (2 * p.cloud.radius_px + 1) ** 2,
+        "bins per descriptor histogram": p.surroundings.dimension,
+        "bytes per descriptor": n_compressed,
+        "pixels per cloud": p.cloud.maximum_pixels,
+        "minimum points per cloud": p.cloud.minimum_points,
+        "window for clouds": max(p.cloud.radius_px, p.cloud.image_radius_px),
+        "patches per cloud": p.cloud.maximum_patches,
+        "patches per cloud for validation": p.cloud.maximum_validation_patches,
+        "gap for clouds": p.cloud.gap_px,
+        "neighbours per cloud": p.cloud.maximum_pixels * (2 * p.cloud.radius_px + 1) ** 2,
         "hypotheses": max(alignment.n_refined, alignment.n_fine, alignment.consensus.n_seeds),
         "correspondences": alignment.matching.n_sources * alignment.matching.n_nearest,
         "rivals": max(rivals.n_axes, rivals.n_planes, rivals.n_shifts, rivals.n_proposed),
-        "iterations of a refinement": max(refinement.iterations for refinement in refinements),
+        "iterations per refinement": max(refinement.iterations for refinement in refinements),
         "stride": min(strides),
-        "pixels about an edge": p.validation.agreement.edge_px,
-        "rounds of a hypothesis": alignment.consensus.rounds,
-        "neighbours in a sequence": sequence.n_neighbours,
-        "correspondences of sequences": sequence.n_sources * sequence.n_nearest,
-        "cells along a plan": plan.side,
-        "yaws of a plan": max(plan.n_yaws, plan.kept_yaws, 2 * plan.sliced_yaws),
-        "heights of a plan": round(plan.height_range / plan.height_step),
-        "hypotheses of plans": max(
+        "edge pixels": p.validation.agreement.edge_px,
+        "rounds per hypothesis": alignment.consensus.rounds,
+        "neighbours per sequence": sequence.n_neighbours,
+        "correspondences from sequences": sequence.n_sources * sequence.n_nearest,
+        "cells per side of a plan": plan.side,
+        "yaws per plan": max(plan.n_yaws, plan.kept_yaws, 2 * plan.sliced_yaws),
+        "heights per plan": round(plan.height_range / plan.height_step),
+        "hypotheses from plans": max(
             max(plan.n_kept, plan.n_sliced) * plan.n_heights,
             max(plan.kept_yaws, 2 * plan.sliced_yaws) * plan.n_peaks,
         ),
@@ -173,18 +173,18 @@ def check_bounds(p: ModelParameters, n_components: int, n_compressed: int) -> No
 
 def _check_cloud(p: CloudParameters) -> None:
     if not 1e-4 <= p.minimum_range < p.maximum_range <= 1e6:
-        raise ValueError("the range of a cloud must start above 0 and not be empty")
+        raise ValueError("the range for clouds must start above 0 and must not be empty")
     if not (p.voxel_size > 0 and min(p.voxel_angle, p.image_angle) >= 1e-4):
-        raise ValueError("voxels and pixels of a cloud must have a positive size")
+        raise ValueError("the sizes of voxels and pixels for clouds must be positive")
     if not max(p.voxel_angle, p.image_angle) <= 0.1 or not p.same_surface > 0:
-        raise ValueError("voxels and pixels of a cloud are too large, or their angles too small")
+        raise ValueError("voxel and pixel angles and same_surface for clouds are out of bounds")
     if not min(p.seed_px, p.validation_seed_px) >= 1:
-        raise ValueError("the distance between seeds of a cloud must be at least one voxel")
+        raise ValueError("the distance between seeds for clouds must be at least one voxel")
     if not 0 < p.range_gate <= 1:  # a gate of 1 admits neighbours at e times the range
-        raise ValueError("the range gate of a cloud must be above 0 and at most 1")
+        raise ValueError("the range gate for clouds must be above 0 and at most 1")
 
 
-#: Maximum size of a file, sufficient for a model with the maximum number of components.
+#: Maximum size of a model file, bytes; it suffices for the maximum number of components.
 MAXIMUM_BYTES = 16 << 20
 
 
@@ -204,7 +204,7 @@ def write_model(model: Model) -> bytes:
 def save_model(model: Model, path: Path) -> None:
     """Write a model to a file atomically; the folder must exist."""
     data = write_model(model)
-    parse_model(data, str(path))  # raise before an unreadable file is written
+    parse_model(data, str(path))  # raise an error instead of writing an unreadable file
     write_whole(path, data)
 
 
@@ -328,18 +328,18 @@ def _assemble_model(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> M
 
 
 def _parse_answer(values: Any) -> AnswerParameters:
-    """Parse the answer parameters; raise an error if they are invalid."""
+    """Parse the answer parameters; raise ValueError or UnreadableModel if they are invalid."""
     answer = apply_changes(AnswerParameters(), values, "answer")
     refinement, views = answer.map.refinement, answer.map
     counts = {
-        "iterations of a refinement": refinement.iterations,
+        "iterations per refinement": refinement.iterations,
         "stride": refinement.stride,
-        "views of a pose": max(views.n_views, views.n_refining, views.n_noise),
-        "poses that are compared": max(views.n_poses, views.n_places, views.n_refined),
+        "views per pose": max(views.n_views, views.n_refining, views.n_noise),
+        "compared poses": max(views.n_poses, views.n_places, views.n_refined),
     }
     _check_counts(counts)
     if not (views.cell > 0 and views.reach > 0 and views.around_reach > 0):
-        raise ValueError("reaches and cells of the map must be positive")
+        raise ValueError("the reaches and the cell of the map verification must be positive")
     return answer
 
 
@@ -375,14 +375,14 @@ def _parse_whitening(
     return Whitening(levels, basis, scales, offsets, d0)
 
 
-#: Version of the layout of the cached file, and part of its name.
+#: Version of the layout of cached files, which is part of their names.
 CACHE_VERSION = 1
-#: Number of bytes before the bins: a multiple of a cache line, so that the bins are aligned.
+#: Number of bytes before the bins, a multiple of a cache line so that the bins are aligned.
 HEAD = 64
-#: Number of bins between two reports of progress.
+#: Number of bins between two progress reports.
 CHUNK = 16_384
 
-#: Callback with the number of finished bins and the number of all bins.
+#: Callback that takes the number of finished bins and the total number of bins.
 Progress = Callable[[int, int], None]
 
 
@@ -396,8 +396,8 @@ def open_table(
 ) -> PairTable:
     """Open the pair table of a model from the cache, or build and cache it.
 
-    If several processes build it simultaneously, each writes a complete file with the same bytes.
-    If the cache folder is not writable, the table is only in memory.
+    Processes that build it simultaneously all write complete files with the same bytes. If the
+    cache folder is not writable, the table exists only in memory.
 
     Parameters
     ----------
@@ -428,12 +428,12 @@ def _map_table(path: Path, model: Model) -> PairTable | None:
         packed = np.memmap(path, np.float32, "r", offset=HEAD, shape=shape)
     except (OSError, ValueError):
         return None
-    # slices of a memmap are slow, so use an ndarray with the same memory
+    # slicing a memmap is slow, so use an ndarray that shares its memory
     return PairTable(np.asarray(packed)) if head == _file_head(packed) else None
 
 
 def _file_head(packed: Floats32) -> bytes:
-    """Return the head of the cached file: kind, version, and a checksum (verified in 20 ms)."""
+    """Return the head of a cached file: kind, version and checksum, which is verified in 20 ms."""
     checksum = zlib.crc32(packed.view(np.uint8).data)
     return f"sceneprint table {CACHE_VERSION} {checksum:08x}".encode().ljust(HEAD)
 

@@ -370,7 +370,7 @@ def test_an_upload_waits_for_a_service_that_compiles(tmp_path, monkeypatch, caps
     monkeypatch.setattr(http, "LIMIT_S", 0.0)  # asked once
     with Client.embedded(tmp_path) as client:
         client._worker._runner._context.signers._compiled.clear()
-        assert unsigned_reason(client, []) == "They are signed when it is ready."
+        assert unsigned_reason(client, []) == "They are signed when the service is ready."
     assert "the service is compiling its kernels" in capsys.readouterr().err
 
 

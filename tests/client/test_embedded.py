@@ -10,7 +10,7 @@ import pytest
 
 import sceneprint
 from benchmarks.waiting import PATIENCE_S
-from sceneprint_client import Client, client, errors
+from sceneprint_client import Client, errors
 from service.embedded import LocalService, embedded_settings
 
 BINARY = {"Content-Type": "application/octet-stream"}
@@ -133,6 +133,6 @@ def test_a_folder_that_cannot_be_opened(tmp_path):
 
 
 def test_without_the_package_of_the_service(tmp_path, monkeypatch):
-    monkeypatch.setattr(client, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "service.embedded", None)
     with pytest.raises(errors.MissingDependency, match=r"In a clone, run: pip install \."):
         Client.embedded(tmp_path)

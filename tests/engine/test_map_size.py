@@ -33,7 +33,7 @@ def test_a_map_is_weighed(full, ids, monkeypatch):
     shop = full.statistics.collect(1, "shop").bytes
     assert (shop.database, shop.blobs, shop.index) == (0, 0, 0)
 
-    monkeypatch.setattr(measuring, "WEIGHED", 4)  # the 1st, 4th, 7th and 10th stand for all
+    monkeypatch.setattr(measuring, "MEASURED_FRAMES", 4)  # the 1st, 4th, 7th and 10th stand for all
     some = [one for i, one in enumerate(held) if i % 3 == 0]
     artifacts = sum(full.store.blobs.path(one[2]).stat().st_size for one in some)
     with full.store.database.read() as connection:
@@ -43,7 +43,7 @@ def test_a_map_is_weighed(full, ids, monkeypatch):
     assert told.database == sum(one[1] for one in some) * 3
     # what is deleted takes nothing
     full.delete_frame("hall", names[0])
-    monkeypatch.setattr(measuring, "WEIGHED", 1000)
+    monkeypatch.setattr(measuring, "MEASURED_FRAMES", 1000)
     with full.store.database.read() as connection:
         told = measuring.sizes_of_map(connection, full.store, full.settings.indexes, row)
     assert told.database == sum(one[1] for one in held[1:])

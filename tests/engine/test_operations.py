@@ -200,7 +200,7 @@ def test_many_blobs_are_measured_by_a_part_of_them(make_engine, monkeypatch):
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(bytes(1001))
     assert measuring.sizes(engine.settings, engine.store).blobs == 600 * 1001
-    monkeypatch.setattr(measuring, "MEASURED", 150)
+    monkeypatch.setattr(measuring, "MEASURED_FILES", 150)
     estimate = measuring.sizes(engine.settings, engine.store).blobs
     assert estimate == pytest.approx(600 * 1001, rel=0.25)
 

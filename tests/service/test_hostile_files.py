@@ -110,7 +110,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
             place.rename(folder / "away")
         place.write_bytes(b"a file where the folder should be")
         with monkeypatch.context() as patch:
-            patch.setattr(lifecycle, "LEFT_S", 50.0)
+            patch.setattr(lifecycle, "DELAY_S", 50.0)
             with pytest.raises(UnusableStore):
                 engine.run(engine.claim("w"))
             assert engine.claim("w") is None  # it lets others go first
@@ -119,7 +119,7 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
             assert work.frame.id == other.frame_id
             assert engine.run(work) == JobState.SUCCEEDED
         due(truth, folder)
-        monkeypatch.setattr(lifecycle, "LEFT_S", 0.0)
+        monkeypatch.setattr(lifecycle, "DELAY_S", 0.0)
         for _ in range(4):  # more often than a frame may break down
             work = engine.claim("w")
             assert work is not None

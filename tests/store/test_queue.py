@@ -5,7 +5,7 @@ import time
 import pytest
 from sqlalchemy import event, select, update
 
-from sceneprint.engine.jobs.lifecycle import LEFT_S
+from sceneprint.engine.jobs.lifecycle import DELAY_S
 from sceneprint.errors import LostLease, UnknownJob
 from sceneprint.process import work_of
 from sceneprint.settings import Settings
@@ -271,6 +271,6 @@ def test_jobs_and_leases_written_before_the_clock_was_set_back_are_taken(
 
 def test_no_pause_and_no_lease_is_longer_than_the_clock_may_be_wrong_by():
     longest = max(queue.pause_s(n) for n in range(1, queue.MAXIMUM_FAILURES))
-    assert max(longest, LEFT_S) < queue.LONGEST_PAUSE_S
+    assert max(longest, DELAY_S) < queue.LONGEST_PAUSE_S
     lease = Settings.model_fields["job_lease_s"].metadata
     assert max(one.le for one in lease if hasattr(one, "le")) == queue.LONGEST_LEASE_S

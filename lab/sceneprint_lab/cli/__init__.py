@@ -1,6 +1,6 @@
 """Commands that the lab adds to `sceneprint`."""
 
-#: Summaries of the commands in `sceneprint --help`. Entry points specify their modules.
+#: Summaries of the commands for `sceneprint --help`. Entry points specify the commands' modules.
 COMMANDS = {
     "demo": "run a service, upload a map, query it over HTTP and print the accuracy",
     "evaluate": "measure retrieval, validation and pose accuracy on frames with known poses",

@@ -1,9 +1,9 @@
 """Fit the confidence of answers: `python -m sceneprint_lab.cli.confidence_fit --evidence FILE`.
 
 The command generates sites of all kinds, most of them with incomplete maps and drifting poses,
-answers all their queries, and fits the penalties to the candidate poses and their correctness.
-It uses no recordings. With --views, it fuses the frames of each map into a surface and replaces
-them by rendered views, to fit the confidence for maps that were imported as a whole.
+answers all queries at these sites, and fits the penalties to the candidate poses and to whether
+each is right. No recordings are used. With --views, the frames of each map are fused into a surface
+and replaced by rendered views of it, to fit the confidence for maps that were imported as a whole.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ SHARES: dict[str, dict[str, float]] = {
 }  # fmt: skip
 #: Factors for the number of sites of kinds whose decisive evidence is rare.
 TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
-#: Flaws of two maps in three. Scans are dense, so most may be missing; their poses already drift.
+#: Flaws of two maps in three. Scans are dense, so most of them may be missing; the poses of scans
+#: already drift.
 FLAWS = {"depth": MapFlaws(0.5, 0.01, 0.004), "lidar": MapFlaws(0.9, 0.0, 0.0)}
-#: Flaws of maps whose frames are fused to one surface, which has fewer gaps.
+#: Flaws of maps whose frames are fused into a surface, which has fewer gaps.
 SURFACE_FLAWS = {"depth": MapFlaws(0.3, 0.01, 0.004), "lidar": MapFlaws(0.3, 0.0, 0.0)}
-#: Minimum penalty of a pose that a single view supports. A fit to 1,200 queries without it found
-#: fewer poses in recordings of scanners; neither fit found a wrong one.
+#: Minimum penalty of a pose that a single view suggests. Without it, a fit to 1,200 queries found
+#: fewer poses in recordings of scanners; neither fit found a wrong pose.
 LONE = {"depth": 0.0, "lidar": 2.5}
 
 
@@ -53,14 +54,14 @@ def collect(
 ) -> Iterator[list[SiteAnswer]]:
     """Yield the answers to the queries of each site, for all kinds of sites of a sensor.
 
-    The minimum confidence is 0, so that frames of similar places are always compared.
+    The minimum confidence is 0, so frames of similar places are always compared.
 
     Parameters
     ----------
     preset, sensor, seed : model, sensor ("depth" or "lidar"), and seed of the sites
     sites, queries : number of sites per kind, and of queries per site
     jobs : number of processes
-    views : whether maps consist of views of the surface that is fused from their frames
+    views : whether a map consists of views of the surface that is fused from its frames
     """
     work = [
         (kind, index * TIMES.get(kind, 1) + k, queries)
@@ -77,13 +78,13 @@ def collect(
 def _ask(
     signer: Signer, work: tuple[str, int, int], *, seed: int, flaws: MapFlaws, views: bool
 ) -> list[SiteAnswer]:
-    """Return the answers at a site (kind, index, queries); two maps in three have flaws."""
+    """Return the answers at a site (kind, index, query count); two maps in three have flaws."""
     flawed = flaws if work[1] % 3 else None
     return ask_site(signer, work, seed=seed, flaws=flawed, confidence=0.0, as_surface=views)
 
 
 def read_samples(path: Path) -> list[JudgedQuery]:
-    """Return the samples of a file with one JSON object per line."""
+    """Return the samples in a file that has one JSON object per line."""
     rows = [json.loads(line) for line in path.read_text().splitlines()]
     return [
         JudgedQuery(
@@ -106,7 +107,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="number of processes (default: 1)")
     parser.add_argument("--views", action="store_true", help="use views of a fused surface as maps")
     parser.add_argument("--evidence", type=Path, required=True,
-                        help="file of samples, which is read if it exists")  # fmt: skip
+                        help="file of samples; if it exists, it is read")  # fmt: skip
     parser.add_argument("--out", type=Path, help="model file to write")
     options = parser.parse_args()
     model = read_model(options.preset)

@@ -45,8 +45,9 @@ from sceneprint_client.api import Added, Answer, JobState
 from sceneprint_lab.evaluation.report import FramePlace, answer_rows, decimal, judge_answers
 
 SEED = 11
-#: Number of frames of a walk through a room, 3 to 8 cm apart, and the indices in each group of ten
-#: frames that belong to the map and to the queries. A query is 10 to 30 cm from the map's frames.
+#: Number of frames of a walk through a room, 3 to 8 cm apart; and indices, in each group of ten
+#: frames, of those for the map and of those for queries. A query is 10 to 30 cm from the map's
+#: frames.
 WALK, TEN, MAP, QUERIES = 100, 10, (0, 2, 4), (7,)
 DEPTH_SCALE = 1000.0
 
@@ -69,7 +70,7 @@ def write_building(folder: Path, rooms: int) -> Generator[None]:
 
 
 def _write_room(folder: Path, number: int) -> None:
-    """Write a room as a scene with one sequence for the map and one for the queries."""
+    """Write a room as a scene that has one sequence for the map and one for the queries."""
     from sceneprint_lab.synth import KINECT, take, trajectory
     from sceneprint_lab.synth.dataset import room_and_rng
 
@@ -88,15 +89,15 @@ def _write_room(folder: Path, number: int) -> None:
             write_pose(run / f"frame-{i:06d}.pose.txt", pose)
 
 
-#: Without split files: fractions of each sequence for the map, and for the gap after it.
+#: Without split files: share of each sequence for the map, and share for the gap after it.
 DATABASE_SHARE, GAP_SHARE = 0.60, 0.05
-#: Maximum number of database and query frames, evenly spread, so that the demo takes minutes.
+#: Maximum number of database frames and of query frames, so that the demo takes minutes only.
 MOST_DATABASE, MOST_QUERIES = 300, 180
 
 
 @dataclass(frozen=True, eq=False)
 class DemoFrame:
-    """A frame of the demo, with the parent frame of its pose and the name of its sequence."""
+    """A frame of the demo, the parent frame of its pose, and the name of its sequence."""
 
     parent: str
     session: str
@@ -105,16 +106,18 @@ class DemoFrame:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Database and query frames of the demo."""
+    """The database frames and the query frames of the demo."""
 
     database: list[DemoFrame]
     queries: list[DemoFrame]
 
 
 def choose_frames(path: Path) -> Choice:
-    """Return database and query frames, as the scene's split files specify if there are any.
+    """Return evenly spaced database and query frames, at most MOST_DATABASE and MOST_QUERIES.
 
-    Raise DatasetError if there is no sequence, or too few frames for both.
+    Split files select them if there are any; otherwise, the database is the beginning of each
+    sequence, and the queries are its end. Raise DatasetError if there is no sequence, or there are
+    too few frames for both uses.
     """
     database: list[DemoFrame] = []
     queries: list[DemoFrame] = []
@@ -191,9 +194,9 @@ def run_demo(options: argparse.Namespace) -> int:
 
 
 def _building(folder: Path, rooms: int) -> Path:
-    """Write a synthetic building with a progress bar, and return its folder."""
+    """Write a synthetic building while showing a progress bar; return its folder."""
     start = time.perf_counter()
-    # Close the generator before the folder is removed, since its processes write there.
+    # Close the generator before the folder is removed, because its processes write to the folder.
     with closing(write_building(folder, rooms)) as written:
         for _ in tqdm(written, total=rooms, desc="synthetic building", unit="room", disable=None):
             pass
@@ -204,13 +207,13 @@ def _building(folder: Path, rooms: int) -> Path:
 DEMO_MAP = "demo"
 #: Number of concurrent uploads.
 PARALLEL = 4
-#: Errors of a single frame that do not stop the demo.
+#: Errors with a single frame, which do not stop the demo.
 _OF_FRAME = (FrameError, FrameConflict)
 
 
 @dataclass(frozen=True, eq=False)
 class DemoQuery:
-    """A query, its answers without and with diversification, and the time of the latter, s."""
+    """A query, its answers without and with diversification, and the duration of the latter, s."""
 
     chosen: DemoFrame
     ranked: Answer
@@ -219,14 +222,18 @@ class DemoQuery:
 
 
 def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
-    """Upload the database and wait until all frames are signed.
+    """Create the demo's map, upload the database to it, and wait until all frames are signed.
 
-    Raise DatasetError if no frame could be signed. Raise ServiceError if some frames were not
-    signed in time.
+    Frames that are refused or cannot be signed are printed and skipped.
 
     Returns
     -------
-    indexed : indexed frames by id
+    indexed : indexed frames, by id
+
+    Raises
+    ------
+    DatasetError : If no frame could be signed
+    ServiceError : If a frame was not signed in time
     """
     client.create_map(DEMO_MAP, model=model)
     indexed: dict[str, DemoFrame] = {}
@@ -243,7 +250,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
                 continue
             indexed[added.frame_id] = frame
             jobs.append(added.job_id)
-    finally:  # after an error, cancel pending uploads
+    finally:  # after an error, cancel the pending uploads
         pool.shutdown(cancel_futures=True)
     with tqdm(total=len(jobs), desc="sign", unit="frame", disable=None) as bar:
 
@@ -271,7 +278,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
 
 def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
-    """Query each query frame, without and with diversification; skip frames that are refused."""
+    """Send each query frame (no pose), without and with diversification; skip refused ones."""
     answered, begun = [], time.perf_counter()
     for frame in tqdm(choice.queries, desc="query", unit="frame", disable=None):
         meta = meta_of(frame.reference, with_pose=False)  # a lost robot has no pose
@@ -306,7 +313,7 @@ _NAMES = {
 
 
 def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> None:
-    """Print the table if true poses are known, and the duration of a query."""
+    """Print the statuses, the table (if all true poses are known), and median durations."""
     counts = Counter(query.diverse.status for query in queries)
     states = ", ".join(f"{count} {status}" for status, count in sorted(counts.items()))
     print(f"queries: {len(queries)}: {states or 'none could be sent'}")
@@ -320,7 +327,7 @@ def report(indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery]) -> No
         print("no table: the true pose of every frame is required")
     if queries:
         medians = [
-            f"{stage} {statistics.median(one.diverse.milliseconds[stage] for one in queries):.0f}"
+            f"{stage} {statistics.median(q.diverse.milliseconds[stage] for q in queries):.0f}"
             for stage in queries[0].diverse.milliseconds
             if stage != "total"
         ]
@@ -356,7 +363,7 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def draw(
     indexed: Mapping[str, DemoFrame], queries: Sequence[DemoQuery], preset: str, out: Path
 ) -> None:
-    """Draw the accepted first match with the largest rotation to OUT/overlay.png."""
+    """Draw the accepted first match with the largest rotation, if any, into OUT/overlay.png."""
     accepted = [
         (query, match, np.array(match.transform.matrix))
         for query in queries
@@ -379,21 +386,19 @@ def draw(
 
 
 def place_of(frame: DemoFrame) -> FramePlace | None:
-    """Return the true pose of a frame, or None if it is unknown."""
+    """Return the true place of a frame, or None if it is unknown."""
     pose = frame.reference.pose
     return None if pose is None else FramePlace(frame.parent, pose)
 
 
-#: Time limits for the start of the service, with a compilation, and for its end, seconds.
+#: Time limits for the start of the service, including compilation, and for its end, seconds.
 START_S, STOP_S = 120.0, 30.0
 _READY = "sceneprint: serving "
 
 
 @contextmanager
 def serving(data: Path, workers: int) -> Iterator[str]:
-    """Run `sceneprint serve` on a free loopback port until the context ends.
-
-    Raise Unreachable if the service did not start; the message includes the end of its log.
+    """Run `sceneprint serve` on a free loopback port during the `with` block.
 
     Parameters
     ----------
@@ -403,6 +408,10 @@ def serving(data: Path, workers: int) -> Iterator[str]:
     Yields
     ------
     url : URL of the ready service
+
+    Raises
+    ------
+    Unreachable : If the service did not start; the message includes the end of its log
     """
     log = data / "service.log"
     arguments = ["--port", "0", "--data", str(data), "--workers", str(workers)]
@@ -433,9 +442,9 @@ def serving(data: Path, workers: int) -> Iterator[str]:
 
 
 def _first_line(pipe: IO[bytes]) -> str:
-    """Return the first line of a pipe, or its beginning if the other end closes.
+    """Return the first line from a pipe, or the part of it before the other end was closed.
 
-    Raise Unreachable if no line arrived in time.
+    Raise Unreachable if no line arrives in time.
     """
     data, until = b"", time.monotonic() + START_S
     with DefaultSelector() as selector:
@@ -446,7 +455,7 @@ def _first_line(pipe: IO[bytes]) -> str:
                     f"The service did not start within {START_S:g} s. "
                     "Run `sceneprint doctor` to see what is missing, or try again."
                 )
-            more = os.read(pipe.fileno(), 4096)  # returns a partial line without waiting
+            more = os.read(pipe.fileno(), 4096)  # returns a partial line at once
             if not more:
                 break
             data += more

@@ -77,7 +77,7 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--distractors", type=Path, nargs="+", default=[], metavar="PATH",
-        help="use all frames of these PATHs in the database",
+        help="add all frames of these PATHs to the database",
     )  # fmt: skip
     command.add_argument(
         "--gap-m", type=positive_number, metavar="METRES",
@@ -141,7 +141,7 @@ def _add_judging(command: argparse.ArgumentParser) -> None:
 
 
 def _share(text: str) -> float:
-    """Return a number above 0 and up to 1."""
+    """Parse a number above 0 and up to 1; raise ArgumentTypeError for others."""
     return number_within(text, lambda number: 0 < number <= 1, "a share above 0, up to 1")
 
 
@@ -200,14 +200,14 @@ def run_evaluate(options: argparse.Namespace) -> int:
 
 
 def _check_writable(file: Path | None) -> None:
-    """Create the folder of the figures, and check before a long evaluation that it is writable."""
+    """Create the folder for the figures; check, before a long evaluation, that it is writable."""
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
         check_writable(file)
 
 
 def _settings_of(options: argparse.Namespace, model_id: str, *keys: str) -> dict[str, Any]:
-    """Return version, model and the options `keys`, with which the evaluation can be repeated."""
+    """Return the version, model and options `keys` with which the evaluation can be repeated."""
     from sceneprint import __version__
 
     def plain(value: Any) -> Any:
@@ -224,11 +224,11 @@ def _skipped(number: int) -> str:
 
 
 def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
-    """Return the frames of the options; raise DatasetError for contradictory options."""
+    """Return the frames that the options select; raise DatasetError if options contradict."""
     from sceneprint_lab.evaluation.protocol import PathRanges, choose, parse_part, parse_ranges
 
     if options.seven_scenes is not None:
-        from sceneprint_lab.synth import KINECT  # camera of 7-Scenes according to its web page
+        from sceneprint_lab.synth import KINECT  # camera of 7-Scenes, according to its web page
 
         return choose(
             [PathRanges(scene) for scene in _seven_scenes(options)],
@@ -259,7 +259,10 @@ def _protocol(options: argparse.Namespace) -> EvaluationProtocol:
 
 
 def _seven_scenes(options: argparse.Namespace) -> list[Path]:
-    """Return the folders of the scenes; print the names of missing scenes to standard error."""
+    """Return the folders of the scenes; print the names of missing scenes to standard error.
+
+    Raise DatasetError if there is no scene, or if another option contradicts --7scenes.
+    """
     from sceneprint_lab.evaluation.report import PAPER
 
     for value, name in (
@@ -287,7 +290,10 @@ def _seven_scenes(options: argparse.Namespace) -> list[Path]:
 
 
 def _baselines(names: list[str] | None) -> tuple[str, ...]:
-    """Return the requested baselines, in the order of BASELINES."""
+    """Return the baselines `names` (none for None, all for []) in the order of BASELINES.
+
+    Raise DatasetError if a name is unknown.
+    """
     from sceneprint_lab.evaluation.baselines import BASELINES
 
     if unknown := [name for name in names or () if name not in BASELINES]:
@@ -303,7 +309,7 @@ def _watch(items: Iterable[T], stage: str, total: int) -> Iterable[T]:
     return tqdm(items, desc=stage, total=total, disable=None)
 
 
-#: Maximum number of frames of a scene; the overlaps of all pairs are computed.
+#: Maximum number of frames of a scene, because the overlaps of all pairs are computed.
 _MOST = 2000
 _PAIR_EXAMPLES = """\
 pairs of one PATH, or of several of one scene, may overlap; pairs of two scenes are

@@ -1,7 +1,7 @@
 """Answer queries at ambiguous places: `python -m sceneprint_lab.cli.lookalike_answers`.
 
-With `--model lidar` the sites are laser scans. An answer is then correct within 50 cm and 10
-degrees, and grossly wrong beyond 2.5 m or 15 degrees.
+With `--model lidar`, the sites consist of laser scans. An answer is then correct within 50 cm and
+10 degrees, and grossly wrong beyond 2.5 m or 15 degrees.
 
 Use seeds 1 to 99 to tune parameters, and unused seeds from 1000 for the final evaluation.
 """
@@ -27,9 +27,9 @@ from sceneprint_lab.evaluation.sites import SiteAnswer, ask_site, kinds_of
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
-#: Number of queries per site for --absent, which requires thousands of queries.
+#: Number of queries per site with --absent, which requires thousands of queries in all.
 ABSENT_BLOCK = 100
-#: Columns of the table, and the names of their values in `measures.answers`.
+#: Columns of the table, and the key of each in the result of `measures.answers`.
 SHARES = {
     "found and right": "found_right", "found and wrong": "found_wrong",
     "wrong of found": "wrong_of_found", "grossly wrong": "grossly_wrong",
@@ -39,7 +39,7 @@ SHARES = {
 
 
 def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
-    """Return a table of SHARES by kind and in total, as lines of Markdown."""
+    """Return a table of SHARES for each kind and in total, as lines of Markdown."""
     lines = [
         f"| kind | queries | answerable | {' | '.join(SHARES)} | ms |",
         f"|---|{'--:|' * (len(SHARES) + 3)}",
@@ -56,7 +56,7 @@ def table(site_answers: Sequence[SiteAnswer]) -> list[str]:
 
 
 def main() -> None:
-    """Answer the queries of the sites and print the table."""
+    """Answer the queries at the sites, and print the table."""
     parser = argparse.ArgumentParser(
         prog="python -m sceneprint_lab.cli.lookalike_answers", description=__doc__
     )

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Stored units per metre.
 DEPTH_SCALE = 1000.0
-#: Kinds of look-alike sites of each sensor.
+#: Kinds of look-alike sites for each sensor.
 LOOKALIKES = {
     "kinect": ("object", "offices", "unmapped", "kitchens", "opposite", "absent"),
     "lidar": ("bays", "streets", "halls", "unmapped", "absent", "sites"),
@@ -105,7 +105,7 @@ def run_synth(options: argparse.Namespace) -> int:
 
 
 def _rooms(options: argparse.Namespace) -> Iterator[None]:
-    """Write all rooms or sites, and yield after each of them."""
+    """Write all rooms or sites; yield after each."""
     common = options.out, options.seed, options.views, options.sensor == "lidar", options.perfect
     write: Callable[[int], None] = partial(_write_room, *common, options.path)
     if options.lookalikes:
@@ -136,7 +136,7 @@ def _write_room(
 def _write_lookalike(
     out: Path, seed: int, queries: int, lidar: bool, perfect: bool, kind: str, index: int
 ) -> None:
-    """Write map and queries of a site, in two scenes if their poses are not comparable."""
+    """Write the map and the queries of a site, as two scenes if their poses are not comparable."""
     from sceneprint_lab.synth import KinectNoise, synthesise_lookalike, synthesise_lookalike_survey
 
     noise = None if perfect else KinectNoise()
@@ -154,7 +154,7 @@ def _write_lookalike(
 
 
 def _write_sequence(folder: Path, frames: Sequence[AnyFrame]) -> None:
-    """Write scans, or depth images and their camera, with poses to a new folder."""
+    """Write scans, or depth images and their camera, to a new folder, together with their poses."""
     folder.mkdir(parents=True)
     for number, frame in enumerate(frames):
         if isinstance(frame, Cloud):

@@ -24,7 +24,7 @@ def add_train(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument(
         "--preset", choices=PRESETS, default=PRESETS[0],
-        help=f"preset with signature size, lengths and scenes (default: {PRESETS[0]})",
+        help=f"preset that defines signature size, lengths and scenes (default: {PRESETS[0]})",
     )  # fmt: skip
     command.add_argument(
         "--rooms", type=whole_number, default=100, metavar="N",
@@ -47,7 +47,7 @@ def add_train(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--radius", type=metres, metavar="R",
-        help="neighbourhood radius of a patch in metres (default: 3; lidar 30)",
+        help="radius of the neighbourhood of a patch, metres (default: 3; lidar 30)",
     )  # fmt: skip
     command.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, metavar="N", help="processes"
@@ -105,7 +105,7 @@ def run_train(options: argparse.Namespace) -> int:
 
 
 def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
-    """Return the parameters with a range from `least` to `most`, for depth images and clouds."""
+    """Return the parameters with the range `least` to `most`, for both depth images and clouds."""
     if least >= most:
         raise TrainingError(f"--range {least:g} {most:g}: Put the smaller distance first.")
     return replace(
@@ -116,7 +116,7 @@ def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
 
 
 class _Bars:
-    """Progress bars of successive stages."""
+    """Progress bars for successive stages."""
 
     def __init__(self) -> None:
         self.stage = ""

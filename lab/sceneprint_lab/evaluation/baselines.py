@@ -1,14 +1,14 @@
-"""Baselines of retrieval, measured in the same run as the signature.
+"""Retrieval baselines, measured in the same run as the signature.
 
 Thumbnails are small inverse depth images, compared by L1 or ZNCC.
 
-FPFH are local features of Open3D (Rusu et al., ICRA 2009), aggregated by VLAD (Jegou et al., CVPR
-2010). The vocabulary is fitted to the searched database, which favours this baseline, because the
-models are not trained on these frames.
+FPFH features (Rusu et al., ICRA 2009) are computed by Open3D and aggregated by VLAD (Jegou et al.,
+CVPR 2010). The vocabulary is fitted to the database that is searched, which favours this baseline:
+our models are not trained on these frames.
 
-Rings are heights around a scanner, as in Scan Context (Kim and Kim, IROS 2018). Rings and sectors
-divide the ground around the sensor into cells; the value of a cell is its maximum height. A
-rotation of the sensor by one sector shifts the columns by one, so two scans are compared at all
+Rings are grids of heights around a scanner, as in Scan Context (Kim and Kim, IROS 2018). Rings and
+sectors divide the ground around the sensor into cells; the value of a cell is its maximum height.
+Rotating the sensor by one sector shifts the columns by one, so two scans are compared at all
 shifts.
 """
 
@@ -58,14 +58,14 @@ class Baseline:
         raise NotImplementedError
 
     def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """Fit the baseline to the features of the `count` frames of the database."""
+        """Fit the baseline to the features of the database's `count` frames."""
 
     def finish(self, features: Floats32) -> Floats32:
-        """Return the descriptor for the features of a frame; all descriptors have one shape."""
+        """Return the descriptor for a frame's features; all descriptors have the same shape."""
         return features
 
     def distances(self, query: Floats32, database: Floats32) -> Floats:
-        """Return the distances (N,) from a descriptor to N descriptors; they may be infinite."""
+        """Return the distances (N,) from a descriptor to N others; a distance may be infinite."""
         raise NotImplementedError
 
 
@@ -99,10 +99,10 @@ def thumbnail(depth: Floats32, rows: int = ROWS, columns: int = COLUMNS) -> Floa
 
 
 class Thumbnails(Baseline):
-    """Baseline that compares small inverse depth images.
+    """A baseline that compares small inverse depth images.
 
-    `comparison`: "l1", the mean absolute difference over cells with samples in both, or
-    "zncc", 1 - zero-mean normalised cross-correlation, with the mean in empty cells.
+    `comparison`: "l1", the mean absolute difference over the cells that have samples in both, or
+    "zncc", 1 - zero-mean normalised cross-correlation, with empty cells set to the mean.
     """
 
     def __init__(self, comparison: Comparison) -> None:
@@ -119,7 +119,7 @@ class Thumbnails(Baseline):
         return thumbnail(frame.depth)
 
     def finish(self, features: Floats32) -> Floats32:
-        """Return the thumbnail, normalised to mean 0 and length 1 for correlation."""
+        """Return the thumbnail; for correlation, normalised to mean 0 and length 1."""
         if self.comparison == "l1":
             return features
         filled = features > 0
@@ -144,11 +144,11 @@ class Thumbnails(Baseline):
 
 # FPFH and VLAD.
 
-#: Edge of voxels, and radii of normals and features, for a sensor with the range RANGE, metres.
-#: These lengths are proportional to the range.
+#: Edge of voxels, radius of normals and radius of features for a sensor with the range RANGE,
+#: metres. They scale with the range.
 VOXEL, NORMALS, FEATURES, RANGE = 0.05, 0.10, 0.25, 9.0
 _WHAT = "The baseline fpfh_vlad"
-#: Number of words in the vocabulary, and of features to which it is fitted.
+#: Number of words in the vocabulary, and number of features to which it is fitted.
 WORDS, LEARNT_FROM = 64, 20_000
 
 
@@ -158,7 +158,7 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
     Parameters
     ----------
     points : (N, 3) metres, with the sensor at the origin
-    scale : factor of VOXEL, NORMALS and FEATURES
+    scale : factor by which VOXEL, NORMALS and FEATURES are multiplied
 
     Returns
     -------
@@ -182,7 +182,7 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
 
 
 def vlad(local: Floats32, words: Floats) -> Floats32:
-    """Return the VLAD descriptor: intra-normalised sums of differences to the nearest words.
+    """Return the VLAD descriptor: intra-normalised sums of differences from the nearest words.
 
     Parameters
     ----------
@@ -191,7 +191,7 @@ def vlad(local: Floats32, words: Floats) -> Floats32:
 
     Returns
     -------
-    (k * d,) float32 unit vector; 0 if all features are words
+    (k * d,) float32 unit vector; 0 if every feature equals a word
     """
     own = local.astype(np.float64)
     squares = (words**2).sum(axis=1) - 2 * own @ words.T  # |own|^2 is the same for every word
@@ -208,7 +208,7 @@ def vlad(local: Floats32, words: Floats) -> Floats32:
 class FpfhVlad(Baseline):
     """The baseline FPFH-VLAD, for depth images and clouds.
 
-    `maximum`: range of the sensor, metres; farther points are omitted.
+    `maximum`: range of the sensor, metres; more distant points are omitted.
     """
 
     name = "fpfh_vlad"
@@ -224,8 +224,8 @@ class FpfhVlad(Baseline):
     def read(self, frame: AnyFrame) -> Floats32:
         """Return the local features of a frame.
 
-        Raise MissingDependency if Open3D cannot be imported. Raise UselessFrame if no point is in
-        range.
+        Raise MissingDependency if Open3D cannot be imported. Raise UselessFrame if no point is
+        within range.
         """
         points = (
             np.asarray(frame.points, np.float64)
@@ -240,7 +240,7 @@ class FpfhVlad(Baseline):
         return features(points, self.maximum / RANGE)
 
     def learn(self, database: Iterable[Floats32], count: int, seed: int) -> None:
-        """Fit the vocabulary by k-means to an equal number of features of each frame."""
+        """Fit the vocabulary by k-means to about the same number of features from each frame."""
         from sklearn.cluster import KMeans
 
         rng, share = np.random.default_rng(seed), -(-LEARNT_FROM // max(count, 1))
@@ -267,8 +267,8 @@ class FpfhVlad(Baseline):
 
 # Rings.
 
-#: Parameters of the paper: number of rings and of sectors, radius of the rings, and offset that
-#: makes heights of the ground positive, metres.
+#: Parameters from the paper: number of rings, number of sectors, radius of the outermost ring, and
+#: offset that makes heights of the ground positive, metres.
 RINGS, SECTORS, RADIUS, LIFT = 20, 60, 80.0, 2.0
 
 
@@ -286,7 +286,7 @@ def ring_descriptor(points: Floats32 | Floats) -> Floats32:
     inside = flat < RADIUS
     ring = (flat[inside] / RADIUS * RINGS).astype(np.intp)
     azimuth = np.mod(np.arctan2(y[inside], x[inside]), 2 * np.pi)
-    # an azimuth just below 2 pi can be rounded up beyond the last sector
+    # rounding can move an azimuth just below 2 pi beyond the last sector
     sector = np.minimum((azimuth / (2 * np.pi) * SECTORS).astype(np.intp), SECTORS - 1)
     highest = np.full((RINGS, SECTORS), -np.inf)
     np.maximum.at(highest, (ring, sector), z[inside] + LIFT)
@@ -295,7 +295,7 @@ def ring_descriptor(points: Floats32 | Floats) -> Floats32:
 
 @kernel
 def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -> None:
-    """Write the normalised columns (sectors, rings) to `unit`, and a mask of non-zero columns."""
+    """Write normalised columns (sectors, rings) to `unit`; mark non-zero columns in `filled`."""
     rings, sectors = descriptor.shape
     for s in range(sectors):
         square = 0.0
@@ -310,7 +310,7 @@ def _unit_columns(descriptor: Floats, unit: Floats, filled: NDArray[np.bool_]) -
 def _least_distance(
     a: Floats, a_filled: NDArray[np.bool_], b: Floats, b_filled: NDArray[np.bool_]
 ) -> float:
-    """Return the minimum over all shifts of `b` of the mean of 1 - cosine of filled columns."""
+    """Return the mean of 1 - cosine over filled columns, minimised over all shifts of `b`."""
     sectors, rings = a.shape
     best = 2.0
     for shift in range(sectors):
@@ -342,7 +342,7 @@ def ring_distances(query: Floats32, database: Floats32) -> Floats:
 
 
 class Rings(Baseline):
-    """The baseline of ring descriptors, for clouds with a viewpoint."""
+    """The ring descriptor baseline, for clouds with a viewpoint."""
 
     name = "rings"
 
@@ -360,7 +360,7 @@ class Rings(Baseline):
         return ring_distances(query, database)
 
 
-#: Constructors of the baselines; their argument is the range of the sensor, metres.
+#: Constructors of the baselines, which take the range of the sensor, metres.
 BASELINES: dict[str, Callable[[float], Baseline]] = {
     "thumbnail_l1": lambda _: Thumbnails("l1"),
     "thumbnail_zncc": lambda _: Thumbnails("zncc"),
@@ -372,12 +372,14 @@ BASELINES: dict[str, Callable[[float], Baseline]] = {
 def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
     """Return baselines by name, and check that their libraries are installed.
 
-    Raise MissingDependency if a library is absent.
-
     Parameters
     ----------
     names : keys of BASELINES
     maximum : range of the sensor, metres
+
+    Raises
+    ------
+    MissingDependency : If a library is absent
     """
     opened = [BASELINES[name](maximum) for name in names]
     for baseline in opened:
@@ -385,7 +387,7 @@ def open_baselines(names: Sequence[str], maximum: float) -> list[Baseline]:
     return opened
 
 
-#: Number of queries for measuring the times of a baseline and of the signature.
+#: Number of queries on which the times of a baseline and of the signature are measured.
 TIMED = 10
 
 
@@ -395,10 +397,10 @@ class Compared:
 
     Parameters
     ----------
-    reason : reason why the baseline cannot be used; empty if it can
+    reason : reason why the baseline cannot be used; empty if it can be
     rankings : database indices for each query, nearest first
     first : validated pair of each query with its nearest frame; None without a ranking
-    milliseconds : median processor times per query to `describe` it, `sign` it and `rank` the
+    milliseconds : median processor time per query to `describe` it, to `sign` it and to `rank` the
         database
     """
 
@@ -413,7 +415,7 @@ def compare(
     baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
     signer: Signer, seed: int, watch: Watch = unwatched,
 ) -> Compared:  # fmt: skip
-    """Rank the database for every query by a baseline, and measure its time in one thread.
+    """Rank the database for every query by a baseline, and measure the time, in one thread.
 
     Parameters
     ----------
@@ -443,7 +445,7 @@ def _compared(
     baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
     seed: int, watch: Watch,
 ) -> Compared:  # fmt: skip
-    """Return the rankings, without `first`; the features are stored in the folder of the store."""
+    """Return the rankings and their time, without `first`; store features in the store's folder."""
 
     def file(member: SignedFrame) -> Path:
         return store.folder / f"{member.number}.{baseline.name}.npy"
@@ -472,7 +474,7 @@ def registered(
     judge: Judge, rankings: Sequence[Sequence[int]], prepared: Prepared,
     overlap_mean: NDArray[np.float64], overlap_least: NDArray[np.float64],
 ) -> list[ValidatedPair | None]:  # fmt: skip
-    """Validate each query with the first frame of its ranking; None without a ranking."""
+    """Validate each query with the first frame of its ranking; return None for empty rankings."""
     pairs: list[ValidatedPair | None] = []
     for i, (query, ranking) in enumerate(zip(prepared.queries, rankings, strict=True)):
         if not ranking:
@@ -492,13 +494,13 @@ def timed(
 ) -> dict[str, float]:
     """Return the median processor times to describe and to sign a query, milliseconds.
 
-    Evenly spaced queries are described and signed alternately, under equal conditions.
+    Evenly spaced queries are described and signed in alternation, so that conditions are equal.
     """
     n = len(prepared.queries)
     chosen = sorted({round(i) for i in np.linspace(0, n - 1, min(TIMED, n))})
     spent: dict[str, list[float]] = {"describe": [], "sign": []}
     frames = [store.frame(prepared.queries[i]) for i in chosen]
-    for frame in (frames[0], *frames):  # the first pass loads libraries and compiles loops
+    for frame in (frames[0], *frames):  # the first pass is not timed: it loads and compiles
         start = time.process_time()
         baseline.finish(baseline.read(frame))
         between = time.process_time()

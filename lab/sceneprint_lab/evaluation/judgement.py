@@ -1,4 +1,4 @@
-"""Rankings, validations and answers of queries, and their errors by the reference poses."""
+"""Rankings, validations and answers for queries, and their errors by the reference poses."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class QueryTask:
-    """A query with its candidates.
+    """A query and its candidates.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class QueryTask:
     selection : database indices of C, in order
     candidates : candidates of `ranking` and `selection`, without duplicates
     allowed : ascending indices of all database frames that the query may find
-    retrieved : R; None prevents the comparison with frames of other places
+    retrieved : R; with None, frames of other places are not compared
     """
 
     number: int
@@ -102,7 +102,7 @@ class QueryTask:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """The result of a QueryTask; see QueryOutcome for the fields."""
+    """The result of a QueryTask; for the fields, see QueryOutcome."""
 
     pairs: dict[int, ValidatedPair]
     average: Error
@@ -118,10 +118,10 @@ class Judge:
 
     Parameters
     ----------
-    geometry : function that returns the geometry of a frame by its number in the store
+    geometry : function that returns the geometry of a frame, given its number in the store
     mode, seed, p, matching : arguments of `validate` for all pairs
     database : frames of the map; empty if only pairs are validated
-    answer : parameters of the model's answers
+    answer : answer parameters of the model
     confidence : minimum confidence of a pose that is found
     unrelated_distance : d0 of the model
     rendered : whether the frames of the map are views rendered from a surface
@@ -144,7 +144,7 @@ def open_judge(
     matching: Matching = "histograms", database: Sequence[SignedFrame] = (),
     answer: AnswerParameters | None = None, unrelated_distance: float = math.inf,
 ) -> Judge:  # fmt: skip
-    """Return a Judge for the frames of a store, with a cache of geometries."""
+    """Return a Judge for the frames of a store, which caches geometries."""
     geometry = lru_cache(128)(store.geometry)  # successive queries share candidates
     return Judge(
         geometry, mode, seed, p, matching, database, answer or AnswerParameters(),
@@ -153,10 +153,10 @@ def open_judge(
 
 
 def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
-    """Return at most VIEWS accepted views of the scene with the most strong views, strong first.
+    """Return at most VIEWS accepted views from the scene with the most strong views, strong first.
 
     Poses are comparable only within a scene. Ties between scenes are resolved by the number of
-    accepted views, then by the rank of the first.
+    accepted views, then by the rank of the first view.
 
     `pairs`: pairs of a query, in the order of R.
     """
@@ -170,9 +170,9 @@ def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
 
 
 def judge(judging: Judge, task: QueryTask) -> Judged:
-    """Validate a query against all candidates, average and answer its pose, and compute errors.
+    """Validate a query against all candidates, average and estimate its pose, and compute errors.
 
-    The bound of registration, the error after refinement from the reference pose, is computed for
+    The bound of registration (the error after refinement from the reference pose) is computed for
     the first match of VDR and for the averaged views of C.
     """
     of = {c.match: c for c in task.candidates}
@@ -199,7 +199,7 @@ def judge(judging: Judge, task: QueryTask) -> Judged:
 
 
 def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -> JudgedAnswer:
-    """Return the answer that a service returns for the candidates of C, with its error.
+    """Return the answer that a service would give for the candidates of C, with its error.
 
     Parameters
     ----------
@@ -217,13 +217,14 @@ def answer_of(judging: Judge, task: QueryTask, prior: PosePrior | None = None) -
 
 
 class _Recording:
-    """The frames that a query may find, in the interface that `localization.decide` requires."""
+    """The frames that a query may find, with the interface that `localization.decide` requires."""
 
     def __init__(self, judging: Judge, task: QueryTask, prior: PosePrior | None) -> None:
         self._judging, self._task, self._prior = judging, task, prior
         self._allowed = set(task.allowed.tolist())
         self._poses = [frame.pose for frame in judging.database]
-        # Frames that the query may not find get a separate scene, so that they do not vote.
+        # Frames that the query may not find are put into a separate scene, so that they do not
+        # vote.
         self._scenes = [
             frame.scene if row in self._allowed else ""
             for row, frame in enumerate(judging.database)
@@ -242,7 +243,7 @@ class _Recording:
 
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         p, agreement = self.p, self._judging.p.agreement
-        ahead = [looks_ahead(self.query)] * len(self._poses)  # the frames have one sensor
+        ahead = [looks_ahead(self.query)] * len(self._poses)  # all frames are from one sensor
         views_of = views_of_rows(
             frames[-1].matches, self._poses, self._geometry, self._scenes, p.map, agreement, ahead,
             [self._judging.rendered] * len(self._poses),
@@ -276,7 +277,7 @@ class _Recording:
         return self._judging.geometry(self._judging.database[row].number)
 
     def _is_far(self, row: int) -> bool:
-        """Return whether there is a prior, and the frame is too far away to show its surfaces."""
+        """Return whether there is a prior and the frame is too far from it to show its surfaces."""
         prior = self._prior
         return prior is not None and not (
             self._scenes[row] == prior.parent and prior.reaches(self._poses[row], self.p.map)
@@ -286,7 +287,7 @@ class _Recording:
 def _judged_answer(
     estimate: PoseEstimate, task: QueryTask, p: LocalizationParameters, spent: float
 ) -> JudgedAnswer:
-    """Return an estimate as an answer, with the errors of its pose and of its candidate places."""
+    """Return an estimate as an answer, with the errors of its pose and of all candidate places."""
 
     def error_of(T: Floats) -> Error:
         return pose_error(T, task.pose) if estimate.parent == task.scene else Error()
@@ -299,14 +300,14 @@ def _judged_answer(
         error = error_of(place.T)
         right = error.within(p.map.place_m, PLACE_DEG)
         places.append(JudgedPlace(evidence, confidences[i], error, right))
-    # The limit of the error is proportional to `place_m`, so it is larger for scans.
+    # The error limit is proportional to `place_m`, so it is larger for scans.
     limits = RIGHT[0] * p.map.place_m / MapParameters.place_m, RIGHT[1]
     error = Error() if estimate.average is None else error_of(estimate.average.T)
     return JudgedAnswer(estimate.status, estimate.strength, error, spent, tuple(places), limits)
 
 
 def _ranking_of(judging: Judge, task: QueryTask, rows: Sequence[int]) -> Ranking:
-    """Return database rows as a ranking, with their distances in R or else d0."""
+    """Return database rows as a ranking, with their distances in R; d0 for rows outside R."""
     index = np.array(rows, np.intp)
     distances = np.full(len(index), judging.unrelated_distance)
     if task.retrieved is not None:
@@ -349,18 +350,18 @@ def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) ->
 def _average(
     task: QueryTask, of: dict[int, Candidate], transforms: dict[int, Floats | None]
 ) -> Error:
-    """Return the error of the pose averaged over transforms by match; infinite without views."""
+    """Return the error of the average pose of transforms, by match; infinite without views."""
     poses = [of[match].pose @ T for match, T in transforms.items() if T is not None]
     if not poses or any(of[match].scene != task.scene for match in transforms):
         return Error()
     return pose_error(average_poses(np.stack(poses)).T, task.pose)
 
 
-# R and C of all queries, by stored signatures.
+# R and C of all queries, from stored signatures.
 
 #: Number of queries whose distances are computed together.
 BLOCK = 64
-#: Number of queries whose distances within R are computed separately to measure the time.
+#: Number of queries for which distances within R are computed again, to measure the time.
 TIMED = 3
 
 
@@ -370,7 +371,7 @@ class Ranked:
 
     Parameters
     ----------
-    ranking : R, database indices, nearest first
+    ranking : R: database indices, nearest first
     distances : (|R|,) distances of R; see `cross_distances`
     selection : C, in the order of R
     milliseconds : times of `rank` (scan and sort), `diversify` and, for some queries,
@@ -405,10 +406,11 @@ def rank(
 
     Returns
     -------
-    ranked : results of the Q queries; their lists are empty if no frame is allowed
+    ranked : results of the Q queries; the lists of a query that may find no frame are empty
     """
     size = max((ranking_size(int(n)) for n in allowed.sum(axis=1)), default=0)
-    # Compute all pairs of the database once if they are fewer than the pairs of all rankings.
+    # Compute the distances of all pairs of the database once if there are fewer of them than pairs
+    # in all rankings.
     whole = len(database) ** 2 <= len(queries) * size**2
     among = pairwise_distances(database, metric) if whole and len(queries) else None
     rows = _rows(queries, database, metric)
@@ -434,7 +436,7 @@ def rank(
 
 
 def _rows(queries: Bytes, database: Bytes, metric: Metric) -> Iterable[tuple[Ints64, float]]:
-    """Yield the distances (N,) of each query to the database, and the time, milliseconds."""
+    """Yield each query's distances (N,) from the database, and the time for them, milliseconds."""
     for begin in range(0, len(queries), BLOCK):
         start = time.perf_counter()
         block = cross_distances(queries[begin : begin + BLOCK], database, metric)

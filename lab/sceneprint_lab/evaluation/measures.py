@@ -52,8 +52,8 @@ def recall(
 
     Returns
     -------
-    figures : number of `queries` that may find a relevant frame, and their recall for each k of
-        FIRST; null without such queries
+    figures : number of `queries` that may find a relevant frame, and the recall of these queries
+        for each k of FIRST; null if there are none
     """
     able = np.flatnonzero((relevant & allowed).any(axis=1)).tolist()
     figures: dict[str, float | int | None] = {"queries": len(able)}
@@ -67,17 +67,18 @@ def recall(
 #
 # counts  --upper_bound-->  rate        scores, labels  --roc-->  Roc
 
-#: Confidence of the bound of a rate.
+#: Confidence of the upper bound on a rate.
 CONFIDENCE = 0.95
 #: Maximum number of points in a curve.
 CURVE = 200
 
 
 def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | None:
-    """Return the one-sided Clopper-Pearson upper bound of a rate.
+    """Return the one-sided Clopper-Pearson upper bound on a rate.
 
-    For 0 events, it is 1 - (1 - confidence)^(1 / of), which for 95 % is about 3 / of (the rule of
-    three). It assumes independent trials; for pairs that share frames, the true bound is higher.
+    For 0 events, the bound is 1 - (1 - confidence)^(1 / of), which for 95 % is about 3 / of (the
+    rule of three). It assumes independent trials; for pairs that share frames, the true bound is
+    higher.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
 
     Returns
     -------
-    rate : upper bound; None without trials
+    rate : upper bound; None if there are no trials
 
     Raises
     ------
@@ -100,7 +101,7 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
     if of == 0:
         return None
     low, high = seen / of, 1.0
-    while (middle := (low + high) / 2) not in (low, high):  # until no number lies between
+    while (middle := (low + high) / 2) not in (low, high):  # until no number lies between them
         low, high = (middle, high) if _at_most(seen, of, middle) > 1 - confidence else (low, middle)
     return high
 
@@ -125,7 +126,7 @@ class Roc:
     ----------
     area : area under the curve, the probability that a right item has a higher score than a wrong
         item; ties count half
-    false, true : (n,) shares of wrong and of right items that reach the threshold, 0 to 1
+    false, true : (n,) shares of wrong items and of right items that reach each threshold, 0 to 1
     thresholds : (n,) descending thresholds of the score, starting with infinity
     """
 
@@ -135,7 +136,7 @@ class Roc:
     thresholds: Floats
 
     def true_at(self, false: float) -> float:
-        """Return the maximum true rate for a false rate of at most `false`."""
+        """Return the maximum true rate at a false rate of at most `false`."""
         return float(self.true[self.false <= false].max())
 
     def thinned(self, most: int = CURVE) -> list[list[float]]:
@@ -151,7 +152,7 @@ class Roc:
 
     def _spaced_indices(self, most: int) -> NDArray[np.intp]:
         n = len(self.true)
-        # Even steps in the sum of both rates represent both ends of the curve.
+        # Equal steps in the sum of both rates represent both ends of the curve.
         at = np.linspace(0, 2, most - 1)
         return np.unique(np.append(np.searchsorted(self.false + self.true, at).clip(0, n - 1), 0))
 
@@ -166,7 +167,7 @@ def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
 
     Returns
     -------
-    curve : None if all items are right or all are wrong
+    curve : None if all items are right or all items are wrong
     """
     n_right, n_wrong = int(right.sum()), int((~right).sum())
     if not n_right or not n_wrong:
@@ -191,12 +192,12 @@ OVERLAPS = 0.3
 
 
 def rows(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """Return the figures of each method, over the queries whose scene is in the database.
+    """Return the figures of each method for the queries whose scene is in the database.
 
     R: the first member of the ranking after registration, accepted or not. VR: the first accepted
-    match among the first members of R, strong before weak. DR, VDR: the same for C.
-    `pose_average`: average of up to five accepted views of C; `pose_average_vr`: the same for R.
-    A query without an accepted match, or with a match of another scene, is a failure.
+    match among the first members of R, strong before weak. DR, VDR: the same for C. `pose_average`:
+    the average of up to five accepted views of C; `pose_average_vr`: the same for R. A query
+    without an accepted match, or with a match of another scene, is a failure.
     """
     here = [o for o in outcomes if o.present]
     return {
@@ -229,7 +230,7 @@ def bound_of(outcome: QueryOutcome) -> Error:
 
 
 def accuracy(errors: Sequence[Error]) -> Figures:
-    """Return the shares of errors within the two thresholds, and medians; null without errors.
+    """Return the shares of errors within each of two limits, and medians; null without errors.
 
     The error of a failure is infinite; an infinite median is null.
     """
@@ -245,7 +246,7 @@ def accuracy(errors: Sequence[Error]) -> Figures:
 
 
 def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
-    """Return figures of the overlap of the first match, and of the first five, with the query.
+    """Return figures on the overlap of the first match, and of the first five, with the query.
 
     `five`: overlaps (`Overlaps.mean`) of the first five matches of each query.
     """
@@ -259,7 +260,7 @@ def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
 
 
 def retrieval(outcomes: Sequence[QueryOutcome], of: str) -> Figures:
-    """Return `overlap_figures` of a row, and the share of first matches in the query's scene."""
+    """Return `overlap_figures` of a row, and the share of its first matches in the right scene."""
     figures = overlap_figures([[p.overlap_mean for p in o.views(of)[:5]] for o in outcomes])
     return figures | {"right_scene": _share([o.views(of)[0].same_scene for o in outcomes])}
 
@@ -284,18 +285,18 @@ def _any_of_five(outcome: QueryOutcome) -> float:
 
 
 def validation(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
-    """Return precision and recall of acceptance, over all validated pairs.
+    """Return the precision and recall of acceptance over all validated pairs.
 
     `precision`: share of accepted pairs whose transform is right within 10 cm and 10 degrees.
     `recall`: share of right transforms that are accepted. `recall_overlap_30`: the same for pairs
     with an overlap (smaller direction) of at least 30 %. `precision_strong`: precision of strong
-    pairs. The other figures are counts; `right_but_...` count right transforms.
+    pairs. The other figures are counts; `right_but_...` are counts of right transforms.
     """
     return validation_of([p for o in outcomes for p in o.pairs.values()])
 
 
 def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | None]:
-    """Return the figures of `validation` for pairs; precision is null if none is accepted."""
+    """Return the figures of `validation` for pairs; precision is null if no pair is accepted."""
     accepted = [p for p in pairs if p.accepted]
     right = [p for p in pairs if p.right]
     clear = [p for p in right if p.overlap_least >= OVERLAPS]
@@ -319,7 +320,7 @@ def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | Non
 
 
 def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
-    """Return the shares of queries without their scene in the database that are accepted.
+    """Return the shares of queries that are accepted although their scene is not in the database.
 
     `accepted_strong` and `accepted_weak` refer to VDR's first match; null without such queries.
     """
@@ -335,7 +336,7 @@ def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
 
 
 def answers(judged: Sequence[JudgedAnswer]) -> dict[str, Any]:
-    """Return the answers of robots as shares of all queries; the first four have the sum 1.
+    """Return the outcomes of answers as shares of all queries; the first four add up to 1.
 
     `found_right`: found with an error within the limits of the answer. `found_wrong`: found with a
     larger error, or in an absent scene. `grossly_wrong`: found with an error beyond GROSS;
@@ -368,7 +369,7 @@ def answers(judged: Sequence[JudgedAnswer]) -> dict[str, Any]:
 
 
 def _calibration(judged: Sequence[JudgedAnswer]) -> Calibration | None:
-    """Return the calibration of each query's most likely pose; None without poses."""
+    """Return the calibration of the most likely pose of each query; None if there are no poses."""
     best = [answer.places[0] for answer in judged if answer.places]
     if not best:
         return None
@@ -382,7 +383,7 @@ class Calibration:
     Parameters
     ----------
     error : expected calibration error over ten bins of equal width
-    brier : mean square of confidence minus outcome
+    brier : mean squared difference between confidence and outcome
     bins : (number of poses, mean confidence, share of right poses) for each non-empty bin
     """
 
@@ -414,7 +415,7 @@ def calibration(confidences: Sequence[float], right: Sequence[bool]) -> Calibrat
 
 
 def first_error(outcome: QueryOutcome, of: str) -> Error:
-    """Return the error of a row's first answer; infinite without an answer."""
+    """Return the error of a row's first answer; infinite if there is none."""
     views = outcome.views(of)
     return views[0].error if views else Error()
 
@@ -448,13 +449,13 @@ PLACES = (
 
 
 def lost(outcomes: Sequence[QueryOutcome]) -> dict[str, int]:
-    """Return the number of queries for each outcome; see `place_of`."""
+    """Return the number of queries with each outcome; see `place_of`."""
     counts = Counter(place_of(outcome) for outcome in outcomes)
     return {place: counts[place] for place in PLACES}
 
 
 def place_of(outcome: QueryOutcome) -> str:
-    """Return the outcome of a query, the first of the following that applies.
+    """Return the outcome of a query: the first of the following that applies.
 
     With an accepted match: `found`, VDR's answer is right within 10 cm and 10 degrees; `near`,
     within 20 cm and 20 degrees; else `wrongly_accepted`. Without an accepted match:
@@ -482,7 +483,7 @@ def place_of(outcome: QueryOutcome) -> str:
 
 # The effect of diversification: the paper's two figures.
 
-#: Edge of a voxel, metres; maximum depth of counted surface, metres; stride of the pixels.
+#: Edge length of a voxel, metres; maximum depth of a surface that counts, metres; stride of pixels.
 VOXEL, FARTHEST, PIXELS = 0.02, 4.0, 2
 
 Voxels = NDArray[np.int64]
@@ -491,7 +492,7 @@ Voxels = NDArray[np.int64]
 def diversity(
     outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
-    """Return the distances of the first five matches, and the volume that they cover.
+    """Return figures on the distances of the first five matches, and on the voxels that they cover.
 
     `translation` contains, for R, DR, VR and VDR, the mean and the standard deviation of the
     distances between the query and its five matches, metres, averaged over queries. `coverage`
@@ -516,7 +517,7 @@ def diversity(
         "VDR": _translation([(o, d) for o, _, d in compared], poses),
     }
     covered = coverage(outcomes, database)
-    # Omit queries whose views show no surface within FARTHEST.
+    # Omit queries whose views do not show any surface within FARTHEST.
     both = [pair for pair in covered if pair is not None and pair[0] > 0]
     ranked_mean, diverse_mean = np.mean(both, axis=0).tolist() if both else (0.0, 0.0)
     return {
@@ -533,7 +534,7 @@ def diversity(
 
 
 def equal_views(outcome: QueryOutcome) -> tuple[list[ValidatedPair], list[ValidatedPair]]:
-    """Return equal numbers of the first validated views of VR and VDR in the query's scene."""
+    """Return equally many of the first validated views of VR and of VDR in the query's scene."""
     ranked, diverse = (_of_scene(outcome, of) for of in ("VR", "VDR"))
     n = min(len(ranked), len(diverse))
     return ranked[:n], diverse[:n]
@@ -542,9 +543,9 @@ def equal_views(outcome: QueryOutcome) -> tuple[list[ValidatedPair], list[Valida
 def coverage(
     outcomes: Sequence[QueryOutcome], database: Callable[[int], AnyFrame]
 ) -> list[tuple[int, int] | None]:
-    """Return the numbers of voxels that the views of VR and VDR cover, for each query.
+    """Return, for each query, the numbers of voxels that the views of VR and of VDR cover.
 
-    Queries with fewer than two views have None.
+    The result for a query with fewer than two views is None.
     """
 
     @lru_cache(256)
@@ -594,7 +595,7 @@ def _of_scene(outcome: QueryOutcome, of: str) -> list[ValidatedPair]:
 def _translation(
     rows: Sequence[tuple[QueryOutcome, list[ValidatedPair]]], poses: Sequence[Floats]
 ) -> dict[str, float | None]:
-    """Return mean and deviation of the distances between queries and views; see `diversity`."""
+    """Return the mean and deviation of the distances between queries and views; see `diversity`."""
     if not rows:
         return {"mean_m": None, "std_m": None}
     distances = [

@@ -149,12 +149,12 @@ def _two(shares: dict[str, float | None]) -> str:
     return " / ".join(decimal(shares[name]) for name in _COLUMNS)
 
 
-#: False rates at which a curve is evaluated.
+#: False rates at which curves are evaluated.
 FALSE_RATES = (0.0, 0.01, 0.05)
 
 
 def evidence(v: PairValidation, p: AcceptanceParameters) -> float:
-    """Return the evidence for acceptance, with an unlimited stiffness."""
+    """Return the evidence for acceptance, with infinite stiffness."""
     e = Evidence(v.residual_m, v.residual_rad, v.overlap, v.plane_overlap, v.violations, math.inf)
     return e.total(p)
 
@@ -164,7 +164,7 @@ def residual(v: PairValidation, p: AcceptanceParameters) -> float:
     return max(v.residual_m / p.residual_m, v.residual_rad / p.residual_rad)
 
 
-#: Statistics of a transform that are higher for right transforms; None if unknown.
+#: Statistics of a transform, all higher for right transforms; None if unknown.
 STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | None]] = {
     "residual": lambda v, p: -residual(v, p),
     "overlap": lambda v, _: v.overlap,
@@ -177,7 +177,7 @@ STATISTICS: dict[str, Callable[[PairValidation, AcceptanceParameters], float | N
 
 
 def curves(pairs: Sequence[ValidatedPair], p: AcceptanceParameters) -> dict[str, Any]:
-    """Return the receiver operating characteristic of each statistic as the only criterion.
+    """Return the receiver operating characteristic of each statistic as the sole criterion.
 
     A pair is right if its transform is right, accepted or not. A pair without a transform or
     without the statistic has no evidence. For `ambiguity`, only pairs with a search for rivals
@@ -210,7 +210,7 @@ def _ambiguity_was_tested(pair: ValidatedPair) -> bool:
     return pair.accepted or pair.validation.ambiguity > 0
 
 
-#: Version of the JSON, which increases if the meaning of a key changes.
+#: Version of the JSON; it increases when the meaning of a key changes.
 SCHEMA_VERSION = 1
 
 
@@ -280,17 +280,17 @@ def _of_scene(
     }
 
 
-#: Relation of an accepted pair to other accepted pairs of the same query.
+#: Relation of an accepted pair to the other accepted pairs of the same query.
 Second = Literal["supported", "contradicted", "alone"]
 
 
 def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
-    """Return the relation of each accepted pair to other pairs; None for pairs not accepted.
+    """Return the relation of each accepted pair to others; None for pairs that are not accepted.
 
     An accepted pair implies a pose of its query, given the reference pose of its match. A pair is
     supported if another accepted pair of the same query, with a match from a different viewpoint,
     implies a pose at the same place. It is contradicted if all such pairs imply poses at other
-    places.
+    places or in other scenes, and alone if there is no such pair.
     """
     members, p = evaluation.members, evaluation.map
     of_query: dict[int, list[int]] = {}
@@ -317,7 +317,7 @@ def second_pairs(evaluation: PairEvaluation) -> list[Second | None]:
 
 
 def support(tried: Sequence[Tried], seconds: Sequence[Second | None]) -> dict[str, Any]:
-    """Return the number and the precision of accepted pairs for each relation of Second."""
+    """Return the number and the precision of the accepted pairs with each relation of Second."""
     report: dict[str, Any] = {}
     kinds: tuple[Second, ...] = get_args(Second)
     for kind in kinds:
@@ -363,7 +363,7 @@ def _shares(errors: Sequence[Error], limits: tuple[float, float]) -> Figures:
 
 
 def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
-    """Return the rates of accepted pairs without overlap, and their upper bounds.
+    """Return the rates at which pairs without overlap are accepted, and upper bounds on the rates.
 
     `cross_scene_planar`: pairs with a planar frame. `by_scenes`: rates for each pair of scenes.
     """
@@ -384,7 +384,7 @@ def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
 
 
 def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
-    """Return counts of accepted pairs without overlap; `upper` is the `upper_bound` of the rate."""
+    """Count the accepted pairs among pairs without overlap; `upper` is the rate's `upper_bound`."""
     accepted = [trial.pair for trial in tried if trial.pair.accepted]
     return {
         "pairs": len(tried),
@@ -396,7 +396,7 @@ def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
 
 
 def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, Any]:
-    """Return the success of the baselines by bin on the same pairs, and the ratio of times.
+    """Return the success of the baselines on the same pairs, by bin, and the time ratios.
 
     `start`: before refinement; `icp`: after the baseline's ICP; `ours`: after our refinement
     instead. `time_ratio`: median over pairs of our time divided by the baseline's, with features.
@@ -427,11 +427,11 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
 
 
 def why(trial: Tried) -> str | None:
-    """Return the kind of failure of a pair; None without a failure.
+    """Return the kind of failure of a pair; None if it is not a failure.
 
-    `wrongly_accepted`: a wrong transform that is accepted. Not accepted: `not_believed`, a right
-    transform; `near`, an error of up to twice the limits; `not_found`, a larger error or no
-    transform although the frames overlap.
+    `wrongly_accepted`: a wrong transform was accepted. If none was accepted: `not_believed`, the
+    transform was right; `near`, its error was up to twice the limits; `not_found`, the error was
+    larger or there was no transform, although the frames overlap.
     """
     pair = trial.pair
     if pair.accepted:

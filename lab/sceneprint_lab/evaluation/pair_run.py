@@ -1,4 +1,4 @@
-"""Evaluation of pairs of frames: sampling, validation, baselines of Open3D, and errors.
+"""Evaluation on pairs of frames: sampling, validation, Open3D baselines, and errors.
 
 PATH...  --evaluate_pairs-->  PairEvaluation
 """
@@ -64,7 +64,7 @@ EDGES = (0.1, 0.3, 0.5, 0.7, 1.0)
 BINS = tuple(f"{round(100 * low)}-{round(100 * high)}" for low, high in pairwise(EDGES))
 #: Maximum overlap (mean of both directions) of two frames of a scene that count as negatives.
 NOTHING = 0.01
-#: Minimum share of pairs with a planar frame in the sample of pairs of two scenes.
+#: Minimum share, among the sampled pairs of two scenes, of pairs with a planar frame.
 PLANAR_SHARE = 0.25
 
 Kind = Literal["overlapping", "same_scene", "cross_scene"]
@@ -72,7 +72,7 @@ Kind = Literal["overlapping", "same_scene", "cross_scene"]
 
 @dataclass(frozen=True)
 class Drawing:
-    """Parameters of the sample of pairs.
+    """Parameters for sampling pairs.
 
     Parameters
     ----------
@@ -110,8 +110,8 @@ class Drawn:
     Parameters
     ----------
     query, match : indices of the frames
-    kind : overlapping pair, or negative of one scene or of two scenes
-    bin : bin of an overlapping pair, else None
+    kind : overlapping pair, negative pair of one scene, or negative pair of two scenes
+    bin : bin of an overlapping pair; None for other pairs
     overlap_mean, overlap_least : see Overlaps; 0 for two scenes
     planar : whether one of the frames is planar
     """
@@ -128,10 +128,10 @@ class Drawn:
 def draw(
     places: Sequence[FrameOrigin], truth: Overlaps, planar: NDArray[np.bool_], p: Drawing
 ) -> list[Drawn]:
-    """Return a sample of pairs of all bins and of both kinds of negatives.
+    """Return a sample of pairs from all bins and of both kinds of negatives.
 
-    Each pair occurs once, with its later frame as the query. All couples of scenes have equally
-    many pairs, a quarter of which have a planar frame. Samples are smaller if fewer pairs exist.
+    Each pair occurs once, with its later frame as the query. Every two scenes have equally many
+    pairs, a quarter of which have a planar frame. Samples are smaller if fewer pairs exist.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ def _of_two_scenes(
 
 
 def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Return at most n different random members of `of`, in ascending order."""
+    """Return at most n distinct random members of `of`, in ascending order."""
     return np.sort(rng.choice(of, min(n, len(of)), replace=False))
 
 
@@ -209,17 +209,17 @@ def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.
 
 T = TypeVar("T")
 
-#: Parameters of FPFH: voxel, radius and number of neighbours of normals, and of features.
+#: Parameters of FPFH: voxel edge, and radius and number of neighbours for normals and for features.
 VOXEL, NORMALS, FEATURES = 0.05, (0.10, 30), (0.25, 100)
 #: Parameters of RANSAC: maximum distance of a correspondence (metres), number of points of a
 #: hypothesis, minimum ratio of edge lengths, maximum number of hypotheses, and confidence.
 CORRESPONDENCE, POINTS, BASELINE_EDGES = 0.075, 3, 0.9
 HYPOTHESES, CONFIDENCE = 100_000, 0.999
-#: Parameter of FGR: maximum distance of a correspondence, metres; half a voxel as in the example of
-#: its authors.
+#: Parameter of FGR: maximum distance of a correspondence, metres; half a voxel, as in its authors'
+#: example.
 FGR_CORRESPONDENCE = 0.025
-#: Parameters of point-to-plane ICP: voxel of both clouds, and maximum distance of a correspondence,
-#: metres.
+#: Parameters of point-to-plane ICP: voxel edge of both clouds, and maximum distance of a
+#: correspondence, metres.
 ICP_VOXEL, ICP_CORRESPONDENCE = 0.02, 0.05
 #: The methods in the order of the tables.
 METHODS = ("FPFH + RANSAC", "FPFH + FGR")
@@ -228,7 +228,7 @@ _FEWEST = 10
 
 
 class Clock:
-    """Stopwatch with the milliseconds of each stage."""
+    """A stopwatch that records the milliseconds of each stage."""
 
     def __init__(self) -> None:
         self.stages: dict[str, float] = {}
@@ -243,13 +243,13 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """The result of one method for a pair.
+    """The result of a method for a pair.
 
     Parameters
     ----------
     start : (4, 4) T_match_query before ICP
     refined : (4, 4) T_match_query after ICP
-    stages : milliseconds by stage, with the features of both frames
+    stages : milliseconds by stage, including the features of both frames
     """
 
     start: Floats
@@ -258,7 +258,7 @@ class Attempt:
 
     @property
     def milliseconds(self) -> float:
-        """Total time of all stages."""
+        """Return the total time of all stages."""
         return sum(self.stages.values())
 
 
@@ -273,7 +273,7 @@ def register(
 ) -> dict[str, Attempt]:  # fmt: skip
     """Register two clouds by each method; return {} if a cloud has too few points.
 
-    Features are computed once; their time counts for each method.
+    Features are computed once; the time for them counts for each method.
 
     Parameters
     ----------
@@ -316,7 +316,7 @@ def register(
         return o3r.registration_fgr_based_on_feature_matching(*thin, *features, option)
 
     def icp(start: Floats) -> Any:
-        # ICP uses finer clouds than the features, with their own normals.
+        # ICP uses denser clouds than the features do, with their own normals.
         fine = [c.voxel_down_sample(scale * ICP_VOXEL) for c in clouds]
         fine[1].estimate_normals(search(*NORMALS))
         return o3r.registration_icp(
@@ -353,15 +353,15 @@ class Other:
 
 @dataclass(frozen=True, eq=False)
 class Tried:
-    """A sampled pair with its validation.
+    """A sampled pair, with its validation.
 
     Parameters
     ----------
     drawn : sampled pair
     pair : validated pair, with `bound` if the frames overlap
-    others : results of the baselines by method; empty if there are too few points; None without
-        baselines or overlap
-    milliseconds : time of our method, with the features of both frames; None without `others`
+    others : results of the baselines, by method; empty if there are too few points; None without
+        baselines or without overlap
+    milliseconds : time of our method, including the features of both frames; None without `others`
     """
 
     drawn: Drawn
@@ -376,9 +376,9 @@ class Bench:
 
     Parameters
     ----------
-    model : model, whose parameters the baselines use
+    model : model whose parameters the baselines use
     limits : maximum error of a right transform, metres and degrees
-    o3d : Open3D; None without baselines
+    o3d : the Open3D module; None without baselines
     """
 
     judging: Judge
@@ -392,7 +392,7 @@ def open_bench(
     store: FrameStore, model: Model, mode: Mode, seed: int, limits: tuple[float, float], *,
     baselines: bool, matching: Matching = "histograms",
 ) -> Bench:  # fmt: skip
-    """Return a Bench for pairs of frames of a store; raise MissingDependency without Open3D."""
+    """Return a Bench for pairs of stored frames; raise MissingDependency if Open3D is missing."""
     o3d = open3d("A baseline of registration") if baselines else None
     judging = open_judge(store, mode, seed, model.parameters.validation, matching)
     return Bench(judging, store, model, limits, o3d)
@@ -443,7 +443,7 @@ def scale_of(p: ModelParameters) -> float:
 
 
 def peer_points(frame: AnyFrame, model: Model) -> Floats:
-    """Return the points (N, 3) of a cloud, or the points of a depth image within the range."""
+    """Return the points (N, 3) of a cloud, or those of a depth image that are within the range."""
     if isinstance(frame, Cloud):
         return frame.points.astype(np.float64)
     p = model.parameters.depth
@@ -453,7 +453,7 @@ def peer_points(frame: AnyFrame, model: Model) -> Floats:
 def refined_by_us(
     query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
 ) -> Floats | None:
-    """Refine a baseline's transform by our method with coarse, then fine gates; None on failure."""
+    """Refine a baseline's transform by our method, first coarsely, then finely; None on failure."""
     coarse = refine_all(query.surface, match.surface, T[None], p.coarse)
     return refine_transform(query, match, coarse[0] if len(coarse) else T, p.fine)
 
@@ -464,7 +464,7 @@ def _error(T: Floats | None, true: Floats) -> Error:
 
 @dataclass(frozen=True)
 class PairSettings:
-    """The settings of an evaluation of pairs.
+    """The settings of an evaluation on pairs.
 
     Parameters
     ----------
@@ -472,9 +472,9 @@ class PairSettings:
     frames : maximum number of frames per scene, evenly spaced over its recordings
     mode, matching, seed : arguments of `validate`
     limits : maximum error of a right transform, metres and degrees
-    baselines : whether Open3D registers overlapping pairs too
-    jobs : number of processes, on which only times depend
-    cache_dir : folder of derived files of the model; None selects the user's cache folder
+    baselines : whether Open3D also registers overlapping pairs
+    jobs : number of processes; only times depend on it
+    cache_dir : folder for files derived from the model; None selects the user's cache folder
     """
 
     drawing: Drawing = field(default_factory=Drawing)
@@ -497,7 +497,7 @@ class PairEvaluation:
     members : N usable frames, without their signatures
     limits : maximum error of a right transform, metres and degrees
     acceptance, map : parameters of the model
-    planes : (N,) shares of the frames' samples in their largest planes
+    planes : (N,) share of each frame's samples that lie in its largest plane
     tried : results in the order of the sample
     left_out : (name, reason) of unusable frames
     prepare_ms : median time to sign a frame and compute its geometry, milliseconds
@@ -519,18 +519,20 @@ def evaluate_pairs(
 ) -> PairEvaluation:  # fmt: skip
     """Sample pairs by true overlap, validate them, and compute their errors.
 
-    Raise DatasetError if no two frames can be used, or none make a pair. Raise MissingDependency if
-    baselines need Open3D, which cannot be imported.
-
     Parameters
     ----------
     paths : paths of sequences with poses; frames of different scenes are negatives
     signer : result of `open_signer`
     store : empty store
     watch : callback for progress
+
+    Raises
+    ------
+    DatasetError : If no two frames can be used, or none make a pair
+    MissingDependency : If baselines need Open3D, which cannot be imported
     """
     if settings.baselines:
-        open3d("A baseline of registration")  # detects a missing library before frames are read
+        open3d("A baseline of registration")  # a missing library is detected before frames are read
     placed = spread(every_frame(paths), settings.frames)
     chosen = tuple(frame for frame, _ in placed)
     prepared = prepare_all(
@@ -593,7 +595,7 @@ def _too_few(prepared: Prepared) -> str:
 
 
 def _plane_share(opened: tuple[FrameStore, float], member: SignedFrame) -> float:
-    """Return the `plane_share` of a stored frame, with the maximum distance from the plane."""
+    """Return the `plane_share` of a stored frame; `opened` is the store and the distance limit."""
     store, off = opened
     return plane_share(view_of(store.frame(member)).samples, off)
 

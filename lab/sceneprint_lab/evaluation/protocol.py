@@ -1,4 +1,4 @@
-"""Frames of an evaluation: selection, signatures, storage, and overlaps.
+"""The frames of an evaluation: their selection, signatures, storage and overlaps.
 
 Protocol  --prepare_all-->  Prepared; depth and geometry in a FrameStore
 """
@@ -54,14 +54,14 @@ if TYPE_CHECKING:
 
 # The results of queries, from which all figures are computed.
 
-#: Number of views of a query that are averaged, counted and drawn.
+#: Maximum number of a query's views that are averaged, counted and drawn.
 VIEWS = 5
 #: Maximum error of a right transform between frames of rooms, metres and degrees.
 RIGHT = (0.10, 10.0)
-#: Maximum rotational error of a pose at the right place, degrees. The maximum translational error
-#: is the parameter `place_m` of the model.
+#: Maximum rotation error of a pose at the right place, degrees. The maximum translation error is
+#: the model's parameter `place_m`.
 PLACE_DEG = 10.0
-#: Errors above which an answer is grossly wrong, metres and degrees.
+#: An answer is grossly wrong if an error exceeds these limits, metres and degrees.
 GROSS = (0.50, 15.0)
 
 
@@ -86,13 +86,13 @@ class SignedFrame:
 
 @dataclass(frozen=True)
 class Error:
-    """The error of an estimated pose; infinite without an estimate."""
+    """The error of an estimated pose; infinite if there is no estimate."""
 
     metres: float = math.inf
     radians: float = math.inf
 
     def within(self, metres: float, degrees: float) -> bool:
-        """Return whether translation and rotation are within limits."""
+        """Return whether both errors are within the limits."""
         return self.metres <= metres and self.radians <= math.radians(degrees)
 
 
@@ -106,7 +106,7 @@ class ValidatedPair:
     validation : result of the validation
     same_scene : whether the match is in the query's scene
     error : error of T_match_query; infinite for another scene
-    bound : error of refinement from the reference pose; None unless computed
+    bound : error after refinement from the reference pose; None unless computed
     overlap_mean, overlap_least : see Overlaps; 0 for another scene
     milliseconds : time of the validation
     limits : maximum error of a right transform, metres and degrees
@@ -158,10 +158,10 @@ class JudgedAnswer:
     ----------
     status : "found", "ambiguous" or "not_found"
     strength : "strong" or "weak"; None unless found
-    error : error of the pose in the map; infinite without a pose or in another parent frame
-    milliseconds : time of the answer without the ranking
+    error : error of the pose; infinite without a pose, or if it is in another parent frame
+    milliseconds : time for the answer, without the ranking
     places : candidate places, most likely first
-    limits : maximum error of a right pose, metres and degrees; default: for a depth camera
+    limits : maximum error of a right pose, metres and degrees; the default is for depth cameras
     """
 
     status: LocalizationStatus = "not_found"
@@ -178,7 +178,7 @@ class JudgedAnswer:
 
     @property
     def grossly_wrong(self) -> bool:
-        """Return whether the pose is found, but its error exceeds GROSS, scaled like `limits`."""
+        """Return whether the pose was found, but its error exceeds GROSS, scaled like `limits`."""
         gross = [g * limit / r for g, limit, r in zip(GROSS, self.limits, RIGHT, strict=True)]
         return self.status == "found" and not self.error.within(*gross)
 
@@ -191,15 +191,16 @@ class QueryOutcome:
     ----------
     name, scene, pose : name, scene and pose of the query
     allowed : (A,) ascending indices of the database frames that the query may find
-    present : whether an allowed frame is in the query's scene
+    present : whether any allowed frame is in the query's scene
     overlap_mean, overlap_least : (A,) overlaps with the allowed frames; see Overlaps
-    ranking : R, indices of database frames, nearest first
+    ranking : R: indices of database frames, nearest first
     distances : (|R|,) distances of R; see `cross_distances`
     selection : C, in the order of R
-    pairs : validated pairs of the first members of R and all of C, by index of the database frame
+    pairs : validated pairs with the first members of R and all of C, by index of the database frame
     candidates : number of members of R that were validated
-    average, average_of_ranking : errors of the average pose over accepted views of C and of R
-    average_bound : error of the average over the same views of C, refined from the reference pose
+    average, average_of_ranking : errors of the poses averaged over accepted views of C, and of R
+    average_bound : error of the average over the same views of C after refinement from the
+        reference pose
     milliseconds : times of ranking, selection and averaging
     answer : complete answer; see `answer_of`
     """
@@ -237,7 +238,7 @@ class QueryOutcome:
         return pairs if of in ("R", "DR") else in_preferred_order(pairs)
 
     def tried(self) -> list[ValidatedPair]:
-        """Return all pairs of C in the order of `associate`: the views of VDR, then other pairs."""
+        """Return all pairs of C in the order of `associate`: views of VDR, then the other pairs."""
         first = self.views("VDR")
         return first + [pair for pair in self.views("DR") if not pair.accepted]
 
@@ -252,23 +253,23 @@ def pose_error(T: Floats, truth: Floats) -> Error:
     return Error(*pose_difference(T, truth))
 
 
-# The overlap of frames by their reference poses, which defines correct retrieval.
+# The overlap of frames by their reference poses, which defines whether retrieval is correct.
 #
 # Frame or Cloud  --view_of-->  AnyView        queries, database  --overlaps-->  Overlaps
 
-#: Spacing of the samples that are compared with the other frame, pixels.
+#: Spacing of the samples that are looked up in the other frame, pixels.
 GRID = 20
-#: Tolerance of depths for `Overlaps.mean`, metres plus a share of the depth.
+#: Depth tolerance of `Overlaps.mean`: metres plus a share of the depth.
 TOLERANCE, RELATIVE_TOLERANCE = 0.05, 0.03
-#: Tolerance of depths for `Overlaps.least`, metres.
+#: Depth tolerance of `Overlaps.least`, metres.
 PAIR_TOLERANCE = 0.10
-#: Maximum number of samples of a cloud, and of points with which samples are compared.
+#: Maximum number of samples of a cloud, and of points in which samples are looked up.
 SAMPLES, POINTS = 2_000, 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class OverlapView:
-    """A depth image in the form in which overlaps are computed.
+    """A depth image, prepared for computing overlaps.
 
     Parameters
     ----------
@@ -285,13 +286,13 @@ class OverlapView:
 
 @dataclass(frozen=True, eq=False)
 class CloudView:
-    """A cloud in the form in which overlaps are computed.
+    """A cloud, prepared for computing overlaps.
 
     Parameters
     ----------
-    samples : (N, 3) points to compare with the other frame, in the parent frame, metres
-    points : tree of the points (M, 3) with which samples are compared, in the parent frame, metres
-    viewpoint : (3,) viewpoint in the parent frame; None without a viewpoint
+    samples : (N, 3) points to look up in the other frame, in the parent frame, metres
+    points : tree of the points (M, 3) in which samples are looked up, in the parent frame, metres
+    viewpoint : (3,) viewpoint in the parent frame, if there is one
     """
 
     samples: Floats
@@ -321,14 +322,14 @@ class Overlaps:
 
 
 def points_at(frame: DepthFrame, y: NDArray[np.intp], x: NDArray[np.intp]) -> Floats:
-    """Return the points (..., 3) of pixels of a depth image, metres, in the sensor's frame."""
+    """Return the points (..., 3) at pixels of a depth image, metres, in the sensor's frame."""
     k, z = frame.intrinsics, frame.depth[y, x].astype(np.float64)
     points: Floats = np.stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z], axis=-1)
     return points
 
 
 def view_of(frame: AnyFrame) -> AnyView:
-    """Return a frame in the form for computing overlaps; raise ValueError without a pose."""
+    """Prepare a frame for computing overlaps; raise ValueError if it has no pose."""
     if frame.pose is None:
         raise ValueError(f"{frame.name} has no pose. Pass frames with poses.")
     if isinstance(frame, Cloud):
@@ -352,7 +353,7 @@ def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
 
 @kernel
 def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int, int]:
-    """Return the numbers of points (N, 3) that a depth image sees, for both tolerances."""
+    """Return how many of the points (N, 3) a depth image sees, for both tolerances."""
     height, width = depth.shape
     loose = strict = 0
     for i in range(len(points)):
@@ -372,7 +373,7 @@ def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int
 
 
 def _near(points: Floats, cloud: CloudView) -> tuple[int, int]:
-    """Return the numbers of points (N, 3) that a cloud sees, for both tolerances."""
+    """Return how many of the points (N, 3) a cloud sees, for both tolerances."""
     wide = np.zeros(len(points))
     if cloud.viewpoint is not None:
         wide = RELATIVE_TOLERANCE * np.linalg.norm(points - cloud.viewpoint, axis=1)
@@ -381,7 +382,7 @@ def _near(points: Floats, cloud: CloudView) -> tuple[int, int]:
 
 
 def _shares(points: Floats, view: AnyView) -> tuple[float, float]:
-    """Return the shares of points (N, 3) that a frame sees, for both tolerances."""
+    """Return the share of the points (N, 3) that a frame sees, for both tolerances."""
     if not len(points):
         return 0.0, 0.0
     if isinstance(view, CloudView):
@@ -394,19 +395,19 @@ def _shares(points: Floats, view: AnyView) -> tuple[float, float]:
 
 
 def overlap(a: AnyView, b: AnyView) -> tuple[float, float]:
-    """Return the overlap (mean, least) of two frames of one parent frame; see Overlaps."""
+    """Return the overlaps (mean, least) of two frames in one parent frame; see Overlaps."""
     there, back = _shares(a.samples, b), _shares(b.samples, a)
     return (there[0] + back[0]) / 2, min(there[1], back[1])
 
 
 def overlaps(queries: Sequence[AnyView], database: Sequence[AnyView]) -> Overlaps:
-    """Return the overlaps of queries with database frames of the same parent frame."""
+    """Return the overlaps of all queries with all database frames, in the same parent frame."""
     shares = np.array([[overlap(q, d) for d in database] for q in queries], float)
     shares = shares.reshape(len(queries), len(database), 2)
     return Overlaps(shares[..., 0], shares[..., 1])
 
 
-# The path of a sensor between two frames of a run.
+# The distance that a sensor travelled between two frames of a run.
 #
 # SignedFrame, ...  --travelled-->  length of the path between each query and each database frame
 
@@ -415,8 +416,8 @@ def travelled(queries: Sequence[SignedFrame], database: Sequence[SignedFrame]) -
     """Return the length of the path from each database frame to each query.
 
     The path consists of straight lines between the frames of the evaluation, so it is too short if
-    the frames are sparse. Frames of one run have the same name up to the last slash, and the order
-    of their names is the order of time.
+    the frames are sparse. The names of frames of one run are equal up to the last slash, and sort
+    in chronological order.
 
     Returns
     -------
@@ -435,7 +436,7 @@ def _run(member: SignedFrame) -> str:
 
 
 def _runs(members: Sequence[SignedFrame]) -> list[dict[str, float]]:
-    """Return, for each run, the path length from its first frame by name of frame, metres."""
+    """Return, for each run, the path length from its first frame to each frame, by name, metres."""
     runs: dict[str, dict[str, SignedFrame]] = {}
     for member in members:
         runs.setdefault(_run(member), {})[member.name] = member
@@ -448,7 +449,7 @@ def _runs(members: Sequence[SignedFrame]) -> list[dict[str, float]]:
     return placed
 
 
-# Computations in one or several processes, with equal results.
+# Computations in one or several processes, with the same results.
 #
 # tasks  --map_over-->  results, in order
 
@@ -458,7 +459,7 @@ R = TypeVar("R")
 
 
 class Watch(Protocol):
-    """Protocol of a function that shows progress during an iteration."""
+    """A function that shows progress during an iteration."""
 
     def __call__(self, items: Iterable[T], stage: str, total: int) -> Iterable[T]:
         """Return an iterable of the items that shows progress."""
@@ -475,14 +476,14 @@ def map_over(
 ) -> Iterator[R]:  # fmt: skip
     """Yield `do(opened, task)` for all tasks; each process computes `opened = opening()` once.
 
-    Libraries use one thread per process, so that the order of sums is fixed and processes do not
-    compete.
+    Libraries use one thread per process, so that the order of summation is fixed and processes do
+    not compete.
 
     Parameters
     ----------
-    tasks : picklable tasks with picklable results
+    tasks : picklable tasks whose results are picklable
     do : function of a module
-    opening : function of a module, or a partial of one
+    opening : function of a module, or a partial of such a function
     jobs : number of processes; 1 uses this process
 
     Yields
@@ -506,7 +507,7 @@ def map_over(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-#: Result of `opening` in a process of the pool.
+#: Result of `opening` in this process of the pool.
 _opened: list[Any] = []
 
 
@@ -533,7 +534,7 @@ _OWN_RANGES = re.compile(r"(.+)@((?:db|queries)=[^@]*)", re.DOTALL)
 
 @dataclass(frozen=True)
 class Range:
-    """Frames start, start + step, ... before stop; None: the first, the end, the default."""
+    """Frames start, start + step, ... before stop; None: first frame, end, default step."""
 
     start: int | None
     stop: int | None
@@ -568,7 +569,7 @@ class ProtocolFrame:
     name : name, unique in the protocol
     scene : parent frame; poses of one scene are comparable
     use : database, query, or both, for evaluations that exclude frames by distance of travel
-    reference : location of the frame
+    reference : location of the frame in its sequence
     """
 
     name: str
@@ -588,7 +589,8 @@ class EvaluationProtocol:
     Parameters
     ----------
     frames : database frames and queries, in the order of the arguments
-    split : whether TrainSplit.txt and TestSplit.txt select them, as for the paper's 7-Scenes table
+    split : whether TrainSplit.txt and TestSplit.txt selected the frames, as for the paper's
+        7-Scenes table
     """
 
     frames: tuple[ProtocolFrame, ...]
@@ -598,7 +600,7 @@ class EvaluationProtocol:
 def parse_ranges(text: str) -> Ranges:
     """Parse ranges such as 0:600, 0:600:2, 650: or 0:25+50:75.
 
-    Raise DatasetError if the text does not consist of ranges, a range is empty, or its step is 0.
+    Raise DatasetError if the text does not consist of ranges, a range is empty, or a step is 0.
     """
     ranges = []
     for part in text.split("+"):
@@ -642,22 +644,24 @@ def choose(
     query_step: int = 1, shared: bool = False,
     find: Callable[[Path], tuple[Run, ...]] = find_sequences,
 ) -> EvaluationProtocol:  # fmt: skip
-    """Assign the frames of paths to the database or the queries, without reading frames.
+    """Assign the frames of paths to the database or to the queries, without reading frames.
 
-    The ranges of a path have precedence over `database` and `queries`, and these over the split
-    files of its scenes.
-
-    Raise DatasetError if the use of a path's frames is unspecified, a range lies outside its path,
-    a frame is selected twice, two scenes have the same name, or there is no query.
+    The ranges of a path have precedence over `database` and `queries`, which have precedence over
+    the split files of its scenes.
 
     Parameters
     ----------
     parts : paths with optional ranges
     distractors : paths whose frames all belong to the database
     database, queries : ranges for paths without ranges
-    database_step, query_step : steps for ranges without a step
-    shared : whether frames may have both uses; frames of paths without ranges then have both
+    database_step, query_step : step for ranges that do not have one
+    shared : whether frames may have both uses; if so, frames of paths without ranges have both
     find : function that returns the sequences of a path; it is called once per path
+
+    Raises
+    ------
+    DatasetError : If the use of a path's frames is unspecified, a range lies outside its path, a
+        frame is selected twice, two scenes have the same name, or there is no query
     """
     gathered = _Gathered(shared=shared, find=find)
     every = (Range(None, None, None),)
@@ -690,7 +694,7 @@ def choose(
 
 
 def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
-    """Return all frames of all paths in order, as queries, without reading frames.
+    """Return all frames of all paths, in order, as queries, without reading frames.
 
     Raise DatasetError if a frame occurs twice, or two scenes have the same name.
     """
@@ -709,7 +713,7 @@ def every_frame(paths: Sequence[Path]) -> tuple[ProtocolFrame, ...]:
 
 
 class _Gathered:
-    """Collection of the selected frames by file."""
+    """The selected frames, by file."""
 
     def __init__(
         self, *, shared: bool = False,
@@ -722,7 +726,7 @@ class _Gathered:
         self._places: dict[str, Path] = {}
 
     def add_split(self, path: Path, database_step: int, query_step: int) -> None:
-        """Add the frames of a path by split files; raise DatasetError if there are none."""
+        """Add the frames that a path's split files select; raise DatasetError if there are none."""
         sequences = self._find(path)
         if not any(s.split for s in sequences):
             raise DatasetError(
@@ -738,7 +742,7 @@ class _Gathered:
             self._add(path, test[::query_step], "query")
 
     def add_ranges(self, path: Path, ranges: Iterable[Range], use: Use, step: int) -> None:
-        """Add the frames of a path in ranges; raise DatasetError if a range lies outside."""
+        """Add the frames of a path in `ranges`; raise DatasetError if a range lies outside it."""
         every = [(s, f) for s in self._find(path) for f in s.frames]
         for part in ranges:
             if (part.start or 0) >= len(every) or (part.stop or 0) > len(every):
@@ -749,7 +753,7 @@ class _Gathered:
             self._add(path, every[part.start : part.stop : part.step or step], use)
 
     def _add(self, path: Path, new: list[tuple[Run, FrameReference]], use: Use) -> None:
-        """Add frames; raise DatasetError for duplicates of frames or of names."""
+        """Add frames, or, if shared, second uses of them; raise DatasetError for duplicates."""
         for run, reference in new:
             scene, file, place = run.parent_frame, reference.path.resolve(), run.place
             if self._places.setdefault(scene, place.resolve()) != place.resolve():
@@ -776,7 +780,7 @@ class _Gathered:
 
 @dataclass(frozen=True)
 class FrameStore:
-    """A folder with depth and geometry of frames by number; they would exceed the memory.
+    """A folder of the depth and geometry of frames, by number, which would not fit into memory.
 
     `folder`: folder of the files; the caller removes it.
     """
@@ -784,7 +788,7 @@ class FrameStore:
     folder: Path
 
     def keep(self, number: int, frame: AnyFrame, geometry: Geometry) -> None:
-        """Store the depth or the points of a frame, and its geometry."""
+        """Store the depth image or the points of a frame, and its geometry."""
         (self.folder / f"{number}.geometry").write_bytes(write_geometry(geometry))
         if isinstance(frame, Cloud):
             seen = "seen" if frame.has_viewpoint else "fused"
@@ -796,7 +800,7 @@ class FrameStore:
         np.save(self.folder / f"{number}.camera.npy", camera)
 
     def frame(self, member: SignedFrame) -> AnyFrame:
-        """Read a stored depth image or cloud, with the pose of the evaluation."""
+        """Read a stored depth image or cloud, with the pose that the evaluation uses."""
         for has_viewpoint, seen in ((True, "seen"), (False, "fused")):
             if (path := self.folder / f"{member.number}.{seen}.npy").exists():
                 return Cloud(np.load(path), has_viewpoint, member.name, member.pose)
@@ -812,13 +816,13 @@ class FrameStore:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """Signed frames of an evaluation, and the reasons why other frames are unusable.
+    """The signed frames of an evaluation, and the reasons why other frames are unusable.
 
     Parameters
     ----------
     queries, database : frames in the order of the protocol
     left_out : (name, reason) of unusable frames
-    milliseconds : median time to sign a frame and compute its geometry; None without frames
+    milliseconds : median time to sign a frame and to compute its geometry; None without frames
     validation, metric, answer, unrelated_distance : parameters of the model
     """
 
@@ -854,15 +858,16 @@ def prepare_all(
 ) -> Prepared:  # fmt: skip
     """Read, sign and store all frames.
 
-    Frames without a pose are omitted because their errors are unknown, except database frames of
-    scenes without queries, which are wrong for any query.
+    Frames without a pose are omitted, because errors cannot be computed for them, except database
+    frames of scenes without queries, which are wrong for any query.
 
     Parameters
     ----------
     chosen : frames of a protocol
     signer : result of `open_signer`
     store : empty store
-    levels : number of levels of psi, finest first; None selects all levels, or stored signatures
+    levels : number of levels of psi, finest first; None selects all levels or, if the model
+        whitens, stored signatures
     jobs : number of processes
     cache_dir : folder of derived files of the model
     watch : callback for progress
@@ -870,7 +875,7 @@ def prepare_all(
     scenes = {frame.scene for frame in chosen if frame.is_for("query")}
     length = signer.model.level_length * levels if levels else None
     tasks = [_Task(i, frame, frame.scene in scenes, length) for i, frame in enumerate(chosen)]
-    # The table of the signer is too large to send, so other processes open the model.
+    # The signer's table is too large to send to other processes, so they open the model.
     own = signer if jobs == 1 else signer.model
     results = map_over(tasks, _prepare, partial(_open, own, cache_dir, store), jobs)
     by_use: dict[str, list[SignedFrame]] = {"query": [], "database": []}
@@ -894,7 +899,7 @@ def prepare_all(
 def _open(
     model: Signer | Model, cache_dir: Path | None, store: FrameStore
 ) -> tuple[Signer, FrameStore]:
-    """Return a signer with the model, and the store."""
+    """Return a signer for the model, and the store."""
     return (model if isinstance(model, Signer) else open_signer(model, cache_dir)), store
 
 
@@ -912,7 +917,7 @@ def _prepare(opened: tuple[Signer, FrameStore], task: _Task) -> _Done:
         return _Done(None, str(error), 0.0)
     store.keep(task.number, frame, geometry)
     vector: Bytes = signature.vector[: task.length]
-    # A distractor without a pose gets a separate scene.
+    # A distractor without a pose gets its own scene.
     scene = task.chosen.name if frame.pose is None else task.chosen.scene
     pose = np.eye(4) if frame.pose is None else frame.pose
     return _Done(SignedFrame(task.number, task.chosen.name, scene, pose, vector), "", spent)

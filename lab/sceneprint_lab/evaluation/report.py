@@ -37,9 +37,9 @@ from sceneprint_lab.evaluation.run import Evaluation
 
 
 def recalls(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the recall of R, of C, and of a random frame; see `recall`.
+    """Return the recall of R, of C and of random frames; see `recall`.
 
-    `within_m` is the maximum distance of a frame that shows the query's place, metres; null: an
+    `within_m` is the maximum distance of a frame that shows the query's place, metres; if null, an
     overlap of half is required instead.
     """
     relevant, allowed = evaluation.relevant, evaluation.allowed
@@ -54,10 +54,11 @@ def recalls(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
-    """Return the figures of each baseline by name, the same as those of R.
+    """Return the figures of each baseline, by name: those of row R without `right_scene`, and more.
 
-    `milliseconds`: see Compared. `ratio`: time to describe a query and to rank the database,
-    divided by the same time for the signature. `reason`: reason why a baseline has no figures.
+    `recall`: see `recall`. `milliseconds`: see Compared. `ratio`: time to describe a query and to
+    rank the database, divided by the time for these with the signature. A baseline that cannot be
+    used has only a `reason`.
     """
     outcomes = evaluation.outcomes
     ours = float(np.median([o.milliseconds["rank"] for o in outcomes]))
@@ -93,13 +94,13 @@ class FramePlace:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """The errors of the answers to one query.
+    """The errors of the answers to a query.
 
     Parameters
     ----------
-    first : error of the first match of each row, and of `pose_average`; infinite without a pose
-    spread : mean and standard deviation of the distance between the query and the first five
-        frames of each row, metres; None with fewer than two frames in the query's parent frame
+    first : error of each row's first match, and of `pose_average`; infinite without a pose
+    spread : mean and standard deviation of the distances between the query and each row's first
+        five frames, metres; None if fewer than two of them are in the query's parent frame
     """
 
     first: Mapping[str, Error]
@@ -109,7 +110,7 @@ class Judgement:
 def judge_answers(
     truth: FramePlace, ranked: Answer, diverse: Answer, places: Mapping[str, FramePlace]
 ) -> Judgement:
-    """Return the errors of two answers to one query.
+    """Return the errors of two answers to the same query.
 
     Parameters
     ----------
@@ -132,9 +133,9 @@ def judge_answers(
 
 
 def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
-    """Return the figures of each row over queries; see `measures.rows`.
+    """Return the figures of each row over all queries; see `measures.rows`.
 
-    `spread_mean_m` and `spread_std_m`: mean of `Judgement.spread` over queries with a spread.
+    `spread_mean_m` and `spread_std_m`: means of `Judgement.spread` over the queries that have one.
     """
     rows: dict[str, Figures] = {}
     for row in ("R", "VR", "DR", "VDR", "pose_average"):
@@ -157,7 +158,7 @@ def _first(matches: Sequence[Match], truth: FramePlace, places: Mapping[str, Fra
 def _spread(
     matches: Sequence[Match], truth: FramePlace, places: Mapping[str, FramePlace]
 ) -> tuple[float, float] | None:
-    """Return mean and standard deviation of distances to the first matches; see Judgement."""
+    """Return mean and standard deviation of the distances to the first matches; see Judgement."""
     near = [places[match.frame_id] for match in matches[:VIEWS]]
     metres = [
         float(np.linalg.norm(place.pose[:3, 3] - truth.pose[:3, 3]))
@@ -167,7 +168,7 @@ def _spread(
     return (float(np.mean(metres)), float(np.std(metres))) if len(metres) >= 2 else None
 
 
-#: Version of the JSON, which increases if the meaning of a key changes.
+#: Version of the JSON; it increases when the meaning of a key changes.
 SCHEMA_VERSION = 1
 
 ROWS = ("R", "VR", "DR", "VDR", "pose_average", "pose_average_vr")
@@ -179,9 +180,10 @@ def figures(
     """Return all figures of an evaluation as JSON values.
 
     The top level contains the figures for all queries and the whole database (`Combine` in the
-    paper). `by_scene` contains those for the queries of each of several scenes. For a 7-Scenes
-    table, `scenes` contains each scene with a separate database, and `average` the mean of their
-    rows. For `recall` and `baselines`, see `recalls` and `baseline_rows`.
+    paper). If there are several scenes, `by_scene` contains the figures for the queries of each.
+    For a 7-Scenes table, `scenes` contains the figures of each scene with a separate database, and
+    `average` the means of their rows. For `recall` and `baselines`, see `recalls` and
+    `baseline_rows`.
 
     Parameters
     ----------
@@ -221,7 +223,7 @@ def figures(
 def measured(
     outcomes: Sequence[QueryOutcome], poses: Sequence[Floats], database: Callable[[int], AnyFrame]
 ) -> dict[str, Any]:
-    """Return all figures of a set of queries; see `diversity` for the parameters."""
+    """Return all figures for a set of queries; for the parameters, see `diversity`."""
     return {
         **rows(outcomes), "bound": bound(outcomes), **oracle_and_random(outcomes),
         "validation": validation(outcomes), "diversity": diversity(outcomes, poses, database),
@@ -231,7 +233,7 @@ def measured(
 
 
 def average(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the mean of each figure of each row over scenes; null if a scene lacks the figure."""
+    """Return the mean over scenes of each figure of each row; null if a scene lacks the figure."""
     result: dict[str, Any] = {}
     for row in ROWS:
         columns = {key: [scene[row][key] for scene in scenes] for key in scenes[0][row]}
@@ -243,7 +245,7 @@ def average(scenes: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def milliseconds(outcomes: Sequence[QueryOutcome]) -> dict[str, float | None]:
-    """Return the median time of each stage per query, or per pair for `validate`."""
+    """Return the median time of each stage per query, or, for `validate`, per pair."""
     stages: dict[str, list[float]] = {
         stage: [o.milliseconds[stage] for o in outcomes if stage in o.milliseconds]
         for stage in ("rank", "compare_ranking", "diversify", "average", "answer")
@@ -293,7 +295,7 @@ def _matches(outcome: QueryOutcome, names: Sequence[str]) -> list[dict[str, Any]
 
 
 def mistakes(outcomes: Sequence[QueryOutcome], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the accepted pairs with wrong transforms and the refused pairs with right ones."""
+    """Return the accepted pairs with wrong and the refused pairs with right transforms."""
     return [
         {
             "query": outcome.name,
@@ -332,12 +334,12 @@ def _described(pair: ValidatedPair, names: Sequence[str]) -> dict[str, Any]:
 
 
 def error_figures(error: Error) -> dict[str, float]:
-    """Return an error as JSON values, metres and degrees."""
+    """Return an error as JSON values, in metres and degrees."""
     return {"translation_m": error.metres, "rotation_deg": math.degrees(error.radians)}
 
 
 def without_infinities(value: Any) -> Any:
-    """Return a JSON value with None in place of infinite numbers and NaN."""
+    """Return a JSON value in which None replaces infinite numbers and NaN."""
     if isinstance(value, dict):
         return {key: without_infinities(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -346,7 +348,7 @@ def without_infinities(value: Any) -> Any:
 
 
 def to_json(report: dict[str, Any]) -> bytes:
-    """Return the bytes of a JSON file."""
+    """Return a report as the bytes of a JSON file."""
     return (json.dumps(report, indent=1, allow_nan=False) + "\n").encode()
 
 
@@ -377,7 +379,7 @@ def table(report: dict[str, Any]) -> list[str]:
     return [*lines, _times(report)]
 
 
-#: Percentages of queries within 5 cm and 5 degrees for R and VDR, from the table of the paper.
+#: Percentages of queries within 5 cm and 5 degrees for R and for VDR, from the paper's table.
 PAPER = {
     "chess": (97.3, 99.5), "fire": (92.3, 97.8), "heads": (93.5, 98.9), "office": (89.7, 98.4),
     "pumpkin": (78.3, 82.8), "redkitchen": (87.9, 93.7), "stairs": (54.8, 61.0),
@@ -386,15 +388,15 @@ PAPER_OVERALL = {"average": (84.8, 90.3), "combine": (84.8, 90.4)}
 
 
 def seven_scenes_table(report: dict[str, Any], scene: str) -> list[str]:
-    """Return a table of the percentages of queries within 5 cm and 5 degrees, with the paper's.
+    """Return a table of the percentages of queries within 5 cm and 5 degrees, beside the paper's.
 
     Average and Combine cover the scenes of the evaluation. The paper has no figures for DR, because
     R has the same first match.
 
     Parameters
     ----------
-    found : result of `figures`
-    scene : name of the first scene, for figures of a single scene
+    report : result of `figures`
+    scene : name of the scene if the figures are those of a single scene
     """
     rows = ("R", "DR", "VDR", "pose_average")
     lines = [
@@ -441,7 +443,7 @@ def _overlap(row: dict[str, Any]) -> str:
 
 
 def _recalls(report: dict[str, Any]) -> list[str]:
-    """Return lines of text on the recall of all rankings and on their times."""
+    """Return lines of text about the recall and the times of all rankings."""
     if "recall" not in report:  # figures of an older version
         return []
     within = report["recall"]["within_m"]
@@ -479,7 +481,7 @@ _ANSWERS = {
 
 
 def _answers(report: dict[str, Any]) -> list[str]:
-    """Return lines of text on the answers."""
+    """Return lines of text about the answers."""
     if "answers" not in report:  # figures of an older version
         return []
     shares = report["answers"]

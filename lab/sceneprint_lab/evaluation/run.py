@@ -50,16 +50,16 @@ from sceneprint_lab.evaluation.protocol import (
 
 #: Maximum distance of a sample from its plane, metres.
 OFF_PLANE = 0.05
-#: Minimum share of samples in one plane of a planar frame.
+#: Minimum share of samples that lie in one plane if a frame is planar.
 PLANAR = 0.6
-#: Number of tested planes through three random samples.
+#: Number of planes that are tested, each through three random samples.
 _TRIES = 200
 
 
 def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
-    """Return the share of samples in the largest plane; the result is deterministic.
+    """Return the share of samples in the largest plane, deterministically.
 
-    Normals and patches are not used, so that the result does not depend on the evaluated method.
+    Normals and patches are not used, so the result does not depend on the method under evaluation.
 
     Parameters
     ----------
@@ -80,13 +80,13 @@ def plane_share(samples: Floats, off: float = OFF_PLANE) -> float:
     offsets = (corners[fixed, 0] * normals).sum(axis=1)
     inside = np.abs(samples @ normals.T - offsets) < off
     best = samples[inside[:, inside.sum(axis=0).argmax()]]
-    centre = best.mean(axis=0)  # refit by least squares, because three noisy samples tilt a plane
+    centre = best.mean(axis=0)  # refit by least squares: three noisy samples tilt a plane
     normal = np.linalg.svd(best - centre, full_matrices=False)[2][2]
     fitted = np.abs((samples - centre) @ normal) < off
     return float(max(fitted.mean(), inside.mean(axis=0).max()))
 
 
-#: Number of queries, and of database frames, in memory.
+#: Number of queries, and of database frames, that are in memory at a time.
 BLOCK = 256
 
 
@@ -105,11 +105,11 @@ class EvaluationSettings:
     absent : whether a query may find only frames of other scenes
     gap_m : minimum distance of travel from a database frame of the same run to a query that may
         find it, metres; None: no limit
-    within_m : maximum distance of a frame that shows the query's place, metres; None requires an
-        overlap of half instead
+    within_m : maximum distance of a frame that shows the query's place, metres; with None, an
+        overlap of half is required instead
     baselines : names of baselines; see BASELINES
-    jobs : number of processes, on which no figure depends
-    cache_dir : folder of derived files of the model; None selects the user's cache folder
+    jobs : number of processes; figures do not depend on it
+    cache_dir : folder for files derived from the model; None selects the user's cache folder
     """
 
     metric: Metric | None = None
@@ -134,9 +134,10 @@ class Evaluation:
     Parameters
     ----------
     prepared : frames of the evaluation
-    alone : outcomes of each scene with a separate database, for a 7-Scenes table of several scenes;
-        else empty
-    allowed, relevant : (Q, N) masks of the frames that a query may find, and that show its place
+    alone : for a 7-Scenes table of several scenes, the outcomes of each with a separate database;
+        otherwise empty
+    allowed, relevant : (Q, N) masks of the frames that a query may find, and of those that show its
+        place
     compared : answers of each baseline
     """
 
@@ -155,17 +156,20 @@ def evaluate(
 ) -> Evaluation:  # fmt: skip
     """Sign all frames, answer all queries, and compute the errors of the answers.
 
-    Raise DatasetError if no query or no database frame is usable. Raise MissingDependency if the
-    library of a baseline is missing.
-
     Parameters
     ----------
     protocol : result of `choose`
     signer : result of `open_signer`
-    store : empty store
+    store : empty store; it receives the depth and the geometry of all frames
+    settings : settings of the evaluation
     watch : callback for progress
+
+    Raises
+    ------
+    DatasetError : If no query or no database frame is usable
+    MissingDependency : If the library of a baseline is missing
     """
-    # This detects missing libraries before the work.
+    # Detect missing libraries before the work.
     baselines = open_baselines(settings.baselines, signer.model.parameters.depth.maximum_depth)
     prepared = prepare_all(
         protocol.frames, signer, store, levels=settings.levels, jobs=settings.jobs,
@@ -213,7 +217,7 @@ def _check_used(protocol: EvaluationProtocol, prepared: Prepared) -> None:
 def _scenes(
     protocol: EvaluationProtocol, prepared: Prepared, settings: EvaluationSettings
 ) -> Iterator[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
-    """Yield name, query indices and database indices of each scene with a separate database."""
+    """For a 7-Scenes table, yield each scene's name, query indices and database indices."""
     scenes = list(dict.fromkeys(q.scene for q in prepared.queries))
     if not protocol.split or len(scenes) < 2 or settings.absent:
         return
@@ -240,7 +244,7 @@ def _allowed(
 
 
 def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched) -> Overlaps:
-    """Return the overlaps of queries with database frames; 0 between scenes."""
+    """Return the overlaps of all queries with all database frames; 0 between scenes."""
     queries, database = prepared.queries, prepared.database
     mean, least = np.zeros((2, len(queries), len(database)))
     total = len(queries) * -(-len(database) // BLOCK)
@@ -254,9 +258,9 @@ def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched)
 def _steps(
     prepared: Prepared, store: FrameStore
 ) -> Iterator[tuple[int, AnyView, int, list[AnyView]]]:
-    """Yield query index and view, and first index and views of a block of the database.
+    """Yield a query's index and view, and the first index and the views of a database block.
 
-    All pairs of queries and blocks occur; at most two blocks of views are in memory.
+    All pairs of a query and a block occur; at most two blocks of views are in memory.
     """
     for first in range(0, len(prepared.queries), BLOCK):
         own = [view_of(store.frame(m)) for m in prepared.queries[first : first + BLOCK]]
@@ -270,7 +274,7 @@ def _evaluate_slice(
     prepared: Prepared, truth: Overlaps, may: NDArray[np.bool_], of_queries: NDArray[np.intp],
     of_database: NDArray[np.intp], store: FrameStore, settings: EvaluationSettings, watch: Watch,
 ) -> list[QueryOutcome]:  # fmt: skip
-    """Return the outcomes of the queries `of_queries` on the database frames `of_database`."""
+    """Answer the queries `of_queries` with the database frames `of_database`; return outcomes."""
     queries, database = [prepared.queries[i] for i in of_queries], prepared.database
     same = np.array([q.scene for q in queries])[:, None] == np.array([d.scene for d in database])
     allowed = np.zeros(same.shape, np.bool_)

@@ -25,25 +25,25 @@ from sceneprint_lab.synth import synthesise_lookalike, synthesise_lookalike_surv
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY, LookalikeSite
 
-#: Minimum overlap (`Overlaps.least`) with a frame for a query to be answerable.
+#: Minimum overlap (`Overlaps.least`) of an answerable query with a frame of the map.
 ANSWERABLE = 0.3
-#: Maximum distance to a scan for a scanner's query to be answerable, metres.
+#: Maximum distance of a scanner's answerable query from a scan of the map, metres.
 ANSWERABLE_M = 10.0
-#: Standard deviations of a prior, metres and degrees; PRIOR_DEG is also its maximum rotation.
+#: Standard deviations of a prior, metres and degrees; PRIOR_DEG is also its maximum rotation error.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0
-#: Minimum and maximum side of the voxels of a surface that represents a site's map, metres.
+#: Minimum and maximum side of the voxels from which a site's map is fused, metres.
 CLOUD_VOXEL_M, MESH_VOXEL_M = (0.05, 0.2), (0.015, 0.03)
-#: Maximum number of views of such a surface.
+#: Maximum number of views of the fused surface.
 VIEWS = 150
 
 
 @dataclass(frozen=True)
 class SiteAnswer:
-    """The answer to one query at a site.
+    """The answer to a query at a site.
 
     Parameters
     ----------
-    site, kind, query : site of the query, its kind, and the number of the query
+    site, kind, query : name and kind of the site, and index of the query
     answerable : whether a frame of the map overlaps the query by ANSWERABLE, or a scan is within
         ANSWERABLE_M
     """
@@ -57,13 +57,13 @@ class SiteAnswer:
 
 @dataclass(frozen=True)
 class MapFlaws:
-    """The flaws of a map: missing frames, and drifting poses.
+    """The flaws of a map: missing frames and drifting poses.
 
     Parameters
     ----------
     missing : maximum share of missing frames
-    drift_m, drift_rad : maximum standard deviation of the change of the error between successive
-        poses, per direction; errors decay and remain within about twice this deviation
+    drift_m, drift_rad : maximum standard deviation of the change in error from one pose to the
+        next, per direction; errors decay, so they stay within about twice this deviation
     """
 
     missing: float = 0.5
@@ -74,11 +74,11 @@ class MapFlaws:
 def with_flaws(
     frames: Sequence[AnyFrame], flaws: MapFlaws, rng: np.random.Generator
 ) -> list[AnyFrame]:
-    """Return a random part of a map's frames in their order, with correlated pose errors.
+    """Return a random subset of a map's frames, in order, with correlated pose errors.
 
     Parameters
     ----------
-    flaws : maximum flaws; the flaws of this map are random shares of them
+    flaws : maximum flaws; the map gets a random share of each
     """
     share = rng.uniform(0.0, 1.0, 3) * (flaws.missing, flaws.drift_m, flaws.drift_rad)
     in_map = rng.uniform(size=len(frames)) >= share[0]
@@ -120,7 +120,7 @@ def signed(
 def prior_about(
     pose: Floats, parent: str, least: float, most: float, rng: np.random.Generator
 ) -> PosePrior:
-    """Return a prior for a pose, with a random error of `least` to `most` metres and 0 to 10 deg.
+    """Return a prior for a pose with a random error of `least` to `most` metres and 0 to 10 deg.
 
     Its standard deviations are always 30 cm and 10 degrees.
     """
@@ -148,7 +148,7 @@ def ask_site(
     prior: tuple[float, float] | None = None, flaws: MapFlaws | None = None,
     confidence: float | None = None, as_surface: bool = False,
 ) -> list[SiteAnswer]:  # fmt: skip
-    """Create a site and return the answers to all its queries.
+    """Create a site and return the answers to all queries at it.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def ask_site(
     work : kind (see `kinds_of`), index and number of queries
     candidates : size of C
     prior : minimum and maximum error of the robot's prior, metres; None for queries without a prior
-    flaws : flaws of the map; None for a map with all frames and exact poses
+    flaws : maximum flaws of the map; None for a map with all frames and exact poses
     confidence : minimum confidence of a pose that is found; None selects the default
     as_surface : whether the map consists of views of a surface that is fused from its frames
     """
@@ -172,7 +172,7 @@ def ask_site(
     if as_surface:
         frames = _views_of(frames, signer.model, rng)
     shown, database, of_map = signed(frames, site.name, signer, 0)
-    # Queries at another place have a separate scene, in which no pose is right.
+    # Queries at a place that the map lacks have a separate scene, in which no pose is right.
     scene = site.name if site.same_frame else f"{site.name}, elsewhere"
     sent, queries_signed, of_queries = signed(site.queries, scene, signer, len(database))
     if not database:
@@ -196,7 +196,7 @@ def ask_site(
 def _views_of(
     frames: Sequence[AnyFrame], model: Model, rng: np.random.Generator
 ) -> Sequence[AnyFrame]:
-    """Return views of the surface that is fused from frames, as for an imported map."""
+    """Fuse frames into a surface, and return views of it, as for an imported map."""
     voxel = rng.uniform(*(CLOUD_VOXEL_M if _is_of_scans(model) else MESH_VOXEL_M))
     surface = join_frames(frames, float(voxel), np.array([0.0, 0.0, 1.0]))
     return render_views(surface, replace(view_parameters(model.parameters), most_views=VIEWS))[1]
@@ -208,14 +208,14 @@ def answers_of(
     priors: Sequence[PosePrior | None] | None = None, confidence: float | None = None,
     rendered: bool = False,
 ) -> list[JudgedAnswer]:  # fmt: skip
-    """Return the answers to queries on a map.
+    """Return the judged answers to queries on a map, in order.
 
     Parameters
     ----------
     database, queries : results of `signed`, with consecutive numbers from 0
-    geometries : geometries of the database and the queries, by number
+    geometries : geometries of the database frames and of the queries, by number
     candidates : size of C
-    priors : prior of each query; None without priors
+    priors : prior of each query; None if there are no priors
     confidence : see `ask_site`
     rendered : whether the frames of the map are views rendered from a surface
     """
@@ -254,5 +254,5 @@ def _answerable(
                        for frames in (sent, shown))  # fmt: skip
         apart = np.linalg.norm(here[:, None] - there, axis=2)
         return [bool(least < ANSWERABLE_M) for least in apart.min(axis=1)]
-    seen = overlaps([view_of(q) for q in sent], [view_of(d) for d in shown])
-    return [bool(most >= ANSWERABLE) for most in seen.least.max(axis=1)]
+    overlap = overlaps([view_of(q) for q in sent], [view_of(d) for d in shown])
+    return [bool(most >= ANSWERABLE) for most in overlap.least.max(axis=1)]

@@ -15,7 +15,7 @@ from sceneprint.geometry.rigid import transform_points
 from sceneprint.geometry.views import Renderer, ViewParameters, ViewPlan, choose_views
 from sceneprint.types import AnyFrame, Cloud, DepthFrame, Floats, Intrinsics, ReferenceSurface
 
-#: Parameters of the fusion, with lengths in metres.
+#: Parameters of the fusion; lengths in metres.
 _FUSION = FusionParameters(most_blocks=400_000, farthest_m=4.0)
 
 
@@ -24,7 +24,7 @@ def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> Refer
 
     Parameters
     ----------
-    frames : clouds, for a cloud with one point per voxel, or depth images, for a mesh
+    frames : clouds, which give a cloud with one point per voxel, or depth images, which give a mesh
     voxel_m : side of the voxels, metres
     up : (3,) unit vector in the parent frame
 
@@ -52,7 +52,7 @@ def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> Refer
 def render_views(
     surface: ReferenceSurface, p: ViewParameters
 ) -> tuple[ViewPlan, list[AnyFrame]]:  # fmt: skip
-    """Return the viewpoints for a surface (see `choose_views`), and their views as frames."""
+    """Select viewpoints of a surface (see `choose_views`); return the plan and views as frames."""
     plan, renderer = choose_views(surface, p), Renderer(surface, p)
     frames: list[AnyFrame] = []
     for number, pose in enumerate(plan.poses):

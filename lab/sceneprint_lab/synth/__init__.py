@@ -1,10 +1,10 @@
-"""Synthetic depth frames of furnished rooms and laser scans of large sites, with exact poses.
+"""Synthetic depth frames of furnished rooms, and laser scans of large sites, with exact poses.
 
     seed, index  --synthesise_room-->  frames        seed, index  --synthesise_survey-->  clouds
     kind, seed, index  --synthesise_lookalike-->  frames of a map, and queries
     kind, seed, index  --synthesise_lookalike_survey-->  clouds of a map, and queries
 
-This package reads and writes no files.
+This package does not read or write files.
 """
 
 from sceneprint_lab.synth.dataset import (

@@ -40,7 +40,7 @@ class SynthRoom:
     ----------
     name : name such as "room-000"
     seed, index : arguments from which the room was generated
-    frames : frames with T_world_camera; depth has sensor noise and steps of a millimetre
+    frames : frames with T_world_camera; depth has sensor noise and is in steps of a millimetre
     """
 
     name: str
@@ -57,16 +57,18 @@ def synthesise_room(
 
     The result depends only on the arguments, so rooms can be generated in any order and process.
 
-    Raise MissingDependency if Embree cannot be imported.
-
     Parameters
     ----------
     seed, index : seed of the collection, and index of the room in it
     views : number of frames
-    along_path : whether the frames follow a hand-held path; else they are independent
+    along_path : whether the frames follow a hand-held path; otherwise they are independent
     step : use every n-th frame along the path
     noise : sensor noise; None for ideal depth
     intrinsics : camera
+
+    Raises
+    ------
+    MissingDependency : If Embree cannot be imported
     """
     room, rng = room_and_rng(seed, index)
     sensor = own_sensor(noise, intrinsics, rng) if noise else None
@@ -93,7 +95,7 @@ def synthesise_room(
 
 
 def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
-    """Return room `index` of the collection `seed`, and the generator to continue with."""
+    """Return room `index` of the collection `seed`, and the random generator to continue with."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
     return make_room(rng), rng
 
@@ -101,7 +103,7 @@ def room_and_rng(seed: int, index: int) -> tuple[Room, np.random.Generator]:
 def render(
     scene: Room | SyntheticMesh | Caster, T_world_camera: Floats, intrinsics: Intrinsics = KINECT
 ) -> Floats32:
-    """Return ideal depth (H, W) float32, metres, 0 where a ray meets no surface."""
+    """Return ideal depth (H, W) float32, metres; 0 where a ray does not meet a surface."""
     return cast_depth(_caster(scene), T_world_camera, intrinsics)[0]
 
 
@@ -124,7 +126,7 @@ def _caster(scene: Room | SyntheticMesh | Caster) -> Caster:
 
 
 def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Generator) -> KinectNoise:
-    """Return a random variation of a sensor: factors of its errors, and a missing border."""
+    """Return a random variation of a sensor: its errors are scaled, and a border may be missing."""
     s = rng.uniform(0.8, 1.4)
     most = intrinsics.width // 18 if rng.random() < 0.4 else 0
     left, right, top, bottom = rng.integers(0, most + 1, 4).tolist()
@@ -138,7 +140,7 @@ def own_sensor(noise: KinectNoise, intrinsics: Intrinsics, rng: np.random.Genera
 #
 # seed, index  --synthesise_survey-->  Survey: clouds with poses
 
-LEAST_POINTS = 2000  #: minimum number of points of an independent scan, in at most _TRIES tries
+LEAST_POINTS = 2000  #: minimum number of points of an independent scan, unless _TRIES tries fail
 _TRIES = 5
 
 _MAKERS = {"hall": make_hall, "storey": make_storey, "block": make_block}
@@ -148,7 +150,7 @@ _ORDER = ("hall", "storey", "hall", "block", "storey")
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """The scans of one synthetic site.
+    """The scans of a synthetic site.
 
     Parameters
     ----------
@@ -168,20 +170,22 @@ def synthesise_survey(
     seed: int, index: int, views: int, *, along_path: bool = False, kind: str | None = None,
     sensor: Spinning | None = None, perfect: bool = False,
 ) -> Survey:  # fmt: skip
-    """Generate a site and scan it.
+    """Generate a site, and scan it.
 
     The result depends only on the arguments, so sites can be generated in any order and process.
-
-    Raise MissingDependency if Embree cannot be imported.
 
     Parameters
     ----------
     seed, index : seed of the collection, and index of the site in it
     views : number of scans
-    along_path : whether the scans follow a walk, 1.5 m apart; else they are independent
-    kind : "hall", "storey" or "block"; default: depends on the index
-    sensor : scanner; default: a random scanner for each site
+    along_path : whether the scans follow a walk, 1.5 m apart; otherwise they are independent
+    kind : "hall", "storey" or "block"; by default, the index selects it
+    sensor : scanner; by default, each site has a random scanner
     perfect : whether to disable errors and losses of the scanner
+
+    Raises
+    ------
+    MissingDependency : If Embree cannot be imported
     """
     premises, rng = premises_and_rng(seed, index, kind)
     drawn = own_scanner(rng)
@@ -203,6 +207,6 @@ def synthesise_survey(
 def premises_and_rng(
     seed: int, index: int, kind: str | None = None
 ) -> tuple[Premises, np.random.Generator]:
-    """Return site `index` of the collection `seed`, and the generator to continue with."""
+    """Return site `index` of the collection `seed`, and the random generator to continue with."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
     return _MAKERS[kind or _ORDER[index % len(_ORDER)]](rng), rng

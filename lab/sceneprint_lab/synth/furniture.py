@@ -1,8 +1,8 @@
-"""Pieces of furniture: meshes, footprints, and surfaces for small objects.
+"""Pieces of furniture: meshes, footprints, and surfaces on which small objects stand.
 
     Shelf, rng  --scatter-->  small objects on that surface
 
-A piece stands on z = 0 with its footprint centred on the origin. Its back, which faces a wall,
+A piece stands on z = 0, and its footprint is centred on the origin. Its back, which faces a wall,
 is at +y, and its front is at -y.
 """
 
@@ -43,7 +43,7 @@ Builder = Callable[[np.random.Generator], SyntheticMesh]
 
 
 def packet(rng: np.random.Generator) -> SyntheticMesh:
-    """Return a carton of any proportion, such as a cereal packet or a parcel."""
+    """Return a carton of random proportions, such as a cereal packet or a parcel."""
     return box(*rng.uniform((0.05, 0.04, 0.04), (0.3, 0.22, 0.3)))
 
 
@@ -193,7 +193,7 @@ def tray(rng: np.random.Generator) -> SyntheticMesh:
     return join([tapered_box((w * s, d * s), (w, d), h)] + ([handle] if rng.random() < 0.4 else []))
 
 
-#: Small objects for any surface, with weights.
+#: Small objects for any surface, and their weights.
 SMALL: tuple[tuple[Builder, float], ...] = (
     (packet, 4), (flat_thing, 4), (stack, 2), (mug, 3), (bottle, 2), (bowl, 1.5), (jar, 2),
     (ball, 1), (bag, 1), (basket, 1), (lamp, 0.5), (plant, 1), (tool, 2), (appliance, 0.7),
@@ -211,14 +211,14 @@ def small_thing(rng: np.random.Generator) -> SyntheticMesh:
 
 @dataclass(frozen=True)
 class Shelf:
-    """A horizontal rectangle that carries objects.
+    """A horizontal rectangle on which objects stand.
 
     Parameters
     ----------
     x, y : centre in the piece's frame, metres
     width, depth : extent along x and y, metres
     z : height, metres
-    headroom : free height above, metres
+    headroom : free height above it, metres
     density : objects per square metre
     """
 
@@ -239,8 +239,8 @@ class Piece:
     ----------
     mesh : mesh on z = 0, with its back towards +y
     width, depth : footprint along x and y, metres
-    surfaces : surfaces that carry objects
-    seats : 1 for a chair at the front; -n for n chairs at random sides; 0 for no chairs
+    surfaces : surfaces on which objects stand
+    seats : 1 for a chair at the front, -n for n chairs at random sides, 0 for no chairs
     """
 
     mesh: SyntheticMesh
@@ -251,11 +251,11 @@ class Piece:
 
 
 def scatter(surface: Shelf, rng: np.random.Generator) -> SyntheticMesh:
-    """Return small objects on a surface without overlaps; half of them are aligned with it."""
-    wanted = rng.poisson(surface.density * surface.width * surface.depth)
+    """Return small objects on a surface, without overlaps; half of them are aligned with it."""
+    count = rng.poisson(surface.density * surface.width * surface.depth)
     placed: list[tuple[float, float, float]] = []
     parts: list[SyntheticMesh] = []
-    for _ in range(min(wanted, 40)):
+    for _ in range(min(count, 40)):
         thing = small_thing(rng)
         low, high = thing.vertices.min(axis=0), thing.vertices.max(axis=0)
         reach = float(np.abs(np.concatenate([low[:2], high[:2]])).max())
@@ -407,7 +407,7 @@ def _pillow(w: float, d: float, h: float, soft: float) -> SyntheticMesh:
 
 
 def _leaning(mesh: SyntheticMesh, slope: float, at: tuple[float, float, float]) -> SyntheticMesh:
-    """Lean a mesh backwards (+y) about z = 0 by `slope` radians, then move it by `at`."""
+    """Tilt a mesh backwards (+y) by `slope` radians about z = 0, then move it by `at`."""
     return mesh.turned(rotation_x(-slope), at)
 
 
@@ -662,7 +662,7 @@ def stairs(rng: np.random.Generator) -> Piece:
 
 
 def _fronts(rng: np.random.Generator, w: float, h: float, z: float) -> SyntheticMesh:
-    """Return doors or drawers with handles in the plane y = 0, from the height `z` upwards."""
+    """Return doors or drawers, with handles, in the plane y = 0 from the height `z` upwards."""
     columns = max(1, round(w / rng.uniform(0.4, 0.7)))
     rows = int(rng.choice((1, 1, 2, 3, 4)))
     a, b, gap = w / columns, h / rows, 0.006
@@ -698,7 +698,7 @@ DOOR_TOP = 2.03  #: height of door openings, metres
 
 
 def with_openings(wall: Wall, rng: np.random.Generator, deepest: float) -> Wall:
-    """Return a wall with random doors, windows and niches of at most `deepest` metres depth."""
+    """Return a wall with random doors, windows and niches, at most `deepest` metres deep."""
     openings: list[Opening] = []
     u = rng.uniform(0.1, 0.8)
     while u < wall.length - 0.6:
@@ -722,7 +722,7 @@ def with_openings(wall: Wall, rng: np.random.Generator, deepest: float) -> Wall:
 
 
 def fittings(wall: Wall, top: Ceiling, rng: np.random.Generator) -> SyntheticMesh:
-    """Return the frames, radiators, curtains, pipes, pictures and boards of one wall."""
+    """Return the frames, radiators, curtains, pipes, pictures and boards of a wall."""
     parts = [m for o in wall.openings for m in _around(o, rng)]
     if rng.random() < 0.5:
         parts += _skirting(wall, rng.uniform(0.04, 0.12))
@@ -745,7 +745,7 @@ def fittings(wall: Wall, top: Ceiling, rng: np.random.Generator) -> SyntheticMes
 
 
 def overhead(outline: Floats, top: Ceiling, rng: np.random.Generator) -> SyntheticMesh:
-    """Return beams and lamps below the ceiling of a room with the outline (n, 2), metres."""
+    """Return beams and lamps below the ceiling of a room that has the outline (n, 2), metres."""
     parts: list[SyntheticMesh] = []
     low, high = outline.min(axis=0), outline.max(axis=0)
     middle, span = (low + high) / 2, high - low
@@ -816,7 +816,7 @@ def _around(o: Opening, rng: np.random.Generator) -> list[SyntheticMesh]:
 
 
 def _gaps(wall: Wall) -> list[tuple[float, float]]:
-    """Return (start, width) of each stretch between openings of more than 0.5 m, with margins."""
+    """Return (start, width) of each stretch of more than 0.5 m between openings, with margins."""
     edges = [0.0, *(u for o in wall.openings for u in (o.start, o.end)), wall.length]
     spans = zip(edges[::2], edges[1::2], strict=True)
     return [(a + 0.1, b - a - 0.2) for a, b in spans if b - a > 0.5]
@@ -857,12 +857,12 @@ def _skirting(wall: Wall, high: float) -> list[SyntheticMesh]:
 
 
 def wall_yaw(wall: Wall) -> float:
-    """Return the yaw, radians, that turns the back of a piece, +y, to a wall."""
+    """Return the yaw, radians, that turns the back of a piece (+y) towards a wall."""
     out = -wall.inward
     return math.atan2(out[1], out[0]) - math.pi / 2
 
 
-# Large objects of halls and streets, which a laser sees from tens of metres away.
+# Large objects in halls and streets, which a laser sees from tens of metres away.
 #
 # rng  --machine, rack, vehicle, tree, ...-->  Piece
 

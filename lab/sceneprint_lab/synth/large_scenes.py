@@ -68,7 +68,7 @@ from sceneprint_lab.synth.rooms import (
 )
 from sceneprint_lab.synth.sensors import Caster
 
-CELL = 0.2  #: edge of a cell of the floor's grid, metres
+CELL = 0.2  #: edge length of a cell of the floor's grid, metres
 CLEARANCE = 0.45  #: minimum distance of a scanner from objects, metres
 
 
@@ -80,7 +80,7 @@ class Premises:
     ----------
     kind : "hall", "storey" or "block"
     mesh : all surfaces
-    floor : the ground and its occupied cells
+    floor : the ground, and its occupied cells
     """
 
     kind: str
@@ -89,12 +89,12 @@ class Premises:
 
     @cached_property
     def caster(self) -> Caster:
-        """Ray caster of the mesh, built at the first use."""
+        """Return the ray caster of the mesh, which is built at the first use."""
         return Caster(self.mesh)
 
     @cached_property
     def walkable(self) -> NDArray[np.bool_]:
-        """Mask (nx, ny) of the largest connected area of the floor with CLEARANCE."""
+        """Return a mask (nx, ny) of the largest connected area of the floor that has CLEARANCE."""
         clear = ndimage.distance_transform_edt(np.pad(~self.floor.claimed, 1))[1:-1, 1:-1]
         parts, n = ndimage.label(clear * self.floor.cell >= CLEARANCE)
         if n == 0:
@@ -107,7 +107,7 @@ class Premises:
 #
 # rng  --make_hall-->  Premises
 
-#: Objects along the walls of a hall and free-standing objects, with weights.
+#: Objects along the walls of a hall, and free-standing objects, with weights.
 _KINDS: tuple[tuple[Menu, Menu], ...] = (
     ({machine: 3, rack: 2, pile: 2, tank: 1}, {machine: 5, tank: 1, pile: 2, cabin: 1, person: 1}),
     ({rack: 5, pile: 3, stairs: 1}, {rack: 5, pile: 3, vehicle: 1, person: 1}),
@@ -168,7 +168,7 @@ def hall_wall(wall: Wall, top: Ceiling, rng: np.random.Generator) -> Wall:
 
 
 def _columns(site: Site, outline: Floats) -> list[SyntheticMesh]:
-    """Return columns on a grid with gaps, and occupy their floor."""
+    """Return columns on a grid with gaps, and mark their floor area as occupied."""
     rng = site.rng
     if rng.random() < 0.2:
         return []
@@ -188,7 +188,7 @@ def _columns(site: Site, outline: Floats) -> list[SyntheticMesh]:
 
 
 def _girders(site: Site, outline: Floats) -> list[SyntheticMesh]:
-    """Return girders under the ceiling, with ducts and lamps below them."""
+    """Return girders under the ceiling, and ducts and lamps below them."""
     rng, height = site.rng, site.top.height
     low, high = outline.min(axis=0), outline.max(axis=0)
     size, middle = high - low, (low + high) / 2
@@ -228,7 +228,7 @@ def _gallery(wall: Wall, site: Site) -> list[SyntheticMesh]:
 
 
 def _pilasters(wall: Wall, site: Site) -> list[SyntheticMesh]:
-    """Return half columns along a wall between its openings."""
+    """Return half columns along a wall, between its openings."""
     rng = site.rng
     if rng.random() < 0.5:
         return []
@@ -294,7 +294,7 @@ def make_storey(rng: np.random.Generator) -> Premises:
 
 @contextmanager
 def _reserved(floor: Floor, place: PiecePose, width: float, depth: float) -> Iterator[None]:
-    """Occupy a rectangle of the floor until the context ends."""
+    """Mark a rectangle of the floor as occupied during the `with` block."""
     before = floor.claimed.copy()
     floor.take(place, width, depth)
     reserved = floor.claimed & ~before
@@ -309,9 +309,10 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:
 def _room(
     extent: tuple[float, float, float, float], side: float, site: Site
 ) -> list[SyntheticMesh]:
-    """Return walls, a door and furniture of a room.
+    """Return the walls, a door and the furniture of a room.
 
-    `extent` is (x0, x1, y0, y1), metres; `side` is the y of the wall to the corridor.
+    `extent` is (x0, x1, y0, y1), metres; `side` is the y coordinate of the wall towards the
+    corridor.
     """
     x0, x1, y0, y1 = extent
     rng, t = site.rng, float(site.rng.uniform(0.1, 0.3))
@@ -339,7 +340,7 @@ def _partition(
     a: tuple[float, float], b: tuple[float, float], thick: float,
     gaps: tuple[tuple[float, float], ...], site: Site,
 ) -> list[SyntheticMesh]:  # fmt: skip
-    """Return a wall from a to b up to the ceiling, with lintels over `gaps` (start, end)."""
+    """Return a wall from a to b, up to the ceiling, with lintels over `gaps` (start, end)."""
     length, yaw = math.dist(a, b), math.atan2(b[1] - a[1], b[0] - a[0])
     along, height = np.array([math.cos(yaw), math.sin(yaw)]), site.top.height
     parts, at = [], 0.0
@@ -400,7 +401,7 @@ def _ground(half: Floats, rng: np.random.Generator) -> SyntheticMesh:
 
 
 def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
-    """Return a building with recessed windows and doors, or [] if its place is occupied."""
+    """Return a building with recessed windows and doors, or [] if its place is already occupied."""
     rng = site.rng
     w, d, h = rng.uniform((6.0, 5.0, 3.0), (32.0, 16.0, 15.0))
     yaw = main + int(rng.integers(0, 2)) * math.pi / 2 + float(rng.normal(0, 0.02))
@@ -429,7 +430,7 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def facade(wall: Wall, h: float, rise: float, deep: float, rng: np.random.Generator) -> Wall:
-    """Return a wall with rows of windows, some of which are missing, and doors."""
+    """Return a wall with doors and with rows of windows, some of which are missing."""
     wide, gap = rng.uniform(0.8, 2.2), rng.uniform(0.6, 3.0)
     high, share = rng.uniform(1.0, 1.8), rng.uniform(0.3, 1.0)
     glass = float(rng.choice((0.3, 0.9)))
@@ -474,7 +475,7 @@ def _garden_wall(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
 
 
 def symmetric_box(side: float = 0.6, hall: float = 12.0) -> Room:
-    """Return a cube in the centre of an empty square hall, with the origin under it.
+    """Return a cube in the centre of an empty square hall; the origin is under the cube.
 
     The scene is symmetric under rotations of 90 degrees about z, so a view does not determine
     which side of the cube it shows.
@@ -495,7 +496,7 @@ def symmetric_hall(rng: np.random.Generator) -> Premises:
 
     The half with x > 0 is built like `make_hall`; the other half is a rotated copy.
     """
-    # The sides are multiples of a cell, reduced by more than the rounding errors.
+    # The sides are multiples of a cell, reduced by more than rounding errors can be.
     a, b = (CELL * np.round(rng.uniform((8.0, 5.0), (20.0, 13.0)) / CELL) - 1e-9).tolist()
     outline = _rectangle(-a, a, -b, b)
     top = Ceiling(float(rng.uniform(3.5, 10.0)), np.zeros(2))
@@ -526,14 +527,18 @@ def symmetric_hall(rng: np.random.Generator) -> Premises:
 def corridor(doors: int, pitch: float = 2.0, width: float = 1.8, height: float = 2.5) -> Room:
     """Return a corridor along +x with identical doors in both long walls.
 
-    Views at a distance of one pitch look the same; only the ends determine the position. A wide
-    and high corridor is a hall of equal bays. Raise ValueError without doors.
+    Views that are one pitch apart look the same; only the ends reveal the position. A wide and high
+    corridor is a hall of equal bays.
 
     Parameters
     ----------
     doors : number of doors in each wall, at least 1
     pitch : distance between doors, metres
     width, height : metres
+
+    Raises
+    ------
+    ValueError : If there are no doors
     """
     if doors < 1:
         raise ValueError(f"A corridor of {doors} doors cannot be built; pass at least 1.")

@@ -83,12 +83,12 @@ from sceneprint_lab.synth.sensors import Caster, Rosette, Scanner, own_rosette, 
 from sceneprint_lab.synth.trajectories import scanner_pose, walk
 
 SURVEYED_KINDS = ("bays", "streets", "halls", "unmapped", "absent", "sites")
-#: Number of scans of a map before some are removed.
+#: Number of scans of a map, before some are removed.
 MAP_SCANS = 30
 
 
 class Stop(NamedTuple):
-    """Location of a scan.
+    """The location of a scan.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ class Stop(NamedTuple):
 
 
 class SurveyPlan(NamedTuple):
-    """Locations of a site's scans; those of the map are in the order of a walk."""
+    """The locations of a site's scans; those of the map are in the order of a walk."""
 
     map: list[Stop]
     queries: list[Stop]
@@ -119,13 +119,10 @@ class SurveyPlan(NamedTuple):
 def synthesise_lookalike_survey(
     kind: str, seed: int, index: int, *, queries: int = 12, perfect: bool = False
 ) -> LookalikeSite[Cloud]:
-    """Generate an ambiguous site and scan it.
+    """Generate an ambiguous site, and scan it.
 
     The result depends only on the arguments. If the poses of the map drift, the pose of a query
-    has the drift of the nearest scan of the map.
-
-    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
-    exist.
+    drifts like that of the nearest scan of the map.
 
     Parameters
     ----------
@@ -133,6 +130,11 @@ def synthesise_lookalike_survey(
     seed, index : seed of the collection, and index of the site among those of its kind
     queries : number of queries
     perfect : whether to disable errors and losses of the scanner, and drift
+
+    Raises
+    ------
+    MissingDependency : If Embree cannot be imported
+    ValueError : If the kind does not exist
     """
     if kind not in SURVEYED_KINDS:
         kinds = ", ".join(SURVEYED_KINDS)
@@ -168,7 +170,7 @@ def synthesise_lookalike_survey(
 
 
 def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
-    """Remove a stretch of a sixth of the stops, and one in ten of the others."""
+    """Remove a sixth of the stops, in one stretch, and one in ten of the others."""
     gap = len(stops) // 6
     start = int(rng.integers(1, len(stops) - gap))
     return [
@@ -179,10 +181,10 @@ def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
 
 
 def with_drift(poses: Floats, rng: np.random.Generator) -> Floats:
-    """Return the poses (n, 4, 4) of a walk with the drift of odometry.
+    """Return the poses (n, 4, 4) of a walk with a drift like that of odometry.
 
-    The first pose is exact. Each step has a random error, with a standard deviation of 1 to 5 cm
-    and .02 to .1 degrees that is constant during the walk.
+    The first pose is exact. Each step has a random error, whose standard deviation, 1 to 5 cm and
+    .02 to .1 degrees, is constant during the walk.
     """
     metres, radians = rng.uniform(0.01, 0.05), math.radians(rng.uniform(0.02, 0.1))
     drifted = [poses[0]]
@@ -196,21 +198,21 @@ def with_drift(poses: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _drifted_pose(T: Floats, true: Floats, recorded: Floats) -> Floats:
-    """Return a true pose with the drift of the nearest scan of the recorded map."""
+    """Return a true pose with the drift of the map's nearest scan."""
     nearest = int(np.linalg.norm(true[:, :3, 3] - T[:3, 3], axis=1).argmin())
     placed: Floats = recorded[nearest] @ inverse(true[nearest]) @ T
     return placed
 
 
 def distinct_fraction(here: Stop, other: Premises, T: Floats, sensor: Scanner) -> float:
-    """Return the share of a scan that differs from a scan at a pose in another place.
+    """Return the share of a scan's ranges that differ from those of a scan in another place.
 
     About a thousand rays within 40 m are compared; ranges differ if they are 30 cm + 2 % apart.
 
     Parameters
     ----------
     here : location of the scan
-    other, T : the other place, and the pose (4, 4) in it
+    other, T : the other place, and the pose (4, 4) of its scan
     sensor : scanner
     """
     rays = sensor.rays(np.random.default_rng(0))
@@ -229,12 +231,12 @@ def _most_different(
     stops: Sequence[Stop], rivals: Callable[[Stop], list[tuple[Premises, Floats]]], n: int,
     sensor: Scanner,
 ) -> tuple[list[Stop], float]:  # fmt: skip
-    """Return n stops that differ from all rivals by DISTINCT_SHARE, or else those that differ most.
+    """Return n stops that differ from all rivals by DISTINCT_SHARE, or those that differ most.
 
     Returns
     -------
     stops : n stops
-    least : minimum share of their scans that differs from a rival
+    least : smallest share by which one of them differs from a rival
     """
     shares = [
         min(distinct_fraction(stop, *rival, sensor) for rival in rivals(stop)) for stop in stops
@@ -263,16 +265,16 @@ _LOOSE = (vehicle, pile, person)
 
 @dataclass(frozen=True, eq=False)
 class Unit:
-    """A unit for repetition along +x, with a clear path along y = 0.
+    """A unit that is repeated along +x, with a clear path along y = 0.
 
     Parameters
     ----------
     kind : "hall" or "block", as in Premises
     pitch : length of a copy along x, metres
     half_way : half the width of the path, metres
-    built : surfaces that all copies share, with x from 0 to pitch
-    things : objects of a copy
-    around : function that returns floor and outer walls for a number of copies
+    built : surfaces that all copies share; x is from 0 to `pitch`
+    things : objects that each copy has, with differences
+    around : function that returns the floor and the outer walls for a number of copies
     """
 
     kind: str
@@ -301,7 +303,7 @@ def bay(rng: np.random.Generator) -> Unit:
     things = [
         piece for outline in sides for piece in stand_about(menu, Floor(outline, CELL), rng, 12)
     ]
-    # Openings of the four outer walls, in the order of `walls_of`; those of long walls repeat.
+    # Openings of the four outer walls, in the order of `walls_of`; those of the long walls repeat.
     with_openings = [
         hall_wall(Wall(np.zeros(2), np.array([1.0, 0.0]), length), top, rng).openings
         for length in (pitch, 2 * half, pitch, 2 * half)
@@ -377,7 +379,7 @@ def stand_about(
 
 
 def row_of(unit: Unit, count: int, likeness: Likeness, rng: np.random.Generator) -> Premises:
-    """Return `count` copies of a unit along +x from the origin; the path is the walkable floor."""
+    """Return `count` copies of a unit along +x from the origin; their path is walkable floor."""
     parts = [unit.around(count)]
     for k in range(count):
         things = furnish(unit.things, 0, likeness, rng)
@@ -387,7 +389,7 @@ def row_of(unit: Unit, count: int, likeness: Likeness, rng: np.random.Generator)
 
 
 def _repeated(openings: Sequence[Opening], pitch: float, copies: range) -> tuple[Opening, ...]:
-    """Return the openings, shifted by a multiple of the pitch for each copy."""
+    """Return the openings of all copies, shifted by multiples of the pitch."""
     return tuple(
         replace(o, start=o.start + k * pitch, end=o.end + k * pitch)
         for k in copies
@@ -400,7 +402,7 @@ def _rectangle(x0: float, x1: float, y0: float, y1: float) -> Floats:
 
 
 def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
-    """Return a rectangle (4, 2) on one side of the x axis, from `near` to `far` away from it."""
+    """Return a rectangle (4, 2) on one side of the x axis, from `near` to `far` off the axis."""
     return _rectangle(x0, x1, *sorted((side * near, side * far)))
 
 
@@ -410,20 +412,20 @@ def _strip(x0: float, x1: float, side: int, near: float, far: float) -> Floats:
 
 
 def _likeness(rng: np.random.Generator) -> Likeness:
-    """Return random differences between copies: shifts of centimetres, and missing objects."""
+    """Return random parameters of differences: shifts of centimetres, and missing objects."""
     shift, missing = rng.uniform((0.0, 0.0), (0.1, 0.2)).tolist()
     return Likeness(shift, 0.02, float(rng.uniform(0.1, 0.6)), missing=missing)
 
 
 class _Carrier:
-    """Generator of poses of a scanner along a row, with a constant height and mounting."""
+    """Generates poses of a scanner along a row, with constant height and mounting."""
 
     def __init__(self, unit: Unit, count: int, sensor: Scanner, rng: np.random.Generator) -> None:
         self.length, self.rng = unit.pitch * count, rng
         self.reach = unit.half_way - 0.5  # distance from the centre line of the path
         self.height = float(rng.uniform(0.5, 1.9))
         self.sees_back = not isinstance(sensor, Rosette)
-        # A scanner with a full view may have any heading; a Rosette looks ahead.
+        # A scanner that sees all around may have any heading; a Rosette looks ahead.
         self.mounted = float(
             rng.uniform(-math.pi, math.pi) if self.sees_back else rng.normal(0, 0.3)
         )
@@ -440,7 +442,7 @@ class _Carrier:
         ]
 
     def anywhere(self, n: int) -> list[Floats]:
-        """Return n poses anywhere on the path; some scanners with a full view face back."""
+        """Return n poses anywhere on the path; some scanners that see all around face backwards."""
         rng = self.rng
         x = rng.uniform(1.5, self.length - 1.5, n)
         y = rng.uniform(-self.reach, self.reach, n)
@@ -474,14 +476,14 @@ def _streets(rng: np.random.Generator, index: int, queries: int, sensor: Scanner
 
 
 def _is_second_variant(index: int) -> bool:
-    """Return whether a site is of the second variant of its kind."""
+    """Return whether a site has the second variant of its kind."""
     return index % 4 in (1, 2)
 
 
 def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
-    """Map all but one of several similar rows of street blocks or bays; query the last row.
+    """Map all but the last of several similar rows of street blocks or bays; query the last row.
 
-    The queries are selected from three times as many stops; see `_most_different`.
+    Queries are selected from three times as many stops; see `_most_different`.
     """
     street = _is_second_variant(index)
     unit = block(rng) if street else bay(rng)
@@ -511,7 +513,7 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
 
 
 def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
-    """Map a hall with one to three details, or one half with enough details to distinguish it."""
+    """Map a hall with one to three details, or one half of a hall whose details distinguish it."""
     hall = _with_details(symmetric_hall(rng), rng)
     if not _is_second_variant(index):
         return _plan_walk(hall, rng, queries)
@@ -534,10 +536,10 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
-    """Add up to three objects to a hall, and occupy their places in both halves."""
+    """Add up to three objects to a hall, and mark their places as occupied in both halves."""
     menu: Menu = {pile: 2, person: 1, cabin: 2, screen: 2, tank: 1, machine: 1}
     things = furnish(stand_about(menu, hall.floor, rng, 3), 0, Likeness(), rng)
-    # A walkable place must remain walkable after half a turn.
+    # A walkable place must also be walkable after half a turn.
     hall.floor.claimed[:] |= hall.floor.claimed[::-1, ::-1]
     return Premises("hall", join([hall.mesh, things]), hall.floor)
 

@@ -65,21 +65,21 @@ from sceneprint_lab.synth.sensors import KINECT_V1, KinectNoise
 from sceneprint_lab.synth.trajectories import orbit, scattered_poses
 
 KINDS = ("object", "offices", "unmapped", "kitchens", "opposite", "absent")
-#: Kinds without similar places.
+#: Kinds of sites without similar places.
 ORDINARY = ("rooms",)
-#: Kinds whose maps do not contain the place of the query.
+#: Kinds of sites whose maps do not contain the places of the queries.
 ELSEWHERE = ("unmapped", "kitchens", "absent")
 #: Kinds of ELSEWHERE whose queries have their own parent frame.
 APART = ("kitchens", "absent")
 
 
-#: DepthFrame or Cloud.
+#: Type of the frames of a site: DepthFrame or Cloud.
 F_co = TypeVar("F_co", bound=AnyFrame, covariant=True)
 
 
 @dataclass(frozen=True, eq=False)
 class LookalikeSite(Generic[F_co]):
-    """A map with ambiguous queries.
+    """A map, and queries that are ambiguous.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class LookalikeSite(Generic[F_co]):
 
 @dataclass(frozen=True, eq=False)
 class FramePlan:
-    """Scenes and poses of a site's frames, and the offset of each scene in the world."""
+    """The scenes and poses of a site's frames, and the offset of each scene in the world."""
 
     map: Sequence[tuple[Room, Floats]]
     queries: Sequence[tuple[Room, Floats]]
@@ -117,12 +117,9 @@ def synthesise_lookalike(
     kind: str, seed: int, index: int, *, queries: int = 12, noise: KinectNoise | None = KINECT_V1,
     intrinsics: Intrinsics = KINECT,
 ) -> LookalikeSite[DepthFrame]:  # fmt: skip
-    """Generate an ambiguous site and render depth frames of it.
+    """Generate an ambiguous site, and render depth frames of it.
 
     The result depends only on the arguments.
-
-    Raise MissingDependency if Embree cannot be imported. Raise ValueError if the kind does not
-    exist.
 
     Parameters
     ----------
@@ -131,6 +128,11 @@ def synthesise_lookalike(
     queries : number of queries
     noise : sensor noise; None for ideal depth
     intrinsics : camera
+
+    Raises
+    ------
+    MissingDependency : If Embree cannot be imported
+    ValueError : If the kind does not exist
     """
     kinds = KINDS + ORDINARY
     if kind not in kinds:
@@ -173,7 +175,7 @@ def worse_sensor(sensor: KinectNoise, rng: np.random.Generator) -> KinectNoise:
     )  # fmt: skip
 
 
-# Objects that are symmetric except for details.
+# Objects that are symmetric apart from details.
 #
 # rng  --symmetric_object-->  SymmetricObject
 
@@ -195,12 +197,12 @@ class SymmetricObject:
 
     @property
     def mesh(self) -> SyntheticMesh:
-        """Body and details as a single mesh."""
+        """Return body and details as a single mesh."""
         return join([self.body, self.details])
 
 
 def cabinet(rng: np.random.Generator) -> SymmetricObject:
-    """Return a cabinet with the same doors on both long sides, and details on one side.
+    """Return a cabinet that has the same doors on both long sides, and details on one side.
 
     It stands on a plinth or on legs; 70 % of the cabinets have a narrower upper part.
     """
@@ -266,10 +268,10 @@ def double_sofa(rng: np.random.Generator) -> SymmetricObject:
     parts.append(ellipsoid((w / 2, 0.1, (h + rise) / 2), soft, 20))
     parts += [box(arm, d, h + 0.15, (a * (w - arm) / 2, 0, 0)) for a in (-1, 1)]
     at = (rng.uniform(-0.3, 0.3) * w, -0.55 * d / 2, h + 0.03)
-    left = box(rng.uniform(0.2, 0.5), rng.uniform(0.2, 0.35), rng.uniform(0.01, 0.03))
+    blanket = box(rng.uniform(0.2, 0.5), rng.uniform(0.2, 0.35), rng.uniform(0.01, 0.03))
     if rng.random() < 0.25:
-        left = blob(rng, rng.uniform((0.14, 0.1, 0.04), (0.2, 0.16, 0.08)), 0.05)
-    return SymmetricObject(join(parts), left.moved(at, rng.normal(0, 0.2)), 2)
+        blanket = blob(rng, rng.uniform((0.14, 0.1, 0.04), (0.2, 0.16, 0.08)), 0.05)
+    return SymmetricObject(join(parts), blanket.moved(at, rng.normal(0, 0.2)), 2)
 
 
 def small_flat(rng: np.random.Generator) -> SyntheticMesh:
@@ -313,7 +315,7 @@ def symmetric_object(rng: np.random.Generator) -> SymmetricObject:
 
 
 def bare_floor(thing: SyntheticMesh, rng: np.random.Generator, half: float = 8.0) -> Room:
-    """Return an object in the middle of an empty floor that loses up to 20 % of samples."""
+    """Return an object in the middle of an empty floor; the floor loses up to 20 % of samples."""
     outline = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     floor = mesh_of(np.c_[outline, np.zeros(4)], [(0, 1, 2), (0, 2, 3)])
     mesh = join([floor.with_loss(float(rng.uniform(0.0, 0.2))), thing])
@@ -334,7 +336,7 @@ def _circled_object(rng: np.random.Generator, index: int, queries: int) -> Frame
 def _every_fourth(
     room: Room, poses: Sequence[Floats], queries: int, rng: np.random.Generator
 ) -> FramePlan:
-    """Use every fourth pose for the map, and `queries` of the other poses as queries."""
+    """Use every fourth pose for the map, and `queries` of the others for queries."""
     others = [k for k in range(len(poses)) if k % 4]
     chosen = sorted(rng.choice(others, min(queries, len(others)), replace=False).tolist())
     return FramePlan([(room, T) for T in poses[::4]], [(room, poses[k]) for k in chosen])
@@ -347,7 +349,7 @@ def _every_fourth(
 
 @dataclass(frozen=True, eq=False)
 class PlacedPiece:
-    """A piece at a place; `loose` pieces are at different places in each copy of a room."""
+    """A piece at a place; a `loose` piece is at a different place in each copy of a room."""
 
     piece: Piece
     place: PiecePose
@@ -356,7 +358,7 @@ class PlacedPiece:
 
 @dataclass(frozen=True)
 class Likeness:
-    """Parameters of the differences between copies of a room.
+    """Parameters of the differences between the copies of a room.
 
     Parameters
     ----------
@@ -382,7 +384,7 @@ def arrange(
     walls: Sequence[Wall], floor: Floor, pieces: Sequence[Piece], middle: Piece | None,
     rng: np.random.Generator,
 ) -> list[PlacedPiece]:  # fmt: skip
-    """Place pieces side by side along walls, `middle` in the centre, and chairs and boxes.
+    """Place pieces side by side along walls, `middle` in the centre, and chairs and boxes anywhere.
 
     The walls are those of a counter-clockwise rectangle. Pieces that do not fit are omitted.
     """
@@ -424,12 +426,12 @@ def _loose(piece: Piece, at: Floats, yaw: float, floor: Floor) -> list[PlacedPie
 def furnish(
     placed: Sequence[PlacedPiece], seed: int, likeness: Likeness, rng: np.random.Generator
 ) -> SyntheticMesh:
-    """Return the slightly displaced pieces of a copy, with objects on them.
+    """Return the pieces of a copy, slightly displaced and with objects on them.
 
     Parameters
     ----------
     placed : arrangement that all copies share
-    seed : seed of the objects that copies share
+    seed : seed of the objects that the copies share
     likeness : differences between copies
     rng : generator of this copy
     """
@@ -449,12 +451,12 @@ def furnish(
 
 
 def rectangle(width: float, depth: float) -> Floats:
-    """Return the corners (4, 2) of a room from the origin, counter-clockwise, metres."""
+    """Return the corners (4, 2) of a room, from the origin, counter-clockwise, metres."""
     return np.array([(0, 0), (width, 0), (width, depth), (0, depth)], float)
 
 
 def _shell(outline: Floats, rng: np.random.Generator, height: float) -> tuple[SyntheticMesh, ...]:
-    """Return the shell of a room, the objects on its ceiling and the fittings of each wall."""
+    """Return the shell of a room, the objects on its ceiling, and the fittings of its walls."""
     top = Ceiling(height, np.zeros(2))
     walls = [with_openings(wall, rng, 0.3) for wall in walls_of(outline)]
     fitted = [fittings(wall, top, rng) for wall in walls]
@@ -462,7 +464,7 @@ def _shell(outline: Floats, rng: np.random.Generator, height: float) -> tuple[Sy
 
 
 def equal_offices(count: int, likeness: Likeness, rng: np.random.Generator) -> list[Room]:
-    """Return rooms with the same plan and furniture and the differences of `likeness`."""
+    """Return rooms with the same plan and furniture, apart from the differences of `likeness`."""
     outline, height = rectangle(*rng.uniform((3.2, 3.6), (4.8, 5.2))), float(rng.uniform(2.4, 3.0))
     built = _shell(outline, rng, height)
     makers = [_OFFICE[k] for k in rng.permutation(len(_OFFICE))]
@@ -492,7 +494,7 @@ def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tupl
 
 
 def _row(rng: np.random.Generator, index: int, queries: int) -> FramePlan:
-    """Map and query all rooms of a row or, for odd indices, all bays of a hall."""
+    """Map and query all rooms of a row or, if the index is odd, all bays of a hall."""
     likeness = Likeness(float(rng.uniform(0.0, 0.03)), float(rng.uniform(0.0, 0.02)))
     if index % 2:
         hall, _ = equal_bays(int(rng.integers(4, 7)), likeness, rng)
@@ -505,7 +507,7 @@ def _row(rng: np.random.Generator, index: int, queries: int) -> FramePlan:
 
 
 def _offsets(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
-    """Return a function for the offset (3,) of each room: side by side, with walls of 0.2 m."""
+    """Return a function that gives the offset (3,) of each room; rooms are 0.2 m apart."""
 
     def shift(room: Room) -> Floats:
         k = next(i for i, other in enumerate(rooms) if other is room)
@@ -514,7 +516,7 @@ def _offsets(rooms: Sequence[Room]) -> Callable[[Room], Floats]:
     return shift
 
 
-#: Views are distinct if at least this share of their pixels is within the range REACH_M and differs
+#: Two views are distinct if at least this share of pixels is within the range REACH_M and differs
 #: by more than DISTINCT_M, metres.
 DISTINCT_SHARE, DISTINCT_M, REACH_M = 0.10, 0.10, 3.5
 _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
@@ -523,9 +525,9 @@ _COARSE = Intrinsics(64, 48, 58.5, 58.5, 31.5, 23.5)
 def difference_share(
     a: Room, b: Room, T_room_camera: Floats, T_other: Floats | None = None
 ) -> float:
-    """Return the share of a view in room `a` that differs from a view in room `b`.
+    """Return the share of a view of room `a` that differs from a view of room `b`.
 
-    The view in `b` has the pose `T_other`; default: the same pose.
+    The view of `b` has the pose `T_other`, by default the same pose.
     """
     here = render(a, T_room_camera, _COARSE)
     there = render(b, T_room_camera if T_other is None else T_other, _COARSE)
@@ -538,8 +540,8 @@ def difference_share(
 def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
     """Map all rooms of a row except the last, and query the last.
 
-    The queries differ from views of the mapped rooms by DISTINCT_SHARE, because no method can
-    distinguish an equal room from a mapped room with a moved chair.
+    Queries differ from views of the mapped rooms by DISTINCT_SHARE, because no method can tell an
+    equal room from a mapped room in which a chair was moved.
     """
     likeness = Likeness(float(rng.uniform(0.02, 0.08)), float(rng.uniform(0.0, 0.04)), 0.3, 0.5)
     rooms = equal_offices(int(rng.integers(2, 4)), likeness, rng)
@@ -565,7 +567,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Frame
     likeness = Likeness(float(rng.uniform(0.03, 0.1)), float(rng.uniform(0.01, 0.05)), 0.3, 0.0)
     placed = arrange(walls_of(rectangle(*small)), Floor(rectangle(*small)), pieces, middle, rng)
     rooms = []
-    for k in range(2):  # the second kitchen is larger, so its far walls are elsewhere
+    for k in range(2):  # the second kitchen is larger, so its far walls are at other places
         outline, height = rectangle(*(small + k * rng.uniform(0.3, 1.5, 2))), rng.uniform(2.4, 3.0)
         mesh = join([*_shell(outline, rng, float(height)), furnish(placed, 0, likeness, rng)])
         rooms.append(Room(mesh, outline, Ceiling(float(height), np.zeros(2))))
@@ -575,7 +577,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Frame
 
 
 def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Map one side of two equal pieces back to back, with different objects; query the other."""
+    """Map one of two equal pieces, back to back, with different objects; query the other."""
     make = (desk, shelf, counter, table, cupboard)[int(rng.integers(0, 5))]
     piece = make(rng)
     w, d = piece.width, piece.depth
@@ -599,8 +601,8 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Frame
     radius = float(rng.uniform(1.5, 2.0)) if w < 1.6 else float(rng.uniform(1.8, 2.2))
     middle = (0.0, 0.0, 0.5 * min(float(piece.mesh.vertices[:, 2].max()), 1.2))
     sweep = math.radians(140)
-    seen = orbit(middle, radius, 20, rng, first=-math.pi / 2 - sweep / 2, sweep=sweep)
-    # Use only views in which the two sides differ, because others have no correct answer.
+    mapped = orbit(middle, radius, 20, rng, first=-math.pi / 2 - sweep / 2, sweep=sweep)
+    # Use only views in which the two sides differ, because other views have no correct answer.
     views = orbit(middle, radius, 6 * queries, rng, first=math.pi / 2 - sweep / 2, sweep=sweep)
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     differences = [difference_share(room, room, T, half_turn @ T) for T in views]
@@ -608,7 +610,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Frame
     if len(fair) < queries:
         fair = sorted(range(len(views)), key=lambda i: -differences[i])[:queries]
     query_poses = [views[i] for i in sorted(rng.permutation(fair)[:queries].tolist())]
-    return FramePlan([(room, T) for T in seen], [(room, T) for T in query_poses])
+    return FramePlan([(room, T) for T in mapped], [(room, T) for T in query_poses])
 
 
 def _absent_places(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
@@ -652,7 +654,7 @@ def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> Frame
 
 
 def with_things(room: Room, count: int, rng: np.random.Generator) -> Room:
-    """Return a room with `count` more chairs, boxes and similar objects on its floor."""
+    """Return a room with `count` additional chairs, boxes and similar objects on its floor."""
     low, high = room.outline.min(axis=0), room.outline.max(axis=0)
     things = []
     for _ in range(count):

@@ -1,9 +1,9 @@
-"""Meshes of closed solids for furniture, and of empty rooms.
+"""Meshes of closed solids, for furniture, and of empty rooms.
 
 a few lengths (metres)  --box, cylinder, cone, revolve, ...-->  SyntheticMesh, outward normals
 rng  --floor_plan-->  outline (n, 2)  --walls_of, shell-->  SyntheticMesh, inward normals
 
-Every solid rests on z = 0 around the z axis. A shell has walls with openings and a ceiling; its
+Every solid stands on z = 0 around the z axis. A shell has walls with openings and a ceiling; its
 normals face inward.
 """
 
@@ -27,7 +27,7 @@ class SyntheticMesh:
     ----------
     vertices : (V, 3) float64, metres, z up
     faces : (F, 3) int32, indices into vertices, counter-clockwise from outside
-    loss : (F,) float32, share of samples on each face that a depth camera loses, [0, 1]; positive
+    loss : (F,) float32, share of samples that a depth camera loses on each face, [0, 1]; positive
         for dark, shiny or transparent surfaces
     """
 
@@ -36,11 +36,11 @@ class SyntheticMesh:
     loss: Floats32
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), yaw: float = 0.0) -> SyntheticMesh:
-        """Return the mesh, rotated about z by yaw, radians, then shifted by offset (3,), metres."""
+        """Return the mesh rotated about z by `yaw` radians, then moved by `offset` (3,), metres."""
         return self.turned(rotation_z(yaw), offset) if yaw else self._shifted(offset)
 
     def turned(self, rotation: Floats, offset: ArrayLike = (0.0, 0.0, 0.0)) -> SyntheticMesh:
-        """Return the mesh transformed by rotation @ x + offset, (3, 3) and (3,) metres."""
+        """Return the mesh transformed by rotation (3, 3) @ x + offset (3,), metres."""
         return replace(self, vertices=self.vertices @ rotation.T + np.asarray(offset, float))
 
     def with_loss(self, share: float) -> SyntheticMesh:
@@ -52,7 +52,7 @@ class SyntheticMesh:
 
 
 def mesh_of(vertices: ArrayLike, faces: ArrayLike) -> SyntheticMesh:
-    """Return a mesh without loss and without degenerate faces."""
+    """Return a mesh of these faces, except degenerate ones, without loss."""
     v = np.asarray(vertices, np.float64).reshape(-1, 3)
     f: NDArray[np.int32] = np.asarray(faces, np.int32).reshape(-1, 3)
     a, b, c = v[f[:, 0]], v[f[:, 1]], v[f[:, 2]]
@@ -70,7 +70,7 @@ def mesh_of(vertices: ArrayLike, faces: ArrayLike) -> SyntheticMesh:
 
 
 def join(meshes: Iterable[SyntheticMesh]) -> SyntheticMesh:
-    """Return all meshes as a single mesh, which is empty for an empty iterable."""
+    """Return all meshes as a single mesh, which is empty if there are none."""
     parts = list(meshes)
     if not parts:
         return SyntheticMesh(np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.float32))
@@ -95,7 +95,7 @@ def rotation_x(angle: float) -> Floats:
 
 
 def face_normals(mesh: SyntheticMesh) -> Floats:
-    """Return the normals (F, 3) of the faces; their length is twice the area of the face, m^2."""
+    """Return the normals (F, 3) of the faces; the length of each is twice the face's area, m^2."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
     return np.asarray(np.cross(b - a, c - a))
 
@@ -106,7 +106,7 @@ def area(mesh: SyntheticMesh) -> float:
 
 
 def volume(mesh: SyntheticMesh) -> float:
-    """Return the enclosed volume, m^3; negative for normals that face inward."""
+    """Return the enclosed volume, m^3; it is negative if normals face inward."""
     return float((mesh.vertices[mesh.faces[:, 0]] * face_normals(mesh)).sum() / 6)
 
 
@@ -131,7 +131,7 @@ def box(
 def tapered_box(
     bottom: tuple[float, float], top: tuple[float, float], height: float
 ) -> SyntheticMesh:
-    """Return a box whose base and top have different (width, depth)."""
+    """Return a box whose `bottom` and `top` have different extents (width, depth)."""
     scale = np.where(_CORNERS[:, 2:] > 0.5, np.array(top), np.array(bottom))
     xy = _CORNERS[:, :2] * scale
     return mesh_of(np.column_stack([xy, _CORNERS[:, 2] * height]), _BOX_FACES)
@@ -163,12 +163,12 @@ def cylinder(radius: float, height: float, segments: int = 16) -> SyntheticMesh:
 
 
 def cone(lower: float, upper: float, height: float, segments: int = 16) -> SyntheticMesh:
-    """Return a truncated cone from the radius `lower` to `upper`; a radius of 0 is a tip."""
+    """Return a truncated cone with the radii `lower` and `upper`; a radius of 0 makes a tip."""
     return revolve([(lower, 0.0), (upper, height)], segments)
 
 
 def ellipsoid(radii: ArrayLike, power: float = 1.0, segments: int = 16) -> SyntheticMesh:
-    """Return a superellipsoid on z = 0: an ellipsoid for `power` 1, almost a box near 0."""
+    """Return a superellipsoid on z = 0: with `power` 1 an ellipsoid, near 0 almost a box."""
     directions = _sphere(segments)
     shaped = np.sign(directions) * np.abs(directions) ** power
     # Scale each direction to the level set |x|^(2/power) + ... = 1.
@@ -242,12 +242,12 @@ def tube(points: Sequence[ArrayLike], radius: float, segments: int = 8) -> Synth
 def triangulate(outline: Floats) -> Ints32:
     """Return triangles (n - 2, 3) of a counter-clockwise polygon (n, 2), by ear clipping."""
     p = np.asarray(outline, float)
-    left = list(range(len(p)))
+    remaining = list(range(len(p)))
     triangles = []
-    while len(left) > 3:
-        for k in range(len(left)):
-            a, b, c = left[k - 1], left[k], left[(k + 1) % len(left)]
-            others = [i for i in left if i not in (a, b, c)]
+    while len(remaining) > 3:
+        for k in range(len(remaining)):
+            a, b, c = remaining[k - 1], remaining[k], remaining[(k + 1) % len(remaining)]
+            others = [i for i in remaining if i not in (a, b, c)]
             if _turn(p[a], p[b], p[c]) > 1e-12 and not any(
                 min(_turn(p[a], p[b], p[i]), _turn(p[b], p[c], p[i]), _turn(p[c], p[a], p[i])) >= 0
                 for i in others
@@ -255,9 +255,9 @@ def triangulate(outline: Floats) -> Ints32:
                 break
         else:  # all remaining corners lie on straight edges
             k = 1
-        triangles.append((left[k - 1], left[k], left[(k + 1) % len(left)]))
-        del left[k]
-    return np.array([*triangles, tuple(left)], np.int32)
+        triangles.append((remaining[k - 1], remaining[k], remaining[(k + 1) % len(remaining)]))
+        del remaining[k]
+    return np.array([*triangles, tuple(remaining)], np.int32)
 
 
 def _turn(a: Floats, b: Floats, c: Floats) -> float:
@@ -298,14 +298,14 @@ def _on_sphere(points: Floats, segments: int) -> SyntheticMesh:
 
 @dataclass(frozen=True)
 class Opening:
-    """A recess in a wall: a door, a window or a niche.
+    """A recess in a wall, such as a door, a window or a niche.
 
     Parameters
     ----------
     start, end : positions along the wall from its first corner, metres
     low, high : heights, metres
     deep : depth behind the wall's plane, metres
-    loss : fraction of samples that a camera loses on its back plane (glass), [0, 1]
+    loss : share of samples that a camera loses on the back plane (glass), [0, 1]
     """
 
     start: float
@@ -318,7 +318,7 @@ class Opening:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A straight wall as seen from inside the room.
+    """A straight wall, as seen from inside the room.
 
     Parameters
     ----------
@@ -339,7 +339,7 @@ class Wall:
         return np.array([-self.along[1], self.along[0]])
 
     def at(self, distance: float, out: float = 0.0) -> Floats:
-        """Return the floor point (2,) at a distance along the wall and `out` into the room."""
+        """Return the floor point (2,) at `distance` along the wall and `out` into the room."""
         return np.asarray(self.corner + distance * self.along + out * self.inward)
 
 
@@ -356,7 +356,7 @@ class Ceiling:
 
 
 def floor_plan(rng: np.random.Generator) -> Floats:
-    """Return a random counter-clockwise outline (n, 2): a rectangle, L, alcove or cut corner."""
+    """Return a random outline (n, 2): a rectangle, an L, or one with an alcove or a cut corner."""
     w, d = rng.uniform(2.6, 8.0), rng.uniform(2.5, 6.5)
     kind = rng.choice(4, p=(0.4, 0.25, 0.2, 0.15))
     a, b = w * rng.uniform(0.4, 0.7), d * rng.uniform(0.4, 0.7)
@@ -397,7 +397,7 @@ def walls_of(outline: Floats) -> list[Wall]:
 
 
 def shell(outline: Floats, walls: list[Wall], top: Ceiling) -> SyntheticMesh:
-    """Return floor, ceiling and walls as a closed surface whose normals face the room."""
+    """Return the floor, ceiling and walls as a closed surface whose normals face the room."""
     flat = triangulate(outline)
     floor = mesh_of(np.c_[outline, np.zeros(len(outline))], flat)
     roof = mesh_of(np.c_[outline, top.at(outline)], flat[:, ::-1])
@@ -405,7 +405,7 @@ def shell(outline: Floats, walls: list[Wall], top: Ceiling) -> SyntheticMesh:
 
 
 def wall_mesh(wall: Wall, top: Ceiling) -> SyntheticMesh:
-    """Return the mesh of a wall up to the ceiling, with its openings as recesses."""
+    """Return the mesh of a wall, up to the ceiling, with its openings as recesses."""
     us = sorted({0.0, wall.length, *(u for o in wall.openings for u in (o.start, o.end))})
     vs = sorted({0.0, *(v for o in wall.openings for v in (o.low, o.high))})
     grid = np.array([[(u, 0.0, v) for u in us] for v in [*vs, math.inf]])

@@ -51,16 +51,16 @@ from sceneprint_lab.synth.mesh import (
 )
 from sceneprint_lab.synth.sensors import Caster
 
-# The grid of occupied cells of a floor, which prevents overlaps of pieces.
+# The grid of a floor's occupied cells, which prevents pieces from overlapping.
 #
 # PiecePose  --Floor.claim-->  whether the place was free
 
-CELL = 0.05  #: edge of a cell of a room's grid, metres
+CELL = 0.05  #: edge length of a cell of a room's grid, metres
 
 
 @dataclass(frozen=True)
 class PiecePose:
-    """Pose of a piece: x, y, metres; yaw, radians."""
+    """The pose of a piece: x and y, metres; yaw, radians."""
 
     x: float
     y: float
@@ -73,7 +73,7 @@ class Floor:
     Parameters
     ----------
     outline : corners, counter-clockwise, metres
-    cell : edge of the grid's cells, metres
+    cell : edge length of the grid's cells, metres
     """
 
     def __init__(self, outline: Floats, cell: float = CELL) -> None:
@@ -87,7 +87,7 @@ class Floor:
         self.claimed = ~self.inside
 
     def claim(self, place: PiecePose, width: float, depth: float, overlap: float = 0.0) -> bool:
-        """Occupy a rotated rectangle of the floor if it is free; return whether it was free.
+        """Mark a rotated rectangle of the floor as occupied if it is free; return whether it was.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Floor:
         total = width * depth / self.cell**2
         within = np.count_nonzero(cells & self.inside[part])
         free = np.count_nonzero(cells & ~self.claimed[part])
-        # Rounding may lose a strip of half a cell along the walls.
+        # Rounding may lose a strip, half a cell wide, along the walls.
         slack = (width + depth) / self.cell + 2
         if within < total - slack or free < within * (1 - overlap) - 1e-9:
             return False
@@ -108,14 +108,14 @@ class Floor:
         return True
 
     def take(self, place: PiecePose, width: float, depth: float) -> None:
-        """Occupy a rotated rectangle without checking that it is free and inside the outline."""
+        """Mark a rotated rectangle as occupied without checking that it is free and inside."""
         part, cells = self._cells(place, width, depth)
         self.claimed[part] |= cells
 
     def _cells(
         self, place: PiecePose, width: float, depth: float
     ) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-        """Return slices of the grid around a rectangle, and a mask of the cells that it covers."""
+        """Return slices of the grid around a rectangle, and a mask of the cells it covers."""
         reach = math.hypot(width, depth) / 2 + self.cell
         middle = np.array([place.x, place.y])
         first = np.floor((middle - reach - self._low) / self.cell).astype(int).clip(0)
@@ -129,7 +129,7 @@ class Floor:
 
 
 def inside(outline: Floats, points: Floats) -> NDArray[np.bool_]:
-    """Return a mask (...,) of the floor points (..., 2) inside an outline (n, 2)."""
+    """Return a mask (...,) of the floor points (..., 2) that are inside an outline (n, 2)."""
     x, y = points[..., 0], points[..., 1]
     result = np.zeros(x.shape, bool)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
@@ -141,7 +141,7 @@ def inside(outline: Floats, points: Floats) -> NDArray[np.bool_]:
 
 
 Maker = Callable[[np.random.Generator], Piece]
-Menu = Mapping[Maker, float]  #: builders of objects, with weights
+Menu = Mapping[Maker, float]  #: builders of objects, and their weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ class Site:
 
 
 def keep_doors_free(site: Site) -> None:
-    """Occupy the floor in front of doors, so that no piece blocks them."""
+    """Mark the floor in front of doors as occupied, so that no piece blocks them."""
     for wall in site.walls:
         for o in wall.openings:
             if o.low == 0.0 and o.high > 1.9:
@@ -182,7 +182,7 @@ def along_wall(wall: Wall, menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
-    """Return random pieces at free places, aligned with the axes or at a random yaw."""
+    """Return random pieces at free places, aligned with the axes or with a random yaw."""
     rng = site.rng
     parts: list[SyntheticMesh] = []
     spots = site.floor.points[~site.floor.claimed]
@@ -198,7 +198,7 @@ def in_the_open(menu: Menu, site: Site) -> list[SyntheticMesh]:
 
 
 def partitions(site: Site) -> list[SyntheticMesh]:
-    """Return free-standing partitions, perpendicular to some of the walls."""
+    """Return free-standing partitions perpendicular to some of the walls."""
     rng, floor = site.rng, site.floor
     lowest = float(site.top.at(floor.points[floor.inside]).min())
     parts = []
@@ -241,7 +241,7 @@ def _pick(menu: Menu, rng: np.random.Generator) -> Piece:
 
 
 def _stand(piece: Piece, place: PiecePose, site: Site) -> list[SyntheticMesh]:
-    """Return a piece with objects and chairs at a place, or [] if it does not fit."""
+    """Return a piece at a place, with objects and chairs, or [] if it does not fit."""
     rng = site.rng
     mesh = with_objects(piece, rng).moved((place.x, place.y, 0.0), place.yaw)
     if (mesh.vertices[:, 2] > site.top.at(mesh.vertices[:, :2]) - 0.02).any():
@@ -318,17 +318,17 @@ class Room:
 
     @property
     def vertices(self) -> Floats32:
-        """Vertices (V, 3), metres, z up."""
+        """Return the vertices (V, 3), metres, z up."""
         return self.mesh.vertices.astype(np.float32)
 
     @property
     def faces(self) -> Ints32:
-        """Indices (F, 3) of the vertices of each face."""
+        """Return the indices (F, 3) of the vertices of each face."""
         return self.mesh.faces
 
     @property
     def size(self) -> Floats:
-        """Extents (3,) of the room along x, y, z, metres."""
+        """Return the extents (3,) of the room along x, y and z, metres."""
         return np.array([*np.ptp(self.outline, axis=0), self.ceiling.at(self.outline).max()])
 
     @cached_property
@@ -356,7 +356,7 @@ def make_room(rng: np.random.Generator) -> Room:
 
 
 def _depth_behind(wall: Wall, outline: Floats) -> float:
-    """Return the maximum depth of recesses in a wall, metres, so that they do not meet the room."""
+    """Return the maximum depth, metres, at which recesses in a wall do not meet the room again."""
     along = np.linspace(-0.3, wall.length + 0.3, 15)
     for depth in (2.0, 1.0, 0.5, 0.25):
         behind = np.linspace(0.01, depth + 0.1, 12)

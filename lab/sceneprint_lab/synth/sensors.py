@@ -3,7 +3,7 @@
     depth (H, W), cosine (H, W)  --kinect_noise-->  depth (H, W), 0 missing
 
 A Kinect measures the disparity d = f b / z of a projected pattern. Errors and steps are uniform in
-disparity, so in depth they grow with z^2. Samples are missing in the projector's shadow, at grazing
+disparity, so they grow with z^2 in depth. Samples are missing in the projector's shadow, at grazing
 incidence and on surfaces that do not reflect.
 """
 
@@ -30,11 +30,11 @@ from sceneprint_lab.synth.mesh import SyntheticMesh
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """First hits of rays.
+    """The first hits of rays.
 
     Parameters
     ----------
-    distance : (R,) float32, in units of the ray's direction; inf without a hit
+    distance : (R,) float32, in lengths of the ray's direction; inf without a hit
     face : (R,) int32, index of the face; -1 without a hit
     normal : (R, 3) float32, outward unit normals of the faces; 0 without a hit
     """
@@ -45,7 +45,7 @@ class RayHits:
 
 
 class Caster:
-    """Ray caster of a mesh; raises MissingDependency if Embree cannot be imported."""
+    """A ray caster for a mesh; creation raises MissingDependency if Embree cannot be imported."""
 
     def __init__(self, mesh: SyntheticMesh) -> None:
         self.mesh = mesh
@@ -76,8 +76,6 @@ def cast_depth(
 ) -> tuple[Floats32, Floats32]:
     """Return an ideal depth image, and the cosine of incidence of each sample.
 
-    Raise MissingDependency if Embree cannot be imported.
-
     Parameters
     ----------
     caster : scene, metres
@@ -88,6 +86,10 @@ def cast_depth(
     -------
     depth : (H, W) float32, metres along the optical axis; 0 without a hit
     cosine : (H, W) float32, |cos| between ray and normal, [0, 1]; 0 without a hit
+
+    Raises
+    ------
+    MissingDependency : If Embree cannot be imported
     """
     depth, cosine, _ = cast_faces(caster, T_world_camera, intrinsics)
     return depth, cosine
@@ -101,7 +103,7 @@ def cast_faces(
     rays = pixel_rays(intrinsics) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
     hits = caster.cast(origins, rays)
-    # Rays have z = 1 in the camera's frame, so their distance is the depth.
+    # Ray directions have z = 1 in the camera's frame, so the distance of a hit is its depth.
     depth = np.where(hits.face >= 0, hits.distance, np.float32(0))
     cosine = np.abs(np.einsum("ij,ij->i", rays, hits.normal))
     cosine /= np.sqrt(np.einsum("ij,ij->i", rays, rays))
@@ -109,7 +111,7 @@ def cast_faces(
 
 
 def pixel_rays(intrinsics: Intrinsics) -> Floats32:
-    """Return rays (H W, 3) float32 through the pixel centres, row by row, with z = 1."""
+    """Return ray directions (H W, 3) float32 through the pixel centres, row by row, with z = 1."""
     x = (np.arange(intrinsics.width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(intrinsics.height) - intrinsics.cy) / intrinsics.fy
     rays = np.ones((intrinsics.height, intrinsics.width, 3), np.float32)
@@ -134,22 +136,22 @@ def _embree_scene(mesh: SyntheticMesh) -> Any:
 
 @dataclass(frozen=True)
 class KinectNoise:
-    """Parameters of a Kinect; lengths in metres, px in pixels of the image."""
+    """Parameters of a Kinect; "m" are metres, "px" are pixels of the image."""
 
-    baseline: float = 0.075  #: camera to projector, m; the projector is on the right
-    disparity_sigma: float = 0.052  #: px; with the steps 1.5 mm at 1 m, 13 mm at 3 m
+    baseline: float = 0.075  #: m; distance from camera to projector, which is on the right
+    disparity_sigma: float = 0.052  #: px; gives depth steps of 1.5 mm at 1 m, 13 mm at 3 m
     correlation: float = 2.2  #: px; standard deviation of the blur of the disparity error
     warp: float = 0.06  #: px; disparity error that is smooth over the image
     disparity_step: float = 0.125  #: px; resolution of disparity
     edge_jitter: float = 0.9  #: px; displacement of samples, which makes edges ragged
-    edge_block: int = 3  #: px; size of blocks with a common displacement
+    edge_block: int = 3  #: px; size of blocks that are displaced together
     shadow_margin: float = 0.5  #: px; smallest disparity difference that casts a shadow
     shadow_growth: int = 3  #: px; width of the window that smears shadows
     grazing_start: float = math.radians(71.0)  #: rad; incidence from which samples are lost
     grazing_end: float = math.radians(84.0)  #: rad; incidence from which all samples are lost
-    speckle: float = 0.0008  #: fraction of samples that are lost anywhere, in patches
+    speckle: float = 0.0008  #: share of samples that are lost anywhere, in patches
     patch: float = 7.0  #: px; size of lost patches
-    border: tuple[int, int, int, int] = (0, 0, 0, 0)  #: px; missing left, right, top, bottom
+    border: tuple[int, int, int, int] = (0, 0, 0, 0)  #: px; missing at left, right, top, bottom
     nearest: float = 0.45  #: m; smallest measured depth
     farthest: float = 8.0  #: m; greatest measured depth
 
@@ -171,7 +173,7 @@ def kinect_noise(
     intrinsics : camera
     rng : source of all noise
     parameters : parameters of the noise
-    loss : (H, W) share of samples that are lost on the visible surface, [0, 1]; None for 0
+    loss : (H, W) share of samples that are lost on the visible surface, [0, 1]; None stands for 0
 
     Returns
     -------
@@ -180,27 +182,27 @@ def kinect_noise(
     p = parameters
     rows, columns = _displaced_pixels(depth, rng, p)
     z, cos = depth[rows, columns], cosine[rows, columns]
-    seen = (z >= p.nearest) & (z <= p.farthest) & _inside_border(depth.shape, p)
+    measured = (z >= p.nearest) & (z <= p.farthest) & _inside_border(depth.shape, p)
     gain = np.float32(intrinsics.fx * p.baseline)
-    disparity = np.divide(gain, np.where(seen, z, 1), dtype=np.float32)
-    seen &= ~_shadow_mask(depth, gain, p)[rows, columns]
+    disparity = np.divide(gain, np.where(measured, z, 1), dtype=np.float32)
+    measured &= ~_shadow_mask(depth, gain, p)[rows, columns]
     lost = _loss_probability(cos, None if loss is None else loss[rows, columns], p)
-    # A threshold on a smooth field groups losses in patches.
+    # A threshold on a smooth field groups losses into patches.
     hole = _field(depth.shape, p.patch, rng) * np.float32(0.9)
     hole += np.float32(math.sqrt(1 - 0.81)) * rng.standard_normal(depth.shape, np.float32)
-    seen &= hole > special.ndtri(lost)
+    measured &= hole > special.ndtri(lost)
     disparity += np.float32(p.disparity_sigma) * _field(depth.shape, p.correlation, rng)
     disparity += np.float32(p.warp) * _field(depth.shape, 80.0, rng)
     step = np.float32(p.disparity_step)
     z = np.divide(gain, np.maximum(np.round(disparity / step) * step, step), dtype=np.float32)
-    seen &= (z >= p.nearest) & (z <= p.farthest)
-    return np.where(seen, z, np.float32(0))
+    measured &= (z >= p.nearest) & (z <= p.farthest)
+    return np.where(measured, z, np.float32(0))
 
 
 def _displaced_pixels(
     depth: Floats32, rng: np.random.Generator, p: KinectNoise
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns (H, W) of samples; blocks near edges of depth are displaced."""
+    """Return rows and columns (H, W) of samples; blocks near depth edges are displaced."""
     height, width = depth.shape
     small = (-(-height // p.edge_block), -(-width // p.edge_block))
     stray = np.round(rng.normal(0, p.edge_jitter, (2, *small))).astype(np.intp)
@@ -221,10 +223,10 @@ def _inside_border(shape: tuple[int, ...], p: KinectNoise) -> NDArray[np.bool_]:
 
 
 def _shadow_mask(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[np.bool_]:
-    """Return a mask (H, W) of the samples in the shadow of the projector, right of the camera.
+    """Return a mask (H, W) of samples in the shadow of the projector, which is on the right.
 
-    A sample in column u is lit by column u - d of the projector. If two samples have the same
-    column of the projector, the farther sample, with the smaller u, is in the shadow.
+    A sample in column u is lit by column u - d of the projector. If two samples need the same
+    column of the projector, the farther one, with the smaller u, is in the shadow.
     """
     far = np.where(depth > 0, depth, np.float32(1e3))
     column = np.arange(depth.shape[1], dtype=np.float32) - gain / far
@@ -234,7 +236,7 @@ def _shadow_mask(depth: Floats32, gain: np.float32, p: KinectNoise) -> NDArray[n
 
 
 def _loss_probability(cosine: Floats32, loss: Floats32 | None, p: KinectNoise) -> Floats32:
-    """Return the probability (H, W) of losing a sample outside of shadows and the border."""
+    """Return the probability (H, W) of losing a sample that is not in a shadow or the border."""
     steep = (math.cos(p.grazing_start) - cosine) / (
         math.cos(p.grazing_start) - math.cos(p.grazing_end)
     )
@@ -256,12 +258,12 @@ def _field(shape: tuple[int, ...], size: float, rng: np.random.Generator) -> Flo
     if step > 1:
         noise = _enlarge(noise, step)
     noise = noise[: shape[0], : shape[1]]
-    # White noise after a Gaussian blur has the standard deviation 1 / (2 sqrt(pi) sigma).
+    # After a Gaussian blur, white noise has the standard deviation 1 / (2 sqrt(pi) sigma).
     return np.asarray(noise * np.float32(2 * math.sqrt(math.pi) * size / step), np.float32)
 
 
 def _enlarge(coarse: Floats32, step: int) -> Floats32:
-    """Return a linear interpolation with `step` samples for each coarse sample."""
+    """Interpolate linearly: return `step` samples for each coarse sample."""
     share = (np.arange(step, dtype=np.float32) / step)[:, None]
     rows = coarse[:-1, None] * (1 - share) + coarse[1:, None] * share
     rows = rows.reshape(-1, coarse.shape[1])
@@ -287,7 +289,7 @@ class Spinning:
     minimum, maximum : range limits, metres
     sigma : standard deviation of a range, metres
     ring_sigma : standard deviation of the offset of all ranges of a ring, metres
-    loss : fraction of returns that are lost at random
+    loss : share of returns that are lost at random
     grazing : cosine of incidence at which half of the returns at the maximum range are lost
     blind_middle, blind_width : centre and width of the azimuths that the carrier hides, rad
     blind_below : elevation below which the carrier hides these azimuths, rad
@@ -309,17 +311,17 @@ class Spinning:
 
     @property
     def elevations(self) -> Floats:
-        """Elevations (rings,), rad, in increasing order."""
+        """Return the elevations (rings,), rad, in increasing order."""
         return np.linspace(self.lowest, self.highest, self.rings)
 
     @property
     def azimuths(self) -> Floats32:
-        """Azimuths (firings,), rad, from -pi."""
+        """Return the azimuths (firings,), rad, from -pi."""
         n = round(2 * math.pi / self.azimuth_step)
         return (np.arange(n) * (2 * math.pi / n) - math.pi).astype(np.float32)
 
     def rays(self, rng: np.random.Generator) -> Floats32:  # noqa: ARG002
-        """Return unit directions (rings x firings, 3), ring by ring, the same in every scan."""
+        """Return unit directions (rings x firings, 3), ring by ring, the same for every scan."""
         azimuth, elevation = self.azimuths, self.elevations.astype(np.float32)[:, None]
         c = np.cos(elevation)
         rays = np.empty((self.rings, len(azimuth), 3), np.float32)
@@ -329,7 +331,7 @@ class Spinning:
         return rays.reshape(-1, 3)
 
     def offsets(self, rng: np.random.Generator) -> Floats32:
-        """Return range errors (rings x firings,) that are common to a ring, metres."""
+        """Return range errors (rings x firings,), metres; each ring has a common error."""
         own = rng.normal(0, self.ring_sigma, self.rings).astype(np.float32)
         return np.repeat(own, len(self.azimuths))
 
@@ -349,14 +351,14 @@ class Rosette:
     """A scanner with a narrow view about its x axis and a non-repeating pattern.
 
     Two prisms of equal deflection rotate at different speeds in the beams of a few lasers, as in a
-    Livox Avia (70 degrees, about 24,000 firings in 0.1 s). Each scan starts at random angles of
-    the prisms.
+    Livox Avia (70 degrees, about 24,000 firings in 0.1 s). Each scan starts with the prisms at
+    random angles.
 
     Parameters
     ----------
-    half_angle : half angle of the cone that the centres of the beams fill, rad
-    firings : number of firings of a scan
-    turns : turns of the first and of the second prism in a scan
+    half_angle : half the apex angle of the cone that the centres of the beams fill, rad
+    firings : number of firings in a scan
+    turns : number of turns of the first prism and of the second prism in a scan
     lasers : number of lasers, one above the other
     laser_step : angle between two lasers, rad
     """
@@ -373,7 +375,7 @@ class Rosette:
     grazing: float = 0.1
 
     def rays(self, rng: np.random.Generator) -> Floats32:
-        """Return unit directions (firings, 3) in chronological order, different in every scan."""
+        """Return unit directions (firings, 3) in chronological order; they differ in every scan."""
         start = rng.uniform(-math.pi, math.pi, 2)
         turned = np.arange(self.firings)[:, None] / self.firings * (2 * math.pi) * self.turns
         waves: NDArray[np.complex128] = np.exp(1j * (turned + start))
@@ -386,11 +388,11 @@ class Rosette:
         return np.stack(rays, axis=1).astype(np.float32)
 
     def offsets(self, rng: np.random.Generator) -> Floats32:  # noqa: ARG002
-        """Return zeros (firings,), since the ranges have no common error."""
+        """Return zeros (firings,), since ranges have no common error."""
         return np.zeros(self.firings, np.float32)
 
     def hidden(self) -> NDArray[np.bool_]:
-        """Return False (firings,), since the carrier blocks no ray."""
+        """Return a mask (firings,) of False, since the carrier blocks no ray."""
         return np.zeros(self.firings, np.bool_)
 
     def perfect(self) -> Rosette:
@@ -407,7 +409,8 @@ def own_scanner(rng: np.random.Generator) -> Spinning:
     low, high = np.radians(rng.uniform((-45.0, 8.0), (-14.0, 45.0)))
     if rings < 64:  # a sensor with few rings has a narrow vertical field of view
         low, high = max(low, -rings * 0.018), min(high, rings * 0.018)
-    # Scanners with many rings have coarser azimuths, so they return a similar number of points.
+    # Scanners with many rings have larger azimuth steps, so that they return a similar number of
+    # points.
     step = math.radians(rng.uniform(0.18, 0.4)) * (1.0 if rings <= 64 else 1.6)
     return Spinning(
         rings=rings, lowest=float(low), highest=float(high), azimuth_step=step,
@@ -433,7 +436,7 @@ def own_rosette(rng: np.random.Generator) -> Rosette:
 def scan(
     caster: Caster, T_world_sensor: Floats, sensor: Scanner, rng: np.random.Generator
 ) -> Floats32:
-    """Return a scan of a scanner at rest.
+    """Scan a scene with a scanner at rest.
 
     Parameters
     ----------
@@ -443,7 +446,8 @@ def scan(
 
     Returns
     -------
-    points : (N, 3) float32 returns, metres, in the sensor frame and the order of the sensor's rays
+    points : (N, 3) float32 returns, metres, in the sensor frame and in the order of the sensor's
+        rays
     """
     rays = sensor.rays(rng)
     turned = rays @ T_world_sensor[:3, :3].T.astype(np.float32)
@@ -451,7 +455,7 @@ def scan(
     hits = caster.cast(origins, turned)
     distance = hits.distance
     cosine = np.abs(np.einsum("ij,ij->i", turned, hits.normal))
-    # The probability of a loss grows with range and with grazing incidence.
+    # The probability of losing a return grows with range and with the angle of incidence.
     far = np.minimum(distance / np.float32(sensor.maximum), 1.0)
     held = 1 - 0.5 ** (cosine / (sensor.grazing * far + 1e-6))
     held *= (1 - sensor.loss) * (1 - np.append(caster.mesh.loss, np.float32(0))[hits.face])

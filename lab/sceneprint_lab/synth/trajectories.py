@@ -24,12 +24,12 @@ from sceneprint_lab.synth.sensors import pixel_rays
 
 CLEARANCE = 0.35  #: minimum distance from the camera to a surface, metres
 HEIGHTS = (0.8, 1.9)  #: range of heights above the floor, metres
-_GOOD_SHARE = 0.75  #: initial minimum share of a view within 0.5 to 5 m
-_COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: Kinect camera with few pixels
+_GOOD_SHARE = 0.75  #: initial minimum share of a view that is within 0.5 to 5 m
+_COARSE = Intrinsics(32, 24, 29.25, 29.25, 15.5, 11.5)  #: a Kinect camera with few pixels
 
 
 def pose(view: Floats) -> Floats:
-    """Return T_world_camera (4, 4), the pose of the optical frame, for a view (6,)."""
+    """Return T_world_camera (4, 4), the pose of the optical frame, of a view (6,)."""
     x, y, z, yaw, pitch, roll = view
     forward = np.array(
         [math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)]
@@ -44,7 +44,7 @@ def pose(view: Floats) -> Floats:
 
 
 def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np.bool_]:
-    """Return a mask (n,) of points (n, 3) in free space at a distance from all surfaces, metres.
+    """Return a mask (n,) of points (n, 3) in free space, `distance` metres from all surfaces.
 
     Rays are cast in 128 directions. A ray that hits the back of a face starts inside a solid or
     outside the room.
@@ -61,9 +61,9 @@ def clear(room: Room, points: Floats, distance: float = CLEARANCE) -> NDArray[np
 
 
 def scattered_poses(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
-    """Return independent views that contain a large part of the room within 0.5 to 5 m.
+    """Return independent views that show a large part of the room within 0.5 to 5 m.
 
-    Half of the candidates look at an object from 0.7 to 3 m, the others in a random direction.
+    Half of the candidates look at an object from 0.7 to 3 m away, the others in random directions.
 
     Parameters
     ----------
@@ -98,14 +98,14 @@ def looking_at(room: Room, n: int, rng: np.random.Generator) -> Floats:
     """Return views (n, 6) of random surface points between knee and head height."""
     a, b, c = (room.mesh.vertices[room.mesh.faces[:, k]] for k in range(3))
     middle = (a + b + c) / 3
-    weight = np.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1))  # favours small objects
+    weight = np.sqrt(np.linalg.norm(np.cross(b - a, c - a), axis=1))  # this favours small objects
     weight *= (middle[:, 2] > 0.3) & (middle[:, 2] < 1.6)
     target = middle[rng.choice(len(middle), n, p=weight / weight.sum())]
     candidates = _positions(room, 6 * n, rng).reshape(n, 6, 3)
     offsets = target[:, None] - candidates
     distance = np.linalg.norm(offsets, axis=2)
-    wanted = rng.uniform(0.7, 3.0, n)
-    best = np.abs(distance - wanted[:, None]).argmin(axis=1)
+    distances = rng.uniform(0.7, 3.0, n)
+    best = np.abs(distance - distances[:, None]).argmin(axis=1)
     rows = np.arange(n)
     d = offsets[rows, best]
     yaw = np.arctan2(d[:, 1], d[:, 0]) + rng.normal(0, 0.15, n)
@@ -130,10 +130,10 @@ def _rolls(n: int, rng: np.random.Generator) -> Floats:
 
 
 def worth_seeing(room: Room, T_world_camera: Floats, least: float) -> bool:
-    """Return whether a share `least` of the view is within 0.5 to 5 m and shows several surfaces.
+    """Return whether a share `least` of a view is within 0.5 to 5 m and shows several surfaces.
 
-    In a coarse grid of rays, a tenth of the neighbours must differ in depth or normal, and the
-    normals must span more than one direction. These limits are proportional to `least`.
+    On a coarse grid of rays, a tenth of the pairs of neighbours must differ in depth or normal, and
+    the normals must span more than one direction. These limits are proportional to `least`.
     """
     rays = pixel_rays(_COARSE) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)
@@ -159,7 +159,7 @@ def _directions(n: int) -> Floats:
     return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
 
 
-# Circles of views around an object.
+# Views from a circle around an object.
 #
 # middle, radius, n, rng  --orbit-->  n x T_world_camera (4, 4), in order
 
@@ -168,17 +168,17 @@ def orbit(
     middle: tuple[float, float, float], radius: float, n: int, rng: np.random.Generator, *,
     first: float | None = None, sweep: float = 2 * math.pi,
 ) -> list[Floats]:  # fmt: skip
-    """Return hand-held views of a point from a circle around it.
+    """Return hand-held views of a point, from a circle around it.
 
     The camera is 1.05 to 1.65 m above z = 0. Distance, height, aim and roll vary slowly, by about
-    0.1 m and a few degrees; the aim also has a jitter of 15 mm.
+    0.1 m and a few degrees; the aim also jitters by 15 mm.
 
     Parameters
     ----------
     middle : point at which the views are aimed, metres
     radius : radius of the circle, metres
-    n : number of views, at intervals of `sweep` / n from the start of the sweep
-    first : azimuth of the first view, rad; default: random
+    n : number of views, at intervals of `sweep` / n from the start
+    first : azimuth of the first view, rad; random by default
     sweep : angle that the views cover, rad
 
     Returns
@@ -199,7 +199,7 @@ def orbit(
     return [pose(view) for view in np.column_stack([eye, yaw, pitch, roll])]
 
 
-# Hand-held paths that return to earlier places: random walks in a network of viewpoints.
+# Hand-held paths that return to earlier places: random walks through a network of viewpoints.
 #
 #     Room, n, rng  --trajectory-->  n x T_world_camera (4, 4), in order
 
@@ -238,8 +238,8 @@ def trajectory(room: Room, n: int, rng: np.random.Generator) -> list[Floats]:
 def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, list[list[int]]]:
     """Return at most `count` viewpoints (k, 6) and, for each, the indices of its neighbours.
 
-    Neighbours are connected by a clear straight line. If fewer than `count` viewpoints are found,
-    each of them is also its own neighbour, because a single viewpoint has no other.
+    A clear straight line connects neighbours. If fewer than `count` viewpoints are found, each is
+    also its own neighbour, because a single viewpoint would have none.
     """
     anchors: list[Floats] = []
     ways: list[list[int]] = []
@@ -270,7 +270,7 @@ def _way(room: Room, a: Floats, b: Floats) -> bool:
 
 
 def _walk(a: Floats, b: Floats, rng: np.random.Generator) -> Floats:
-    """Return views from a (excluded) to b, with yaw in the shorter direction."""
+    """Return views from a (excluded) to b; the yaw turns in the shorter direction."""
     change = b - a
     change[3] = (change[3] + math.pi) % (2 * math.pi) - math.pi
     walked = np.linalg.norm(change[:3]) / rng.uniform(0.03, 0.08)
@@ -292,7 +292,7 @@ def _smoothed(values: Floats, radius: int) -> Floats:
 # Premises, n, rng  --walk, scattered-->  n x T_world_sensor (4, 4)
 
 STEP = 1.5  #: distance between scans on a walk, metres
-COARSE = 3  #: edge of a cell of the grid for walks, in cells of the floor's grid
+COARSE = 3  #: edge length of a cell of the grid for walks, in cells of the floor's grid
 
 
 def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floats]:
@@ -304,7 +304,7 @@ def scattered(premises: Premises, n: int, rng: np.random.Generator) -> list[Floa
 
 
 def walk(premises: Premises, n: int, rng: np.random.Generator, step: float = STEP) -> list[Floats]:
-    """Return n poses of a scanner, `step` metres apart, on a walk that often returns.
+    """Return n poses of a scanner, `step` metres apart, on a walk that often returns to places.
 
     The height of the scanner, and its yaw relative to the direction of travel, are random but
     constant during the walk.
@@ -350,7 +350,7 @@ def scanner_pose(x: float, y: float, z: float, yaw: float, rng: np.random.Genera
 
 
 def _ways(premises: Premises) -> tuple[Floats, csr_array]:
-    """Return walkable spots (n, 2), metres, and the sparse matrix of distances of neighbours."""
+    """Return walkable spots (n, 2), metres, and a sparse matrix of distances to neighbours."""
     free = premises.walkable[::COARSE, ::COARSE]
     parts, count = ndimage.label(free, np.ones((3, 3)))
     if count:

@@ -53,9 +53,8 @@ from sceneprint_client.api.base import MAP_OR_EVERY
 # Event streams.
 #
 # after  --begin-->  place  --next_events-->  events and the next place, repeatedly
-#
-# A place is the number of an event among those of all maps. It is not sent to readers, who receive
-# `seen` instead: the number of the last event that they may read.
+# A place is an event number, counted across all maps. Readers do not receive it; they receive
+# `seen`, the number of the last event that they may read.
 
 
 class EventSlice(NamedTuple):
@@ -63,7 +62,7 @@ class EventSlice(NamedTuple):
 
     Parameters
     ----------
-    place : number of the last event that was read, of any map
+    place : number of the last event read, from any map
     seen : number of the last event up to `place` that the reader may read
     """
 
@@ -72,8 +71,11 @@ class EventSlice(NamedTuple):
     seen: int
 
 
-def begin(database: Database, wanted: EventFilter, minimum: int, after: int | None) -> EventSlice:
-    """Start an event stream: return its first place, and a `missed` event if events were removed.
+def begin(
+    database: Database, event_filter: EventFilter, minimum: int, after: int | None
+) -> EventSlice:
+    """Start an event stream: return its first place, and a `missed` event if the reader missed
+    events that were removed, or that a restore of the database lost.
 
     Parameters
     ----------
@@ -83,8 +85,8 @@ def begin(database: Database, wanted: EventFilter, minimum: int, after: int | No
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
-        seen = newest_seen(connection, wanted)
-        lost = after is not None and removal_floor(connection, wanted, minimum, after) > after
+        seen = newest_seen(connection, event_filter)
+        lost = after is not None and removal_floor(connection, event_filter, minimum, after) > after
     if after is None:
         return EventSlice([], newest, seen)
     if after > newest:  # the database was restored to an earlier state
@@ -92,19 +94,19 @@ def begin(database: Database, wanted: EventFilter, minimum: int, after: int | No
     return EventSlice([missed(after)] if lost else [], after, after)
 
 
-def next_events(database: Database, wanted: EventFilter, place: int, most: int) -> EventSlice:
-    """Return the next slice of a stream: at most `most` events after a place."""
+def next_events(database: Database, event_filter: EventFilter, place: int, most: int) -> EventSlice:
+    """Number pending events, and return up to `most` events of a stream after a place."""
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
-        rows = list_events(connection, wanted, after=place, limit=most)
+        rows = list_events(connection, event_filter, after=place, limit=most)
         if len(rows) == most:
             return EventSlice(rows, rows[-1].number, rows[-1].number)
-        return EventSlice(rows, max(newest, place), newest_seen(connection, wanted))
+        return EventSlice(rows, max(newest, place), newest_seen(connection, event_filter))
 
 
 def missed(place: int) -> EventRow:
-    """Return a `missed` event: events after `place` were removed unread."""
+    """Return a `missed` event, which states that events after `place` were removed unread."""
     return EventRow(place, time.time(), MISSED, None, None, None, {})
 
 
@@ -113,7 +115,7 @@ log = logging.getLogger(__name__)
 #: Seconds between removals of old events, and maximum number of events per removal.
 TIDY_S = 60.0
 AT_MOST = 20_000
-#: Maximum number of prefixes of event kinds in a request.
+#: Maximum number of event kind prefixes in a request.
 MOST_KINDS = 20
 
 
@@ -150,14 +152,14 @@ class Events:
         return EventFilter(frozenset((row.name,)), tuple(kinds))
 
     def page(
-        self, wanted: EventFilter, *, after: str | None = None, cursor: str | None = None,
+        self, event_filter: EventFilter, *, after: str | None = None, cursor: str | None = None,
         limit: int = 100, newest_first: bool = False,
     ) -> EventPage:  # fmt: skip
         """Return a page of events.
 
         Parameters
         ----------
-        after : id of the event before the first event of the page
+        after : id of an event; the page contains only later events
         cursor : `next_cursor` of the previous page
         limit : maximum number of events
         newest_first : whether to sort the events from new to old
@@ -173,9 +175,9 @@ class Events:
             least, before = (least, place) if newest_first else (max(least, place), None)
         number_events(self._store.database)
         with self._store.database.read() as connection:
-            newest = newest_seen(connection, wanted)
+            newest = newest_seen(connection, event_filter)
             rows = list_events(
-                connection, wanted, after=least, before=before, limit=limit + 1,
+                connection, event_filter, after=least, before=before, limit=limit + 1,
                 newest_first=newest_first,
             )  # fmt: skip
         items = [event_record(seals, row) for row in rows[:limit]]
@@ -199,7 +201,7 @@ class Events:
             return 0
 
     def remove_surplus(self) -> int:
-        """Remove events beyond the number stored per map, in blocks; return their number."""
+        """Remove surplus events of each map, except anchors of indexes; return their number."""
         most_events, indexes = self._settings.events_per_map, Path(self._settings.indexes)
 
         def spent(connection: Connection, limit: int) -> list[int]:
@@ -251,7 +253,8 @@ class Audit:
             audit_log.record_change(connection, action, map_name, target, **data)
 
     def tidy(self, now: float | None = None) -> int:
-        """Remove expired lines, at most every PRUNE_S seconds; return the number of removed lines.
+        """Remove expired lines, at most every PRUNE_S seconds, unless the store is read-only;
+        return the number of removed lines.
 
         Errors are logged; a later call retries.
 
@@ -273,19 +276,19 @@ class Audit:
             log.warning("audit entries not removed", extra={"error": str(error)})
             return 0
 
-    def lines(self, wanted: AuditFilter) -> Iterator[AuditLine]:
+    def lines(self, audit_filter: AuditFilter) -> Iterator[AuditLine]:
         """Yield the lines that pass a filter, oldest first."""
         after = 0
         while True:  # one transaction per block, since the consumer may be slow
             with self._store.database.read() as connection:
-                block = audit_log.list_lines(connection, wanted, _BLOCK, after=after)
+                block = audit_log.list_lines(connection, audit_filter, _BLOCK, after=after)
             if not block:
                 return
             yield from map(_audit_line, block)
             after = block[-1].number
 
     def page(
-        self, wanted: AuditFilter, cursor: str | None = None, limit: int = 100
+        self, audit_filter: AuditFilter, cursor: str | None = None, limit: int = 100
     ) -> Page[AuditLine]:
         """Return a page of the lines that pass a filter, newest first.
 
@@ -296,7 +299,7 @@ class Audit:
         seals = self._store.seals
         before = seals.row("audit", cursor)
         with self._store.database.read() as connection:
-            rows = audit_log.list_lines(connection, wanted, limit + 1, before=before)
+            rows = audit_log.list_lines(connection, audit_filter, limit + 1, before=before)
         more = seals.next_cursor("audit", [row.number for row in rows], limit)
         return Page[AuditLine](items=[_audit_line(row) for row in rows[:limit]], next_cursor=more)
 
@@ -314,8 +317,9 @@ def create_key(
     Parameters
     ----------
     grants : scope by map name, where `*` stands for all maps; None grants `admin` on all maps
-    expires_at : time with a time zone at which the key expires; None for no expiry
-    tenant : name of the owner; None creates or selects the tenant with the name of the key
+    expires_at : time, with a time zone, at which the key expires; None for no expiry
+    tenant : name of the owner; None selects the tenant with the name of the key, which is created
+        if it does not exist
 
     Raises
     ------
@@ -426,7 +430,7 @@ def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page
 
 
 def _until(expires_at: datetime) -> float:
-    """Convert a time to seconds since 1970; raise InvalidRequest outside of the years 1 to 9999."""
+    """Convert a time to seconds since 1970; raise InvalidRequest outside the years 1 to 9999."""
     seconds = expires_at.timestamp()
     try:
         datetime.fromtimestamp(seconds, UTC)

@@ -55,12 +55,12 @@ log = logging.getLogger(__name__)
 
 # State of the search indexes, and the events that anchor them.
 
-#: Maximum number of maps to report: those that changed most often.
+#: Maximum number of maps to report; maps that changed most often come first.
 MOST = 200
 
 
 def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexState:
-    """Return the state of the newest readable index of a map, from its manifest."""
+    """Return the state of the newest readable index of a map; `version` is None without one."""
     for _, path in manifests(index_folder(indexes, row)):
         manifest = _read(path)
         if manifest is not None and row.pruned_revision <= manifest.revision <= row.revision:
@@ -79,7 +79,7 @@ def index_states(connection: Connection, indexes: Path) -> list[IndexState]:
 
 
 def anchors(indexes: Path) -> frozenset[int]:
-    """Return the numbers of the events to which the indexes of this machine are anchored."""
+    """Return the event numbers to which the indexes of this machine are anchored."""
     if not indexes.is_dir():
         return frozenset()
     folders = [folder for folder in indexes.iterdir() if is_index_folder(folder.name)]
@@ -98,16 +98,16 @@ def _read(path: Path) -> IndexManifest | None:
 # Disk usage of a store.
 
 #: Maximum number of files to measure; the total size is extrapolated from them.
-MEASURED = 5_000
-#: Maximum number of frames per map to measure, evenly spaced in upload order.
-WEIGHED = 1_000
+MEASURED_FILES = 5_000
+#: Maximum number of frames to measure per map; they are evenly spaced in upload order.
+MEASURED_FRAMES = 1_000
 #: With an object store: maximum number of frames to sample, and of objects to measure.
-SPREAD, ASKED = 64, 16
+SAMPLED_FRAMES, SAMPLED_OBJECTS = 64, 16
 _HERE = func.current_database()
 
 
 def _bytes_of(folder: Path) -> int:
-    """Return the total size of the files below a folder in bytes."""
+    """Return the total size, in bytes, of the readable files under a folder."""
     total = 0
     for path in folder.rglob("*"):
         with suppress(OSError):
@@ -133,7 +133,7 @@ def sizes_of_map(connection: Connection, store: Store, indexes: Path, row: MapRo
     A blob that several frames share counts for each frame, since otherwise the result would reveal
     the content of other maps.
     """
-    numbers, total = frame_queries.frames_with_uploads(connection, row.number, WEIGHED)
+    numbers, total = frame_queries.frames_with_uploads(connection, row.number, MEASURED_FRAMES)
     uploads, signed, blobs = frame_queries.stored_sizes(connection, numbers)
     artifacts = _of_artifacts(store.blobs, blobs)
     share = max(len(numbers), 1)
@@ -154,9 +154,9 @@ def _of_database(database: Database) -> int | None:
 
 
 def _of_objects(store: Store) -> int:
-    """Return the total size of blobs in an object store in bytes, extrapolated from some frames."""
+    """Return the size of the blobs in an object store, bytes, extrapolated from some frames."""
     with store.database.read() as connection:
-        sample = frame_queries.sample_frames(connection, SPREAD)
+        sample = frame_queries.sample_frames(connection, SAMPLED_FRAMES)
         uploads, _, artifacts = frame_queries.stored_sizes(connection, sample)
         total = frame_queries.count_uploads(connection)
         files = frame_queries.bytes_of_files(connection)
@@ -165,10 +165,10 @@ def _of_objects(store: Store) -> int:
 
 
 def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
-    """Return the total size of blobs in bytes; in an object store, extrapolate from a sample."""
+    """Return the total size of blobs, bytes; in an object store, extrapolate it from a sample."""
     if isinstance(blobs, FolderBlobs):
         return sum(blobs.size(digest) or 0 for digest in artifacts)
-    sample = artifacts[:: max(-(-len(artifacts) // ASKED), 1)]
+    sample = artifacts[:: max(-(-len(artifacts) // SAMPLED_OBJECTS), 1)]
     try:
         size = sum(blobs.size(digest) or 0 for digest in sample)
     except UnusableStore:  # other statistics stay available
@@ -177,7 +177,7 @@ def _of_artifacts(blobs: Blobs, artifacts: Sequence[str]) -> int:
 
 
 def _of_blobs(folder: Path) -> int:
-    """Return the total size of the blobs in a folder in bytes, extrapolated from some subfolders.
+    """Return the total size, in bytes, of the blobs in a folder, extrapolated from some subfolders.
 
     File names are hashes, so all subfolders have similar sizes.
     """
@@ -185,11 +185,11 @@ def _of_blobs(folder: Path) -> int:
         parts = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir())
     except OSError:
         return 0
-    total, seen = 0, 0
+    total, n_files = 0, 0
     for done, part in enumerate(parts, 1):
         file_sizes = list(_file_sizes(Path(part)))
-        total, seen = total + sum(file_sizes), seen + len(file_sizes)
-        if seen >= MEASURED:
+        total, n_files = total + sum(file_sizes), n_files + len(file_sizes)
+        if n_files >= MEASURED_FILES:
             return total * len(parts) // done
     return total
 
@@ -212,7 +212,7 @@ def _size(path: Path | os.DirEntry[str]) -> int:
 
 
 def _free_of(folder: Path) -> tuple[int, int]:
-    """Return the free and total bytes of the disk that contains a folder, even a missing folder."""
+    """Return the free and total bytes of the disk for a folder, which need not exist."""
     try:
         usage = shutil.disk_usage(nearest_folder(folder))
     except OSError:
@@ -225,7 +225,8 @@ MINUTE_S, HOUR_S = 60.0, 3600.0
 MEASURED_S = 30.0
 #: Seconds for which metrics are cached.
 METRICS_CACHE_S = 1.0
-#: Number of frames and jobs from which a thread counts them, and its maximum share of the time.
+#: Number of frames and jobs at which a store is large: a background thread then counts it. Maximum
+#: share of the time that this thread spends on counting.
 MANY, COUNTING = 100_000, 0.01
 #: Kinds of samples: request counts of a service, and worker starts.
 SERVICE, WORKER = "service", "worker"
@@ -254,9 +255,10 @@ class StoreCounts:
 
     Parameters
     ----------
-    frames, jobs : number of frames and of jobs, by state
+    frames, jobs : frame counts and job counts, by state
     sizes : result of `sizes`
     at : time of the counts, seconds since 1970
+    seconds : duration of counting
     """
 
     frames: Mapping[str, int]
@@ -273,7 +275,7 @@ class StoreCounts:
 
     @property
     def is_old(self) -> bool:
-        """Return whether the counts are due for renewal, or the clock was set back."""
+        """Return whether to renew the counts: they are due, or the clock was set back."""
         return not 0 <= time.time() - self.at < self.seconds / COUNTING
 
 
@@ -352,7 +354,7 @@ class Statistics:
         with self._lock:  # concurrent requests share one computation
             now = time.monotonic()
             if self._figures is None or now - self._figures[0] > METRICS_CACHE_S:
-                self._figures = now, self._look()
+                self._figures = now, self._collect_figures()
             return self._figures[1]
 
     def counts(self, connection: Connection) -> StoreCounts:
@@ -373,7 +375,7 @@ class Statistics:
         return counts
 
     def state_counts(self) -> tuple[dict[str, int], dict[str, int]]:
-        """Return the numbers of frames and of jobs by state; see `counts`."""
+        """Return the frame counts and the job counts by state; see `counts`."""
         with self._store.database.read() as connection:
             counts = self.counts(connection)
         return dict(counts.frames), dict(counts.jobs)
@@ -396,7 +398,7 @@ class Statistics:
         )  # fmt: skip
         return self._counts
 
-    def _look(self) -> Figures:
+    def _collect_figures(self) -> Figures:
         stats = self.collect(minutes=1)
         with self._store.database.read() as connection:
             began = store_counts.count_samples(connection, WORKER, time.time() - HOUR_S)
@@ -405,7 +407,9 @@ class Statistics:
             return Figures(stats, began, newest, waiting)
 
     def workers(self, connection: Connection) -> list[WorkerSeen]:
-        """Return the processes that wait for or run a job (on SQLite, those of this machine)."""
+        """Return the processes that wait for a job or run one (on SQLite, only those of this
+        machine).
+        """
         busy = store_counts.running_jobs(connection, read_clock(connection))
         names = sorted({*self._bell.listeners(connection), *busy})
         return [WorkerSeen(name=name, job_id=busy.get(name)) for name in names]
@@ -432,7 +436,7 @@ def _minutes(
     happened: Mapping[tuple[int, str], int], samples: list[store_counts.Sample] | None,
     start: float, count: int,
 ) -> list[Minute]:  # fmt: skip
-    """Return the counts of `count` minutes from `start` (seconds since 1970), including empty ones.
+    """Return a record of counts for each of `count` minutes from `start` (seconds since 1970).
 
     Parameters
     ----------

@@ -95,11 +95,16 @@ def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[S
 def add_block(
     uploads: Uploads, task: LongJob, block: Sequence[tuple[str, Callable[[], Upload]]]
 ) -> list[ImportItem]:
-    """Add frames in one commit, and return their results; raise LostLease if the job was cancelled.
+    """Add frames in one commit, and return their results, which contain errors of single frames.
 
     Parameters
     ----------
     block : name and reading function of each frame
+
+    Raises
+    ------
+    LostLease : If the job was cancelled.
+    StoreError, Busy : If the store or the decoders cannot be used now; nothing was added.
     """
     outcomes: list[UploadResult | None] = []
     uploaded = []
@@ -181,15 +186,15 @@ def import_item(name: str, outcome: UploadResult) -> ImportItem:
     return ImportItem(name=name, status=item.status, problem=item.problem, **own)
 
 
-#: Job kinds of imports by the field `as` of a request.
+#: Job kind of an import, by the field `as` of the request.
 KINDS = {"frames": "import", "map": "import-map", "recording": "import-bag"}
 #: Seconds between removals of the archives of finished imports.
 TIDY_S = 5.0
-#: Maximum size of an inflated tar, as a multiple of the largest accepted archive.
+#: Maximum size of an inflated tar, as a multiple of the maximum size of an archive.
 _UNPACKED = 4
 #: Maximum number of ids in one statement.
 _IDS_AT_ONCE = 500
-#: Maximum pixels along the longer side of a rendered view.
+#: Maximum number of pixels along the longer side of a rendered view.
 _MOST_PIXELS = 640
 
 
@@ -284,7 +289,7 @@ def states_of_import(connection: Connection, job: JobRow) -> Counter[str]:
 
 
 def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewParameters:
-    """Return the sensor parameters for views of an imported map.
+    """Return the sensor parameters for views of an imported map; a large camera is scaled down.
 
     Raises
     ------
@@ -421,7 +426,12 @@ class Imports:
         return Page[ImportItem](items=[ImportItem(**row) for row in rows[:limit]], next_cursor=more)
 
     def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice of an import: add at least one block of frames."""
+        """Run a slice of an import: add at least one block of frames.
+
+        Raises
+        ------
+        UnreadableArchive : If the archive is missing, or is unreadable and was therefore removed.
+        """
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(ARCHIVE)

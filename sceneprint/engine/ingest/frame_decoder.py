@@ -28,9 +28,8 @@ from sceneprint_client.formats import CloudFormat, format_at, format_of, titles_
 from sceneprint_client.poses import rotation_of
 from sceneprint_client.sidecars import UNSAID
 
-#: Name of the base frame of a cloud that has its own coordinate frame: its viewpoint is not the
-#: origin.
-GIVEN_FRAME = "cloud"
+#: Name of the base frame of a cloud whose viewpoint is not the origin of its coordinates.
+CLOUD_FRAME = "cloud"
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,11 +216,11 @@ def base_of(
         return None
     T = np.eye(4)
     T[:3, 3] = viewpoint
-    return GIVEN_FRAME, T
+    return CLOUD_FRAME, T
 
 
 def _file_format(data: bytes) -> CloudFormat:
-    """Return the file format of an accepted cloud; one without magic bytes is a KITTI scan."""
+    """Return the file format of an accepted cloud; a file without magic bytes is a KITTI scan."""
     return format_of(data) or "kitti"
 
 

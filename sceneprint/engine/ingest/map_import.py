@@ -64,7 +64,7 @@ from sceneprint_client.api.frames import VIRTUAL, ImportOptions, MapImportResult
 _AT_ONCE = 16
 #: Seconds between checks for unsigned views.
 _PAUSE_S = 1.0
-#: Maximum depth units per metre of rendered images, and maximum depth in these units.
+#: Maximum number of depth units per metre in rendered images, and maximum depth in these units.
 _DEPTH_SCALE, _FARTHEST = 1000.0, 65_000
 #: Maximum number of weak areas in an import result.
 _MOST_WEAK = 20
@@ -96,7 +96,7 @@ class StoredSurface:
 
     @classmethod
     def read(cls, file: BinaryIO) -> StoredSurface:
-        """Read a surface from a file of `write`."""
+        """Read a surface from a file that `write` wrote."""
         arrays = [npy.read_array(file, allow_pickle=False) for _ in range(7)]
         points, triangles, offset, up, poses, held_out, floor = arrays
         surface = ReferenceSurface(points, triangles if len(triangles) else None, offset, up)
@@ -123,8 +123,8 @@ class _Views:
     def upload(self, number: int) -> Upload:
         """Render a view, and return its upload.
 
-        The frame id is a hash of content and viewpoint: a repeated view is a duplicate, but equal
-        views of two places are two frames.
+        The frame id is a hash of the image, the pose and the names: a repeated view is a duplicate,
+        but equal views of two places are two frames.
 
         Parameters
         ----------
@@ -149,11 +149,11 @@ class _Views:
 
     def view(self, pose: Floats) -> Upload:
         """Render a view at T_map_sensor (4, 4); the metadata does not contain the pose."""
-        seen, camera = self._renderer.view(pose), self._p.camera
+        image, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
-            return Upload(encode_npy(seen), FrameMeta())
+            return Upload(encode_npy(image), FrameMeta())
         scale = min(_DEPTH_SCALE, _FARTHEST / self._p.farthest)
-        samples = np.round(seen * scale).astype(np.uint16)
+        samples = np.round(image * scale).astype(np.uint16)
         intrinsics = copy_fields(CameraIntrinsics, camera)
         return Upload(encode_png(samples), FrameMeta(intrinsics=intrinsics, depth_scale=scale))
 
@@ -170,7 +170,7 @@ class MapImporter:
 
     Parameters
     ----------
-    queries : queries that test the localisation of held-out views
+    queries : search that localises held-out views as a test
     """
 
     def __init__(self, context: Context, uploads: Uploads, queries: Queries) -> None:
@@ -410,12 +410,12 @@ class MapImporter:
         )  # fmt: skip
 
 
-#: Maximum distance of points from their origin in metres; single precision suffices up to it.
+#: Maximum coordinate of a point, in metres, for which single precision suffices.
 _FARTHEST_M = 20_000.0
 
 
 def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> ReferenceSurface:
-    """Move a surface to another offset; raise InvalidRequest if the offset is too far from it."""
+    """Change the offset of a surface; raise InvalidRequest if a point is too far from it."""
     to = np.array([offset.x, offset.y, offset.z])
     points = surface.points + (surface.offset - to)
     if not np.abs(points).max() <= _FARTHEST_M:
@@ -439,10 +439,11 @@ def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
     Parameters
     ----------
     stored : surface with the poses of the test views
+    outcomes : coverage outcome of each test view
 
     Returns
     -------
-    areas : weak areas, sorted by the number of failed views from high to low
+    areas : up to _MOST_WEAK areas, sorted by the number of failed views from high to low
     """
     if not outcomes:
         return []
@@ -464,4 +465,4 @@ def weak_areas(stored: StoredSurface, outcomes: list[Any]) -> list[WeakArea]:
             areas.append(
                 WeakArea(centre=vector(centre), width_m=width, views=views, found=cell.found)
             )
-    return sorted(areas, key=lambda one: one.found - one.views)[:_MOST_WEAK]
+    return sorted(areas, key=lambda area: area.found - area.views)[:_MOST_WEAK]

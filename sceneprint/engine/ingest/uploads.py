@@ -40,7 +40,7 @@ from sceneprint_client.api.frames import BatchItem, SampleRange, check_frame_id,
 
 # Identity: decide whether an upload is a new frame, a duplicate, or a conflict.
 
-#: Names of columns in error messages, where they differ from the column.
+#: Names of columns in error messages, where they differ from the column names.
 _FIELDS = {
     "pose_parent": "pose.parent_frame", "base": "T_base_sensor", "content_id": "content",
     "cloud": "units_per_metre",
@@ -93,12 +93,12 @@ def find_duplicate(
 
 
 def _differing(frame: FrameRow, metadata: dict[str, Any]) -> list[str]:
-    """Return the fields that differ from those that the caller of the frame sent."""
+    """Return the names of the fields of an upload that differ from those sent with a frame."""
     stored = vars(frame)
     if frame.sent_parent is not None:  # a join has moved the pose
         stored = {**stored, "pose": frame.sent_pose, "pose_parent": frame.sent_parent}
 
-    def sent(name: str, value: Any) -> Any:  # of a cloud, only its units
+    def sent(name: str, value: Any) -> Any:  # compare only the units of a cloud
         return value["units_per_metre"] if name == "cloud" and value is not None else value
 
     names = [name for name in metadata if name not in _LABELS]
@@ -112,8 +112,8 @@ def _differing(frame: FrameRow, metadata: dict[str, Any]) -> list[str]:
 def is_retried(state: FrameState) -> bool:
     """Return whether a repeated upload retries a frame in this state.
 
-    Failed frames are retried, and redundant frames, since the frame that they duplicated may have
-    been deleted.
+    It retries failed frames, and redundant frames, since the frame that made them redundant may
+    have been deleted.
     """
     return state in (FrameState.FAILED, FrameState.REDUNDANT)
 
@@ -162,11 +162,13 @@ def _added(frame: FrameRow, job_id: str, reason: str | None = None) -> Added:
     )  # fmt: skip
 
 
-def _before(
+def _earlier_results(
     connection: Connection, row: MapRow, once: IdempotentRequest | None
 ) -> list[UploadResult] | None:
     """Return the results of an earlier request with the key of `once`, with the current states of
-    its frames; None if there is none, or if the map was deleted and created again.
+    its frames; None without such a request, or if one of its frames no longer exists.
+
+    Raise IdempotencyConflict if the earlier request was different.
     """
     data = None if once is None else once.stored_result(connection)
     if data is None:
@@ -232,7 +234,7 @@ class _Prepared:
 
     @property
     def size(self) -> int:
-        """Bytes of the upload."""
+        """Size of the upload, bytes."""
         return len(self.upload.data)
 
     @property
@@ -254,14 +256,14 @@ class _Request:
     ----------
     todo : uploads without a result, by their index in the request
     results, once, fence : see `Uploads.add_all`
-    left : blobs of the last attempt that may be unreferenced
+    unused : blobs of the last attempt that may be unreferenced
     """
 
     todo: dict[int, _Prepared]
     results: list[UploadResult | None]
     once: IdempotentRequest | None
     fence: Callable[[Connection], None] | None
-    left: list[str] = field(default_factory=list)
+    unused: list[str] = field(default_factory=list)
 
     @cached_property
     def blobs(self) -> dict[str, bytes]:
@@ -275,7 +277,7 @@ class _Request:
 
 
 class IncomingBytes:
-    """Number of bytes of incoming archives by map, which no row in the database counts yet."""
+    """Number of archive bytes that a map is receiving, and that no database row counts yet."""
 
     def __init__(self) -> None:
         self._sizes, self._guard = Counter[int](), threading.Lock()
@@ -330,7 +332,7 @@ class Uploads:
         self, map_name: str, uploads: Sequence[Upload], once: IdempotentRequest | None = None,
         fence: Callable[[Connection], None] | None = None,
     ) -> tuple[list[UploadResult], bool]:  # fmt: skip
-        """Store frames in a map in one commit; their results contain errors of single frames.
+        """Store frames in a map in one commit; the results contain errors of single frames.
 
         Parameters
         ----------
@@ -343,7 +345,7 @@ class Uploads:
         """
         with self._store.database.read() as connection:
             row = find_map(connection, map_name)
-            before = _before(connection, row, once)
+            before = _earlier_results(connection, row, once)
         if before is not None:
             for upload, outcome in zip(uploads, before, strict=True):
                 if outcome.added is not None:  # the stored blob may be lost
@@ -408,10 +410,10 @@ class Uploads:
         return UploadResult(added.model_copy(update={"reason": reason}))
 
     def _renew(self, map_name: str, frame_id: str, upload: Upload) -> None:
-        """Replace the blob of a frame if it is lost or damaged."""
-        left = repair.take_upload(self._store, map_name, frame_id, upload.data)
-        if left:
-            garbage_collection.collect_blobs(self._store, left)
+        """Replace the blob of a frame if it is lost or damaged; remove unreferenced blobs."""
+        unused = repair.take_upload(self._store, map_name, frame_id, upload.data)
+        if unused:
+            garbage_collection.collect_blobs(self._store, unused)
 
     def _write(
         self, row: MapRow, ready: dict[int, _Prepared], results: list[UploadResult | None],
@@ -451,12 +453,12 @@ class Uploads:
                     garbage_collection.collect_blobs(self._store, list(blobs))
                 raise
             if written is not None:
-                if request.left:
-                    garbage_collection.collect_deleted_blobs(self._store, request.left)
+                if request.unused:
+                    garbage_collection.collect_deleted_blobs(self._store, request.unused)
                 return written
 
     def _insert_single(self, row: MapRow, request: _Request) -> UploadResult | None:
-        """Insert a new frame by one statement that concurrent uploads share, on PostgreSQL.
+        """Insert a new frame with a statement that concurrent uploads share, on PostgreSQL.
 
         Return None without writing if the frame is not new or has a requested id, other uploads
         wait for the map, or the database is SQLite.
@@ -486,11 +488,11 @@ class Uploads:
             now = find_map(connection, row.name)
             if now.number != row.number:
                 return None
-            before = _before(connection, now, request.once)
+            before = _earlier_results(connection, now, request.once)
             if before is not None:
-                request.left[:] = request.blobs
+                request.unused[:] = request.blobs
                 return list(before), True
-        request.left.clear()
+        request.unused.clear()
         new = {
             i: _new_frame(row, prepared)
             for i, prepared in request.todo.items()
@@ -504,7 +506,7 @@ class Uploads:
             now = find_map(connection, row.name)
             if now.number != row.number:
                 return None
-            written[i] = _store_single(connection, now, prepared, request.left)
+            written[i] = _store_single(connection, now, prepared, request.unused)
         results = [written.get(i, result) for i, result in enumerate(request.results)]
         if request.once is not None and not any(
             result is not None and isinstance(result.error, errors.QuotaExceeded)
@@ -525,7 +527,7 @@ class Uploads:
 
 
 def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
-    """Return the row of a frame to insert unless it exists.
+    """Return a frame that is to be inserted if it does not exist.
 
     With `once` (PostgreSQL only), the statement also stores the result for the idempotency key.
     """
@@ -547,31 +549,31 @@ def _new_result(new: NewFrame) -> UploadResult:
 
 
 def _store_single(
-    connection: Connection, row: MapRow, ready: _Prepared, left: list[str]
+    connection: Connection, row: MapRow, ready: _Prepared, unused: list[str]
 ) -> UploadResult:
-    """Store an upload, and return its result; add blobs that may be unreferenced to `left`."""
+    """Store an upload, and return its result; add blobs that may be unreferenced to `unused`."""
     upload = ready.upload
     try:  # search again: another upload may have added the frame
         frame = find_duplicate(connection, row, ready.content, ready.metadata, upload.frame_id)
     except errors.FrameConflict as error:
-        left.append(ready.blob)
+        unused.append(ready.blob)
         return UploadResult(None, error=error)
     if frame is not None and not is_retried(frame.state):
         relax_novelty(connection, frame.number, upload.if_novel)
-        left.append(ready.blob)
+        unused.append(ready.blob)
         return UploadResult(upload_response(connection, frame))
     new = frame is None or frame.state == FrameState.REDUNDANT
     # the quota already counts the former blob of a failed frame, whose size may differ
     counted = 0 if frame is None or new else frame.bytes
     try:
-        left.extend(make_room(connection, row, ready.size - counted, new=new))
+        unused.extend(make_room(connection, row, ready.size - counted, new=new))
     except errors.QuotaExceeded as error:
-        left.append(ready.blob)
+        unused.append(ready.blob)
         return UploadResult(None, error=error)
     if frame is None:
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
     else:
-        left.append(frame.blob)  # the new blob may have another file format
+        unused.append(frame.blob)  # the new blob may have another file format
         frame = renew_frame(connection, frame.number, ready.blob_columns)
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)

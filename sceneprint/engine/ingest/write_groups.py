@@ -176,7 +176,7 @@ def _do(write: _Waiting[_Work], connection: Connection) -> None:
 
 
 class NewFrames(_Group[NewFrame]):
-    """Write group that inserts new frames of all maps by one statement; PostgreSQL only."""
+    """Write group that inserts new frames of all maps with one statement; PostgreSQL only."""
 
     def __init__(self, database: Database) -> None:
         super().__init__()

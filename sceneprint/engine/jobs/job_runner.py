@@ -68,7 +68,7 @@ class JobRunner:
             )  # fmt: skip
 
     def put_back(self, work: Work | LongJob) -> None:
-        """Return a claimed job to the queue."""
+        """Return a claimed job to the queue, and wake a worker."""
         if isinstance(work, LongJob):
             self._tasks.put_back(work)
         else:

@@ -30,8 +30,8 @@ from sceneprint_client.api.admin import RefusedRetry, RetriedJobs
 
 log = logging.getLogger(__name__)
 
-#: Delay in seconds before the next attempt of a job whose result could not be stored.
-LEFT_S = 5.0
+#: Delay, in seconds, before the next attempt of a job whose result could not be stored.
+DELAY_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Work:
 
     @property
     def again(self) -> bool:
-        """Return whether the job signs an indexed frame again; meanwhile it stays indexed."""
+        """Return whether the job signs an indexed frame again; the frame remains indexed."""
         return self.job.kind == REENCODE
 
     @property
@@ -66,8 +66,11 @@ def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
             set_state(connection, work.frame.number, FrameState.RECEIVED)
 
 
-def restart_jobs(store: Store, work: Work) -> JobState | None:
-    """Queue or cancel a job whose map has switched models; return its state, None without lease."""
+def restart_job(store: Store, work: Work) -> JobState | None:
+    """Queue a job whose map has switched models, or cancel it if its frame is signed again.
+
+    Return the state of the job; None if the lease was lost.
+    """
     if not work.again:
         put_back(store, work)
         return JobState.QUEUED
@@ -88,7 +91,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     """Mark a job as failed, and its frame as rejected, after an error that a retry would repeat.
 
     A frame that is signed again (`work.again`) is not rejected. If the map has switched models, the
-    job is restarted; see `restart_jobs`. Return the state of the job; None if the lease was lost.
+    job is restarted; see `restart_job`. Return the state of the job; None if the lease was lost.
     """
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
@@ -102,12 +105,15 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     except LostLease:
         return None
     except Outdated:
-        return restart_jobs(store, work)
+        return restart_job(store, work)
     return JobState.FAILED
 
 
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
-    """Queue a failed job for another attempt, or mark it as dead; return its state."""
+    """Queue a failed job for another attempt, or mark it as dead and its frame as failed.
+
+    Return the state of the job; None if the lease was lost.
+    """
     reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
     try:
@@ -134,7 +140,7 @@ def failure_texts(error: Exception) -> tuple[str, str]:
 
 
 def about(work: Work, **more: object) -> dict[str, object]:
-    """Return the log fields of a job, and the fields `more`."""
+    """Return the log fields of a job, with the fields `more` added."""
     return {
         "job_id": work.job.id, "frame_id": work.frame.id, "map": work.map.name,
         "attempt": work.job.attempts, **more,
@@ -200,7 +206,8 @@ def get_job(store: Store, job_id: str) -> Job:
 
 
 def cancel(store: Store, job_id: str) -> Job:
-    """Cancel a queued or running job; return a cancelled job unchanged.
+    """Cancel a queued or running job, and fail its unsigned frame; return a cancelled job
+    unchanged.
 
     A worker may continue with the job, but its result is refused. The archive of an import is
     removed immediately.
@@ -224,17 +231,19 @@ def cancel(store: Store, job_id: str) -> Job:
 
 
 def retry(store: Store, bell: Wakeup, job_id: str) -> tuple[Job, bool]:
-    """Retry a failed, dead or cancelled job by a new job of the same priority; resume a long job.
+    """Retry a failed, dead or cancelled job: queue a new job, or resume a long job.
 
     Returns
     -------
-    job : new or resumed job, or an unfinished job that already retries the frame
+    job : new or resumed job, an unfinished job that already retries the frame, or the unfinished
+        long job itself
     is_new : whether the job was queued by this call
 
     Raises
     ------
     UnknownJob : If the job does not exist.
-    CannotRetry : If the job succeeded, a later job of its frame has ended, or the upload is lost.
+    CannotRetry : If the job succeeded. For the job of a frame, also if it is unfinished, a later
+        job of the frame has ended, the frame needs no retry, or the upload is lost.
     """
     job, is_new = _retry(store, job_id)
     if is_new:
@@ -309,7 +318,7 @@ def worker_died(
 ) -> JobState | None:
     """Release a job of a dead worker before the end of its lease.
 
-    Return the new state of the job; None if another worker has it or it is over. See
+    Return the new state of the job; None if the job is over or another worker holds it. See
     `queue.fail_dead_worker` for the parameters.
     """
     with store.database.write() as connection:
@@ -329,7 +338,7 @@ def worker_died(
 
 
 def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
-    """Mark the frame of a job as failed, unless the frame is indexed or deleted."""
+    """Mark the frame of a job as failed, and record an event, if the frame awaits its signature."""
     if job.frame_number is None:
         return
     frame = frame_of(connection, job.frame)

@@ -40,15 +40,15 @@ from sceneprint_client.api import FrameState, JobState
 log = logging.getLogger(__name__)
 
 #: Maximum seconds to retry storing a result while the database is unreachable, and seconds between
-#: attempts. The time that a worker has to stop is longer.
+#: attempts. A worker has more time than this to stop.
 AWAY_S, AGAIN_S = 12.0, 0.5
 
 
 def claim(store: Store, worker: str, lease_s: float) -> lifecycle.Work | LongJob | None:
     """Claim the next job for `lease_s` seconds; return None if no job is due.
 
-    Before that, mark jobs as dead that ended too many workers. A job without a frame is a LongJob.
-    See also `queue.claim`.
+    Before that, mark jobs that killed too many workers as dead, and their frames as failed. A job
+    without a frame becomes a LongJob. See also `queue.claim`.
     """
     with store.database.read() as connection:
         if not queue.has_due(connection):
@@ -96,6 +96,10 @@ def run(
     -------
     state : new state of the job: queued if it will be retried; None if the lease was lost and the
         result discarded
+
+    Raises
+    ------
+    UnusableStore : If the store cannot be used; the job was returned to the queue, if possible.
     """
     start = time.perf_counter()
     state: JobState | None
@@ -110,13 +114,13 @@ def run(
         log.warning("lease lost", extra=lifecycle.about(work, error=str(error)))
         state = None
     except lifecycle.Outdated:
-        state = lifecycle.restart_jobs(store, work)
+        state = lifecycle.restart_job(store, work)
     except errors.FrameError as error:
         state = lifecycle.reject(store, work, error)
     except errors.UnusableStore:  # a full disk does not count as a failure of the frame
         with suppress(errors.UnusableStore):  # otherwise, the lease expires
             # with a delay, so that a worker with a free disk can claim the job
-            lifecycle.put_back(store, work, lifecycle.LEFT_S)
+            lifecycle.put_back(store, work, lifecycle.DELAY_S)
             if result is not None:
                 collect_blobs(store, [result.signature.geometry])
         raise
@@ -137,7 +141,7 @@ def run(
 
 
 def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> SigningResult:
-    """Sign a frame, and store its artifact."""
+    """Sign a frame, and store its artifact; raise Outdated if the map no longer uses the model."""
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
@@ -177,6 +181,11 @@ def _store(
     Returns
     -------
     blobs : blobs that may be unreferenced now, such as those of a redundant frame
+
+    Raises
+    ------
+    LostLease, Outdated : If another worker took the job, or the map has switched its model.
+    DamagedBlob : If a deletion removed the artifact.
     """
     signature = result.signature
     if work.again:
@@ -221,7 +230,10 @@ _SWEPT = "A deletion removed the artifact, so the frame is signed again."
 
 
 def _index_alone(store: Store, work: lifecycle.Work, result: SigningResult) -> bool:
-    """Index a new frame by one statement, if possible; return whether it was."""
+    """Index a new frame with a single statement, if possible; return whether it was indexed.
+
+    It is possible on PostgreSQL, for a frame without `if_novel`.
+    """
     signature = result.signature
     if store.database.is_sqlite or work.frame.novelty is not None:
         return False
@@ -285,7 +297,7 @@ def find_nearest(
 
     Returns
     -------
-    nearest : nearest frame; None if the signature is of another model than the map
+    nearest : nearest frame; None if the map uses another model than the signature
 
     Raises
     ------
@@ -306,8 +318,8 @@ def find_nearest(
 
 
 def why_redundant(
-    connection: Connection, frame: FrameRow, signature: StoredSignature, seen: Nearest | None,
-    model: Model,
+    connection: Connection, frame: FrameRow, signature: StoredSignature,
+    search_result: Nearest | None, model: Model,
 ) -> str | None:  # fmt: skip
     """Return the reason why a frame is redundant; None if it is novel.
 
@@ -315,7 +327,7 @@ def why_redundant(
 
     Parameters
     ----------
-    seen : result of `find_nearest`
+    search_result : result of `find_nearest`
 
     Raises
     ------
@@ -323,9 +335,9 @@ def why_redundant(
     """
     novelty = frame_of(connection, frame.number).novelty  # may have been relaxed since the claim
     row = map_of_number(connection, frame.map_number)
-    if novelty is None or seen is None or row.model_id != signature.model_id:
+    if novelty is None or search_result is None or row.model_id != signature.model_id:
         return None
-    nearest = _nearest_now(connection, row, _vector(signature), seen, model.metric)
+    nearest = _nearest_now(connection, row, _vector(signature), search_result, model.metric)
     if nearest is None:
         return None
     distance = np.array(nearest[1])
@@ -340,10 +352,10 @@ def why_redundant(
 
 
 def _nearest_now(
-    connection: Connection, row: MapRow, vector: Bytes, seen: Nearest, metric: Metric
+    connection: Connection, row: MapRow, vector: Bytes, search_result: Nearest, metric: Metric
 ) -> tuple[int, int] | None:
-    nearest = seen.nearest
-    for block in changes_since(connection, row, seen.revision):
+    nearest = search_result.nearest
+    for block in changes_since(connection, row, search_result.revision):
         for change in block:
             if nearest is not None and change.number == nearest[0]:
                 raise Stale

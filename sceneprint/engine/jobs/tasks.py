@@ -17,7 +17,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
-from sceneprint.engine.jobs.lifecycle import LEFT_S, failure_texts, renewed
+from sceneprint.engine.jobs.lifecycle import DELAY_S, failure_texts, renewed
 from sceneprint.engine.serializers import job_record
 from sceneprint.engine.upkeep.garbage_collection import collect_deleted_blobs
 from sceneprint.errors import (
@@ -216,7 +216,7 @@ class Tasks:
             self.put_back(task)
             state = JobState.QUEUED
         except UnusableStore:  # a full disk does not count as a failure of the job
-            self.put_back(task, LEFT_S)
+            self.put_back(task, DELAY_S)
             raise
         except Exception as error:
             state = self._break_down(task, error)
@@ -227,7 +227,7 @@ class Tasks:
         return state
 
     def _end_of_slice(self, job: JobRow) -> IsOver:
-        """Return the `IsOver` of a slice that starts now."""
+        """Return the `IsOver` function of a slice that starts now."""
         until, look_at = time.monotonic() + SLICE_S, 0.0
 
         def is_over() -> bool:
@@ -323,7 +323,7 @@ def _make_room(
 
 
 def _about(task: LongJob, **more: object) -> dict[str, object]:
-    """Return the log fields of a job, and the fields `more`."""
+    """Return the log fields of a job, with the fields `more` added."""
     job = task.job
     name = None if task.map is None else task.map.name
     return {"job_id": job.id, "kind": job.kind, "map": name, "attempt": job.attempts, **more}

@@ -56,26 +56,26 @@ if TYPE_CHECKING:
 
 #: Maximum number of consecutive requests without a new part before the pull fails.
 ROUNDS = 10
-#: Size of a response in bytes from which no further part is added.
+#: Size of a response, in bytes, at which no more parts are added.
 MOST_BYTES = 32 << 20
 _NAMES = [column.name for column in COLUMNS]
 
 
 def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes, int]]:
-    """Yield the parts of the indexed frames of a map: digest, bytes and number of rows."""
+    """Yield the digest, bytes and number of rows of each part of the indexed frames of a map."""
     for rows, _ in cut_rows(encoded_rows(COLUMNS, copied_rows(connection, row)), [0]):
         data = write_part(_NAMES, rows)
         yield hashlib.sha256(data).hexdigest(), data, len(rows)
 
 
 class MapCopies:
-    """Sources of map copies, on the side of the service."""
+    """Sources of map copies in the service."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def bundle(self, map_name: str, have: Collection[str]) -> bytes:
-        """Return a consistent state of a map: a line of JSON (`MapCopy`), then bytes of parts.
+        """Return a consistent state of a map: a line of JSON (`MapCopy`), then the bytes of parts.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ _MARK = "map-copy.json"
 
 
 def claim_folder(folder: Path) -> None:
-    """Mark a data folder as a folder of map copies; raise InvalidRequest if it has other files."""
+    """Create or mark a data folder for map copies; raise InvalidRequest if it has other files."""
     if (folder / _MARK).is_file():
         return
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -183,22 +183,23 @@ def pull_map(
     client: Client, store: Store, map_name: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> PulledMap:  # fmt: skip
-    """Update the copy of a map to its current state in the service.
+    """Create the copy of a map, or update it to the current state of the service.
 
-    Until the end, queries of the copy use its former state.
+    Queries of the copy use its former state until the update is complete.
 
     Parameters
     ----------
     client : client with a key that may read the map
     store : store of the copy
-    progress : callback with the number of fetched frames, and of all frames to fetch
+    progress : callback that receives the number of fetched frames, and the number of frames to
+        fetch
 
     Raises
     ------
     UnknownMap : If the service has no such map that the key may read.
     Conflict : If the map was replaced, switched its model or lost artifacts meanwhile, or frames
         were uploaded into the copy.
-    DamagedBlob : If the service sent damaged bytes.
+    DamagedBlob : If the service sent damaged bytes, or an artifact was removed during the update.
     """
     pull = _Pull(_own_parts(store, map_name), {})
     artifacts = size = idle = 0
@@ -288,7 +289,7 @@ def _changed(map_name: str) -> Conflict:
 
 
 def _find_copy(connection: Connection, head: MapCopy) -> MapRow | None:
-    """Return the copy of a map; None without a copy, or if it is of a former map of this name."""
+    """Return the copy of a map; None without a copy, or if it copies a former map of this name."""
     row = next((record for record in list_maps(connection) if record.name == head.name), None)
     if row is None or (row.created_at, row.model_id) != (head.created_at, head.model_id):
         return None
@@ -300,7 +301,7 @@ def _write(
 ) -> tuple[int, int]:
     """Update the copy in one transaction; return the number of written and of removed frames."""
     before = {name: row for part in pull.own.values() for name, row in part.items()}
-    written = [_copied(head, row) for name, row in rows.items() if before.get(name) != row]
+    written = [_decode_row(head, row) for name, row in rows.items() if before.get(name) != row]
     blobs: list[str] = []
     with store.blobs.block_removals(), store.database.write() as connection:
         store_model(connection, head.model_id, head.model, model)
@@ -311,26 +312,26 @@ def _write(
             existing[copy.id] for copy in written
             if copy.id in existing and existing[copy.id].content_id != copy.values["content_id"]
         ]  # fmt: skip
-        for some in blocks([one.number for one in (*deleted, *renewed)]):
+        for some in blocks([frame.number for frame in (*deleted, *renewed)]):
             blobs += delete_frames(connection, row, list(some))
-        remaining = existing.keys() - {one.id for one in renewed}
-        for one in written:
-            if not store.blobs.holds(one.signature.geometry):
+        remaining = existing.keys() - {frame.id for frame in renewed}
+        for copy in written:
+            if not store.blobs.holds(copy.signature.geometry):
                 raise DamagedBlob(
-                    f"The artifact {one.signature.geometry[:12]} was removed during the pull. "
+                    f"The artifact {copy.signature.geometry[:12]} was removed during the pull. "
                     "Pull the map again."
                 )
-            if one.id in remaining:
-                write_frame(connection, row, existing[one.id], one.values)
-                replace_signature(connection, existing[one.id], one.signature)
-        new = [one for one in written if one.id not in remaining]
+            if copy.id in remaining:
+                write_frame(connection, row, existing[copy.id], copy.values)
+                replace_signature(connection, existing[copy.id], copy.signature)
+        new = [copy for copy in written if copy.id not in remaining]
         for first in range(0, len(new), BLOCK):
             add_copied(connection, row, new[first : first + BLOCK])
     collect_deleted_blobs(store, blobs)
     return len(written), len(deleted)
 
 
-def _copied(head: MapCopy, row: Row) -> CopiedFrame:
+def _decode_row(head: MapCopy, row: Row) -> CopiedFrame:
     """Decode a row to a frame."""
     ((name, *cells),) = decoded_rows(COLUMNS, [row])
     values: dict[str, Any] = {
@@ -343,7 +344,9 @@ def _copied(head: MapCopy, row: Row) -> CopiedFrame:
 
 
 def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:
-    """Return the copy of a map; create it if it is missing, replace it if it is of a deleted map.
+    """Create, replace or update the row of a copied map, and return the row.
+
+    A copy of a former map of this name is replaced; its blobs are added to `blobs`.
 
     Raises
     ------
@@ -362,7 +365,7 @@ def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: lis
 
 
 def _require_copied(store: Store, rows: Iterable[FrameRow], map_name: str) -> None:
-    """Raise Conflict if a frame was uploaded into the copy, that is, has an upload."""
+    """Raise Conflict if the upload of a frame is stored: it was uploaded into the copy."""
     own = [row.id for row in rows if store.blobs.holds(row.blob)]
     if own:
         raise Conflict(

@@ -50,7 +50,7 @@ from sceneprint_client.api.listing import FrameListing, Run, Session, Trajectory
 from sceneprint_client.api.results import CloudFrame, FramePatches, FrameSignature, PatchLevel, View
 from sceneprint_client.formats import BYTES, format_at
 
-#: Version of the derived data, for entity tags; increment it if their bytes change.
+#: Version of derived data in entity tags; increment it when the bytes of derived data change.
 FORM = 1
 
 
@@ -64,7 +64,7 @@ class IndexedFrame:
     artifact: str
 
     def tag(self, what: str, *options: object) -> str:
-        """Return the entity tag of derived data, named `what`, with some options."""
+        """Return the entity tag of the derived data `what`, computed with `options`."""
         return tag_of(what, FORM, self.frame.content_id, self.row.model_id, *options)
 
 
@@ -97,7 +97,8 @@ def living(row: MapRow, frame: FrameRow) -> FrameRow:
 
 
 def geometry_of(store: Store, signers: Signers, indexed: IndexedFrame) -> Geometry:
-    """Return the geometry of a frame; if it is damaged, rebuild it from the upload.
+    """Return the geometry of a frame; if it is damaged, rebuild it from the upload, and queue a job
+    that repairs it.
 
     Raises
     ------
@@ -135,7 +136,7 @@ _MOST_NAMES = 20
 
 
 def list_frames(
-    store: Store, map_name: str, wanted: FrameListing, cursor: str | None, limit: int
+    store: Store, map_name: str, listing: FrameListing, cursor: str | None, limit: int
 ) -> Page[Frame]:
     """Return a page of the frames that pass a filter, in the requested order.
 
@@ -144,12 +145,12 @@ def list_frames(
     UnknownMap : If the map does not exist.
     InvalidRequest : If the service did not issue the cursor.
     """
-    beyond = _position_of(store, cursor, wanted)
+    beyond = _position_of(store, cursor, listing)
     with store.database.read() as connection:
         row = find_map(connection, map_name)
-        rows = frame_queries.list_frames(connection, row.number, beyond, limit + 1, wanted)
+        rows = frame_queries.list_frames(connection, row.number, beyond, limit + 1, listing)
         items = frame_records(connection, row, rows[:limit])
-    more = _position_cursor(store, rows[limit - 1], wanted) if len(rows) > limit else None
+    more = _position_cursor(store, rows[limit - 1], listing) if len(rows) > limit else None
     return Page[Frame](items=items, next_cursor=more)
 
 
@@ -160,19 +161,19 @@ def get_frame(store: Store, map_name: str, frame_id: str) -> Frame:
         return frame_records(connection, row, [find_frame(connection, row, frame_id)])[0]
 
 
-def _position_cursor(store: Store, last: FrameRow, wanted: FrameListing) -> str:
-    """Return the cursor of the page after a frame; it has the sort key, not only the id."""
+def _position_cursor(store: Store, last: FrameRow, listing: FrameListing) -> str:
+    """Return a cursor for the page after a frame; it contains the sort key besides the number."""
     sealed = store.seals.seal("frame", last.number)
-    if wanted.order != "taken":
+    if listing.order != "taken":
         return sealed
     return f"{sealed}~{_packed([last.captured_at, last.sequence])}"
 
 
-def _position_of(store: Store, cursor: str | None, wanted: FrameListing) -> CapturePosition | None:
-    """Decode a cursor of `_position_cursor`; raise InvalidRequest if it is not authentic."""
+def _position_of(store: Store, cursor: str | None, listing: FrameListing) -> CapturePosition | None:
+    """Decode a cursor from `_position_cursor`; raise InvalidRequest if it is not authentic."""
     if cursor is None:
         return None
-    if wanted.order != "taken":
+    if listing.order != "taken":
         number = store.seals.row("frame", cursor)
         return None if number is None else CapturePosition(number, None, None)
     sealed, _, values = cursor.partition("~")
@@ -221,8 +222,8 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
     with store.database.read() as connection:
         row = find_map(connection, map_name)
         counts = count_run(connection, row.number, run)
-        robot = _only("robot", run.robot, {one for one, _, _ in counts}, run.session)
-        parents = {one for _, one, _ in counts if one is not None}
+        robot = _only("robot", run.robot, {name for name, _, _ in counts}, run.session)
+        parents = {name for _, name, _ in counts if name is not None}
         parent = _only("parent_frame", run.parent_frame, parents, run.session)
         total = sum(count for _, _, count in counts)
         if run.most is None and total > MOST_POSES:
@@ -291,10 +292,10 @@ def trajectory_file(track: Trajectory) -> str:
     return trajectory_text(track.poses, comments)
 
 
-def _only(what: str, wanted: str | None, names: Iterable[str | None], session: str) -> str | None:
-    """Return `wanted` or the only name in `names`; raise InvalidRequest if that is ambiguous."""
-    if wanted is not None:
-        return wanted
+def _only(what: str, choice: str | None, names: Iterable[str | None], session: str) -> str | None:
+    """Return `choice`, else the only name in `names`; raise InvalidRequest if it has several."""
+    if choice is not None:
+        return choice
     names = sorted(set(names), key=lambda name: name or "")
     if len(names) > 1:
         shown = ", ".join("none" if name is None else repr(name)[:60] for name in names[:5])
@@ -378,7 +379,7 @@ def level_of(patches: Patches) -> PatchLevel:
 
 
 def npy_of(vector: bytes) -> bytes:
-    """Return an NPY file with bytes as a uint8 array (D,)."""
+    """Convert bytes to an NPY file with a uint8 array (D,)."""
     return encode_npy(np.frombuffer(vector, np.uint8))
 
 
@@ -452,7 +453,7 @@ class FrameFiles:
                 map=indexed.row.name,
                 frame=sensor_of(indexed.frame),
                 model=indexed.label,
-                levels=[level_of(one) for one in self._hierarchy(indexed)[1].levels],
+                levels=[level_of(level) for level in self._hierarchy(indexed)[1].levels],
                 validation=level_of(geometry_of(self._store, self._signers, indexed).patches),
             )
 
@@ -514,22 +515,24 @@ class FrameFiles:
         return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
 
     def _hierarchy(self, indexed: IndexedFrame) -> tuple[Surface, Hierarchy]:
-        """Compute surface and hierarchy of a frame from its upload; stored points are rounded."""
+        """Compute surface and hierarchy of a frame from its upload, since stored points are
+        rounded.
+        """
         p = self._signers(indexed.row.model_id).model.parameters
         frame = read_stored(
             self._store.blobs.get(indexed.frame.blob), indexed.frame, self._store.decoders
         )
-        seen = see(frame, p)
-        return seen, hierarchy_of(seen, p, indexed.frame.id)
+        surface = see(frame, p)
+        return surface, hierarchy_of(surface, p, indexed.frame.id)
 
     def _labels(self, indexed: IndexedFrame) -> Ints32:
-        """Return the label image of the finest patches; points of a cloud are projected onto it."""
-        seen, hierarchy = self._hierarchy(indexed)
+        """Return the label image of the finest patches; points of a cloud are projected into it."""
+        surface, hierarchy = self._hierarchy(indexed)
         labels = hierarchy.labels[0]
-        if isinstance(seen.camera, Intrinsics):
+        if isinstance(surface.camera, Intrinsics):
             return labels
         drawn = geometry_of(self._store, self._signers, indexed).surface
-        return project_labels(vista_of(drawn), drawn, seen.points.reshape(-1, 3), labels.ravel())
+        return project_labels(vista_of(drawn), drawn, surface.points.reshape(-1, 3), labels.ravel())
 
     def _signature(self, indexed: IndexedFrame) -> tuple[bytes, tuple[list[int], list[int]]]:
         number, model_id = indexed.frame.number, indexed.row.model_id

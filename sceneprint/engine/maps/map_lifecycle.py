@@ -142,13 +142,15 @@ def edit_frame(
     store: Store, map_name: str, frame_id: str, patch: Mapping[str, Any],
     if_match: Collection[str] | None = None,
 ) -> Frame:  # fmt: skip
-    """Edit the metadata of a frame by a JSON merge patch (RFC 7396).
+    """Edit the metadata of a frame with a JSON merge patch (RFC 7396).
+
+    A pose in a joined parent frame is converted to the root frame.
 
     Parameters
     ----------
     map_name, frame_id : map and id of a frame in any state
     patch : fields of FrameEdit to change; None removes a value
-    if_match : entity tags from `frame_tag` that permit the edit; None permits it always
+    if_match : entity tags from `frame_tag` that permit the edit; None always permits it
 
     Raises
     ------
@@ -226,7 +228,7 @@ def _merged(frame: FrameRow, patch: Mapping[str, Any]) -> FrameMeta:
     }
     for field, change in patch.items():
         is_transform = field in ("pose", "T_base_sensor") and isinstance(change, Mapping)
-        values[field] = _with(values[field], change) if is_transform else change
+        values[field] = _merge_transform(values[field], change) if is_transform else change
     fields = {name: value for name, value in values.items() if value is not None}
     return record_of(FrameMeta, {"intrinsics": frame.intrinsics, **fields}, "The edit of the frame")
 
@@ -237,7 +239,7 @@ def _relative_transform(
     return None if matrix is None else {name: frame, "matrix": matrix}
 
 
-def _with(now: Mapping[str, Any] | None, change: Mapping[str, Any]) -> dict[str, Any]:
+def _merge_transform(now: Mapping[str, Any] | None, change: Mapping[str, Any]) -> dict[str, Any]:
     """Apply a patch to a transform; the result has only one of the two notations."""
     change = {ROS_NAMES.get(name, name): value for name, value in change.items()}
     old = dict(now or {})
@@ -279,7 +281,7 @@ TIDY_S = 2.0
 
 
 def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Path | Model) -> Map:
-    """Start to re-encode a map with another model; if it has started, retry its failed jobs.
+    """Start to re-encode a map with another model; if this has already started, retry failed jobs.
 
     Parameters
     ----------
@@ -375,9 +377,10 @@ class Reencodings:
         return self._switch(row, version)
 
     def _switch(self, row: MapRow, version: IndexVersion | None) -> bool:
+        """Switch a complete re-encoding to the next model; return False if it is not complete."""
         with self._store.database.write() as connection:
             now = find_map(connection, row.name)
-            if not _still(now, row) or not stored.is_complete(connection, now):
+            if not _is_same_switch(now, row) or not stored.is_complete(connection, now):
                 return False  # a frame was indexed meanwhile, or another process switched the map
             usable = trusted(connection, now, version)
             if usable is not None:
@@ -393,14 +396,17 @@ class Reencodings:
 
 
 def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
-    """Queue jobs for all frames without a signature of the next model; return their number."""
+    """Queue jobs for frames without a signature of the next model; return their number.
+
+    With `again`, this includes frames whose job has failed.
+    """
     after, queued = 0, 0
     while True:
         with store.database.read() as connection:  # usually none, so avoid a write lock
             if not stored.unqueued_frames(connection, row, after, again=again):
                 return queued
         with store.database.write() as connection:
-            if not _still(find_map(connection, row.name), row):
+            if not _is_same_switch(find_map(connection, row.name), row):
                 return queued
             numbers = stored.unqueued_frames(connection, row, after, again=again)
             stored.enqueue_all(connection, row, numbers)
@@ -409,7 +415,10 @@ def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
 
 
 def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
-    """Remove jobs and signatures of former models of a map; return whether all were removed."""
+    """Remove jobs and signatures of former models of a map, for about `at_most_s` seconds.
+
+    Return whether all were removed.
+    """
     start = time.monotonic()
     while True:
         with store.database.read() as connection:
@@ -435,7 +444,7 @@ def _tidy(store: Store, row: MapRow, at_most_s: float = math.inf) -> bool:
         collect_blobs(store, blobs)
 
 
-def _still(now: MapRow, row: MapRow) -> bool:
+def _is_same_switch(now: MapRow, row: MapRow) -> bool:
     return (now.number, now.next_model_id) == (row.number, row.next_model_id)
 
 
@@ -475,7 +484,7 @@ class Catalogue:
         ]
 
     def find(self, name: str, may_read: Callable[[str], bool] | None = None) -> Model:
-        """Return a preset or a stored model.
+        """Return a preset by its name, or a model by its id or label.
 
         Parameters
         ----------

@@ -81,12 +81,14 @@ def coverage_plans(
     """
     flat = {name: positions.get(name, np.empty((0, 3))) @ axes[name].axes.T for name in queried}
     flat_queried = {
-        name: np.array([one.at for one in some]) @ axes[name].axes.T
+        name: np.array([position.at for position in some]) @ axes[name].axes.T
         for name, some in queried.items()
     }
     if cell_m is None:
         every = [np.concatenate([flat[name], flat_queried[name]]) for name in queried]
-        cell_m = cell_width(max((float(np.ptp(one, axis=0).max()) for one in every), default=0.0))
+        cell_m = cell_width(
+            max((float(np.ptp(points, axis=0).max()) for points in every), default=0.0)
+        )
     while True:
         counted = {
             name: (_places(flat[name], cell_m), _places(flat_queried[name], cell_m))
@@ -101,7 +103,7 @@ def coverage_plans(
             x_axis=axes[name].axes[0].tolist(),
             y_axis=axes[name].axes[1].tolist(),
             up_from=axes[name].up_from,
-            cells=_cells(Counter(all_of), some, [one.outcome for one in queried[name]]),
+            cells=_cells(Counter(all_of), some, [position.outcome for position in queried[name]]),
         )
         for name, (all_of, some) in counted.items()
     ]
@@ -142,7 +144,7 @@ def localisability(cell: CoverageCell) -> float:
 def plan_changes(
     before: Sequence[CoveragePlan], after: Sequence[CoveragePlan]
 ) -> list[PlanChanges]:
-    """Return the changes between two comparable results, of cells with queried frames in either."""
+    """Return the changes of the cells in which either of two comparable results queried frames."""
     names = dict.fromkeys(plan.parent_frame for plan in (*after, *before))
     changed = []
     for name in names:
@@ -181,7 +183,7 @@ def _change(
 
 #: RGB colour that is legible on white and on black, and opacity of a single cell and of a wall.
 _COLOUR, _OPACITIES = (122, 130, 143), (90.0, 255.0)
-#: Percentile of the counts per pixel from which a pixel is fully opaque.
+#: Percentile of the counts per pixel at which a pixel becomes fully opaque.
 _FULL = 97.0
 
 
@@ -206,11 +208,11 @@ class PlanFrame:
 def plan_frame(
     axes: Floats, low: Sequence[float], high: Sequence[float], cell_m: float, longer: int
 ) -> PlanFrame:
-    """Return the smallest frame of an image that contains a box.
+    """Return the smallest image frame on a plan that contains a box.
 
     Parameters
     ----------
-    axes : (2, 3) unit vectors to the right and to the top
+    axes : (2, 3) unit vectors that point right and up on the plan
     low, high : (3,) opposite corners of the box, metres
     cell_m : minimum length of a side, metres
     longer : length of the longer side, pixels
@@ -229,7 +231,7 @@ def surface_picture(
     plan: PlanFrame, axes: Floats, points: Iterable[Floats], cell_m: float,
     heights: tuple[float | None, float | None],
 ) -> bytes:  # fmt: skip
-    """Draw the plan of a surface as a PNG; a pixel is more opaque the more points it contains.
+    """Draw the plan of a surface as a PNG; pixels with more points are more opaque.
 
     Parameters
     ----------

@@ -113,7 +113,11 @@ class MapSurfaces:
         return record, pending
 
     def remove(self, map_name: str) -> None:
-        """Remove the surface of a map until the next build; raise UnknownMap if there is no map."""
+        """Remove the surface of a map, which is built again only by `begin`.
+
+        Rows that remain after _CALL_S seconds are removed by workers. Raise UnknownMap if the map
+        does not exist.
+        """
         with self._store.database.write() as connection:
             row = find_map(connection, map_name)
             surface = stored.find_surface(connection, row.number)
@@ -132,11 +136,12 @@ class MapSurfaces:
         self, map_name: str, parent: str | None = None, level: int = 0,
         cursor: str | None = None, limit: int = 1000,
     ) -> Page[SurfaceTile]:  # fmt: skip
-        """Return a page of tiles, sorted by column, row and floor.
+        """Return a page of tiles, sorted by column, row and floor; it is empty without a surface.
 
         Parameters
         ----------
-        parent : parent frame; None selects the parent frame with the most frames
+        parent : parent frame of the poses; None selects the parent frame with the most frames
+        level : level of detail; 0 is the finest
 
         Raises
         ------
@@ -191,7 +196,7 @@ class MapSurfaces:
         self, map_name: str, spot: Sequence[float], radius: float | None = None,
         parent: str | None = None, cursor: str | None = None, limit: int = 20,
     ) -> Page[SurfaceSighting]:  # fmt: skip
-        """Return a page of the frames that observed a spot, sorted by distance of the viewpoint.
+        """Return a page of the frames that observed a spot, nearest viewpoint first.
 
         A page may have fewer than `limit` frames, since a call checks a limited number of frames.
 
@@ -347,6 +352,8 @@ class MapSurfaces:
 def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple[bool, list[str]]:
     """Queue a job for an outdated surface, unless a job is pending; remove the former job.
 
+    If no frame must be added or removed, record that the surface is up to date instead.
+
     Returns
     -------
     pending : whether a job is pending now
@@ -381,7 +388,7 @@ def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple
 
 
 def remove_block(store: Store, row: MapRow) -> bool:
-    """Remove a block of the rows of a deleted surface; return whether all are removed."""
+    """Remove a block of the rows of a deleted surface; return whether no rows remain."""
     with store.database.write(map_number=row.number) as connection:
         surface = stored.find_surface(connection, row.number)
         if surface is None or surface.wanted:
@@ -427,7 +434,7 @@ class SurfaceUpkeep:
                 pairs = stored.maps_to_update(connection)
             if self._auto:
                 self._add_rows([row for row, surface in pairs if surface is None])
-            seen = self._seen
+            changes_before = self._seen
             self._seen = {}
             for row, surface in pairs:
                 if surface is None:
@@ -436,17 +443,24 @@ class SurfaceUpkeep:
                     if surface.model_id:
                         remove_block(self._store, row)
                     continue
-                self._look(row, surface, seen.get(row.number))
+                self._begin_after_changes(row, surface, changes_before.get(row.number))
         except SceneprintError as error:
             log.warning("check of surfaces failed", extra={"error": str(error)})
 
-    def _look(
-        self, row: MapRow, surface: SurfaceRow, seen: tuple[tuple[int, int], float] | None
+    def _begin_after_changes(
+        self, row: MapRow, surface: SurfaceRow, last_change: tuple[tuple[int, int], float] | None
     ) -> None:
-        """Start a job once no new frames arrive, at the latest LONGEST_S after the first change."""
+        """Start a job once no new frames arrive, at the latest LONGEST_S after the first change.
+
+        A job that failed with the same frames is not repeated.
+        """
         at = row.revision, surface.pose_edits
-        changed = seen is None or seen[0] != at
-        since = time.monotonic() if seen is None or (changed and seen[1] == _DONE) else seen[1]
+        changed = last_change is None or last_change[0] != at
+        since = (
+            time.monotonic()
+            if last_change is None or (changed and last_change[1] == _DONE)
+            else last_change[1]
+        )
         self._seen[row.number] = at, since
         if since == _DONE or (changed and time.monotonic() - since < LONGEST_S):
             return
@@ -500,17 +514,17 @@ def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | N
     job = _job_of(connection, surface)
     is_building = job is not None and not job.state.over
     frames = sum(stored.count_fused(connection, row.number).values())
-    left = 0
+    frames_left = 0
     if is_building and job is not None and job.progress and job.progress.get("total"):
-        left = job.progress["total"] - job.progress.get("done", 0)
+        frames_left = job.progress["total"] - job.progress.get("done", 0)
     elif not surface.is_current(row):
         of_model = surface.model_id == row.model_id
-        left = (
+        frames_left = (
             stored.count_left(connection, surface)
             if of_model
             else stored.count_posed(connection, row)
         )
-    state: SurfaceState = "stale" if left else "ready"
+    state: SurfaceState = "stale" if frames_left else "ready"
     if is_building:
         state = "building"
     elif not frames:
@@ -520,7 +534,7 @@ def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | N
     return MapSurface(
         map=row.name, state=state, job_id=None if job is None else job.id,
         error=job.error if job is not None and failed else None,
-        frames=frames, frames_left=left, updated_at=when(surface.updated_at),
+        frames=frames, frames_left=frames_left, updated_at=when(surface.updated_at),
         sessions=surface.sessions, first_taken=when(surface.first_taken),
         last_taken=when(surface.last_taken), taken_from=when(surface.taken_from),
         taken_step_s=surface.taken_step_s,
@@ -597,7 +611,7 @@ def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[T
 
 
 def _drawn_level(surface: SurfaceRow, totals: Sequence[LevelTotals], plan: PlanFrame) -> int:
-    """Return the coarsest level as fine as a pixel, or a coarser level that has fewer cells."""
+    """Return the coarsest level with cells up to a pixel wide, or a coarser one if it is large."""
     fine = [level for level in totals if surface.cell_m * FACTOR**level.level <= plan.m_per_pixel]
     first = fine[-1].level if fine else 0
     few = [level.level for level in totals if level.level >= first and level.cells <= _DRAWN_CELLS]

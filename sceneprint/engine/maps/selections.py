@@ -47,8 +47,8 @@ def delete_selection(
 
     Parameters
     ----------
-    tombstones : handler of the deletion
-    seconds : time after which no further block is started
+    tombstones : handler that makes the deletion undoable
+    seconds : duration after which no further block is started
 
     Raises
     ------
@@ -64,13 +64,13 @@ def delete_selection(
             numbers = [frame.number for frame in block]
             blobs = delete_frames(connection, row, numbers, deletion=deletion)
             last = numbers[-1] if numbers else last
-            left = _count(connection, row, selection, last)
+            remaining = _count(connection, row, selection, last)
             record = tombstones.find(connection, row, deletion)
         collect_deleted_blobs(store, blobs)
         deleted += len(block)
-        if not left or time.monotonic() >= until:
+        if not remaining or time.monotonic() >= until:
             break
-    return FramesDeleted(map=row.name, frames=deleted, remaining=left, deletion=record)
+    return FramesDeleted(map=row.name, frames=deleted, remaining=remaining, deletion=record)
 
 
 def edit_selection(
@@ -96,13 +96,13 @@ def edit_selection(
             for frame in block:
                 changed += _edit(connection, row, frame, edit, inverse)
                 last, last_id = frame.number, frame.id
-            left = _count(connection, row, edit, last)
+            remaining = _count(connection, row, edit, last)
         done += len(block)
-        if not left or done >= MOST_SELECTED or time.monotonic() >= until:
+        if not remaining or done >= MOST_SELECTED or time.monotonic() >= until:
             break
     return FramesEdited(
-        map=row.name, frames=changed, remaining=left, last_frame_id=last_id if left else None,
-        inverse=list(inverse.values()),
+        map=row.name, frames=changed, remaining=remaining,
+        last_frame_id=last_id if remaining else None, inverse=list(inverse.values()),
     )  # fmt: skip
 
 
@@ -221,15 +221,15 @@ def edit_session(
             for frame in block:
                 write_frame(connection, row, frame, _values(frame, edit))
                 at, last = frame.id, frame.number
-            left = _count(connection, row, selection, last)
+            remaining = _count(connection, row, selection, last)
         done += len(block)
-        if not left or time.monotonic() >= until:
+        if not remaining or time.monotonic() >= until:
             break
     if after is None:
         _require_frames(done, map_name, session, robot)
     return SessionChange(
         map=row.name, session=edit.session or session, robot=edit.robot or robot, frames=done,
-        remaining=left, last_frame_id=at if left else None,
+        remaining=remaining, last_frame_id=at if remaining else None,
     )  # fmt: skip
 
 
@@ -246,7 +246,7 @@ def _values(frame: FrameRow, edit: SessionEdit) -> dict[str, object]:
 
 
 def _of_session(session: str, robot: str | None) -> FrameSelection:
-    """Return the selection of a session, without validation of names that may predate it."""
+    """Return the selection of a session; do not validate names, since old names may be invalid."""
     robots = [] if robot is None else [robot]
     listing = FrameListing.model_construct(session=[session], robot=robots)
     return FrameSelection.model_construct(filter=listing)

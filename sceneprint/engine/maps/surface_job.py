@@ -50,11 +50,11 @@ from sceneprint.store.tables import MapRow
 from sceneprint.types import Floats, Geometry
 from sceneprint_client.surface_encoding import CELL, NO_SESSION, SIDE, STEPS
 
-#: Kind of the jobs, and kind of the event after a job.
+#: Kind of the jobs, and kind of the event that a finished job records.
 SURFACE, UPDATED = "surface", "surface.updated"
 #: Seconds for which a slice fuses frames; writing the tiles takes about as long.
 SLICE_S = 1.5
-#: Number of levels of a surface, and finest cell width in voxels of the model of the map.
+#: Number of levels of a surface, and width of its finest cells in voxel widths of the model.
 LEVELS, VOXELS = 3, 2.5
 #: Maximum number of parent frames in a record, and of sessions that cells distinguish.
 MOST_PARENTS, MOST_SESSIONS = 20, 10_000
@@ -79,7 +79,7 @@ def surface_points(geometry: Geometry) -> Floats:
 
 
 def tile_cells(store: Store, tile: TileRow, scale: TimeScale | None) -> Cells:
-    """Return the cells of a tile with times on a scale; raise DamagedBlob if the tile is lost."""
+    """Return the cells of a tile, with times on `scale`; raise DamagedBlob if the tile is lost."""
     data = store.blobs.get(tile.blob or "")
     if tile.level:
         return np.frombuffer(data, CELL)
@@ -115,7 +115,15 @@ class _Slice:
     blobs: list[str] = field(default_factory=list)
 
     def store(self, connection: Connection, map_number: int) -> tuple[dict[_Key, int], list[str]]:
-        """Write the tiles; return the numbers of the finest tiles, and unreferenced blobs."""
+        """Write the changed tiles, and remove the rows of empty tiles.
+
+        Mark damaged tiles for rebuilding, and doom blobs that are no longer referenced.
+
+        Returns
+        -------
+        numbers : row numbers of the finest tiles
+        unused : doomed blobs, to collect after the commit
+        """
         numbers: dict[_Key, int] = {}
         unused: list[str] = []
         for (parent, level, place), values in self.tiles.items():
@@ -213,8 +221,10 @@ class SurfaceHandler:
         self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow],
         is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        """Rebuild tiles from the frames that overlap them, while time allows."""
-        tiles = _first_cells(tiles)
+        """Rebuild tiles from the frames that overlap them, while time allows; store unfinished
+        drafts.
+        """
+        tiles = _leading_tiles(tiles)
         last = tiles[0].rebuilt_to or 0
         sums: dict[_Key, list[CellSums]] = {}
         for tile in tiles:
@@ -260,7 +270,7 @@ class SurfaceHandler:
     ) -> SliceResult:
         """Encode tiles again, with the current time scale of the surface."""
         done = _Slice()
-        self._publish(surface, self._sums_of(_first_cells(tiles), done), done)
+        self._publish(surface, self._sums_of(_leading_tiles(tiles), done), done)
         return self._result(surface, progress, done, _Sessions(surface.sessions))
 
     def _add(
@@ -388,7 +398,7 @@ class SurfaceHandler:
     def _publish_coarser(
         self, surface: SurfaceRow, level: int, parts: Mapping[_Key, Cells], done: _Slice
     ) -> dict[_Key, Cells]:
-        """Store changed tiles of a coarser level in `done`; return their cells by coarser tile."""
+        """Store changed tiles of a coarser level in `done`; return them coarsened, by tile."""
         groups: dict[_Key, dict[TilePlace, Cells]] = {}
         for (parent, place), cells in parts.items():
             x, y, z = (value // FACTOR for value in place)
@@ -427,7 +437,7 @@ class SurfaceHandler:
         addition: _Addition | None = None,
     ) -> SliceResult:  # fmt: skip
         def write(connection: Connection) -> Collection[str]:
-            numbers, left = done.store(connection, surface.map_number)
+            numbers, unused = done.store(connection, surface.map_number)
             values: dict[str, Any] = {"updated_at": time.time()}
             if addition is not None:
                 stored.add_fused(connection, surface, addition.frames)
@@ -441,7 +451,7 @@ class SurfaceHandler:
             if sessions.names != surface.sessions:
                 values["sessions"] = sessions.names
             stored.write_surface(connection, surface.map_number, **values)
-            return left
+            return unused
 
         return SliceResult(False, _with_total(progress), write=write, blobs=done.blobs)
 
@@ -456,7 +466,7 @@ class _Addition:
 
 
 class _Sessions:
-    """Session names by their index in cells; `index` appends new names."""
+    """Session names by the index that cells store; `index` appends new names."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = list(names)
@@ -473,19 +483,19 @@ class _Sessions:
 
 
 def parent_records(
-    connection: Connection, row: MapRow, known: Mapping[str, dict[str, Any]]
+    connection: Connection, row: MapRow, earlier: Mapping[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
     """Return the records of the parent frames of a surface, sorted by number of frames.
 
     Parameters
     ----------
-    known : earlier records by name; their axes and up vectors are reused
+    earlier : earlier records by name; their axes and up vectors are reused
     """
     counts = stored.count_fused(connection, row.number)
     names = sorted(counts, key=lambda name: (-counts[name], name))[:MOST_PARENTS]
     records = []
     for name in names:
-        record = known.get(name)
+        record = earlier.get(name)
         if record is None:
             some = stored.spread_fused(connection, row.number, name, 200)
             view = parent_axes(connection, row, some)
@@ -512,8 +522,8 @@ def _restart(surface: SurfaceRow, progress: dict[str, Any], keys: Sequence[_Key]
     return SliceResult(False, progress, write=write)
 
 
-def _first_cells(tiles: Sequence[TileRow]) -> list[TileRow]:
-    """Return as many of the first tiles as have up to _CELLS cells in total, at least one."""
+def _leading_tiles(tiles: Sequence[TileRow]) -> list[TileRow]:
+    """Return the first tiles that have at most _CELLS cells in total, but at least one tile."""
     room = np.cumsum([tile.cells for tile in tiles]) <= _CELLS
     return list(tiles[: max(int(room.sum()), 1)])
 
@@ -521,7 +531,7 @@ def _first_cells(tiles: Sequence[TileRow]) -> list[TileRow]:
 def _tiles_of(
     connection: Connection, surface: SurfaceRow, keys: Iterable[_Key], level: int = 0
 ) -> list[TileRow]:
-    """Return the tiles that exist at the places `keys` on a level."""
+    """Return the tiles of a level that exist at the places `keys`."""
     places: dict[str, list[TilePlace]] = {}
     for parent, place in keys:
         places.setdefault(parent, []).append(place)

@@ -43,14 +43,14 @@ class Tombstones:
     Parameters
     ----------
     seconds : time for which deleted frames can be restored; 0 disables restoration
-    wake : function to call when restored frames wait for a signature
+    wake : function that wakes workers, since restored frames may need a signature
     """
 
     def __init__(self, store: Store, seconds: float, wake: Callable[[], None]) -> None:
         self._store, self._seconds, self._wake = store, seconds, wake
 
     def begin(self, row: MapRow) -> int | None:
-        """Create a deletion, and return its number; None if restoration is disabled.
+        """Return the number of a new deletion; None if restoration is disabled.
 
         Parameters
         ----------
@@ -121,16 +121,16 @@ class Tombstones:
         Parameters
         ----------
         deletion_id : id of a deletion from `list_all`
-        seconds : time after which no further block is started
+        seconds : duration after which no further block is started
 
         Raises
         ------
         UnknownMap, UnknownDeletion : If the deletion does not exist or cannot be undone.
         QuotaExceeded : If the map has no room for all frames; none was restored.
         """
-        until, done, last, left = time.monotonic() + seconds, 0, 0, 1
+        until, done, last, remaining = time.monotonic() + seconds, 0, 0, 1
         refused: list[RefusedFrame] = []
-        while left and (not last or time.monotonic() < until):
+        while remaining and (not last or time.monotonic() < until):
             with self._store.database.write() as connection:
                 row = find_map(connection, map_name)
                 number = int(deletion_id) if _NUMBER.fullmatch(deletion_id) else 0
@@ -138,7 +138,7 @@ class Tombstones:
                 if deletion is None:
                     if not last:
                         raise _unknown_deletion(row, deletion_id)
-                    left = 0  # the deletion has expired
+                    remaining = 0  # the deletion has expired
                     break
                 if not last:
                     _require_room(row, deletion)
@@ -152,10 +152,10 @@ class Tombstones:
                     else:
                         reason = f"it was uploaded again as frame {successor}"
                         refused.append(RefusedFrame(frame_id=frame.id, reason=reason))
-                left = deletion.frames - (done - before) - len(refused)
+                remaining = deletion.frames - (done - before) - len(refused)
         self._wake()
         return FramesRestored(
-            map=row.name, frames=done, refused=refused[:MOST_REFUSED], remaining=left
+            map=row.name, frames=done, refused=refused[:MOST_REFUSED], remaining=remaining
         )
 
     def purge(self, *, everything: bool = False) -> int:
@@ -168,7 +168,7 @@ class Tombstones:
         with self._store.database.read() as connection:
             rows, purged = list_maps(connection), 0
         for row in rows:
-            while numbers := self._spent(row, everything=everything):
+            while numbers := self._expired(row, everything=everything):
                 with self._store.database.write(map_number=row.number) as connection:
                     # skip frames that were restored or purged meanwhile
                     existing = {frame[0] for frame in oldest_tombstones(connection, row.number)}
@@ -178,7 +178,7 @@ class Tombstones:
                 purged += len(numbers)
         return purged
 
-    def _spent(self, row: MapRow, *, everything: bool) -> list[int]:
+    def _expired(self, row: MapRow, *, everything: bool) -> list[int]:
         """Return the frame numbers of the oldest expired tombstones of a map; see `purge`."""
         with self._store.database.read() as connection:
             over = read_clock(connection) - self._seconds

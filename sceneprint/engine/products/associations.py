@@ -60,12 +60,12 @@ from sceneprint_client.api import Page
 from sceneprint_client.api.base import Transform
 from sceneprint_client.api.sessions import APART, Association, Edge, GraphFormat, NewAssociation
 
-#: Maximum number of frames of both sessions.
+#: Maximum total number of frames in both sessions.
 MOST_FRAMES = 5000
 
 
 def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
-    """Return session and robot of each side of an association; a loop closure has one side."""
+    """Return the session and robot of each side of an association; a loop closure has one side."""
     robots: list[str | None] = [*(request.robots or [])] or [None] * len(request.sessions)
     return list(zip(request.sessions, robots, strict=True))
 
@@ -115,9 +115,9 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
 
 
 def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
-    """Return the numbers of the frames to compare the next frame with, in ascending order.
+    """Return the frame numbers to compare the next frame with, in ascending order.
 
-    These are the frames of the other session, or earlier frames of the same session.
+    These are the frames of the other session, or sufficiently earlier frames of the same session.
     """
     place, target = progress["done"], progress["target"]
     if len(request.sessions) == 2:
@@ -152,7 +152,10 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     def step(
         self, task: LongJob, request: NewAssociation, progress: dict[str, Any]
     ) -> list[dict[str, Any]]:
-        """Match the next frame, and return its edges; skip a deleted or damaged frame."""
+        """Match the next frame, and return its edges; skip a deleted or damaged frame.
+
+        Damaged frames are queued for signing.
+        """
         number, among = progress["source"][progress["done"]], eligible(request, progress)
         if not len(among):
             return []
@@ -272,7 +275,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
         Raises
         ------
-        UnknownMap, UnknownJob : If the association does not exist.
+        UnknownMap, UnknownJob : If the map or the association does not exist.
         NotIndexed : If it has not succeeded.
         """
         with self._store.database.write() as connection:
@@ -299,7 +302,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
     def items(
         self, connection: Connection, job: JobRow, first: int, limit: int
     ) -> list[dict[str, Any]]:
-        """Return edges; after the association has succeeded, they include their verdicts."""
+        """Return edges; they include their verdicts after the association has succeeded."""
         edges = super().items(connection, job, first, limit)
         verdicts = [dict[str, Any](consistent=None, loops=None, closed=None)] * len(edges)
         if job.result is not None:

@@ -37,14 +37,15 @@ def finish_association(
 ) -> tuple[list[dict[str, Any]], dict[str, int], list[dict[str, Any]]]:  # fmt: skip
     """Check the edges against each other, and join parent frames by votes of the edges.
 
-    An edge is consistent if it closes a loop with an edge of another viewpoint, or agrees with the
-    join of its two parent frames.
+    An edge is consistent if it forms a closed loop with an edge from another viewpoint, or agrees
+    with the join of its two parent frames.
 
     Parameters
     ----------
+    items : edges
     source, target : frame numbers of both runs, in chronological order
     stops : existing frames by number
-    scale : scale of lengths of the model, relative to a model for rooms
+    scale : length scale of the model, relative to that of a model for rooms
 
     Returns
     -------
@@ -109,18 +110,18 @@ def _joins(
         source, target = edges.source[own], edges.target[own]
         poses: tuple[Floats, Floats] = (runs[0].poses[source], runs[1].poses[target])
         votes = association_votes(edges.transforms[own], *poses, source, target, edges.weights[own])
-        one = join_sessions(votes, request.seed, numbers)
-        agree[own] = one.agree & (one.T is not None)
+        join = join_sessions(votes, request.seed, numbers)
+        agree[own] = join.agree & (join.T is not None)
         first, second = (stops[items[chosen[0]][side]] for side in ("from", "to"))
         joins.append(
             Join(
                 from_session=first.session or "", to_session=second.session or "",
                 from_robot=first.robot, to_robot=second.robot, from_parent=a, to_parent=b,
-                transform=None if one.T is None else transform(one.T, b, a),
-                strength=one.strength, support=one.support, votes=len(own), rival=one.rival,
-                spread_m=None if one.T is None else one.spread_m,
-                spread_deg=None if one.T is None else math.degrees(one.spread_rad),
-                reason=one.reason,
+                transform=None if join.T is None else transform(join.T, b, a),
+                strength=join.strength, support=join.support, votes=len(own), rival=join.rival,
+                spread_m=None if join.T is None else join.spread_m,
+                spread_deg=None if join.T is None else math.degrees(join.spread_rad),
+                reason=join.reason,
             ).model_dump(mode="json")
         )  # fmt: skip
     return joins, agree

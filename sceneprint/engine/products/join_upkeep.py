@@ -31,11 +31,11 @@ log = logging.getLogger(__name__)
 
 #: Seconds between checks of all maps.
 LOOK_S = 5.0
-#: Minimum number of frames in each session; a strong join needs votes of five frames in each.
+#: Minimum number of frames in each session; a strong join needs votes from five frames of each.
 LEAST_FRAMES = 5
 #: Factor by which two sessions must grow before they are associated again.
 GROWTH = 1.25
-#: Number of the newest associations of a map to consider.
+#: Number of newest associations to consider per map.
 _JOBS = 200
 
 
@@ -57,22 +57,25 @@ class JoinUpkeep:
                 rows = list_maps(connection)
             before, self._settled = self._settled, {}
             for row in rows:
-                if before.get(row.number) == row.revision or self._look(row):
+                if before.get(row.number) == row.revision or self._queue_next(row):
                     self._settled[row.number] = row.revision
         except SceneprintError as error:
             log.warning("search for joins failed", extra={"error": str(error)})
 
-    def _look(self, row: MapRow) -> bool:
-        """Start an association if one is due; return whether the map needs no further check."""
+    def _queue_next(self, row: MapRow) -> bool:
+        """Queue the next association of a map, once all frames are signed; wake a worker.
+
+        Return whether the map needs no check until it changes: there is nothing to associate.
+        """
         with self._store.database.read() as connection:  # usually none is due: avoid a write lock
             states = count_states(connection, row.number)
             if states.get(FrameState.RECEIVED) or states.get(FrameState.SIGNING):
                 return False
-            if _due(connection, row) is None:
+            if _next_association(connection, row) is None:
                 return True
         with self._store.database.write(map_number=row.number) as connection:
             row = map_of_number(connection, row.number)
-            request = _due(connection, row)  # again, under the lock
+            request = _next_association(connection, row)  # again, under the lock
             if request is not None:
                 data = request.model_dump(mode="json", exclude_unset=True)
                 kind = Associations.kind
@@ -81,8 +84,12 @@ class JoinUpkeep:
         return False
 
 
-def _due(connection: Connection, row: MapRow) -> NewAssociation | None:
-    """Return the next association to start in a map; None if no association is due."""
+def _next_association(connection: Connection, row: MapRow) -> NewAssociation | None:
+    """Return a request to associate the largest session of a parent frame with that of the root.
+
+    Return None while an association runs, or if all pairs were undone, have an unsuitable size, or
+    have not grown since their last association.
+    """
     runs = posed_runs(connection, row.number)
     largest = _largest(runs)
     if len(largest) < 2:
@@ -112,7 +119,7 @@ def _largest(runs: Sequence[ParentRun]) -> list[ParentRun]:
 
 
 def _request(run: ParentRun, root: ParentRun) -> NewAssociation | None:
-    """Return a request to associate two sessions; None if their size does not permit it."""
+    """Return a request to associate two sessions; None if their sizes do not permit it."""
     few = min(run.frames, root.frames) < LEAST_FRAMES
     if few or run.frames + root.frames > MOST_FRAMES:
         return None
@@ -126,7 +133,7 @@ def _request(run: ParentRun, root: ParentRun) -> NewAssociation | None:
 
 
 def _is_worth(request: NewAssociation, total: int, jobs: Sequence[JobRow]) -> bool:
-    """Return whether two sessions were not associated yet, or have grown since then."""
+    """Return whether two sessions were never associated, or have grown since they were."""
     for job in jobs:
         before = NewAssociation.model_validate(job.data or {})
         if {*sessions_of(before)} == {*sessions_of(request)}:

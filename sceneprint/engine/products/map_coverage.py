@@ -3,7 +3,7 @@
     frames  --step-->  items  --coverage_plans-->  plans, counts
 
 Each query excludes the frame itself and, depending on the request, frames of the same time or
-session. Otherwise it equals the query of a robot. The answer is not stored.
+session. Otherwise, it is the same as the query of a robot. The answer is not stored.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from sceneprint_client.api.coverage import (
 
 
 @dataclass(frozen=True, eq=False)
-class _Measured:
+class _Measurement:
     """A succeeded coverage job, with its request and its result."""
 
     request: NewMapCoverage
@@ -68,16 +68,16 @@ class _Measured:
     plans: list[CoveragePlan]
 
 
-#: Maximum number of parent frames with a plan, selected by their number of queried frames.
+#: Maximum number of parent frames with a plan: those with the most queried frames.
 MOST_PLANS = 20
-#: Duration in seconds that exceeds any session.
+#: A duration, in seconds, that exceeds any session.
 _FOREVER_S = 1e12
 #: Errors of a deleted, edited or damaged frame, which is skipped.
 _SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, UnreadableGeometry)
 
 
 def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage) -> list[int]:
-    """Return the numbers of the frames that a coverage job queries, in this order.
+    """Return the frame numbers that a coverage job queries, in query order.
 
     Raises
     ------
@@ -222,8 +222,8 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         InvalidRequest : If the results have different options, cells or axes.
         """
         with self._store.database.read() as connection:
-            after = self._measured(connection, map_name, job_id)
-            before = self._measured(connection, map_name, since)
+            after = self._measurement(connection, map_name, job_id)
+            before = self._measurement(connection, map_name, since)
         _require_comparable(before, after)
         plans = plan_changes(before.plans, after.plans)
         trends = Counter(cell.trend for plan in plans for cell in plan.cells)
@@ -233,15 +233,15 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
             result_after=after.result, plans=plans,
         )  # fmt: skip
 
-    def _measured(self, connection: Connection, map_name: str, job_id: str) -> _Measured:
+    def _measurement(self, connection: Connection, map_name: str, job_id: str) -> _Measurement:
         job = self.find(connection, map_name, job_id)
         stored = self.require_success(job, "plans")
         request = NewMapCoverage.model_validate(job.data or {})
         result = CoverageResult.model_validate(stored)
-        return _Measured(request, result, _plans(connection, job))
+        return _Measurement(request, result, _plans(connection, job))
 
 
-def _require_comparable(before: _Measured, after: _Measured) -> None:
+def _require_comparable(before: _Measurement, after: _Measurement) -> None:
     """Raise InvalidRequest if two results have different options, cells or axes."""
     names = [
         name
@@ -287,7 +287,7 @@ def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> Coverage
         frame_id=stop.id, robot=stop.robot, session=stop.session,
         parent_frame=None if pose is None else stop.parent,
         position=None if pose is None else vector(row[3] for row in pose[:3]),
-        look_alikes=[stops[one].id for one in item["look_alikes"] if one in stops],
+        look_alikes=[stops[number].id for number in item["look_alikes"] if number in stops],
         **{name: item[name] for name in same},
     )  # fmt: skip
 
@@ -338,12 +338,12 @@ def _is_within(off: tuple[float, float], request: NewMapCoverage) -> bool:
     return off[0] <= request.tolerance_m and math.degrees(off[1]) <= request.tolerance_deg
 
 
-#: Maximum distance in metres between a pose of an answer and the pose by a match that supports it.
+#: Maximum distance, in metres, between a pose of an answer and the pose by a supporting match.
 _SAME_POSE_M = 1.0
 
 
 def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
-    """Return the ids of the matches that support some poses, without repetition."""
+    """Return the ids of the matches that imply the poses most closely, without repetition."""
     frame_ids: list[str] = []
     for pose in poses:
         near = [
@@ -362,7 +362,7 @@ def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
 def plans_of(
     connection: Connection, row: MapRow, items: Sequence[dict[str, Any]], cell_m: float | None
 ) -> tuple[list[CoveragePlan], float]:
-    """Return the plans of queried frames with poses, and the cell width in metres."""
+    """Return the plans of the queried frames that have poses, and the cell width in metres."""
     outcomes = {item["frame"]: item["outcome"] for item in items}
     by_parent: dict[str, list[PathFrame]] = {}
     for stop in path_frames(connection, outcomes).values():

@@ -77,7 +77,7 @@ def pose_graph(
         steps = [step for run in runs for step in _steps(run, place)]
         edges += steps
         kinds += ["odometry"] * len(steps)
-    poses, frames = _placed(stops, edges, joins)
+    poses, frames = _place_vertices(stops, edges, joins)
     return PoseGraph(stops, poses, frames, edges, kinds)
 
 
@@ -98,10 +98,13 @@ def _diagonal(metres: float, radians: float) -> Floats:
     return np.diag(np.repeat((metres**2, radians**2), 3))
 
 
-def _placed(
+def _place_vertices(
     stops: Sequence[PathFrame], edges: Sequence[PoseEdge], joins: Sequence[Mapping[str, Any]]
 ) -> tuple[list[Floats | None], list[str | None]]:
-    """Move poses to the most common parent frame by joins; return poses and parent frames."""
+    """Return the pose and the parent frame of each vertex; None if unknown.
+
+    Joins convert poses to the most common parent frame; edges give vertices without a pose one.
+    """
     counted = Counter(stop.parent for stop in stops if stop.pose is not None)
     parents = sorted((name for name in counted if name), key=lambda name: (-counted[name], name))
     into: dict[str, tuple[str, Floats]] = {}  # T_root_parent, by parent
@@ -112,7 +115,7 @@ def _placed(
         waiting = deque([root])
         while waiting:
             here = waiting.popleft()
-            for neighbour, T in _joined(here, joins):
+            for neighbour, T in _neighbours(here, joins):
                 if neighbour not in into:
                     into[neighbour] = (root, into[here][1] @ T)
                     waiting.append(neighbour)
@@ -126,8 +129,8 @@ def _placed(
     return poses, frames
 
 
-def _joined(parent: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, Floats]]:
-    """Return the neighbours of a parent frame by joins: name and T_parent_neighbour (4, 4)."""
+def _neighbours(parent: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[str, Floats]]:
+    """Return the name and T_parent_neighbour (4, 4) of each parent frame that a join connects."""
     neighbours = []
     for join in joins:
         is_loop = join["from_parent"] == join["to_parent"]

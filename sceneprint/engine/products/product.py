@@ -34,7 +34,7 @@ Record = TypeVar("Record", bound=Product)
 
 
 class Numbered(Protocol):
-    """Record of an item that has its number in the job."""
+    """Record of an item, with the number of the item in the job."""
 
     number: int
 
@@ -43,7 +43,7 @@ Item = TypeVar("Item", bound=Numbered)
 
 #: Priority below that of uploads and re-encodings: slices run only when no other job waits.
 BACKGROUND = REENCODING_PRIORITY - 1
-#: Maximum duration of a slice, seconds, by which it may delay uploads.
+#: Maximum duration of a slice, seconds; it may delay uploads for that long.
 SLICE_S = 3.0
 #: Number of items to read at once.
 _BLOCK = 500
@@ -57,7 +57,7 @@ class Products(ABC, Generic[Request, Record]):
     kind : kind of the jobs, such as coverage
     record : class of the API records
     priority : priority of the jobs
-    item_count : field of a result with the number of items; further rows of the job follow the
+    item_count : result field that contains the number of items; other rows of the job follow the
         items
     """
 
@@ -100,7 +100,13 @@ class Products(ABC, Generic[Request, Record]):
         return False
 
     def begin(self, map_name: str, request: Request) -> Record:
-        """Queue a job; raise UnknownMap if there is no map, and InvalidRequest as `start` does."""
+        """Queue a job, and return its record.
+
+        Raises
+        ------
+        UnknownMap : If the map does not exist.
+        InvalidRequest : See `start`.
+        """
         with self._store.database.read() as connection:
             progress = self.start(connection, find_map(connection, map_name), request)
         data = request.model_dump(mode="json", exclude_unset=True)
@@ -135,7 +141,7 @@ class Products(ABC, Generic[Request, Record]):
         return Page[self.record](items=items, next_cursor=more)  # type: ignore[name-defined]
 
     def get(self, map_name: str | None, job_id: str) -> Record:
-        """Return a job with its details; raise UnknownMap or UnknownJob if it does not exist."""
+        """Return a job with its details; see `find` for errors."""
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)
             return self.record_of(job, map_name, **self.details(connection, job))
@@ -145,7 +151,7 @@ class Products(ABC, Generic[Request, Record]):
 
         Raises
         ------
-        UnknownMap, UnknownJob : If the job does not exist.
+        UnknownMap, UnknownJob : If the map or the job does not exist.
         Conflict : If the map depends on the job; see `check_removal`.
         """
         with self._store.database.write() as connection:
@@ -229,7 +235,7 @@ class Products(ABC, Generic[Request, Record]):
 
         Raises
         ------
-        UnknownMap, UnknownJob : If the job does not exist.
+        UnknownMap, UnknownJob : If the map or the job does not exist.
         NotIndexed : If the job has not succeeded.
         DamagedBlob : If the file is lost.
         """
@@ -247,7 +253,7 @@ class Products(ABC, Generic[Request, Record]):
     def items(
         self, connection: Connection, job: JobRow, first: int, limit: int
     ) -> list[dict[str, Any]]:
-        """Return up to `limit` items of a job from number `first`; the job may be running."""
+        """Return up to `limit` items of a job from item number `first`; the job may be running."""
         if job.result is not None:
             limit = max(min(limit, job.result[self.item_count] - first), 0)
         rows = queue.items_of(connection, job.number, first, limit)
@@ -265,7 +271,7 @@ class Products(ABC, Generic[Request, Record]):
 
         Raises
         ------
-        UnknownMap, UnknownJob : If the job does not exist.
+        UnknownMap, UnknownJob : If the map or the job does not exist.
         InvalidRequest : If the service did not issue the cursor.
         """
         after = row_of(cursor)
@@ -283,7 +289,7 @@ class Products(ABC, Generic[Request, Record]):
 
 
 def spread_evenly(numbers: list[int], most: int) -> list[int]:
-    """Return at most `most` of some numbers, evenly spaced."""
+    """Return at most `most` of the numbers, evenly spaced."""
     if len(numbers) <= most:
         return numbers
     return [numbers[i * len(numbers) // most] for i in range(most)]
@@ -306,7 +312,7 @@ class StepwiseProducts(Products[Request, Record]):
         """Conclude a job after its last step; `items` are those of the last slice."""
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run steps, at least one, while time allows; conclude the job after the last."""
+        """Run at least one step, and more while time allows; conclude the job after the last."""
         request: Request = self.record.request_type.model_validate(task.data)  # type: ignore[assignment]
         is_over = ends_within(is_over, SLICE_S)
         progress = dict(task.progress) or self.restart(task.of_map, request)

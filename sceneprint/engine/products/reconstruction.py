@@ -111,7 +111,7 @@ def fused(
     open3d("A reconstruction")
     p = FusionParameters(voxel_m=request.voxel_m)
     frames, parts, left_out = list[DepthFrame](), list[FusedView](), list[LeftOut]()
-    # a cloud cannot be fused; only its explained share is computed
+    # a cloud cannot be fused; only the share of it that the matches explain is computed
     if query is not None and request.include_query and isinstance(query.surface.camera, Intrinsics):
         frame, source = _own(store, query, own, model_id, as_of)
         frames.append(prepare_view(frame, p))
@@ -135,7 +135,9 @@ def fused(
     added = added_areas(mesh, first, len(frames)).tolist()
     volume, _ = observed_volume(frames)
     as_mesh = request.output == "mesh"
-    seen = None if query is None else query.surface.points[query.surface.valid].astype(np.float64)
+    query_points = (
+        None if query is None else query.surface.points[query.surface.valid].astype(np.float64)
+    )
     coverage = Coverage(
         views=[
             part.model_copy(update={"added_m2": a}) for part, a in zip(parts, added, strict=True)
@@ -143,7 +145,7 @@ def fused(
         left_out=left_out,
         area_m2=float(sum(added)),
         observed_volume_m3=volume,
-        query_explained=0.0 if seen is None else share_seen(seen, others),
+        query_explained=0.0 if query_points is None else share_seen(query_points, others),
         voxel_m=voxel,
         points=len(mesh.points),
         triangles=len(mesh.triangles) if as_mesh else 0,
@@ -176,7 +178,7 @@ def _read(store: Store, view: JobView, model_id: str, as_of: float) -> tuple[Dep
     Raises
     ------
     NotFound : If the map or the frame was deleted.
-    DamagedBlob, UnreadableGeometry : If upload and geometry are lost.
+    DamagedBlob, UnreadableGeometry : If both upload and geometry are lost or damaged.
     FrameError : If the frame is empty or not a depth image.
     """
     with store.database.read() as connection:
@@ -323,7 +325,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
 
 
 def _matches_to_fuse(matches: Sequence[Match], request: NewReconstruction) -> list[Match]:
-    """Return the matches to fuse, in the order of the ranking."""
+    """Return the matches to fuse, in the order of the ranking; raise InvalidRequest without any."""
     accepted = [m for m in matches if m.validation.status == "accepted" and m.transform is not None]
     if not accepted:
         raise InvalidRequest(

@@ -1,4 +1,4 @@
-"""Differences of two sessions of a map: surfaces that disappeared, and new surfaces.
+"""Differences between two sessions of a map: surfaces that disappeared, and new surfaces.
 
     frames of both sessions  --view_cells, merge_views-->  cells  --frame_verdicts-->  counts
     counts  --cell_states-->  same, gone, new, unseen
@@ -57,7 +57,7 @@ from sceneprint_client.surface_encoding import NO_SESSION
 #: Maximum number of cells of a session; with more, the job starts over with cells twice as wide.
 MOST_CELLS = 500_000
 #: Maximum number of unmerged cells in memory.
-_HELD = 1_000_000
+_MOST_UNMERGED = 1_000_000
 #: Names of the files of a job: the state of a running job, and the points of the result.
 STATE, POINTS = "state.npz", "points"
 
@@ -66,7 +66,7 @@ SIDES: tuple[Side, Side] = ("before", "after")
 
 
 def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -> str:
-    """Return the parent frame in which two sessions are compared.
+    """Return the parent frame in which to compare two sessions: the requested or most common one.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -
 
 
 class Differences(Products[NewDifference, Difference]):
-    """Differences of sessions."""
+    """Differences between sessions."""
 
     kind = "difference"
     record = Difference
@@ -123,7 +123,7 @@ class Differences(Products[NewDifference, Difference]):
         }  # fmt: skip
 
     def shows_deleted(self, connection: Connection, job: JobRow) -> bool:
-        """Return whether a frame of a job was deleted."""
+        """Return whether a frame of a job was deleted permanently."""
         frames: dict[Side, list[int]] = (job.progress or {}).get("frames", {})
         return any_purged(connection, [number for own in frames.values() for number in own])
 
@@ -164,7 +164,7 @@ class Differences(Products[NewDifference, Difference]):
                 views[side].append(view_cells(points, progress["cell_m"], stamp))
                 cell_count += count_cells(views[side][-1])
             progress["done"] += 1
-            if is_over() or cell_count > _HELD:
+            if is_over() or cell_count > _MOST_UNMERGED:
                 break
         for side in SIDES:
             state.cells[side] = merge_views(state.cells[side], views[side])
@@ -188,7 +188,7 @@ class Differences(Products[NewDifference, Difference]):
                 break
 
     def _posed(self, row: MapRow, number: int, parent: str) -> tuple[Geometry, Floats] | None:
-        """Return geometry and T_parent_sensor of a frame; None if lost or of another parent."""
+        """Return the geometry and T_parent_sensor of a frame; None if either is not available."""
         with self._store.database.read() as connection:
             stop = path_frames(connection, [number]).get(number)
             blob = geometry_blobs(connection, [number], row.model_id).get(number)
@@ -242,7 +242,7 @@ class _State:
 
     @classmethod
     def read(cls, data: bytes) -> _State:
-        """Read a state from bytes of `data`."""
+        """Read a state from the bytes that `data` returns."""
         state = cls()
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             for side in SIDES:
@@ -275,5 +275,5 @@ class _State:
 
 
 def _order(frames: dict[Side, list[int]]) -> list[tuple[Side, int]]:
-    """Return session side and number of all frames, in the order of processing."""
+    """Return the side and the number of each frame, in the order of processing."""
     return [(side, number) for side in SIDES for number in frames[side]]

@@ -36,7 +36,7 @@ class StoredAnswer:
     ----------
     vector : (D,) signature of the query
     geometry : encoded geometry of the query; None without validation
-    ranked : frame numbers of R, in its order
+    ranked : frame numbers of R, in the order of R
     at : time of the answer, seconds since 1970
     origin : robot, session and capture time of an uploaded query
     base : name of the base frame of the robot, and T_base_query (4, 4); None if unknown
@@ -55,7 +55,7 @@ class StoredAnswer:
     up: Floats | None = None
 
 
-#: Sizes of head and signature in bytes; these are followed by the geometry.
+#: Sizes, in bytes, of the head and the signature, which follow them; the geometry is last.
 _PARTS = struct.Struct("<II")
 #: Errors that `decode_answer` raises for damaged bytes.
 DAMAGED = (ValueError, KeyError, TypeError, ValidationError, struct.error)
@@ -168,8 +168,8 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
     Parameters
     ----------
     days : lifetime of answers; permanent answers do not expire
-    may_read : function that returns whether the caller may read a map. Of maps that the caller may
-        not read, the record omits names (except the map of the query), frames and the title
+    may_read : function that returns whether the caller may read a map. For maps that the caller may
+        not read, the record omits names (except that of the query's own map), frames and the title
     """
     frame = pose = None
     if row.frame_id is not None and row.frame_map is not None and may_read(row.frame_map):
@@ -182,7 +182,7 @@ def query_record(row: QueryRow, days: float, may_read: Callable[[str], bool]) ->
         )  # fmt: skip
     return copy_fields(
         QueryRecord, row, query_id=row.id, at=when(row.at), pose=pose, frame=frame,
-        maps=[one for one in row.searched if one == row.map or may_read(one)],
+        maps=[name for name in row.searched if name == row.map or may_read(name)],
         stored=row.bytes > 0, kept_at=when(row.kept_at),
         title=row.title if all(map(may_read, row.searched)) else None,
         expires_at=None if row.kept_at else when(row.at + DAY_S * days),

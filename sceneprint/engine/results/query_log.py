@@ -71,12 +71,12 @@ log = logging.getLogger(__name__)
 _ID = re.compile(r"[0-9a-f]{32}")
 #: Minimum seconds between commits of a process; the first query after a pause is written at once.
 GATHER_S = 0.1
-#: Maximum number of queries per commit, number of waiting queries, and total size of their
-#: geometry.
+#: Maximum number of queries per commit, and of waiting queries; maximum total size of the
+#: geometries of waiting queries, bytes.
 AT_ONCE, MOST_WAITING, MOST_WAITING_BYTES = 100, 10_000, 64 << 20
 #: Number of answers to write concurrently.
 AT_ONCE_PUT = 8
-#: Seconds between attempts to write queries, and maximum wait in `close`.
+#: Seconds between attempts to write queries, and maximum seconds that `close` waits.
 AGAIN_S, CLOSING_S = 2.0, 5.0
 #: Maximum seconds that a reader waits for queries of this process to be written.
 PATIENCE_S = 10.0
@@ -84,15 +84,15 @@ PATIENCE_S = 10.0
 TIDY_S, TIDY_MOST, BLOCK = 60.0, 20_000, 100
 #: Maximum number of queries, and of permanent answers, per map.
 MOST_QUERIES, MOST_KEPT = 100_000, 1000
-#: Age in seconds from which a file without a row is removed.
+#: Minimum age, in seconds, at which a file without a row is removed.
 _ORPHAN_S = 60.0
-#: Share of the space for answers that triggers a removal once written, and that a removal frees.
+#: Share of the space for answers: writing this much triggers a removal, which frees this much.
 _SHARE = 1 / 16
 
 
 @dataclass(eq=False)
 class _Waiting:
-    """A query to be written, its answer, and the size of the geometry in bytes."""
+    """A query to be written, its answer, and the size of the geometry, bytes."""
 
     row: NewQuery
     answer: StoredAnswer | None
@@ -123,6 +123,8 @@ class QueryLog:
         self, row: NewQuery, answer: StoredAnswer | None = None, shown: Sequence[int] = ()
     ) -> None:
         """Queue a query for the log, with its answer if memory permits; never block or raise.
+
+        Do nothing if the log is disabled; count the query as lost if too many queries wait.
 
         Parameters
         ----------
@@ -155,7 +157,7 @@ class QueryLog:
             return self._changed.wait_for(lambda: self._settled >= target, wait_s)
 
     def close(self) -> None:
-        """Write the waiting queries, and accept no more queries."""
+        """Accept no more queries, and wait CLOSING_S seconds for the waiting ones to be written."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -182,18 +184,18 @@ class QueryLog:
                         max(0.0, GATHER_S - since),
                     )
                 batch = list(islice(self._waiting, AT_ONCE))
-            if not self._stored(batch) and self._closed:
+            if not self._write_batch(batch) and self._closed:
                 return
 
-    def _stored(self, batch: Sequence[_Waiting]) -> bool:
+    def _write_batch(self, batch: Sequence[_Waiting]) -> bool:
         """Write a batch of queries; return False if the batch must be retried."""
         loss_reason = None
         try:
             if not self._store.database.read_only:
                 # concurrently, since object stores are slow
                 with ThreadPoolExecutor(AT_ONCE_PUT, "query-log-put") as pool:
-                    list(pool.map(self._write_file, [one for one in batch if one.answer]))
-            rows = [one.row for one in batch if one.row.listed or one.row.bytes]
+                    list(pool.map(self._write_file, [entry for entry in batch if entry.answer]))
+            rows = [entry.row for entry in batch if entry.row.listed or entry.row.bytes]
             with self._store.database.write() as connection:
                 add_queries(connection, rows)
             self._bytes_written += sum(row.bytes for row in rows)
@@ -245,14 +247,14 @@ class QueryLog:
             log.warning("queries lost", extra={"lost": self._lost, "error": reason})
 
     def page(
-        self, wanted: WantedQueries, names: Collection[str] | None, cursor: str | None, limit: int,
-        may_read: Callable[[str], bool] = lambda _: True,
+        self, query_filter: WantedQueries, names: Collection[str] | None, cursor: str | None,
+        limit: int, may_read: Callable[[str], bool] = lambda _: True,
     ) -> Page[QueryRecord]:  # fmt: skip
         """Return a page of queries, newest first, including unwritten queries of this process.
 
         Parameters
         ----------
-        wanted : filter of the queries, without maps
+        query_filter : filter of the queries, without maps
         names : names of the maps; unknown names are ignored, and None selects all maps
         may_read : see `query_record`
 
@@ -265,8 +267,8 @@ class QueryLog:
         with self._store.database.read() as connection:
             if names is not None:
                 numbers = [row.number for row in list_maps(connection) if row.name in names]
-                wanted = replace(wanted, map_numbers=tuple(numbers))
-            rows = list_queries(connection, wanted, before, limit + 1)
+                query_filter = replace(query_filter, map_numbers=tuple(numbers))
+            rows = list_queries(connection, query_filter, before, limit + 1)
         more = self._store.seals.next_moment("query", [(r.at, r.number) for r in rows], limit)
         items = [query_record(row, self._days, may_read) for row in rows[:limit]]
         return Page[QueryRecord](items=items, next_cursor=more)
@@ -298,7 +300,7 @@ class QueryLog:
         return row if stands else None
 
     def find(self, query_id: str) -> StoredAnswer:
-        """Return the answer to a query; raise UnknownQuery as `find_row` does."""
+        """Return the answer to a query; see `find_row` for errors."""
         row = self.find_row(query_id)
         try:
             return decode_answer(self._data(row))
@@ -320,7 +322,7 @@ class QueryLog:
         return data
 
     def record(self, query_id: str) -> QueryRecord:
-        """Return the API record of a query; raise UnknownQuery as `find_row` does."""
+        """Return the API record of a query; see `find_row` for errors."""
         return query_record(self.find_row(query_id), self._days, lambda _: True)
 
     def keep(self, query_id: str, title: str | None) -> QueryRecord:
@@ -439,7 +441,7 @@ class QueryLog:
             after = batch[-1][0]
 
     def _sweep(self) -> None:
-        """Remove files without a row, left by killed processes."""
+        """Remove files without a row, which killed processes left."""
         before = time.time() - _ORPHAN_S
         names = iter([name for name, at in self._files.list() if at < before])
         while batch := list(islice(names, BLOCK)):

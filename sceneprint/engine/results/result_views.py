@@ -117,8 +117,8 @@ class Pairs:
         NotIndexed : If the query ran without validation, or the map has another model now.
         """
         stored = self._log.find(query_id)
-        named = (one for one in stored.answer.matches if one.frame_id == frame_id)
-        match = next((one for one in named if map_name in (None, one.map)), None)
+        named = (record for record in stored.answer.matches if record.frame_id == frame_id)
+        match = next((record for record in named if map_name in (None, record.map)), None)
         if match is None:
             where = "" if map_name is None else f" in map {map_name!r:.80}"
             raise errors.UnknownFrame(
@@ -144,7 +144,8 @@ class Pairs:
         )  # fmt: skip
 
     def load(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
-        """Return the geometries of query and match; rebuild a damaged geometry of the match.
+        """Return the geometries of query and match; rebuild and repair a damaged geometry of the
+        match.
 
         Raises
         ------
@@ -190,27 +191,27 @@ class Pairs:
 
 
 class _ValidationCache:
-    """Cache of the latest validations; concurrent requests share one computation."""
+    """Cache of the latest validations, without errors; concurrent requests share a computation."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._made: OrderedDict[tuple[str, str], Future[PairValidation]] = OrderedDict()
+        self._futures: OrderedDict[tuple[str, str], Future[PairValidation]] = OrderedDict()
 
     def get(self, key: tuple[str, str], make: Callable[[], PairValidation]) -> PairValidation:
         with self._lock:
-            future = self._made.get(key)
+            future = self._futures.get(key)
             mine = future is None
             if future is None:
-                future = self._made[key] = Future()
-            self._made.move_to_end(key)
-            while len(self._made) > _CACHE_SIZE:
-                self._made.popitem(last=False)
+                future = self._futures[key] = Future()
+            self._futures.move_to_end(key)
+            while len(self._futures) > _CACHE_SIZE:
+                self._futures.popitem(last=False)
         if mine:
             try:
                 future.set_result(make())
             except BaseException as error:
                 with self._lock:
-                    self._made.pop(key, None)
+                    self._futures.pop(key, None)
                 future.set_exception(error)
         return future.result()
 
@@ -277,7 +278,7 @@ class Inspection:
         return picture(colours, width, {"view": view, "model": stored.answer.model, **text})
 
     def cloud(self, query_id: str) -> bytes:
-        """Return the points and normals of the query as PLY, in its sensor frame.
+        """Return the points and normals of the query as a PLY file, in its sensor frame.
 
         See `preview` for errors.
         """
@@ -290,7 +291,10 @@ class Inspection:
         return write_ply(points, normals, comments=comments)
 
     def similarities(self, query_id: str, limit: int = 50) -> Similarities:
-        """Return the pairwise similarities of the query and the first frames of its ranking."""
+        """Return the pairwise similarities of the query and the first frames of its ranking.
+
+        Raise UnknownQuery if the answer is not stored.
+        """
         stored = self._log.find(query_id)
         numbers = stored.ranked[:limit]
         with self._store.database.read() as connection:
@@ -298,19 +302,21 @@ class Inspection:
             vectors = stored_signatures(connection, rows, stored.model_id)
             names = {row.number: row.name for row in list_maps(connection)}
         # omit maps that were not searched, which the caller may not be permitted to read
-        known = [
+        readable = [
             n for n in numbers if n in vectors and names[rows[n].map_number] in stored.answer.maps
         ]
         stacked: Bytes = np.stack(
-            [stored.vector, *(np.frombuffer(vectors[n], np.uint8) for n in known)]
+            [stored.vector, *(np.frombuffer(vectors[n], np.uint8) for n in readable)]
         )
         model = self._signers(stored.model_id).model
         shares = similarity(pairwise_distances(stacked, model.metric), model.unrelated_distance)
         return Similarities(
             query_id=query_id,
             model=stored.answer.model,
-            frames=[FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in known],
-            names=[rows[n].name for n in known],
+            frames=[
+                FrameName(map=names[rows[n].map_number], frame_id=rows[n].id) for n in readable
+            ],
+            names=[rows[n].name for n in readable],
             similarity=shares.round(4).tolist(),
         )
 
@@ -357,7 +363,7 @@ class Inspection:
         Parameters
         ----------
         colour : meaning of the colours: source, normal, or distance from the other surface
-        by : transform of the query points: that of the match, its best rival, or identity
+        by : transform of the query points: the transform of the match, its best rival, or none
 
         Raises
         ------
@@ -421,7 +427,7 @@ def _triples(rows: Floats) -> list[Triple]:
 
 
 class PointClouds:
-    """Points of frames, queries and matches in binary; see `sceneprint.formats.export`."""
+    """Points of frames, queries and matches in binary form; see `sceneprint.formats.export`."""
 
     def __init__(self, context: Context, pairs: Pairs) -> None:
         self._store, self._signers, self._log = context.store, context.signers, context.query_log
@@ -436,7 +442,7 @@ class PointClouds:
 
         def make() -> bytes:
             geometry = geometry_of(self._store, self._signers, indexed)
-            points, total = _some(geometry, limit)
+            points, total = _limited_points(geometry, limit)
             return _encoded(geometry, points, total, np.array(matrix))
 
         tag = indexed.tag("points", indexed.frame.id, indexed.row.name, name, matrix, limit)
@@ -455,7 +461,7 @@ class PointClouds:
 
         def make() -> bytes:
             geometry = geometry_of_query(stored)
-            points, total = _some(geometry, limit)
+            points, total = _limited_points(geometry, limit)
             return _encoded(geometry, points, total)
 
         return Output(tag_of("points of a query", FORM, query_id, limit), make)
@@ -495,7 +501,7 @@ class PointClouds:
                     (("transform", "the match has no rival"),),
                 )
             mine, other = (query, match) if side == "query" else (match, query)
-            points, total = _some(mine, limit)
+            points, total = _limited_points(mine, limit)
             if T is None:
                 return _encoded(mine, points, total)
             T = T if side == "query" else inverse(T)
@@ -507,7 +513,7 @@ class PointClouds:
         return Output(tag, make)
 
 
-def _some(geometry: Geometry, limit: int) -> tuple[Floats32, int]:
+def _limited_points(geometry: Geometry, limit: int) -> tuple[Floats32, int]:
     """Return up to `limit` points with normals (N, 6), and the total number of points."""
     every = sample_points(geometry.surface, 1)
     return np.ascontiguousarray(every[thinned(len(every), limit)]), len(every)

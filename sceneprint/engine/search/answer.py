@@ -191,9 +191,10 @@ class _StoredDatabase:
 
     def posed(self, rows: Sequence[int]) -> Mapping[int, PosedFrame]:
         with self._store.database.read() as connection:
-            known = viewpoints_among(connection, rows)
+            viewpoints = viewpoints_among(connection, rows)
         return {
-            one.number: PosedFrame(parent_key(one), one.pose, not one.is_cloud) for one in known
+            row.number: PosedFrame(parent_key(row), row.pose, not row.is_cloud)
+            for row in viewpoints
         }
 
     def compare(self, rows: Sequence[int]) -> Sequence[PairMatch]:
@@ -201,23 +202,23 @@ class _StoredDatabase:
         positions = np.flatnonzero(np.isin(last.searched.ranking.indices, rows)).tolist()
         more = self._validated(last, positions, retry=False)
         with self._store.database.read() as connection:
-            known = frames_of(connection, [match.index for match in more.matches])
+            existing_rows = frames_of(connection, [match.index for match in more.matches])
         self.attempts[-1] = replace(
             last,
             checks=replace(last.checks, geometries=last.checks.geometries | more.geometries),
-            rows=last.rows | known,
-            rivals=[match for match in more.matches if match.index in known],
+            rows=last.rows | existing_rows,
+            rivals=[match for match in more.matches if match.index in existing_rows],
             late=bool(more.late),
         )
         return self.attempts[-1].rivals
 
     def _validated(
         self, attempt: _Attempt, positions: Sequence[int],
-        known: Mapping[int, PairValidation] | None = None, *, retry: bool = True,
+        validations: Mapping[int, PairValidation] | None = None, *, retry: bool = True,
     ) -> Validated:  # fmt: skip
         return validated(
             self._store, attempt.searched, positions, attempt.prepared.geometry, self._query,
-            self._deadline, self._model.parameters.validation, attempt.prepared.up, known,
+            self._deadline, self._model.parameters.validation, attempt.prepared.up, validations,
             guided=False, retry=retry,
         )  # fmt: skip
 
@@ -226,7 +227,10 @@ def _attempt(
     store: Store, places: Sequence[SearchedMap], model: Model, prepared: PreparedQuery,
     query: Query, deadline: Deadline, prior: PosePrior | None, clock: _Clock | None = None,
 ) -> _Attempt:  # fmt: skip
-    """Search the maps for a frame of a query, and validate its candidates."""
+    """Search the maps for a frame of a query, and validate its candidates.
+
+    Frames with damaged signatures are queued for signing.
+    """
     clock = clock or _Clock({})
     searched = search_maps(store, places, prepared, query, model)
     for place in places:
@@ -280,7 +284,7 @@ def _answer(
         clock.stage("explain")
     clock.spent["total"] = round(sum(clock.spent.values()), 2)
     counts = [_counts(searched, i, candidates, checks, matches) for i in range(len(places))]
-    sums = {name: sum(getattr(one, name) for one in counts) for name in Counts.model_fields}
+    sums = {name: sum(getattr(count, name) for count in counts) for name in Counts.model_fields}
     total = Counts(**sums)
     deciding = [*last.matches, *rivals_left]
     accepted = [last.rows[m.index] for m in deciding if m.validation.status == "accepted"]
@@ -335,10 +339,10 @@ def _validate_more(
     accepted = sum(match.validation.status == "accepted" for match in checks.matches)
     rest = [position for position in last.chosen if position not in checks.chosen]
     if query.k > VERDICT_MATCHES and (rest or accepted == VERDICT_MATCHES) and not checks.late:
-        known = {match.index: match.validation for match in checks.matches}
+        validations = {match.index: match.validation for match in checks.matches}
         return validated(
             store, last.searched, [*checks.chosen, *rest], last.prepared.geometry, query, deadline,
-            p, last.prepared.up, known, k=query.k, retry=False,
+            p, last.prepared.up, validations, k=query.k, retry=False,
         )  # fmt: skip
     return replace(checks, chosen=last.chosen)
 
@@ -376,7 +380,7 @@ def _counts(
     checks: Validated,
     matches: Sequence[PairMatch],
 ) -> Counts:
-    """Count the frames of map number `i` that reached each stage."""
+    """Count the frames of the searched map `searched.parts[i]` that reached each stage."""
     part, hits = searched.parts[i], searched.hits[i]
     number = part.place.row.number
     statuses = [
@@ -396,9 +400,9 @@ def _counts(
     )
 
 
-#: Minimum number of distinct planes for a distinctive frame.
+#: Minimum number of distinct planes in a distinctive frame.
 _FEWEST_PLANES = 4.0
-#: Ratio of surface distances in the query to those in the candidates that indicates a wrong scale.
+#: Ratio between surface distances in the query and in the candidates that indicates a wrong scale.
 _OTHER_SCALE = 2.5
 
 
@@ -496,13 +500,13 @@ def _cause_in_view(
     others = list(checks.geometries.values())
     if not others:
         return None
-    if all(type(one.surface.camera) is not type(geometry.surface.camera) for one in others):
+    if all(type(other.surface.camera) is not type(geometry.surface.camera) for other in others):
         return (
             "other_sensor",
             "the frame and the map are from different kinds of sensors. Query a map of the same "
             "kind of sensor",
         )
-    ratio = _distance(geometry) / float(np.median([_distance(one) for one in others]))
+    ratio = _distance(geometry) / float(np.median([_distance(other) for other in others]))
     if not 1 / _OTHER_SCALE < ratio < _OTHER_SCALE:
         return (
             "scale",

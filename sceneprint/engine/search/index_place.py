@@ -56,10 +56,10 @@ log = logging.getLogger(__name__)
 _FOLDER, _SWEPT, _USED = "index/", "index/.swept", ".used"
 #: Seconds between checks for a newer index of a queried map.
 LOOK_S = 30.0
-#: Age in seconds from which unlisted parts are removed; other hosts may still download younger
-#: ones.
+#: Minimum age, in seconds, at which unlisted parts are removed; other hosts may still be
+#: downloading younger parts.
 GRACE_S = 600.0
-#: Seconds after its last query for which the index of a map is not evicted.
+#: Seconds after the last query of a map during which its index is not evicted.
 IN_USE_S = 600.0
 
 
@@ -103,7 +103,9 @@ class IndexPlace:
         return index_folder(self._indexes, row)
 
     def head(self, row: MapRow) -> IndexManifest | None:
-        """Return the newest manifest of a map; None without an index, or if it was withdrawn."""
+        """Return the newest manifest of a map; None without an index, or if the newest is
+        withdrawn.
+        """
         if self._store is not None:
             numbered = _numbered(self._list(row))
             return self._read(numbered[-1]) if numbered else None
@@ -142,7 +144,11 @@ class IndexPlace:
 
     @contextmanager
     def turn(self, row: MapRow) -> Iterator[Callable[[], None] | None]:
-        """Lock the index of a map against builders on other hosts; see `index_turn`."""
+        """Lock the index of a map against builders on other hosts; yield None if one holds the
+        lock.
+
+        Otherwise, yield a function that checks that the lock is still held; see `index_turn`.
+        """
         if self._store is None:  # builders on the same host lock the folder
             yield lambda: None
             return
@@ -177,10 +183,10 @@ class IndexPlace:
         before = math.inf if clean else now - GRACE_S
         fetchable = [entry for entry, after in pairwise(numbered) if after.changed_at >= before]
         needed = set[str]()
-        for one in (*fetchable, numbered[-1]):
-            manifest = self._read(one)
+        for entry in (*fetchable, numbered[-1]):
+            manifest = self._read(entry)
             files = () if manifest is None else manifest.files
-            needed |= {one.key, *(f"{self._prefix(row)}{name}" for name, _ in files)}
+            needed |= {entry.key, *(f"{self._prefix(row)}{name}" for name, _ in files)}
         self._delete(o.key for o in listed if o.key not in needed and o.changed_at < before)
 
     def withdraw(self, row: MapRow) -> None:
@@ -225,18 +231,18 @@ class IndexPlace:
             return
         self._store.put(_SWEPT, b"")
         keys = [entry.key for entry in self._store.list(_FOLDER)]
-        known = self._known()
+        rows_by_folder = self._known()
         self._delete(
             key for key in keys
-            if is_index_folder(name := key.split("/")[1]) and name not in known
+            if is_index_folder(name := key.split("/")[1]) and name not in rows_by_folder
         )  # fmt: skip
 
     def remove_unknown(self) -> None:
         """Remove local indexes of deleted maps and of former models."""
         folders = self._folders()
-        known = self._known() if folders else {}
+        rows_by_folder = self._known() if folders else {}
         for folder in folders:
-            if folder.name not in known:
+            if folder.name not in rows_by_folder:
                 shutil.rmtree(folder, ignore_errors=True)
                 log.info("index removed", extra={"folder": folder.name})
 
@@ -285,7 +291,7 @@ class IndexPlace:
                 log.warning("index not fetched", extra={"map": row.name, "error": str(error)})
 
     def sync(self, row: MapRow, *, needed: bool = True) -> IndexManifest | None:
-        """Download the newest index of a map to the folder, unless it is there.
+        """Download the newest index of a map to its local folder, unless it is there.
 
         Parameters
         ----------
@@ -293,8 +299,8 @@ class IndexPlace:
 
         Returns
         -------
-        manifest : manifest of the local version; None without a version consistent with the
-            database
+        manifest : manifest of the local version; None if no version that is consistent with the
+            database is available, or another process is writing to the folder
 
         Raises
         ------

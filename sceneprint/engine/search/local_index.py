@@ -53,8 +53,8 @@ class IndexView:
     Parameters
     ----------
     size : number of searchable frames
-    dead : numbers of deleted frames in the index or the tail
-    damaged : numbers of frames without a readable signature
+    dead : frame numbers of deleted frames in the index or the tail
+    damaged : frame numbers of frames without a readable signature
     version : version of the index; None without an index
     """
 
@@ -130,7 +130,7 @@ class AppendBuffer:
 
     @property
     def bytes_held(self) -> int:
-        """Size in bytes of the memory that the kernel cannot evict."""
+        """Size, in bytes, of the memory that the kernel cannot evict."""
         return self._rows.nbytes if self._rows.nbytes <= IN_MEMORY else 0
 
     def reserve(self, more: int) -> None:
@@ -208,7 +208,7 @@ def _nameless(folder: Path, size: int) -> mmap.mmap:
     ) from failed
 
 
-#: Number of new frames above which a reader restarts with a newer index instead of reading them.
+#: Maximum number of new frames to read; a reader that lacks more restarts with a newer index.
 READ_MOST = 20_000
 #: Seconds between checks for a newer version, and until an unreadable version is tried again.
 _LOOK_S, _AGAIN_S = 1.0, 60.0
@@ -275,7 +275,7 @@ class Reader:
 
     @property
     def bytes_held(self) -> int:
-        """Memory of the tail in bytes."""
+        """Size, in bytes, of the memory of the tail that the kernel cannot evict."""
         return self._tail.bytes_held
 
     def is_outdated(self) -> bool:
@@ -369,13 +369,13 @@ class Reader:
         return newest_number(self._folder) if self._model.metric == "l2" else None
 
     def _newest(
-        self, connection: Connection, row: MapRow, known: IndexVersion | None
+        self, connection: Connection, row: MapRow, previous: IndexVersion | None
     ) -> IndexVersion | None:
         number = self._newest_number()
         if number is None:
             return None
         length = self._model.signature_bytes
-        version = newest(self._folder, row.model_id, length, known=known)
+        version = newest(self._folder, row.model_id, length, known=previous)
         if version is None or version.number < number:
             self._unsound = number, time.monotonic() + _AGAIN_S
         return trusted(connection, row, version)

@@ -105,7 +105,10 @@ def check_model(first: str, second: str) -> None:
 
 
 def _other_models(store: Store, rows: Sequence[MapRow]) -> list[MapRow] | None:
-    """Return the current rows of maps if a map has switched its model; None if no map has."""
+    """Return the current rows of maps if a map has switched its model.
+
+    Return None if no map has switched, or a map was deleted or replaced.
+    """
     try:
         with store.database.read() as connection:
             rows_now = find_maps(connection, [row.name for row in rows])
@@ -205,7 +208,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
 
 
 def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
-    """Return the names of the two sensor frames, with the ids `a` and `b` if the ids are equal."""
+    """Return the names of both sensor frames, with the ids `a` and `b` if their ids are equal."""
     ids = [x if side.frame is None else side.frame[1] for x, side in (("a", a), ("b", b))]
     if ids[0] == ids[1]:
         ids = ["a", "b"]
@@ -281,7 +284,10 @@ class Queries:
         self, maps: Sequence[str], frame: FrameName, query: Query, since: float | None = None,
         sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Search maps for a stored frame, except itself; see `prepare_stored` and `upload`."""
+        """Search maps for a stored frame, but do not match it with itself.
+
+        See `prepare_stored` and `upload`.
+        """
         deadline = Deadline(query.deadline_ms, since)
 
         def ask(rows: list[MapRow]) -> Answer:
@@ -439,7 +445,7 @@ class Queries:
 
 
 def check_sequence(metas: Sequence[FrameMeta], query: Query) -> None:
-    """Raise InvalidRequest if the length or the odometry of a sequence is not valid."""
+    """Raise InvalidRequest if the stages, length or odometry of a sequence are not valid."""
     check_localizes(query)
     if not 2 <= len(metas) <= MOST_OF_SEQUENCE:
         raise InvalidRequest(
@@ -496,5 +502,5 @@ def localization_of(answer: Answer) -> Localization:
     return copy_fields(
         Localization, answer, **own, status=status, map=answer.maps[0], strength=strength,
         best=accepted[0] if accepted and status == "found" else None,
-        matches=[one.frame_id for one in accepted],
+        matches=[match.frame_id for match in accepted],
     )  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 
 from sceneprint.engine.search import retrieval
 from sceneprint.engine.search.up_vectors import known_ups
-from sceneprint.engine.search.verification import NOT_ASKED, Validated, thresholds
+from sceneprint.engine.search.verification import NOT_REQUESTED, Validated, thresholds
 from sceneprint.engine.serializers import copy_fields, sensor_of, transform, vector
 from sceneprint.errors import DamagedBlob, UnknownFrame, UnreadableGeometry
 from sceneprint.geometry.registration.icp import (
@@ -96,7 +96,7 @@ class Candidates:
 
 
 def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
-    """Return matches without the accepted matches beyond the first `k`."""
+    """Return the matches, but only the first `k` of the accepted matches."""
     accepted = [match.index for match in matches if match.validation.status == "accepted"]
     return [match for match in matches if match.index not in accepted[k:]]
 
@@ -267,11 +267,11 @@ def explain(
     among : (R, R) distances within R; None if diversification was not requested
     p : parameters of the selection
     """
-    left = None
+    gains = None
     if among is not None and len(candidates.ranking):
-        left = remaining_gains(among, np.asarray(checks.chosen, np.intp), p)
+        gains = remaining_gains(among, np.asarray(checks.chosen, np.intp), p)
     records = {match.index: validation_record(match.validation) for match in checks.matches}
-    return list(_each(candidates, checks, records, among, left))
+    return list(_each(candidates, checks, records, among, gains))
 
 
 def figures(v: ValidationRecord) -> str:
@@ -290,7 +290,7 @@ def figures(v: ValidationRecord) -> str:
 
 def _each(
     candidates: Candidates, checks: Validated, records: dict[int, ValidationRecord],
-    among: Ints64 | None, left: np.ndarray | None,
+    among: Ints64 | None, gains: np.ndarray | None,
 ) -> Iterator[Explanation]:  # fmt: skip
     chosen = set(checks.chosen)
     for position, number in enumerate(candidates.ranking.indices.tolist()):
@@ -303,11 +303,11 @@ def _each(
             reason = figures(records[number])
         elif position in chosen:
             stage = "retrieve" if candidates.selection is None else "diversify"
-            was_requested = checks.untried != NOT_ASKED
+            was_requested = checks.untried != NOT_REQUESTED
             outcome = "skipped" if was_requested else "ranked"
             reason = checks.unreadable.get(number, checks.untried)
-        elif among is not None and left is not None:
-            reason = _not_selected(candidates, checks, among, position, float(left[position]))
+        elif among is not None and gains is not None:
+            reason = _not_selected(candidates, checks, among, position, float(gains[position]))
         else:
             reason = f"not a candidate: these were the first {len(chosen)} frames of the ranking"
         yield Explanation(

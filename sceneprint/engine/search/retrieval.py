@@ -40,8 +40,8 @@ from sceneprint.types import Bytes, Floats, Geometry
 from sceneprint_client.api import Filter, FrameMeta, FrameName, Query
 from sceneprint_client.api.frames import Kind
 
-#: Maximum total size of tails in bytes; beyond it, readers of the least recently queried maps are
-#: closed.
+#: Maximum total size of tails, bytes; when it is exceeded, the readers of the least recently
+#: queried maps are closed.
 HELD_BYTES = 1 << 30
 #: Seconds between checks for readers of deleted maps.
 _TIDY_S = 10.0
@@ -178,9 +178,9 @@ def prepare_upload(
         return PreparedQuery(
             signer.model.id, vector, None, origin, None, _since(start), base=base, kind=kind, up=up
         )
-    signature, seen = prepare(read.frame, signer)
+    signature, geometry = prepare(read.frame, signer)
     # decode the artifact again: it is rounded, and a stored frame must get the same answer
-    artifact = write_geometry(seen)
+    artifact = write_geometry(geometry)
     return PreparedQuery(
         signature.model_id, signature.vector, read_geometry(artifact), origin, None, _since(start),
         base=base, artifact=artifact, kind=kind, up=up, pose=read.frame.pose,
@@ -264,7 +264,8 @@ def _since(start: float) -> float:
     return 1e3 * (time.perf_counter() - start)
 
 
-#: Assumed duration of the first validation, seconds; later, it is the longest so far.
+#: Assumed duration of the first validation, seconds; later ones are assumed to take as long as the
+#: longest so far.
 FIRST_S = 0.03
 
 
@@ -309,8 +310,8 @@ class MapSearch:
 
     Parameters
     ----------
-    dead : numbers of excluded frames: deleted frames, and the queried frame
-    among : numbers of the frames that pass the filter; None without a filter
+    dead : frame numbers to exclude: deleted frames, and the queried frame
+    among : frame numbers that pass the filter; None without a filter
     size : number of searchable frames
     """
 
@@ -395,7 +396,9 @@ def search_maps(
 
 
 def rank_among_all(searched: Searched, prepared: PreparedQuery, number: int, distance: int) -> int:
-    """Return the exact rank, from 1, of a frame at `distance` among all that pass the filter."""
+    """Return the exact rank, from 1, of a frame at `distance` among all frames that pass the
+    filter.
+    """
     return 1 + sum(
         part.place.view.nearer(prepared.vector, number, distance, dead=part.dead, among=part.among)
         for part in searched.parts
@@ -416,7 +419,7 @@ def _part(store: Store, place: SearchedMap, prepared: PreparedQuery, query: Quer
 def _among(
     store: Store, place: SearchedMap, dead: frozenset[int], prepared: PreparedQuery, filters: Filter
 ) -> Keys:
-    """Return the numbers of the frames in a view, except `dead`, that pass a filter."""
+    """Return the frame numbers in a view that pass a filter, except `dead`."""
     view = place.view
     with store.database.read() as connection:
         numbers = passing_frames(connection, place.row.number, filters, prepared.origin)

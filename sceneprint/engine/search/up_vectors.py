@@ -51,7 +51,7 @@ def parent_up(connection: Connection, numbers: Iterable[int]) -> Floats | None:
 
     Parameters
     ----------
-    numbers : numbers of frames with poses in this parent frame
+    numbers : frame numbers of frames with poses in this parent frame
 
     Returns
     -------
@@ -102,7 +102,7 @@ class PlanAxes:
 
     Parameters
     ----------
-    axes : (2, 3) unit vectors to the right and to the top of the plan, in the parent frame
+    axes : (2, 3) unit vectors that point right and up in the plan, in the parent frame
     up_from : source of the up vector
     """
 
@@ -136,7 +136,7 @@ def upright(poses: Floats, clouds: Sequence[bool]) -> Floats:
 
 
 def parent_axes(connection: Connection, row: MapRow, numbers: Sequence[int]) -> PlanAxes:
-    """Return the axes of the plan of the parent frame that contains some frames."""
+    """Return the axes of a plan in the parent frame of the frames `numbers`."""
     numbers = numbers[:: max(len(numbers) // _UP_FRAMES, 1)]
     if (up := parent_up(connection, numbers)) is not None:
         return PlanAxes(plan_axes(up), "frames" if row.up is None else "map")

@@ -46,8 +46,8 @@ from sceneprint_client.api.query import FARTHEST_PRIOR, LEAST_DEVIATION, MOST_DE
 
 #: Default number of candidates to validate for the pose of a query.
 CANDIDATES = 10
-#: Limits for frames without free space or with little overlap, by the limit that a caller sets;
-#: they get the same value.
+#: For each limit that a caller can set: the limits for frames without free space or with little
+#: overlap that get the same value.
 _ALSO_SET = {
     "residual_m": ("apart_m",),
     "residual_rad": ("apart_rad",),
@@ -56,7 +56,7 @@ _ALSO_SET = {
     "ambiguous_share": ("blind_ambiguous_share",),
 }
 #: Reason why no candidate was validated in a query without validation.
-NOT_ASKED = "not requested"
+NOT_REQUESTED = "not requested"
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +102,8 @@ def validated(
 ) -> Validated:  # fmt: skip
     """Validate candidates in order until `k` are accepted or the deadline passes.
 
+    Frames with an unreadable geometry are queued for signing.
+
     Parameters
     ----------
     chosen : positions in R of the candidates
@@ -112,7 +114,7 @@ def validated(
     guided : whether earlier matches predict transforms of later candidates
     """
     if geometry is None:
-        return Validated(chosen, [], {}, NOT_ASKED, deadline.reached)
+        return Validated(chosen, [], {}, NOT_REQUESTED, deadline.reached)
     ranking, model_id = searched.ranking, searched.parts[0].place.row.model_id
     with store.database.read() as connection:
         blobs = geometry_blobs(connection, ranking.indices[list(chosen)].tolist(), model_id)
@@ -174,7 +176,7 @@ def placed(
     rows: Mapping[int, FrameRow],
     query_frames: Sequence[QueryFrame], prior: PosePrior | None, model: Model, query: Query,
 ) -> PoseEstimate | None:  # fmt: skip
-    """Estimate the pose of a query from its matches, and the frames near the poses that they imply.
+    """Estimate the pose of a query from its matches, and from frames near the poses they imply.
 
     Parameters
     ----------
@@ -311,14 +313,16 @@ def nearest_first(
     posed = {viewpoint.number: viewpoint for viewpoint in viewpoints}
 
     def far(position: int) -> bool:
-        one = posed.get(int(ranking.indices[position]))
-        return one is None or parent_key(one) != prior.parent or not prior.reaches(one.pose, p)
+        viewpoint = posed.get(int(ranking.indices[position]))
+        if viewpoint is None or parent_key(viewpoint) != prior.parent:
+            return True
+        return not prior.reaches(viewpoint.pose, p)
 
     return sorted(chosen, key=far)
 
 
 def parent_key(row: FrameRow | FrameViewpoint) -> str:
-    """Return a unique key of a parent frame: map number, space, and frame name."""
+    """Return a unique key of a parent frame: its map number, a space, and its name."""
     return f"{row.map_number} {row.pose_parent}"
 
 

@@ -40,7 +40,7 @@ _LEFT_AT_ONCE = 1_000
 def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
     """Remove the unreferenced blobs among `blobs`.
 
-    The check is a write transaction, so that no upload can add a reference meanwhile. During a
+    The check runs in a write transaction, so no upload can add a reference meanwhile. During a
     snapshot or a removal by another process, blobs are only marked as doomed;
     `collect_doomed_blobs` removes them later.
 
@@ -58,7 +58,10 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
 
 
 def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
-    """Remove unreferenced blobs in one transaction; return False if they were only doomed."""
+    """Remove unreferenced blobs in one write transaction.
+
+    If another process holds the removal lock, doom the whole block instead, and return False.
+    """
     with store.database.write() as connection, store.blobs.removing() as allowed:
         if not allowed:
             doom(connection, block)
@@ -70,7 +73,11 @@ def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
 
 
 def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
-    """Doom unreferenced blobs in a transaction, then remove them; see `_remove_in_turn`."""
+    """Doom unreferenced blobs in a write transaction, remove them after it, and clear the marks.
+
+    If another process still holds the removal lock after _PATIENCE_S seconds, doom the whole block
+    instead, and return False.
+    """
     with suppress(StoreLocked):
         store.blobs.wait_for_removal(seconds=_PATIENCE_S)
     with ExitStack() as removal:
@@ -128,7 +135,7 @@ def collect_doomed_blobs(
     ----------
     before : remove only blobs doomed before this time (seconds since 1970), since another process
         may be removing the others; None selects all
-    seconds : time after which no further block is started
+    seconds : duration after which no further block is started
 
     Returns
     -------

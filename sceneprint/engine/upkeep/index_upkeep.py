@@ -49,13 +49,15 @@ log = logging.getLogger(__name__)
 
 #: Seconds for which a step verifies indexes; meanwhile, jobs wait.
 STEP_S = 0.25
-#: Name of the file whose modification time is the start of the last verification round.
+#: Name of the file whose modification time is the start time of the last verification round.
 _STAMP = ".scrubbed"
 #: Maximum seconds between checks for old deletions that an index does not contain.
 AGING_S = 3600.0
-#: Seconds until the next attempt, after a shared index failed or was built by another host.
+#: Seconds until the next attempt, after a shared index could not be published or another host was
+#: building it.
 ELSEWHERE_S = 30.0
-#: Name of the file in an index folder whose times are those of the last and the next purge.
+#: Name of a file in an index folder: its access time is the time of the last purge, and its
+#: modification time that of the next purge.
 _PURGED = ".rest"
 
 
@@ -78,9 +80,9 @@ class Scrubber:
         Returns
         -------
         folder : index folder from which a damaged file was removed, so that the index must be
-            rebuilt; None without damage
+            rebuilt; None if no damage was found
         """
-        if self._round is None and self._is_time():
+        if self._round is None and self._start_round():
             self._round = chain.from_iterable(map(scrub, folders))
         until = time.monotonic() + STEP_S
         while self._round is not None and time.monotonic() < until:
@@ -95,7 +97,8 @@ class Scrubber:
                 return damaged.parent
         return None
 
-    def _is_time(self) -> bool:
+    def _start_round(self) -> bool:
+        """Return whether a round is due; if so, record its start for all processes."""
         if time.monotonic() - self._looked < min(self._pause_s, 60):
             return False
         self._looked = time.monotonic()
@@ -137,9 +140,9 @@ class Upkeep:
         self._aged = dict[tuple[int, str], float]()
 
     def run(self) -> int:
-        """Publish the indexes that are due, and run a step of verification.
+        """Publish outdated indexes, remove unknown ones, and run a step of verification.
 
-        Return the number of published indexes. Errors of single indexes are logged; queries read
+        Return the number of published indexes. Errors in single indexes are logged; queries read
         the unindexed frames from the database.
         """
         with self._store.database.read() as connection:
@@ -249,7 +252,7 @@ class Upkeep:
     def _is_outdated(self, connection: Connection, row: MapRow, since: int) -> bool:
         """Return whether an index at revision `since` must be updated.
 
-        It must if it lacks too many frames or deletions, or will soon be too old to be updated.
+        This is so if it lacks too many frames or deletions, or will soon be too old to be updated.
         """
         if since < row.pruned_revision:
             since = 0
@@ -334,7 +337,7 @@ class Upkeep:
         """Publish the index of a map if it is outdated or with `force`; return None if not
         published.
 
-        With `rebuild` or `clean`, do not reuse earlier parts at all, or not those with deleted
+        With `rebuild`, reuse no earlier parts; with `clean`, reuse none that contain deleted
         frames.
         """
         if not force and self._is_up_to_date(row):
@@ -412,7 +415,7 @@ class Upkeep:
             return not self._is_outdated(connection, now, since)
 
     def _newest(self, row: MapRow, model: Model) -> IndexVersion | None:
-        """Return the newest sound local index; do not verify parts again."""
+        """Return the newest sound local index; verify each part only once."""
         sound = self._verified.get((row.number, row.model_id))
         version = newest(self._place.folder(row), row.model_id, model.signature_bytes, sound=sound)
         if version is not None:

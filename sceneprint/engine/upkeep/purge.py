@@ -71,7 +71,7 @@ class Retention:
         self._next = 0.0
 
     def run(self, now: float | None = None) -> int:
-        """Delete old frames and rows, if it is due, for about TURN_S seconds; return their number.
+        """If due, delete old frames and rows for about TURN_S seconds; return their number.
 
         If any remain, the next call continues. Errors are logged; a later call retries.
 
@@ -145,7 +145,11 @@ class MemoryPurging:
         self._purged = time.monotonic()
 
     def run(self) -> None:
-        """Release deleted maps and, at intervals, deleted frames."""
+        """Free the memory of deleted maps and, at intervals, of deleted frames.
+
+        At these intervals, remove local indexes that still contain deleted frames. Also remove
+        surplus queries and answers.
+        """
         context, readers = self._context, self._context.readers
         context.query_log.tidy()  # for nodes without workers
         with context.store.database.read() as connection:
@@ -159,9 +163,10 @@ class MemoryPurging:
             readers.purge(connection)
 
 
-#: Age in seconds from which doomed blobs are removed here instead of by the deleting process.
+#: Minimum age, in seconds, of doomed blobs to remove here; the deleting process removes younger
+#: ones.
 _YOUNG_S = 60.0
-#: Maximum duration of removing doomed blobs, seconds; meanwhile, jobs wait.
+#: Maximum duration of the removal of doomed blobs, seconds; meanwhile, jobs wait.
 _SWEEP_S = 20.0
 #: Pause before the next purge of an index, as a multiple of the duration of the last purge.
 PAUSE = 10.0
@@ -169,7 +174,7 @@ PAUSE = 10.0
 
 @dataclass(frozen=True)
 class Purged:
-    """Number of objects that a purge removed or rebuilt.
+    """Counts of the objects that a purge removed or rebuilt.
 
     Parameters
     ----------
@@ -210,7 +215,8 @@ class Purging:
         self._next = time.monotonic() + self._every_s
         self._store.geometries.forget_older(self._every_s)
         before = time.time() - min(_YOUNG_S, self._every_s)
-        return self._all(before, self._upkeep.is_purge_due, seconds=min(_SWEEP_S, self._every_s))
+        seconds = min(_SWEEP_S, self._every_s)
+        return self._purge_all(before, self._upkeep.is_purge_due, seconds=seconds)
 
     def now(self) -> Purged:
         """Purge all deleted frames; no deletion can be undone afterwards.
@@ -221,12 +227,12 @@ class Purging:
         StoreError, OSError : If something cannot be removed; raised after the rest was removed.
         """
         failed: list[Exception] = []
-        purged = self._all(None, lambda _: True, failed)
+        purged = self._purge_all(None, lambda _: True, failed)
         if failed:
             raise failed[0]
         return purged
 
-    def _all(
+    def _purge_all(
         self, before: float | None, selects: Callable[[MapRow], bool],
         failed: list[Exception] | None = None, seconds: float = math.inf,
     ) -> Purged:  # fmt: skip
@@ -251,12 +257,12 @@ class Purging:
             products=sum(attempt(product.forget) for product in self._products),
             answers=attempt(self._log.purge),
             indexes=attempt(partial(self._upkeep.sweep, now=before is None))
-            + sum(attempt(lambda row=row: self._index(row)) for row in rows),  # type: ignore[misc]
+            + sum(attempt(lambda row=row: self._purge_index(row)) for row in rows),  # type: ignore[misc]
         )
         self._store.database.shrink_log()
         return purged
 
-    def _index(self, row: MapRow) -> int:
+    def _purge_index(self, row: MapRow) -> int:
         start = time.monotonic()
         done = self._upkeep.purge(row)
         seconds = time.monotonic() - start

@@ -75,11 +75,11 @@ def resign_frames(store: Store, row: MapRow, numbers: Sequence[int], model_id: s
         with store.database.read() as connection:  # usually none is due: avoid a write lock
             # sample randomly, so that irreparable frames do not prevent other repairs
             sample = random.sample(list(numbers), min(MOST, len(numbers)))
-            due = _due(connection, sample, model_id)
+            due = _repairable(connection, sample, model_id)
         if not due:
             return 0
         with store.database.write() as connection:
-            due = _due(connection, due, model_id)
+            due = _repairable(connection, due, model_id)
             ids = {frame.number: frame.id for frame in frames_of(connection, due).values()}
             for number in due:
                 job = enqueue(connection, REENCODE, number, PRIORITY, model_id)
@@ -109,7 +109,8 @@ def rebuild_frame(store: Store, signer: Signer, frame: FrameRow) -> tuple[Bytes,
     return signature.vector, write_geometry(geometry)
 
 
-def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[int]:
+def _repairable(connection: Connection, numbers: Sequence[int], model_id: str) -> list[int]:
+    """Return the indexed frames without a pending or recent repair job and without a known loss."""
     frames = frames_of(connection, numbers)
     now, due = time.time(), []
     for number in dict.fromkeys(numbers):
@@ -124,7 +125,7 @@ def _due(connection: Connection, numbers: Sequence[int], model_id: str) -> list[
 
 
 def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list[str]:
-    """Replace the upload of a frame if it is lost or damaged.
+    """Replace the upload of a frame if it is lost or damaged; repair its geometry if it is, too.
 
     Parameters
     ----------

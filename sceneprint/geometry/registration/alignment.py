@@ -307,7 +307,7 @@ def _fit_hypotheses(
         for j in range(count):
             total += common[i, j]
         support[i] = total
-    weights, places, found = np.zeros(count), np.empty(count, np.int32), 0
+    weights, places, n_fitted = np.zeros(count), np.empty(count, np.int32), 0
     order = np.empty(min(n_support, count), np.int32)
     for _ in range(n_seeds):
         seed = int(np.argmax(support))
@@ -323,14 +323,14 @@ def _fit_hypotheses(
             if row[j] > 0:
                 support[j] *= 1.0 - 0.5 * row[j] / row[order[0]]
         support[seed] = 0.0
-        if not _fit_transform(p, n, q, m, weights, normal_weight, places, T[found]):
+        if not _fit_transform(p, n, q, m, weights, normal_weight, places, T[n_fitted]):
             continue
         for _ in range(rounds):
-            _weigh_inliers(p, n, q, m, T[found], distance, cosine, weights)
-            if not _fit_transform(p, n, q, m, weights, normal_weight, places, T[found]):
+            _weigh_inliers(p, n, q, m, T[n_fitted], distance, cosine, weights)
+            if not _fit_transform(p, n, q, m, weights, normal_weight, places, T[n_fitted]):
                 break
-        found += 1
-    return found
+        n_fitted += 1
+    return n_fitted
 
 
 def consensus(source: Patches, target: Patches, pairs: Ints32, p: ConsensusParameters) -> Floats:
@@ -677,6 +677,6 @@ def _rank(
     overlap_p: OverlapParameters,
 ) -> Ints32:  # fmt: skip
     """Return the indices of refined transforms, best first."""
-    seen = plane_agreement(source.planes, target.planes, transforms, overlap_p)
-    scores = seen.share - p.rank_violations * seen.violations
+    agreement = plane_agreement(source.planes, target.planes, transforms, overlap_p)
+    scores = agreement.share - p.rank_violations * agreement.violations
     return np.argsort(-scores, kind="stable").astype(np.int32)

@@ -103,11 +103,11 @@ def _squared_distances(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> 
 @disjoint_kernel
 def _select_near(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
     """Write the indices, except `but`, of the squared distances below a limit; return the count."""
-    found = 0
+    selected = 0
     for j in range(count):
-        places[found] = j
-        found += 1 if (squares[j] < limit) & (j != but) else 0
-    return found
+        places[selected] = j
+        selected += 1 if (squares[j] < limit) & (j != but) else 0
+    return selected
 
 
 @disjoint_kernel
@@ -207,10 +207,10 @@ def _accumulate(
         start = 0
         for s in range(len(scales)):
             radius, n_flat, n_high = scales[s, 0], int(scales[s, 1]), int(scales[s, 2])
-            found = _select_near(lies[0], reached, -1, radius * radius, near)
-            _spread(lies, near, found, radius, n_flat, n_high, n_angles, weights, starts)
+            n_near = _select_near(lies[0], reached, -1, radius * radius, near)
+            _spread(lies, near, n_near, radius, n_flat, n_high, n_angles, weights, starts)
             end = start + n_flat * n_high * n_angles
-            _add_shares(lies, bins, near, found, weights, starts, out[i, start:end])
+            _add_shares(lies, bins, near, n_near, weights, starts, out[i, start:end])
             start = end
 
 
@@ -358,7 +358,7 @@ def _match_nearest(
     count, length = target.shape
     farthest = np.int32(2147483647)
     squares = np.empty(count, np.int32)
-    found = 0
+    n_pairs = 0
     for row in range(len(drawn)):
         query = source[drawn[row]]
         for j in range(count):
@@ -378,11 +378,11 @@ def _match_nearest(
                     best = j
             if squares[best] == farthest:  # the gate excludes all other patches
                 break
-            pairs[found, 0] = drawn[row]
-            pairs[found, 1] = best
+            pairs[n_pairs, 0] = drawn[row]
+            pairs[n_pairs, 1] = best
             squares[best] = farthest
-            found += 1
-    return found
+            n_pairs += 1
+    return n_pairs
 
 
 @dataclass(frozen=True, eq=False)

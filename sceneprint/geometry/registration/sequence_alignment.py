@@ -99,7 +99,7 @@ def _write_sequences(
 ) -> None:  # fmt: skip
     count = len(others)
     squares, azimuths = np.empty(count), np.empty(most)
-    found = np.empty((most, 4))
+    neighbours = np.empty((most, 4))
     for i in range(len(means)):
         n = normals[i]
         # any direction in the plane can be azimuth 0, because the start is selected later
@@ -135,10 +135,10 @@ def _write_sequences(
             cosine = o[0] * n[0] + o[1] * n[1] + o[2] * n[2]
             whole = np.sqrt(dx * dx + dy * dy + dz * dz)
             along = (o[0] * dx + o[1] * dy + o[2] * dz) / whole
-            found[m, 0] = np.sqrt(a * a + b * b)
-            found[m, 1] = height
-            found[m, 2] = np.arccos(min(max(cosine, -1.0), 1.0))
-            found[m, 3] = np.arccos(min(max(along, -1.0), 1.0))
+            neighbours[m, 0] = np.sqrt(a * a + b * b)
+            neighbours[m, 1] = height
+            neighbours[m, 2] = np.arccos(min(max(cosine, -1.0), 1.0))
+            neighbours[m, 3] = np.arccos(min(max(along, -1.0), 1.0))
             azimuths[m] = np.arctan2(b, a)
             m += 1
         lengths[i] = m
@@ -150,7 +150,7 @@ def _write_sequences(
             if azimuths[order[s]] - before > widest:
                 start, widest = s, azimuths[order[s]] - before
         for s in range(m):
-            symbols[i, s] = found[order[(start + s) % m]]
+            symbols[i, s] = neighbours[order[(start + s) % m]]
 
 
 def neighbour_sequences(patches: Patches, about: Patches, p: SequenceParameters) -> Sequences:

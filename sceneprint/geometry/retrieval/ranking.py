@@ -320,8 +320,8 @@ def ranking_size(n_map: int) -> int:
     """
     if n_map < 0:
         raise ValueError(f"A map cannot have {n_map} frames. Pass 0 or more.")
-    wanted = min(max(round(RANKING_SHARE * n_map), SMALLEST_RANKING), LARGEST_RANKING)
-    return min(wanted, n_map)
+    size = min(max(round(RANKING_SHARE * n_map), SMALLEST_RANKING), LARGEST_RANKING)
+    return min(size, n_map)
 
 
 #: Distances: exact, as this module computes them, or in floating point.

@@ -328,5 +328,5 @@ def _invert(
         x = x - (yy * x_off - xy * y_off) / determinant
         y = y - (xx * y_off - xy * x_off) / determinant
     x_back, y_back = _distort(x, y, k)
-    known = np.hypot(x_back - x_seen, y_back - y_seen) < 2.0 * _TOLERANCE
-    return x, y, known & _unfolded(x, y, k)
+    valid = np.hypot(x_back - x_seen, y_back - y_seen) < 2.0 * _TOLERANCE
+    return x, y, valid & _unfolded(x, y, k)

@@ -77,8 +77,8 @@ def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
     while True:
         around = math.ceil(2 * math.pi / step)
         column = ((angles[:, 0] + math.pi) * (around / (2 * math.pi))).astype(np.int64) % around
-        seen = np.flatnonzero(np.bincount(column, minlength=around))
-        ends = np.append(seen, seen[0] + around)
+        occupied = np.flatnonzero(np.bincount(column, minlength=around))
+        ends = np.append(occupied, occupied[0] + around)
         widest = int(np.diff(ends).argmax())
         unit = 2 * math.pi / around
         height = max(math.ceil((high - low) / unit), 1)

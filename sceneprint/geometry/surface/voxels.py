@@ -259,10 +259,10 @@ def _link(
         for dx in range(-1, 2):
             for dy in range(-1, 2):
                 for dz in range(-1, 2):
-                    wanted = key + (dx * span + dy) * span + dz
-                    at = hash_key(wanted, secret) & mask
+                    neighbour = key + (dx * span + dy) * span + dz
+                    at = hash_key(neighbour, secret) & mask
                     while table[at] >= 0:
-                        if cells[order[starts[table[at]]]] == wanted:
+                        if cells[order[starts[table[at]]]] == neighbour:
                             around[count] = table[at]
                             count += 1
                             break
@@ -339,9 +339,9 @@ def _touch(
                 keep[k] = False
                 continue
             dx, dy, dz = at[j, 0] - at[i, 0], at[j, 1] - at[i, 1], at[j, 2] - at[i, 2]
-            one = abs(dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2])
+            here = abs(dx * normals[i, 0] + dy * normals[i, 1] + dz * normals[i, 2])
             other = abs(dx * normals[j, 0] + dy * normals[j, 1] + dz * normals[j, 2])
-            keep[k] = min(one, other) <= max(gaps[i], gaps[j])
+            keep[k] = min(here, other) <= max(gaps[i], gaps[j])
 
 
 #: Side of the square that has the area of the neighbourhood's disc, in radii.

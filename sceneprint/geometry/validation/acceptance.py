@@ -413,16 +413,16 @@ def best_alternative(
     """
     moved = np.concatenate([symmetries(match.patches, p) @ T, T @ symmetries(query.patches, p)])
     near = select_rivals(T, refine_all(query.surface, match.surface, moved, p.first), p)
-    seen = plane_agreement(query, match, near, agreement_p)
-    hopeful = near[(seen.share > p.hopeful_share) & (seen.violations < p.hopeful_violations)]
+    result = plane_agreement(query, match, near, agreement_p)
+    hopeful = near[(result.share > p.hopeful_share) & (result.violations < p.hopeful_violations)]
     proposed = select_rivals(T, proposed, p)
     order = -np.arange(len(proposed), dtype=float)
     chosen = select_distinct(proposed, order, p.rival_m, p.rival_rad, p.n_proposed)
     hopeful = np.concatenate([hopeful, proposed[chosen]])
     rivals = np.concatenate([voted, refine_all(query.surface, match.surface, hopeful, p.then)])
     rivals = select_rivals(T, rivals, p)
-    seen = plane_agreement(query, match, rivals, agreement_p)
-    share = np.where(seen.violations < max(p.refuted, violations), seen.share, 0.0)
+    result = plane_agreement(query, match, rivals, agreement_p)
+    share = np.where(result.violations < max(p.refuted, violations), result.share, 0.0)
     level = are_level(rivals, ups, most_tilt)
     tilted = float(share[~level].max(initial=0.0))
     share = np.where(level, share, 0.0)

@@ -550,8 +550,8 @@ def _refine_proposal(
         return None
     residual, _ = _combine_directions(there, back, p.acceptance)
     T = middle(there.T, inverse(back.T))
-    seen = plane_agreement(query.planes, match.planes, T[None], p.agreement)
-    evidence = _collect_evidence(query, match, (there, back), T, residual, seen, 0, p)
+    agreement = plane_agreement(query.planes, match.planes, T[None], p.agreement)
+    evidence = _collect_evidence(query, match, (there, back), T, residual, agreement, 0, p)
     return _Proposal(T, proposal.directions, (there, back), *evidence)
 
 
@@ -611,20 +611,20 @@ def _collect_evidence(
     there = overlap_counts(query.points, match.geometry.surface, T, p.agreement)
     back = overlap_counts(match.points, query.geometry.surface, inverse(T), p.agreement)
     inliers = there.inliers + back.inliers
-    seen = [counts for counts in (there, back) if counts.violations is not None]
-    violated = sum(counts.violations or 0 for counts in seen)
-    agreeing = sum(counts.inliers for counts in seen)
+    viewed = [counts for counts in (there, back) if counts.violations is not None]
+    violated = sum(counts.violations or 0 for counts in viewed)
+    agreeing = sum(counts.inliers for counts in viewed)
     weights = sum(float(frame.planes.weights.sum(dtype=float)) for frame in (query, match))
     e = Evidence(
         *residual,
         overlap=inliers / max(there.points + back.points, 1),
         plane_overlap=float(by_planes.share[k]),
-        violations=violated / max(agreeing + violated, 1) if seen else None,
+        violations=violated / max(agreeing + violated, 1) if viewed else None,
         stiffness=min(alignment.stiffness for alignment in found_by),
-        one_sided=len(seen) == 1,
+        one_sided=len(viewed) == 1,
         planes=float(by_planes.share[k]) * weights / 2,
         plane_violations=float(by_planes.violations[k]),
-        worst_violations=max((counts.violation_share for counts in seen), default=0.0),
+        worst_violations=max((counts.violation_share for counts in viewed), default=0.0),
     )
     return e, inliers
 

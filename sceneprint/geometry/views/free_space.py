@@ -60,8 +60,8 @@ class Floors:
     @property
     def lowest(self) -> float | None:
         """Return the median height of the lowest floor; None if there is no floor."""
-        known = self.heights[0][np.isfinite(self.heights[0])]
-        return float(np.median(known)) if len(known) else None
+        heights = self.heights[0][np.isfinite(self.heights[0])]
+        return float(np.median(heights)) if len(heights) else None
 
 
 def robust_extent(pieces: Surfels) -> tuple[Floats, Floats]:

@@ -93,20 +93,20 @@ def view_parameters(
         )
     if camera is None and model.cloud.maximum_range > _FARTHEST_CAMERA:
         nearest, farthest = model.cloud.minimum_range, model.cloud.maximum_range
-        usual, seen = SCANNER_HEIGHTS, None
+        usual, view = SCANNER_HEIGHTS, None
     else:
         nearest, farthest = model.depth.minimum_depth, model.depth.maximum_depth
-        usual, seen = CAMERA_HEIGHTS, camera or DEFAULT_CAMERA
-    if seen is not None:
-        seen = Intrinsics(seen.width, seen.height, seen.fx, seen.fy, seen.cx, seen.cy)
+        usual, view = CAMERA_HEIGHTS, camera or DEFAULT_CAMERA
+    if view is not None:
+        view = Intrinsics(view.width, view.height, view.fx, view.fy, view.cx, view.cy)
     return ViewParameters(
-        camera=seen,
+        camera=view,
         step=model.cloud.image_angle,
         elevation=_ELEVATION,
         nearest=nearest,
         farthest=farthest,
         heights=tuple(sorted(heights)) if heights is not None else usual,
-        spacing=farthest / (25.0 if seen else 40.0),
+        spacing=farthest / (25.0 if view else 40.0),
         clearance=max(nearest, farthest / 100.0),
         grain=farthest / 600.0,
         cell=farthest / 100.0,

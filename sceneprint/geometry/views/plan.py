@@ -105,9 +105,9 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
     views = [(k, d) for k, sight in enumerate(sights) for d in _useful_views(sight, p)]
     least = _LEAST_GAIN if p.camera else _LEAST_GAIN_AROUND
     chosen, covered = _cover(sights, views, lookout.universe, p.most_views, least)
-    left = sorted(set(range(len(views))) - set(chosen))
-    tests = min(max(len(chosen) // _VIEWS_A_TEST, _LEAST_TESTS), _MOST_TESTS, len(left))
-    spread = np.linspace(0, len(left) - 1, tests).astype(int)
+    others = sorted(set(range(len(views))) - set(chosen))
+    tests = min(max(len(chosen) // _VIEWS_A_TEST, _LEAST_TESTS), _MOST_TESTS, len(others))
+    spread = np.linspace(0, len(others) - 1, tests).astype(int)
 
     def poses(indices: Sequence[int]) -> Floats:
         transforms = np.tile(np.eye(4), (len(indices), 1, 1))
@@ -117,7 +117,7 @@ def choose_views(surface: ReferenceSurface, parameters: ViewParameters) -> ViewP
         return transforms
 
     return ViewPlan(
-        poses(chosen), poses([left[k] for k in spread]), floors.lowest, len(views), covered
+        poses(chosen), poses([others[k] for k in spread]), floors.lowest, len(views), covered
     )
 
 

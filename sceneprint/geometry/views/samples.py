@@ -85,9 +85,9 @@ def _fit_cells(
         at = order[starts[cell]]
         for dx in range(-1, 2):
             for dy in range(-1, 2):
-                wanted = keys[cell] + (dx * shape[1] + dy) * shape[2]
-                k = np.searchsorted(keys, wanted - 1)
-                while k < len(keys) and keys[k] <= wanted + 1:
+                neighbour = keys[cell] + (dx * shape[1] + dy) * shape[2]
+                k = np.searchsorted(keys, neighbour - 1)
+                while k < len(keys) and keys[k] <= neighbour + 1:
                     cells += 1
                     for i in range(starts[k], starts[k + 1]):
                         j = order[i]
@@ -295,14 +295,14 @@ class Blocks:
         """
         x, y, z = (self.centres @ T[:3, :3].T + T[:3, 3]).T
         r = self.radii
-        seen = (z > -r) & (z - r < farthest)
+        visible = (z > -r) & (z - r < farthest)
         for along, focal, middle, size in (
             (x, camera[0], camera[2], shape[1]), (y, camera[1], camera[3], shape[0]),
         ):  # fmt: skip
             for slope, sign in ((-(middle + 0.5) / focal, 1.0), ((size - middle) / focal, -1.0)):
                 # a block is invisible if it lies more than its radius beyond a side of the view
-                seen &= sign * (along - slope * z) > -r * math.sqrt(1.0 + slope * slope)
-        return self.starts[seen], self.ends[seen]
+                visible &= sign * (along - slope * z) > -r * math.sqrt(1.0 + slope * slope)
+        return self.starts[visible], self.ends[visible]
 
 
 def sort_into_blocks(points: Floats32, side: float, extents: Floats32) -> tuple[Ints64, Blocks]:
