@@ -37,7 +37,7 @@ SHARES: dict[str, dict[str, float]] = {
         "sites": 70, "absent": 10, "bays": 6, "streets": 6, "halls": 4, "unmapped": 4,
     },
 }  # fmt: skip
-#: Factors for the number of sites of kinds whose decisive evidence is rare.
+#: Factors by which there are more sites of those kinds whose decisive evidence is rare.
 TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
 #: Flaws of two maps in three. Scans are dense, so most of them may be missing; the poses of scans
 #: already drift.

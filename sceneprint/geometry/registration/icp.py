@@ -498,9 +498,9 @@ def refine_with_index(
 
 
 Method = Literal["information-scaled", "votes-and-spread"]
-#: Name of the method by which `pair_covariance` estimates.
+#: Name of the method that `pair_covariance` uses.
 PAIR_METHOD: Method = "information-scaled"
-#: Name of the method by which `fuse_votes` estimates.
+#: Name of the method that `fuse_votes` uses.
 PLACE_METHOD: Method = "votes-and-spread"
 
 #: Indices that reorder (rotation, translation), as in a refinement, to (translation, rotation).

@@ -228,7 +228,7 @@ def _height_histograms(points: Floats, normals: Floats, p: PlanParameters) -> Fl
 
 
 def _height_offsets(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> list[float]:
-    """Return the heights of the source over the target that best align level surfaces, metres."""
+    """Return up to `n_heights` heights of the source over the target that align level surfaces."""
     scores = sum(
         np.correlate(b, a, "full") for a, b in zip(source.heights, target.heights, strict=True)
     )
@@ -407,8 +407,7 @@ def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> F
             yield blurred * spectrum
 
     both = np.stack([angles, angles + math.pi], axis=1).ravel()
-    found, _ = _transforms_at_peaks(source, target, both, products(), 2 * p.cell, p.n_sliced, p)
-    return found
+    return _transforms_at_peaks(source, target, both, products(), 2 * p.cell, p.n_sliced, p)[0]
 
 
 def _transforms_at_peaks(

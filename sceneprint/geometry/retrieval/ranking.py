@@ -141,7 +141,9 @@ def distances(query: Bytes, database: Bytes, metric: Metric, rows: Ints64 | None
     _require_signatures(query[None], database, metric)
     if rows is not None:
         if rows.ndim != 1 or rows.dtype.kind not in "iu":
-            raise ValueError(f"rows are {rows.dtype} {rows.shape}. Pass integer indices (r,).")
+            raise ValueError(
+                f"The rows have type {rows.dtype}, shape {rows.shape}. Pass integer indices (r,)."
+            )
         if len(rows) and not 0 <= rows.min() <= rows.max() < len(database):
             raise ValueError(
                 f"Rows {rows.min()} to {rows.max()} do not all exist: the database has "
@@ -289,7 +291,7 @@ def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
     """
     if distances.ndim != 1 or distances.dtype.kind not in "iu" or size < 0:
         raise ValueError(
-            f"Cannot rank {size} of {distances.dtype} distances of shape {distances.shape}. "
+            f"Cannot rank {size} of the {distances.shape} distances of type {distances.dtype}. "
             "Pass integers (N,) and a non-negative size."
         )
     size = min(size, len(distances))

@@ -596,7 +596,7 @@ def _seeds(seen: Voxels, spacing: float) -> Ints32:
 def _grow_patches(
     seen: Voxels, labels: Ints32, spacing: float, least: float, p: SegmentationParameters
 ) -> tuple[Ints32, int]:
-    """Grow patches from seeds at a spacing; return labels (V,) and the number of patches."""
+    """Grow patches, except those below `least` voxels; return labels (V,) and their number."""
     points, normals, links = seen.points[0], seen.normals[0], seen.links
     centres = np.zeros((int(labels.max(initial=-1)) + 1, 8))
     grown = labels.copy()

@@ -71,7 +71,7 @@ def to_angles(points: Floats32, pole: int, out: Floats) -> None:
 
 
 def fit_camera(angles: Floats, pole: int, p: CloudParameters) -> Sphere:
-    """Return the camera that covers all points with at most `maximum_pixels` pixels."""
+    """Return the camera that covers all points, with pixels enlarged to fit `maximum_pixels`."""
     low, high = float(angles[:, 1].min()), float(angles[:, 1].max())
     step = p.image_angle
     while True:

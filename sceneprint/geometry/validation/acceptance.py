@@ -121,9 +121,10 @@ _IN_FREE_SPACE = "of the points lie where the other frame saw free space"
 
 
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
-    """Return the reason to reject a transform regardless of rivals, None without one: Sec. III-E.
+    """Return the status and the reason if a transform fails regardless of rivals, else None.
 
-    Mode "paper" checks the residual only.
+    The status is "rejected" or, if the evidence leaves a choice, "ambiguous" (Sec. III-E). Mode
+    "paper" checks the residual only.
     """
     if e.residual_m > p.residual_m or e.residual_rad > p.residual_rad:
         if not math.isfinite(e.residual_m):
@@ -206,7 +207,7 @@ def sparse_evidence_suffices(
 def belief(
     e: Evidence, ambiguity: float, p: AcceptanceParameters
 ) -> tuple[Status, Strength | None, str]:
-    """Return the status, strength and reason of a transform without an objection."""
+    """Return the status, strength and reason of a transform to which there is no `objection`."""
     most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
     if e.violations is None:  # free space is unknown, so it refutes no rival
         most = p.blind_ambiguous_share * e.plane_overlap
@@ -272,12 +273,12 @@ def _write_symmetries(
     same_plane: float, least_crossing: float, shift: float, n_shifts: int, motions: Floats,
 ) -> int:  # fmt: skip
     """Write the motions of `symmetries`; return their number. Means and normals are (3, P)."""
-    left, mass, axes = areas.copy(), np.empty(len(areas)), np.zeros((n_axes + 2, 3))
+    remaining, mass, axes = areas.copy(), np.empty(len(areas)), np.zeros((n_axes + 2, 3))
     count = 0
     for number in range(n_axes):
-        _sum_parallel(normals, left, cosine, mass)
+        _sum_parallel(normals, remaining, cosine, mass)
         most = int(np.argmax(mass))
-        if left[most] <= 0:
+        if remaining[most] <= 0:
             break
         axis, across = np.zeros(3), np.zeros(len(areas))
         for i in range(len(areas)):
@@ -285,7 +286,7 @@ def _write_symmetries(
             for k in range(3):
                 dot += normals[k, i] * normals[k, most]
             if abs(dot) > cosine:
-                across[i], left[i] = left[i], 0.0
+                across[i], remaining[i] = remaining[i], 0.0
                 for k in range(3):
                     axis[k] += normals[k, i] * areas[i] * np.sign(dot)
         axis /= np.sqrt((axis * axis).sum())

@@ -163,7 +163,7 @@ def trace(
 def _coincident_patches(
     query: Patches, match: Patches, T: Floats, p: ConsensusParameters
 ) -> tuple[Ints32, Floats]:
-    """Return pairs of mutually nearest patches with similar normals, and their distances."""
+    """Return pairs of mutually nearest patches with similar normals, and distances, ascending."""
     if not len(query) or not len(match):
         return np.zeros((0, 2), np.int32), np.zeros(0)
     apart = np.linalg.norm(transform_points(T, query.means)[:, None] - match.means, axis=2)

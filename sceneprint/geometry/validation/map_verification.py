@@ -367,7 +367,7 @@ def _refine_places(
     frames: Sequence[MapFrame], places: list[ScoredPose], views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> list[ScoredPose]:  # fmt: skip
-    """Refine places, best first, until there are `n_refined` different refined places.
+    """Refine places until there are `n_refined` different refined ones; return all, best first.
 
     Poses that converge to the same result are the same place, and must not count as its rivals.
     """

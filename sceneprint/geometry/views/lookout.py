@@ -23,7 +23,7 @@ from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, Ints64
 
 #: Number of pixels along an edge of the cube; each is three degrees wide.
 _FACE_PX = 28
-#: Maximum elevation of horizontal directions from a place, rad.
+#: Maximum elevation of directions that count as horizontal, rad.
 _BESIDE = math.radians(30.0)
 #: Number of azimuths from which a piece can be seen, and number of octaves of distance.
 SIDES, OCTAVES = 6, 3

@@ -154,7 +154,10 @@ def _is_free(sight: Sight, p: ViewParameters, one_sided: bool) -> bool:
 def _select_front(
     free: list[tuple[Floats, Sight]], pieces: Surfels, lookout: Lookout, p: ViewParameters
 ) -> list[tuple[Floats, Sight]]:
-    """Return the free places from which surfaces are seen from the front."""
+    """Return the free places from which surfaces are seen from the front.
+
+    The sides of a mesh that is inside out are swapped. In a cloud, the views of a wall vote.
+    """
     if pieces.one_sided:
         # a mesh that is inside out shows its back in all free space
         shares = np.array([sight.back.mean() for _, sight in free if sight.hit.mean() > _INDOORS])

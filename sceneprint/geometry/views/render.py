@@ -25,7 +25,8 @@ from sceneprint.types import Floats, Floats32, Intrinsics, Ints32, ReferenceSurf
 
 #: Radius of the disc of a point, as a share of the spacing of points.
 _OVERLAP = 0.7
-#: Radius of the disc of a point without a plane, such as on a wire or a leaf, as the same share.
+#: Radius of the disc of a point on no plane, such as on a wire or a leaf, as a share of the
+#: spacing.
 _LONELY = 0.3
 #: Width of the cells whose points determine a normal, in spacings of points.
 _NEIGHBOURHOOD = 3.0
