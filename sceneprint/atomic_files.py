@@ -25,7 +25,7 @@ def create_private(path: Path) -> int:
 
     Raises
     ------
-    OSError : If the file exists or cannot be created.
+    OSError : If the file exists or cannot be created
     """
     flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
     return os.open(path, flags, PRIVATE_FILE)
@@ -45,7 +45,7 @@ def nearest_folder(folder: Path) -> Path:
 
     Raises
     ------
-    OSError : If the process has no permission to enter a parent folder.
+    OSError : If the process has no permission to enter a parent folder
     """
     folder = folder.absolute()
     return next(parent for parent in (folder, *folder.parents) if parent.is_dir())
@@ -66,7 +66,7 @@ def check_writable(path: Path) -> None:
 
     Raises
     ------
-    OSError : If the path is a folder, or no file can be created in its parent folder.
+    OSError : If the path is a folder, or no file can be created in its parent folder
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -102,7 +102,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    OSError : If the file cannot be replaced.
+    OSError : If the file cannot be replaced
     """
     part = _temporary_path(path)
     try:
@@ -141,7 +141,7 @@ def make_folder(folder: Path) -> None:
 
     Raises
     ------
-    OSError : If the folder cannot be created or is a file.
+    OSError : If the folder cannot be created or is a file
     """
     if folder.is_dir():
         return
@@ -158,7 +158,7 @@ def put_new(part: Path, path: Path) -> None:
 
     Raises
     ------
-    FileExistsError : If the path exists.
+    FileExistsError : If the path exists
     """
     try:
         os.link(part, path)
@@ -213,7 +213,7 @@ def sync_folder(folder: Path) -> None:
 
     Raises
     ------
-    OSError : If the folder cannot be synced.
+    OSError : If the folder cannot be synced
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:

@@ -164,7 +164,7 @@ def read_secret_files(environment: MutableMapping[str, str]) -> None:
     Raises
     ------
     InvalidRequest : If a file cannot be read or contains no secret, or if both `NAME` and
-        `NAME_FILE` are set.
+        `NAME_FILE` are set
     """
     for name in SECRETS:
         path = environment.get(f"{name}_FILE")

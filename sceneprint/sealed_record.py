@@ -29,7 +29,7 @@ def unseal(data: bytes) -> dict[str, Any]:
 
     Raises
     ------
-    ValueError : If the bytes are not a sealed record or have changed.
+    ValueError : If the bytes are not a sealed record or have changed
     """
     values = json.loads(data)
     if not isinstance(values, dict) or values.pop("sha256", None) != _checksum(values):

@@ -369,7 +369,7 @@ class Settings(BaseSettings):
 
         Raises
         ------
-        UnusableStore : If BLOB_URL stores blobs in the memory of one process.
+        UnusableStore : If BLOB_URL stores blobs in the memory of one process
         """
         if str(self.blobs).startswith("memory:"):
             raise UnusableStore(

@@ -274,7 +274,7 @@ def train(
         for step, mixture in enumerate(fit, 1):  # noqa: B007 -- the last mixture is the result
             notify("mixture", step, mixture_p.iterations)
     provenance = {
-        "training": _written(p),
+        "training": _provenance(p),
         "mixture": asdict(mixture_p),
         "own_frames": len(references),
         "frames_used": len(lessons),
@@ -285,7 +285,7 @@ def train(
     return whitened(model, p, references, jobs, notify) if p.whitening_rooms else model
 
 
-def _written(p: TrainingParameters) -> dict[str, Any]:
+def _provenance(p: TrainingParameters) -> dict[str, Any]:
     """Return the parameters for the provenance, without unused ones of scenes and whitening."""
     written = asdict(p)
     if p.scenes == "rooms":
@@ -335,7 +335,7 @@ def whitened(
     from threadpoolctl import threadpool_limits
 
     psi, places = list[Ints16](), list[str]()
-    with _helpers(jobs, _open_signer, model, p.levels) as pool:
+    with _open_pool(jobs, _open_signer, model, p.levels) as pool:
         rooms = pool.map(partial(_room_psi, p), range(p.whitening_rooms))
         for done, (place, vectors) in enumerate(rooms, 1):
             report("whitening", done, p.whitening_rooms)
@@ -397,7 +397,7 @@ def _median_distance(stored: Bytes, metric: Metric) -> float:
     return float(np.median(among[np.triu_indices(len(stored), 1)]))
 
 
-def _helpers(jobs: int, begin: Callable[..., None] | None = None, *arguments: Any) -> Executor:
+def _open_pool(jobs: int, begin: Callable[..., None] | None = None, *arguments: Any) -> Executor:
     """Return a pool of `jobs` processes that first call `begin`; a thread if `jobs` is 1."""
     if jobs == 1:
         return ThreadPoolExecutor(1, "training", begin, arguments)
@@ -411,7 +411,7 @@ def _lessons(
     """Yield the training data of all synthetic scenes, then of the user's frames."""
     room = partial(_room_lessons, model_p, p, draw)
     frame = partial(_own_lesson, model_p, p, draw)
-    with _helpers(jobs) as pool:
+    with _open_pool(jobs) as pool:
         for done, lessons in enumerate(pool.map(room, range(p.rooms)), 1):
             report("rooms", done, p.rooms)
             yield from lessons

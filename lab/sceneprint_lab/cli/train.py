@@ -88,7 +88,7 @@ def run_train(options: argparse.Namespace) -> int:
     )  # fmt: skip
     model_p, mixture_p = preset_parameters(options.preset)
     if options.range is not None:
-        model_p = _of_range(model_p, *options.range)
+        model_p = _with_range(model_p, *options.range)
     if options.radius is not None:
         properties = replace(model_p.properties, radius=options.radius)
         model_p = replace(model_p, properties=properties)
@@ -104,7 +104,7 @@ def run_train(options: argparse.Namespace) -> int:
     return 0
 
 
-def _of_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
+def _with_range(p: ModelParameters, least: float, most: float) -> ModelParameters:
     """Return the parameters with the range `least` to `most`, for both depth images and clouds."""
     if least >= most:
         raise TrainingError(f"--range {least:g} {most:g}: Put the smaller distance first.")

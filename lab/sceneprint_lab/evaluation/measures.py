@@ -91,7 +91,7 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
 
     Raises
     ------
-    ValueError : If an argument is out of range.
+    ValueError : If an argument is out of range
     """
     if not 0 <= seen <= of or not 0 < confidence < 1:
         raise ValueError(

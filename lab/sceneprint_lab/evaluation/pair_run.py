@@ -171,7 +171,7 @@ def _of_one_scene(
     choices.append(("same_scene", None, (mean < NOTHING) & (least < NOTHING)))
     for number, (kind, name, good) in enumerate(choices):
         rng = np.random.default_rng((p.seed, 0, scene, number))
-        for k in _some(np.flatnonzero(good), p.pairs, rng):
+        for k in _sample(np.flatnonzero(good), p.pairs, rng):
             i, j = int(later[k]), int(earlier[k])
             flat = bool(planar[i] or planar[j])
             pairs.append(Drawn(i, j, kind, name, float(mean[k]), float(least[k]), flat))
@@ -189,16 +189,16 @@ def _of_two_scenes(
     rng: np.random.Generator,
 ) -> list[Drawn]:  # fmt: skip
     flat = (planar[a][:, None] | planar[b]).ravel()
-    first = _some(np.flatnonzero(flat), round(PLANAR_SHARE * n), rng)
+    first = _sample(np.flatnonzero(flat), round(PLANAR_SHARE * n), rng)
     rest = np.setdiff1d(np.arange(len(flat)), first)
-    chosen = np.concatenate([first, _some(rest, n - len(first), rng)])
+    chosen = np.concatenate([first, _sample(rest, n - len(first), rng)])
     return [
         Drawn(int(a[k // len(b)]), int(b[k % len(b)]), "cross_scene", None, 0.0, 0.0, bool(flat[k]))
         for k in np.sort(chosen)
     ]
 
 
-def _some(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def _sample(of: NDArray[np.intp], n: int, rng: np.random.Generator) -> NDArray[np.intp]:
     """Return at most n distinct random members of `of`, in ascending order."""
     return np.sort(rng.choice(of, min(n, len(of)), replace=False))
 

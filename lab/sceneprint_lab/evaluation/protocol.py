@@ -352,7 +352,7 @@ def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
 
 
 @kernel
-def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int, int]:
+def _count_seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int, int]:
     """Return how many of the points (N, 3) a depth image sees, for both tolerances."""
     height, width = depth.shape
     loose = strict = 0
@@ -372,7 +372,7 @@ def _seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int
     return loose, strict
 
 
-def _near(points: Floats, cloud: CloudView) -> tuple[int, int]:
+def _count_near(points: Floats, cloud: CloudView) -> tuple[int, int]:
     """Return how many of the points (N, 3) a cloud sees, for both tolerances."""
     wide = np.zeros(len(points))
     if cloud.viewpoint is not None:
@@ -386,11 +386,11 @@ def _shares(points: Floats, view: AnyView) -> tuple[float, float]:
     if not len(points):
         return 0.0, 0.0
     if isinstance(view, CloudView):
-        loose, strict = _near(points, view)
+        loose, strict = _count_near(points, view)
         return loose / len(points), strict / len(points)
     k = view.intrinsics
     camera = np.array([k.fx, k.fy, k.cx, k.cy])
-    loose, strict = _seen(points, view.depth, camera, view.pose)
+    loose, strict = _count_seen(points, view.depth, camera, view.pose)
     return loose / len(points), strict / len(points)
 
 

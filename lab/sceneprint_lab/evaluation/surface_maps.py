@@ -30,7 +30,7 @@ def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> Refer
 
     Raises
     ------
-    MissingDependency, UselessFrame, InvalidRequest : See `fuse`.
+    MissingDependency, UselessFrame, InvalidRequest : See `fuse`
     """
     clouds = [(frame.points, frame.pose) for frame in frames if isinstance(frame, Cloud)]
     if not clouds:

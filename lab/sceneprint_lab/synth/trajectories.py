@@ -248,7 +248,7 @@ def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, 
         views = views[clear(room, views[:, :3], CLEARANCE + 0.08)]
         good = [v for v in views if worth_seeing(room, pose(v), 0.7 - 0.001 * attempt)]
         for view in good:
-            reached = [k for k, a in enumerate(anchors) if _way(room, a, view)]
+            reached = [k for k, a in enumerate(anchors) if _is_way_clear(room, a, view)]
             if anchors and not reached:
                 continue
             for k in reached:
@@ -262,7 +262,7 @@ def _network(room: Room, count: int, rng: np.random.Generator) -> tuple[Floats, 
     return np.array(anchors), ways
 
 
-def _way(room: Room, a: Floats, b: Floats) -> bool:
+def _is_way_clear(room: Room, a: Floats, b: Floats) -> bool:
     """Return whether the straight line between two views is clear."""
     steps = max(2, int(np.linalg.norm(a[:3] - b[:3]) / 0.15))
     points = a[:3] + np.linspace(0, 1, steps)[:, None] * (b[:3] - a[:3])
