@@ -69,7 +69,7 @@ def _add_frames(command: argparse.ArgumentParser) -> None:
     for option, what in (("--db-step", "database"), ("--query-step", "query")):
         command.add_argument(
             option, type=positive, default=1, metavar="N",
-            help=f"use every N-th {what} frame where a range has no step (default: 1)",
+            help=f"use every N-th {what} frame if a range has no step (default: 1)",
         )  # fmt: skip
     command.add_argument(
         "--max-overlap", type=_share, metavar="X",
@@ -330,7 +330,7 @@ def add_evaluate_pairs(command: argparse.ArgumentParser) -> None:
     _add_judging(command)
     command.add_argument(
         "--right", nargs=2, type=_limit, default=[0.1, 10.0], metavar=("METRES", "DEGREES"),
-        help="maximum errors of a correct transform (default: 0.1 10)",
+        help="maximum errors of a correct transform, metres and degrees (default: 0.1 10)",
     )  # fmt: skip
     command.add_argument(
         "--baselines",
@@ -347,11 +347,11 @@ def add_evaluate_pairs(command: argparse.ArgumentParser) -> None:
 
 def _add_drawing(command: argparse.ArgumentParser) -> None:
     for option, default, kind, what in (
-        ("--pairs", 120, positive, "pairs for each overlap bin of each scene"),
-        ("--negatives", 400, whole_number, "pairs of two scenes, in total"),
+        ("--pairs", 120, positive, "number of pairs per scene and overlap bin"),
+        ("--negatives", 400, whole_number, "total number of pairs of two scenes"),
         (
             "--apart", 30, whole_number,
-            "minimum distance in the recording between two frames, in frames",
+            "minimum number of frames by which two frames of a recording are apart",
         ),
         ("--frames", 300, _frames, "maximum number of frames of each scene, evenly spread"),
         ("--seed", 0, whole_number, "random seed of sampling and validation"),

@@ -69,7 +69,7 @@ def main() -> None:
         help="default: all ambiguous kinds of the model's sensor",
     )  # fmt: skip
     parser.add_argument("--absent", type=int, default=0, metavar="N",
-                        help="query N frames of other places instead")  # fmt: skip
+                        help="instead, query N frames of other places")  # fmt: skip
     parser.add_argument(
         "--prior", nargs=2, type=float, metavar=("LEAST", "MOST"),
         help="range of the error of the robot's prior, metres (default: no prior)",

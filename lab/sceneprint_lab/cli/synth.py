@@ -56,7 +56,7 @@ def add_synth(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--views", type=positive, default=25, metavar="M",
-        help="number of views per room; with --lookalikes, of queries per site (default: 25)",
+        help="number of views per room or, with --lookalikes, of queries per site (default: 25)",
     )  # fmt: skip
     command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
     command.add_argument(
