@@ -76,9 +76,7 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
 def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSequence:
     """Set the depth scale of a sequence; return recordings unchanged, and any sequence for None.
 
-    Raises
-    ------
-    InvalidRequest : If the frames are clouds, or their files define the unit.
+    Raise InvalidRequest if the frames are clouds, or their files define the unit.
     """
     if scale is None or sequence.layout is Layout.RECORDING:  # recordings handle the scale
         return sequence

@@ -83,7 +83,7 @@ def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
     try:
         stats = client.stats(minutes=1)
         own = sum(job.state is JobState.QUEUED for job in client.wait(jobs, timeout_s=0.0))
-    except SceneprintError:  # the key may not read them
+    except SceneprintError:  # the key does not permit reading them
         return waiting_reason(None)
     return waiting_reason(stats, own)
 

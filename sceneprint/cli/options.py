@@ -62,9 +62,7 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
 def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
     """Return the filter options as a JSON object; None without a filter.
 
-    Raises
-    ------
-    InvalidRequest : If only one of --region and --region-frame is present.
+    Raise InvalidRequest if only one of --region and --region-frame is present.
     """
     region = None
     if (options.region is None) != (options.region_frame is None):
@@ -217,9 +215,7 @@ def add_data_option(command: argparse.ArgumentParser) -> None:
 def settings_of(options: argparse.Namespace) -> Settings:
     """Return the settings of the environment, overridden by the options.
 
-    Raises
-    ------
-    InvalidRequest : If a value is not valid.
+    Raise InvalidRequest if a value is not valid.
     """
     from pydantic import ValidationError
 
@@ -248,9 +244,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
 def existing_store(options: argparse.Namespace) -> Settings:
     """Return the settings of an existing store, so that a mistyped --data does not create a store.
 
-    Raises
-    ------
-    UnusableStore : If the data folder has no database.
+    Raise UnusableStore if the data folder has no database.
     """
     settings = settings_of(options)
     if settings.database_url is None and not (settings.data_dir / "sceneprint.db").is_file():

@@ -435,10 +435,8 @@ def _frames_to_localize(
 ) -> list[FrameReference]:
     """Return all frames, or the frame of `--frame`.
 
-    Raises
-    ------
-    DatasetError : If the frame does not exist, a prior applies to several frames, or --last
-        conflicts with other options.
+    Raise DatasetError if the frame does not exist, a prior applies to several frames, or --last
+    conflicts with other options.
     """
     if options.last is not None and options.last > MOST_OF_SEQUENCE:
         raise DatasetError(f"--last {options.last}: use a number from 1 to {MOST_OF_SEQUENCE}.")
@@ -476,10 +474,7 @@ def _frames_before(
 
     K is --last; the default is 3, or 1 with --up. The frames have poses, are spaced as in
     `spaced_views`, and are in chronological order. Without --last, a frame without a pose has none.
-
-    Raises
-    ------
-    DatasetError : If --last exceeds 1, but the frame has no pose.
+    Raise DatasetError if --last exceeds 1, but the frame has no pose.
     """
     most = options.last or (_LAST if options.up is None else 1)
     if most == 1:

@@ -82,14 +82,12 @@ def run_sign(options: argparse.Namespace) -> int:
 def _named_frames(options: argparse.Namespace) -> dict[str, FrameReference]:
     """Return all frames under the paths, by unique name.
 
-    Raises
-    ------
-    DatasetError : If a path has no frames, or a name or file occurs twice.
+    Raise DatasetError if a path has no frames, or a name or file occurs twice.
     """
     frames: dict[str, FrameReference] = {}
     files: set[Path] = set()
     for path in options.paths:
-        several = len(options.paths) > 1 and path.is_dir()  # names of files are unique
+        several = len(options.paths) > 1 and path.is_dir()  # file names are unique
         prefix = f"{path.resolve().name}/" if several else ""
         for sequence in sequences_at(path, options):
             for reference in sequence.frames:

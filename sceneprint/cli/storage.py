@@ -67,7 +67,7 @@ def run_migrate(options: argparse.Namespace) -> int:
         if options.check:
             print(shown if usable else f"{shown}; run `sceneprint migrate`")
             return 0 if usable else 1
-        with open_command_store(settings):  # migrates the schema
+        with open_command_store(settings):  # opening it migrates the schema
             pass
         after, _ = _revisions(database)
     finally:
@@ -260,10 +260,8 @@ def _add_database_options(command: argparse.ArgumentParser) -> None:
 def _named_database(options: argparse.Namespace) -> Settings:
     """Return the settings of the environment, with the database in `--database` if present.
 
-    Raises
-    ------
-    InvalidRequest : If the URL is not valid, or contains a password, which all users of the machine
-        could see.
+    Raise InvalidRequest if the URL is not valid, or contains a password, which all users of the
+    machine could see.
     """
     from pydantic import SecretStr
     from sqlalchemy import make_url

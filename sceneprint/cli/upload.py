@@ -366,7 +366,7 @@ def map_lines(client: Client, map_name: str, clouds: int) -> list[str]:
         two = list(first.values())[:2]
         line = (
             f"the poses of map {now.name} are in {now.parent_frames} parent frames, and an answer "
-            "uses that of its matches. The service joins those that reliably show one place"
+            "uses the frame of its matches. The service joins those that reliably show one place"
         )
         if len(two) == 2:
             options = " ".join(f"--session {shlex.quote(str(session.session))}" for session in two)
@@ -403,9 +403,7 @@ def summary_of(
 def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
     """Return the sequences at all paths, numbered within their sessions.
 
-    Raises
-    ------
-    DatasetError : If a path has no frames, or two places have the same default parent frame.
+    Raise DatasetError if a path has no frames, or two places have the same default parent frame.
     """
     from sceneprint.formats.dataset.frame_reference import numbered_sequences
 

@@ -206,7 +206,7 @@ class Events:
 
         def spent(connection: Connection, limit: int) -> list[int]:
             if not surplus_events(connection, most_events, (), 1):
-                return []  # usual case; avoids reading the indexes
+                return []  # in the usual case, avoid reading the indexes
             return surplus_events(connection, most_events, anchors(indexes), limit)
 
         return remove_in_blocks(self._store.database, spent, remove_events, AT_MOST)
@@ -292,9 +292,7 @@ class Audit:
     ) -> Page[AuditLine]:
         """Return a page of the lines that pass a filter, newest first.
 
-        Raises
-        ------
-        InvalidRequest : If the service did not issue the cursor.
+        Raise InvalidRequest if the service did not issue the cursor.
         """
         seals = self._store.seals
         before = seals.row("audit", cursor)
@@ -416,9 +414,7 @@ def rotate_key(store: Store, name: str, overlap_s: float = OVERLAP_S) -> MadeKey
 def list_keys(store: Store, cursor: str | None = None, limit: int = 100) -> Page[Key]:
     """Return a page of keys, sorted by name.
 
-    Raises
-    ------
-    InvalidRequest : If the service did not issue the cursor.
+    Raise InvalidRequest if the service did not issue the cursor.
     """
     after = None if cursor is None else _name_of(cursor)
     with store.database.read() as connection:

@@ -112,7 +112,7 @@ def add_block(
         try:
             uploaded.append(read())
             outcomes.append(None)
-        except (errors.StoreError, errors.Busy):  # temporary, so the slice is repeated
+        except (errors.StoreError, errors.Busy):  # these are temporary, so repeat the slice
             raise
         except errors.SceneprintError as error:
             outcomes.append(UploadResult(None, error=error))
@@ -291,9 +291,7 @@ def states_of_import(connection: Connection, job: JobRow) -> Counter[str]:
 def view_parameters_of(model: ModelParameters, options: ImportOptions) -> ViewParameters:
     """Return the sensor parameters for views of an imported map; a large camera is scaled down.
 
-    Raises
-    ------
-    InvalidRequest : If the options contain a camera, but the model is for 360-degree scans.
+    Raise InvalidRequest if the options contain a camera, but the model is for 360-degree scans.
     """
     k = options.camera
     camera = None
@@ -428,9 +426,8 @@ class Imports:
     def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
         """Run a slice of an import: add at least one block of frames.
 
-        Raises
-        ------
-        UnreadableArchive : If the archive is missing, or is unreadable and was therefore removed.
+        Raise UnreadableArchive if the archive is missing, or is unreadable and was therefore
+        removed.
         """
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
@@ -453,14 +450,12 @@ class Imports:
         """Remove the archives of finished imports, at most every TIDY_S seconds; return their
         number.
 
-        Raises
-        ------
-        UnusableStore : If the store cannot be written; a later call retries.
+        Raise UnusableStore if the store cannot be written; a later call retries.
         """
         if time.monotonic() - self._tidied < TIDY_S:
             return 0
         self._tidied = time.monotonic()
-        with self._store.database.read() as connection:  # usually none, so avoid a write lock
+        with self._store.database.read() as connection:  # usually none exist: avoid a write lock
             if not queue.finished_with_file(connection, ARCHIVE):
                 return 0
         with self._store.database.write() as connection:

@@ -316,7 +316,7 @@ def _matrix(pose: GivenTransform) -> Floats:
     if pose.matrix is not None:
         return rigid_transform(np.array(pose.matrix))
     t, r = pose.translation, pose.rotation
-    if t is None or r is None:  # excluded by the schema
+    if t is None or r is None:  # the schema excludes this case
         raise InvalidPose("The pose is incomplete. Send translation and rotation, or matrix.")
     q = np.array([r.x, r.y, r.z, r.w])
     length = float(np.linalg.norm(q))

@@ -93,7 +93,7 @@ def find_duplicate(
 
 
 def _differing(frame: FrameRow, metadata: dict[str, Any]) -> list[str]:
-    """Return the names of the fields of an upload that differ from those sent with a frame."""
+    """Return the names of the upload fields that differ from those sent with a stored frame."""
     stored = vars(frame)
     if frame.sent_parent is not None:  # a join has moved the pose
         stored = {**stored, "pose": frame.sent_pose, "pose_parent": frame.sent_parent}
@@ -272,7 +272,7 @@ class _Request:
 
     @property
     def is_single(self) -> bool:
-        """Return whether the request stores exactly one frame, without a fence."""
+        """Return whether the request stores exactly one frame and has no fence."""
         return len(self.results) == len(self.todo) == 1 and self.fence is None
 
 
@@ -431,7 +431,7 @@ class Uploads:
         results : results of all uploads
         replayed : see `add`
         """
-        self._store.database.require_writable()  # before any blob is written
+        self._store.database.require_writable()  # fail before any blob is written
         todo = {i: prepared for i, prepared in ready.items() if results[i] is None}
         request = _Request(todo, results, once, fence)
         blobs = request.blobs
@@ -483,7 +483,7 @@ class Uploads:
         if request.fence is not None:
             request.fence(connection)
         if not all(map(self._store.blobs.holds, request.blobs)):
-            return None  # also before a replay, since its frame may refer to the blob
+            return None  # retry before a replay too: its frame may refer to the blob
         if request.once is not None:
             now = find_map(connection, row.name)
             if now.number != row.number:

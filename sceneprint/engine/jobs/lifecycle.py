@@ -185,9 +185,7 @@ def list_jobs(
 ) -> Page[Job]:  # fmt: skip
     """Return a page of jobs, newest first; see `queue.list_jobs`.
 
-    Raises
-    ------
-    InvalidRequest : If the service did not issue the cursor.
+    Raise InvalidRequest if the service did not issue the cursor.
     """
     before = store.seals.row("job", cursor)
     with store.database.read() as connection:
@@ -293,11 +291,8 @@ def retry_dead(
 ) -> RetriedJobs:  # fmt: skip
     """Retry the dead jobs of a page, newest first; skip jobs that were already retried.
 
-    Each retry is a transaction of its own, so an error does not undo earlier retries.
-
-    Raises
-    ------
-    InvalidRequest : If the service did not issue the cursor.
+    Each retry is a transaction of its own, so an error does not undo earlier retries. Raise
+    InvalidRequest if the service did not issue the cursor.
     """
     page = list_jobs(store, JobState.DEAD, cursor, limit, map_names=map_names)
     retried, refused = [], []

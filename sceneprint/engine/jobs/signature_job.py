@@ -271,7 +271,7 @@ def _replace_signature(store: Store, work: lifecycle.Work, signature: StoredSign
 # signature  --find_nearest-->  Nearest, at a revision  --why_redundant, in the commit-->  reason
 #
 # The search holds no lock. The commit also compares frames that were indexed after the search, so
-# that of two simultaneous frames of a place, only one is stored.
+# only one of two simultaneous frames of the same place is stored.
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ def why_redundant(
     ------
     Stale : If the nearest frame has changed since the search.
     """
-    novelty = frame_of(connection, frame.number).novelty  # may have been relaxed since the claim
+    novelty = frame_of(connection, frame.number).novelty  # it may have been relaxed since the claim
     row = map_of_number(connection, frame.map_number)
     if novelty is None or search_result is None or row.model_id != signature.model_id:
         return None

@@ -258,7 +258,7 @@ def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
             f"A part of map {map_name!r} arrived damaged. Nothing was changed. Pull the map again."
         )
     rows = list(read_rows(data, _NAMES))
-    for _ in decoded_rows(COLUMNS, rows):  # checks the types of values
+    for _ in decoded_rows(COLUMNS, rows):  # check the types of the values
         pass
     return {row[0]: row for row in rows}
 
@@ -266,9 +266,7 @@ def _read_part(map_name: str, digest: str, data: bytes) -> dict[str, Row]:
 def _fetch_artifact(client: Client, store: Store, map_name: str, digest: str) -> int:
     """Fetch and store an artifact unless it is stored; return the number of fetched bytes.
 
-    Raises
-    ------
-    DamagedBlob : If the fetched bytes are damaged.
+    Raise DamagedBlob if the fetched bytes are damaged.
     """
     if store.blobs.holds(digest):
         return 0
@@ -346,11 +344,8 @@ def _decode_row(head: MapCopy, row: Row) -> CopiedFrame:
 def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: list[str]) -> MapRow:
     """Create, replace or update the row of a copied map, and return the row.
 
-    A copy of a former map of this name is replaced; its blobs are added to `blobs`.
-
-    Raises
-    ------
-    Conflict : If the copy has uploaded frames, which would be lost.
+    A copy of a former map of this name is replaced; its blobs are added to `blobs`. Raise Conflict
+    if the copy has uploaded frames, which would be lost.
     """
     rows = {record.name: record for record in list_maps(connection)}
     before, row = rows.get(head.name), _find_copy(connection, head)

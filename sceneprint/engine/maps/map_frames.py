@@ -324,7 +324,7 @@ def _names_of(cursor: str) -> tuple[str, str]:
     try:
         session, robot = _unpacked(cursor)
         if isinstance(session, str) and isinstance(robot, str):
-            f"{session}{robot}".encode()  # checks for lone surrogates
+            f"{session}{robot}".encode()  # fails for lone surrogates
             return session, robot
     except (ValueError, TypeError, RecursionError):
         pass

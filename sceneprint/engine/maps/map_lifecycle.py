@@ -1,6 +1,6 @@
 """Creation, editing, deletion and re-encoding of maps, and the models for them.
 
-    begin_reencoding  -->  jobs  -->  a second signature of each frame  --Reencodings.run-->  switch
+    begin_reencoding  -->  jobs  -->  second signatures of all frames  --Reencodings.run-->  switch
 
 While a map is re-encoded, queries use its current model. Once all frames have signatures of the
 next model, one commit switches the map. Any process continues an interrupted re-encoding.
@@ -112,7 +112,7 @@ def get_map(store: Store, name: str) -> Map:
 def delete_map(context: Context, name: str) -> None:
     """Delete a map with its frames and queries; raise UnknownMap if it does not exist."""
     store = context.store
-    context.query_log.remove_of_map(name)  # in blocks, between which other processes can write
+    context.query_log.remove_of_map(name)  # other processes can write between its blocks
     with store.database.write() as connection:
         blobs = remove_map(connection, find_map(connection, name))
     context.readers.forget(name)
@@ -402,7 +402,7 @@ def _enqueue(store: Store, row: MapRow, *, again: bool = False) -> int:
     """
     after, queued = 0, 0
     while True:
-        with store.database.read() as connection:  # usually none, so avoid a write lock
+        with store.database.read() as connection:  # usually none exist: avoid a write lock
             if not stored.unqueued_frames(connection, row, after, again=again):
                 return queued
         with store.database.write() as connection:

@@ -99,7 +99,7 @@ _Key = tuple[str, TilePlace]
 
 @dataclass
 class _Slice:
-    """Changes of tiles in a slice.
+    """Changes to tiles in a slice.
 
     Parameters
     ----------

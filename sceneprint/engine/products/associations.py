@@ -73,10 +73,8 @@ def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
 def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> list[list[PathFrame]]:
     """Return the frames of each session that pass the filter of a request, in chronological order.
 
-    Raises
-    ------
-    InvalidRequest : If a session has no such frame or frames of several robots, or the sessions
-        have more than MOST_FRAMES frames.
+    Raise InvalidRequest if a session has no such frame or frames of several robots, or the sessions
+    have more than MOST_FRAMES frames.
     """
     sides, runs = sessions_of(request), []
     numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
@@ -166,7 +164,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             blobs = geometry_blobs(connection, [number], row.model_id)
         geometry = self._geometry(row, number, blobs)
         if number not in vectors or not alive or geometry is None:
-            if alive:  # damaged, not deleted
+            if alive:  # the frame is damaged, not deleted
                 resign_frames(self._store, row, [number], row.model_id)
             progress["skipped"] += 1
             return []
@@ -268,7 +266,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
                     return row, model, self._context.readers.view(connection, row)
 
     def undo_join(self, map_name: str, job_id: str) -> Association:
-        """Undo the joins of an association, and return it.
+        """Undo the joins of an association, and return the association.
 
         The frames are moved to the poses that the remaining joins imply, or back to the uploaded
         poses. An association without joins does not change.
@@ -376,9 +374,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> list[str]:
     """Join parent frames in the commit that ends an association; return an empty list of blobs.
 
-    Raises
-    ------
-    Swept : If another association joined one of the parent frames, so the slice must be repeated.
+    Raise Swept if another association joined one of the parent frames, so the slice must be
+    repeated.
     """
     for join in joins:
         if not join_parent(connection, task.of_map.number, join, task.job.id):

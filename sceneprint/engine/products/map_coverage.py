@@ -79,9 +79,7 @@ _SKIPPED = (UnknownFrame, InvalidRequest, DamagedBlob, DamagedSignature, Unreada
 def frames_to_query(connection: Connection, row: MapRow, request: NewMapCoverage) -> list[int]:
     """Return the frame numbers that a coverage job queries, in query order.
 
-    Raises
-    ------
-    InvalidRequest : If no frame passes the filter.
+    Raise InvalidRequest if no frame passes the filter.
     """
     numbers = numbers_of_runs(connection, row.number, request.session, request.robot)[
         :: request.every
@@ -150,7 +148,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
             query = plain.model_copy(update={"filter": Filter(not_within_s=left_out_s)})
 
         def ask(rows: list[MapRow]) -> Answer:
-            self._context.signers(rows[0].model_id)  # slow, so before the transaction
+            self._context.signers(rows[0].model_id)  # this is slow, so do it before the transaction
             ready = prepare_stored(self._store, self._context.signers, row.name, stop.id, plain)
             if ready.frame is None or ready.frame[0] != stop.number:
                 raise UnknownFrame(f"Frame {stop.id} was deleted and replaced by a new frame.")

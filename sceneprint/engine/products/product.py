@@ -72,15 +72,13 @@ class Products(ABC, Generic[Request, Record]):
     def start(self, connection: Connection, row: MapRow, request: Request) -> dict[str, Any]:
         """Return the initial progress of a job, with `done` and `total`.
 
-        Raises
-        ------
-        InvalidRequest : If the map lacks sessions or frames of the request.
+        Raise InvalidRequest if the map lacks sessions or frames of the request.
         """
         raise NotImplementedError
 
     @abstractmethod
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice of a job: some steps, or the conclusion."""
+        """Run a slice of a job: at least one step, or the conclusion of the job."""
 
     def fields(self, job: JobRow) -> dict[str, Any]:
         """Return the record fields that depend on the request of a job."""

@@ -68,9 +68,7 @@ SIDES: tuple[Side, Side] = ("before", "after")
 def shared_parent(connection: Connection, row: MapRow, request: NewDifference) -> str:
     """Return the parent frame in which to compare two sessions: the requested or most common one.
 
-    Raises
-    ------
-    InvalidRequest : If a session has no poses, or the sessions share no parent frame.
+    Raise InvalidRequest if a session has no poses, or the sessions share no parent frame.
     """
     counts = {}
     for side in SIDES:
@@ -135,7 +133,7 @@ class Differences(Products[NewDifference, Difference]):
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
             file = queue.files_of(connection, task.job.number).get(STATE)
-        # slow, so before a transaction
+        # this is slow, so do it before a transaction
         parameters = self._context.signers(row.model_id).model.parameters
         progress.setdefault("cell_m", cell_width(parameters.cloud.voxel_size))
         state = _State() if file is None else _State.read(self._store.blobs.get(file.blob))

@@ -192,7 +192,7 @@ class QueryLog:
         loss_reason = None
         try:
             if not self._store.database.read_only:
-                # concurrently, since object stores are slow
+                # write concurrently, since object stores are slow
                 with ThreadPoolExecutor(AT_ONCE_PUT, "query-log-put") as pool:
                     list(pool.map(self._write_file, [entry for entry in batch if entry.answer]))
             rows = [entry.row for entry in batch if entry.row.listed or entry.row.bytes]
@@ -242,7 +242,7 @@ class QueryLog:
 
     def _lose(self, count: int, reason: str) -> None:
         self._lost += count
-        # log the first loss, and whenever the number of digits increases
+        # log the first loss, and each increase of the number of digits
         if len(str(self._lost)) > len(str(self._lost - count)) or self._lost == count:
             log.warning("queries lost", extra={"lost": self._lost, "error": reason})
 
@@ -276,13 +276,11 @@ class QueryLog:
     def find_row(self, query_id: str) -> QueryRow:
         """Return the row of a query whose answer is stored.
 
-        Raises
-        ------
-        UnknownQuery : If the answer does not exist or has expired, or one of its maps or its frame
-            was deleted.
+        Raise UnknownQuery if the answer does not exist or has expired, or one of its maps or its
+        frame was deleted.
         """
         row = self._current(query_id)
-        if row is None:  # perhaps not written yet
+        if row is None:  # it may not be written yet
             self.flush()
             if not self._store.database.is_sqlite:
                 time.sleep(GATHER_S)
@@ -370,9 +368,7 @@ class QueryLog:
     def remove_of_map(self, name: str) -> int:
         """Remove all queries of a map in blocks; return their number.
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
+        Raise UnknownMap if the map does not exist.
         """
         with self._store.database.read() as connection:
             number = find_map(connection, name).number

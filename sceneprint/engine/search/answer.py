@@ -253,7 +253,7 @@ def _attempt(
     shown = range(len(ranking)) if query.explain else chosen
     with store.database.read() as connection:
         rows = frames_of(connection, ranking.indices[list(shown)].tolist())
-    matches = [match for match in checks.matches if match.index in rows]  # without deleted frames
+    matches = [match for match in checks.matches if match.index in rows]  # omit deleted frames
     return _Attempt(prepared, searched, selection, among, scales, chosen, checks, rows, matches)
 
 

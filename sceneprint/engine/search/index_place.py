@@ -212,7 +212,7 @@ class IndexPlace:
         if not folder.is_dir():
             return True
         manifest = None if head is None or not manifests(folder) else self.sync(row)
-        # even without other versions: a failed or killed removal may have left parts
+        # clear it even without other versions: a failed or killed removal may have left parts
         return clear(folder, but=None if manifest is None else manifest.number)
 
     def sweep(self, *, now: bool = False) -> None:
@@ -374,7 +374,8 @@ class IndexPlace:
         stale = self.stale_keys(row, read_manifest(path))
         stale_before = self._stale.get(folder.name, frozenset())
         is_outdated = bool(stale and (stale & stale_before or len(manifests(folder)) > 1))
-        clear(folder, but=None if is_outdated else number)  # also parts that no version lists
+        # this also removes parts that no version lists
+        clear(folder, but=None if is_outdated else number)
         self._stale[folder.name] = stale
 
     def _make_room(self, size: int, keep: Path) -> bool:

@@ -136,9 +136,7 @@ class AppendBuffer:
     def reserve(self, more: int) -> None:
         """Reserve capacity for `more` signatures, to avoid repeated copies.
 
-        Raises
-        ------
-        UnusableStore : If the disk has no room for the file.
+        Raise UnusableStore if the disk has no room for the file.
         """
         n = len(self)
         if n + more > self._capacity:
@@ -146,8 +144,8 @@ class AppendBuffer:
             # double the capacity, but add at most IN_MEMORY bytes
             step = min(self._capacity, max(IN_MEMORY // length, 64))
             capacity = max(n + more, self._capacity + step)
-            rows = self._allocate(capacity, length)  # first, since this may fail
-            rows[:n] = self._rows[:n]  # a copy, since views use the old array
+            rows = self._allocate(capacity, length)  # allocate first, since this may fail
+            rows[:n] = self._rows[:n]  # copy, since views use the old array
             new = np.empty(capacity - n, np.int64)
             self._keys = np.concatenate([self._keys[:n], new])
             self._revisions = np.concatenate([self._revisions[:n], new])
@@ -339,7 +337,7 @@ class Reader:
             log.error("damaged signature skipped", extra={"frame_id": change.frame_id})
             self._damaged.add(change.number)
         elif self._tail.revision_of(change.number) < change.revision:
-            # else appended already, by an interrupted call
+            # otherwise, an interrupted call has appended it already
             if self._tail.revision_of(change.number):  # a damaged frame was signed again
                 self._tail = self._tail.copy(0, without={change.number})
             self._tail.append(change, np.frombuffer(change.vector, np.uint8))
@@ -386,7 +384,7 @@ class Reader:
         included = np.isin(deleted, tail.keys)
         if version is not None:
             included |= version.has(deleted)
-            both = int(version.has(tail.keys).sum())  # frames signed again
+            both = int(version.has(tail.keys).sum())  # frames that were signed again
         dead = frozenset(deleted[included].tolist())
         size = len(version or ()) + len(tail) - both - len(dead)
         model, damaged = self._model, frozenset(self._damaged)

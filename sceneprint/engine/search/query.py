@@ -292,7 +292,7 @@ class Queries:
 
         def ask(rows: list[MapRow]) -> Answer:
             self._check_models(rows)
-            self._signers(rows[0].model_id)  # slow, so before a connection is opened
+            self._signers(rows[0].model_id)  # slow, so do it before opening a connection
             ready = prepare_stored(self._store, self._signers, frame.map, frame.frame_id, query)
             return self.answer(rows[: len(maps)], ready, query, deadline, sent=sent)
 

@@ -356,9 +356,7 @@ class ExplainedQuery:
 def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     """Explain at which stage a query rejected a frame, and how the frame would align.
 
-    Raises
-    ------
-    UnknownFrame : If the frame is not in the queried maps.
+    Raise UnknownFrame if the frame is not in the queried maps.
     """
     part, row = _locate_frame(case, frame_id)
     absent = _absent(case, part, row)

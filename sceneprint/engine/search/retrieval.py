@@ -388,7 +388,7 @@ def search_maps(
     keys = np.concatenate([hit.keys for hit in hits])
     all_distances = np.concatenate([hit.distances for hit in hits])
     owners = np.repeat(np.arange(len(parts)), [len(hit) for hit in hits])
-    first = np.lexsort((keys, all_distances))[:size]  # ties in upload order
+    first = np.lexsort((keys, all_distances))[:size]  # sort ties in upload order
     distances = all_distances[first]
     shares = similarity(distances, model.unrelated_distance)
     return Searched(parts, hits, Ranking(keys[first].astype(np.intp), distances, shares),

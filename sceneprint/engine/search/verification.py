@@ -127,7 +127,7 @@ def validated(
     def open_geometry(number: int) -> Geometry | None:
         if number not in blobs:  # deleted during the query
             return None
-        try:  # only one, since 200 geometries have 125 MB
+        try:  # load one at a time, since 200 geometries take 125 MB
             geometry_of = store.geometries.read(blobs[number])
         except (DamagedBlob, UnreadableGeometry) as error:
             unreadable[number] = str(error)
@@ -249,7 +249,7 @@ def prior_of(store: Store, query: Query, places: Sequence[SearchedMap]) -> PoseP
     row, name = places[0].row, str(prior.pose.parent_frame)
     with store.database.read() as connection:
         joined = find_joins(connection, row.number).get(name)
-        if joined is not None:  # convert to the root frame, as stored poses are
+        if joined is not None:  # convert it to the root frame, like stored poses
             name, T = joined.root, joined.T @ T
             covariance = transform_covariance(covariance, joined.T[:3, :3], np.zeros(3))
         if not has_parent_frame(connection, row.number, name):

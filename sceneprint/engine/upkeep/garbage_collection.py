@@ -86,7 +86,7 @@ def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
                 doom(connection, block)
                 return False
             referred = referred_blobs(connection, block)
-            # leave younger marks, whose removal may still be running without its lock
+            # leave younger marks: the removal of their blobs may still be running without its lock
             clear_doomed(connection, [*referred], before=time.time() - LONGEST_S)
             unreferenced = [blob for blob in block if blob not in referred]
             at = doom(connection, unreferenced)

@@ -53,7 +53,7 @@ class Housekeeping:
     def run(self) -> int:
         """Run the tasks that are due; return the number of published indexes."""
         store = self._context.store
-        number_events(store.database)  # for events that nobody has read
+        number_events(store.database)  # including events that nobody has read
         self.reencodings.run()
         self.retention.run()
         published = self.upkeep.run()

@@ -187,7 +187,7 @@ class Upkeep:
         """Publish the index of the next model of a map before the switch, if the map is large
         enough.
 
-        Errors of writing are logged; the map then switches without an index.
+        Write errors are logged; the map then switches without an index.
 
         Returns
         -------
@@ -221,7 +221,7 @@ class Upkeep:
     def _try_publish(self, row: MapRow, *, force: bool = False) -> bool:
         try:
             if force and self._place.is_shared:
-                self._place.sync(row)  # downloads removed parts again
+                self._place.sync(row)  # download removed parts again
                 return False
             return self._publish(row, force=force) is not None
         except UnknownMap:
@@ -258,7 +258,7 @@ class Upkeep:
             since = 0
         if since and self._is_aging(connection, row, since):
             return True
-        if row.revision - since <= self._tail_frames:  # avoids counting rows
+        if row.revision - since <= self._tail_frames:  # this avoids counting rows
             return False
         return count_indexed(connection, row.number, since) > self._tail_frames or (
             count_gone(connection, row.number, since) > self._tail_frames
@@ -301,7 +301,7 @@ class Upkeep:
         done = True
         if stale and not empty:
             done = self._publish(row, force=True, clean=True) is not None
-        if done and older:  # also removes files of killed builders
+        if done and older:  # this also removes files of killed builders
             head = None if empty else self._place.head(row)
             done = self._place.remove_all_but(row, head)
         if not done:
@@ -329,7 +329,8 @@ class Upkeep:
             times = (self._place.folder(row) / _PURGED).stat()
         except OSError:
             return True
-        return not times.st_atime <= time.time() < times.st_mtime  # also if the clock was set back
+        # a purge is also due if the clock was set back
+        return not times.st_atime <= time.time() < times.st_mtime
 
     def _publish(
         self, row: MapRow, *, force: bool = False, rebuild: bool = False, clean: bool = False

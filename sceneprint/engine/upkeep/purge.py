@@ -120,7 +120,7 @@ class Retention:
         """Delete a block of the oldest frames of a map, and return its size."""
         if row.retention_days is None:
             return 0
-        with self._store.database.read() as connection:  # usually none, so avoid a write lock
+        with self._store.database.read() as connection:  # usually none exist: avoid a write lock
             now = read_clock(connection) if at is None else at
             if not old_frames(connection, row.number, now - DAY_S * row.retention_days, 1):
                 return 0
@@ -151,7 +151,7 @@ class MemoryPurging:
         surplus queries and answers.
         """
         context, readers = self._context, self._context.readers
-        context.query_log.tidy()  # for nodes without workers
+        context.query_log.tidy()  # needed on nodes without workers
         with context.store.database.read() as connection:
             if time.monotonic() - self._purged < self._every_s:
                 readers.tidy(connection)

@@ -144,7 +144,7 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
         return []
     if store.database.read_only or frame.state == FrameState.DELETED:
         return []
-    store.blobs.wait_for_removal(frame.blob)  # which may have started before the commit
+    store.blobs.wait_for_removal(frame.blob)  # it may have started before the commit
     if not is_known_loss(frame.reason) and store.blobs.condition(frame.blob) == "sound":
         return []
     while True:
@@ -153,7 +153,7 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
             now = frames_of(connection, [frame.number]).get(frame.number)
             if now is None:
                 return [blob, frame.blob]
-            if store.blobs.holds(blob):  # not removed by a deletion
+            if store.blobs.holds(blob):  # no deletion has removed it
                 renew_upload(connection, now.number, blob, len(data), without_loss(now.reason))
                 artifacts = geometry_blobs(connection, [now.number], row.model_id)
                 break
