@@ -56,7 +56,7 @@ def error_problem(request_id: str, error: errors.SceneprintError) -> JSONRespons
     return response
 
 
-#: Names from RFC 9110, which the standard library has since Python 3.13.
+#: Names from RFC 9110, which the standard library uses from Python 3.13 on.
 _PHRASES = {413: "Content Too Large", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
 
 

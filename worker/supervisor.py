@@ -105,7 +105,9 @@ class Supervisor:
         slot.worker = worker
 
     def _replace(self, slot: Slot) -> None:
-        """Start another worker, after a pause if the ended one had no job; else release its job."""
+        """Replace an ended worker, later if it died without a job, and release the job that it
+        held.
+        """
         pid, code, trace = slot.end()
         if code == 0:
             log.info("worker replaced", extra={"pid": pid})

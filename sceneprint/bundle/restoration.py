@@ -370,7 +370,7 @@ def restore_to_server(
         names = reading.secrets()
         owner = next((owner_of(value) for name, value in names if name == "seals"), "")
         with database.read() as connection:
-            check_empty(connection)  # then the blobs' owner mark may be replaced
+            check_empty(connection)  # only then may the blobs' owner mark be replaced
         with _owner_mark(settings, owner, OpaqueIds(database).owner):
             with database.write() as connection:  # opening the blobs checks their owner
                 check_empty(connection)

@@ -26,7 +26,7 @@ ROUNDED = 1 << 24
 
 def library() -> Any:
     """Return the module faiss, limited to one thread, because requests run concurrently."""
-    import faiss  # late, as it takes 0.3 s
+    import faiss  # imported late, because it takes 0.3 s
 
     faiss.omp_set_num_threads(1)  # the setting applies to the calling thread
     return faiss

@@ -206,8 +206,8 @@ def scrub(folder: Path) -> Iterator[Path | None]:
 
     Yields
     ------
-    path : None after each block, so that the caller may pause; once the path of each damaged or
-        missing file
+    path : None after each block, so that the caller may pause; or the path of a damaged or missing
+        file
     """
     for _, path in manifests(folder):
         try:

@@ -215,7 +215,7 @@ _FIXED = frozenset(
     ("frame_state", "job_kind", "job_model_id", "job_state", "job_attempts", "job_failures",
      "job_token", "event_kind")
 )  # fmt: skip
-#: Columns with the value of another column.
+#: Columns that repeat the value of another column.
 _SAME = {
     "job_map_number": "frame_map_number", "event_frame_id": "frame_id", "event_job_id": "job_id",
     "line_at": "event_at", "line_tenant": "job_tenant", "line_action": "event_kind",

@@ -529,7 +529,9 @@ surface_frames = Table(
     Column("frame_number", WHOLE, ForeignKey("frames.number"), primary_key=True),
     Column("map_number", WHOLE, ForeignKey("maps.number"), nullable=False),
     Column("parent", _string(128), nullable=False),
-    Column("changed", Boolean, nullable=False),  # edited since, so it must be fused again
+    Column(
+        "changed", Boolean, nullable=False
+    ),  # edited after its fusion, so it must be fused again
     Index(None, "map_number", "parent", "changed"),
 )
 

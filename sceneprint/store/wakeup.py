@@ -185,8 +185,8 @@ class Listener:
             self._open()
 
 
-# Rings through PostgreSQL for several hosts, also only hints: if the server is unreachable, or a
-# pooler drops listeners, workers poll.
+# Rings through PostgreSQL, for several hosts. They too are only hints: if the server is
+# unreachable, or a pooler drops listeners, workers poll.
 
 log = logging.getLogger(__name__)
 

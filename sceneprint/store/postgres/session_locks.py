@@ -56,8 +56,8 @@ _WAIT = "SELECT set_config('lock_timeout', %s, true), pg_advisory_xact_lock_shar
 class SessionLocks(Locks):
     """Lock on the blobs for all hosts that share a PostgreSQL database.
 
-    It does not work with a pooler that shares connections among clients. Connect to the server
-    directly, or configure the pooler for session pooling.
+    The lock does not work with a pooler that shares connections among clients. Connect to the
+    server directly, or configure the pooler for session pooling.
     """
 
     def __init__(self, database: Database) -> None:
