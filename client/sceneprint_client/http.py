@@ -609,7 +609,7 @@ def read_record(kind: type[Record], response: httpx.Response) -> Record:
 
 
 def error_of(response: httpx.Response) -> errors.SceneprintError:
-    """Return the error that a response reports, in the class of its problem type or as Refused."""
+    """Return the error of a response, of the class for its problem type, or else Refused."""
     error = _error_of(response)
     error.retry_after_s = retry_after_s(response.headers.get("Retry-After", ""))
     return error

@@ -42,7 +42,7 @@ class _JoinedScan:
 
 
 class Joiner:
-    """Scans of the last metres of a drive.
+    """Joined scans of the last metres of a drive.
 
     A point with a known time is corrected for motion between its capture and its scan's stamp. A
     scan is rejected if the odometry does not cover its duration or implies more than 50 m/s. If

@@ -319,7 +319,7 @@ class MapMethods(ServiceConnection):
 
     @Series
     def sessions(self, map_name: str) -> AsyncIterator[Session]:
-        """Yield the sessions of a map by robot, with frame counts, times and parent frames.
+        """Yield the sessions of a map, sorted by robot, with frame counts, times and parent frames.
 
         Raise UnknownMap if the map does not exist.
         """

@@ -321,7 +321,7 @@ def read_pose(path: Path) -> NDArray[np.float64]:
 
 
 def pose_numbers(words: list[str]) -> list[float]:
-    """Return the numbers of the words of a pose; raise InvalidPose if one is not a number."""
+    """Convert the words of a pose to numbers; raise InvalidPose if a word is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError as cause:

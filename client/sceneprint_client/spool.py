@@ -129,7 +129,7 @@ class SpoolStatus:
     waiting : number of frames to upload
     refused : number of frames that the service rejected; `Spool.refusals` returns the reasons
     bytes, most_bytes : disk space of waiting and rejected frames, and its limit
-    uploaded : number of uploaded frames since the creation of the spool
+    uploaded : number of frames uploaded since the spool was created
     thinned : number of waiting frames that a full spool dropped
     discarded : number of rejected frames that a full spool dropped
     oldest : capture time of the first waiting frame, or else the time at which it was added; None

@@ -137,7 +137,7 @@ def decode_tile(data: bytes, tile: SurfaceTile, tile_m: float) -> SurfaceCells:
     ----------
     data : bytes from `surface_tile`
     tile : the tile
-    tile_m : width of tiles of its level, metres
+    tile_m : width of the tiles of this level, metres
 
     Raises
     ------

@@ -177,7 +177,7 @@ class TransformTree:
     def sorted_paths(self, *paths: tuple[str, str]) -> TransformTree:
         """Return a tree of the transforms on the paths between pairs (ancestor, child).
 
-        Samples of moving transforms are sorted by stamp, as `excerpt` requires, and shared.
+        Samples of moving transforms are sorted by stamp in both trees, as `excerpt` requires.
         """
         part = TransformTree()
         for ancestor, child in paths:

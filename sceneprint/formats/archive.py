@@ -1,6 +1,6 @@
 """Reading of frames from tar and zip archives without unpacking: archives cannot choose paths.
 
-file  --open_archive-->  Archive: sequences, refused, frame_of(reference)
+file  --open_archive-->  Archive: sequences, refused, data_of(reference)
 file  --tar_entries, zip_entries-->  ArchiveEntry, ...  --read_entry-->  bytes
 name  --parts_of-->  parts of a relative path
 
@@ -693,7 +693,7 @@ def _is_hidden(parts: tuple[str, ...]) -> bool:
 def _omitted_folder(parts: tuple[str, ...]) -> tuple[str, ...] | None:
     """Return the path of a member's first folder whose name indicates colour or infrared, if any.
 
-    The topmost folder is skipped: it may be the packed data set, whose name is arbitrary.
+    The topmost folder is skipped, because it may be the packed data set, whose name is arbitrary.
     """
     ends = (end for end in range(2, len(parts)) if is_beside_depth(parts[end - 1]))
     end = next(ends, None)

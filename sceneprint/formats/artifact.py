@@ -221,7 +221,7 @@ def unpack_image(
     ----------
     packed : (h, w, 3) uint16; pixels whose first number is 0 are invalid
     scale : result of `pack_image`
-    most : maximum number of a packed normal, as passed to `pack_image`
+    most : maximum value of a packed normal, as passed to `pack_image`
     """
     shape = (camera.height, camera.width)
     points, normals = np.zeros((*shape, 3), np.float32), np.zeros((*shape, 3), np.float32)

@@ -616,7 +616,7 @@ def novelty_of(value: bool | float | str | None) -> float | None:
 
     Raises
     ------
-    InvalidRequest : If the value is none of these.
+    InvalidRequest : If the value is invalid.
     """
     text = str(value).lower()  # generated clients send Python's names, True and False
     if value is None or text == "false":

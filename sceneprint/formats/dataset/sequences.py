@@ -543,7 +543,7 @@ def _sequences_in(
 
 
 def _unread_folders(folder: Path) -> dict[str, int]:
-    """Return the subfolders of a folder of frames that have frames too, and their frame counts."""
+    """Return the names of subfolders that have frames too, and the number of frames in each."""
     counts = {}
     for name in list_folder(folder)[1]:
         if is_beside_depth(name):

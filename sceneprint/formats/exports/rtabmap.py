@@ -146,8 +146,8 @@ class RtabmapScan:
 
 
 def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequence, ...]:
-    """Return the frames of a database: a sequence per parent frame and camera, or, if no node has
-    depth, per parent frame, with the laser scans.
+    """Return the frames of a database: a sequence of depth images per parent frame and camera, or,
+    if no node has depth, a sequence of laser scans per parent frame.
 
     The poses are the optimised poses that rtabmap stores when it closes a database. If they are
     missing, odometry provides the poses, and each session has a separate parent frame.

@@ -73,7 +73,7 @@ _LEAST_OF_BEST = 0.93  #: minimum column spread at length four, relative to the 
 
 
 def _row_length(data: bytes) -> int | None:
-    """Estimate the number of float32 per row; return None unless it clearly differs from four.
+    """Estimate the number of float32 values per row; return None unless it clearly is not four.
 
     With a wrong length, columns mix all fields and have similar means. Therefore, the variance of
     the column means, relative to the variance of all values, is maximal for the correct length. In

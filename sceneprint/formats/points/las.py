@@ -2,7 +2,7 @@
 
 bytes  --read_las-->  FilePoints
 
-Records of all point formats start with X, Y, Z as integers. The header has their scale and offset.
+Records of all point formats start with X, Y, Z as integers; the header states scale and offset.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def _fill_offsets(
     view: Bytes, start: int, places: Places, sizes: Places, lengths: Places,
     signed: NDArray[np.bool_], values: Places, little: bool,
 ) -> tuple[int, int]:  # fmt: skip
-    """Fill `places` with offsets; return the offset after the last complete row, and its number."""
+    """Fill `places` with offsets; return the end of the complete rows, and their number."""
     at, end = start, len(view)
     for row in range(len(places)):
         for p in range(len(sizes)):

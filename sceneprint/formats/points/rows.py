@@ -41,7 +41,7 @@ class FilePoints:
 
     Parameters
     ----------
-    count : number of points; at most as many as the file is long enough for
+    count : number of points, which the file is long enough to contain
     blocks : coordinates in order, in blocks (n, 3) of float64; missing points are NaN or infinite,
         and may cause numpy warnings
     viewpoint : viewpoint that the file states; None if it states none

@@ -254,7 +254,7 @@ def _open_reader(path: Path, *, ros1: bool) -> Ros1Reader | Ros2Reader:
 
 @contextmanager
 def _dataset_errors(path: Path, what: str = "The recording cannot be read") -> Iterator[None]:
-    """Convert exceptions of rosbags to DatasetError within a `with` block."""
+    """Convert exceptions that rosbags raises within a `with` block to DatasetError."""
     try:
         yield
     except (SceneprintError, GeneratorExit):

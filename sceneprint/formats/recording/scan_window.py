@@ -35,7 +35,8 @@ class ScanWindow:
     scans : stamp of each scan in order, nanoseconds, and its entry of `BagScan.places`
     metres : length of the path whose scans are joined
     tree : transforms with sorted samples; the windows of a recording share them
-    world, sensor, frame : parent frame of the odometry, sensor's frame, and points' frame
+    world, sensor, frame : parent frame of the odometry, frame of the sensor, and frame of the
+        points
     """
 
     scans: Sequence[tuple[int, tuple[int, int]]]
@@ -98,7 +99,7 @@ def scan_windows(
     Parameters
     ----------
     scan : stamps and places of all scans
-    tree : transforms of the part of the bag
+    tree : transforms of this part of the bag
     poses : T_world_sensor (4, 4) of the scans with a pose, by index
     keyframes : indices of the keyframes; they have poses
     names : parent frame of the odometry, frame of the sensor, and frame of the points
