@@ -417,8 +417,6 @@ def data_root():
 def ros():
     """Functions that write ROS messages and bags."""
     spec = util.spec_from_file_location("bag_writer", ROOT / "tests" / "bag_writer.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = util.module_from_spec(spec)
     spec.loader.exec_module(module)  # importing rosbags takes half a second
     return SimpleNamespace(

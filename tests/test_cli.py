@@ -207,8 +207,6 @@ def test_a_reader_that_leaves_does_not_stop_the_writing(rooms, model_file, tmp_p
     process = subprocess.Popen(
         [*map(str, command), "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
-    assert process.stdout is not None
-    assert process.stderr is not None
     process.stdout.close()
     error = process.stderr.read().decode()
     process.stderr.close()

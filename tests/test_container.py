@@ -71,7 +71,6 @@ def steps_of(text):
         name, _, rest = line.strip().partition(" ")
         stage += name.upper() == "FROM"
         flags = re.match(r"(?:--\S+\s+)*", rest.lstrip())
-        assert flags is not None
         rest = rest.lstrip()[flags.end() :]
         steps.append(Step(stage, name.upper(), tuple(flags[0].split()), rest))
     return steps

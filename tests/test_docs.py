@@ -49,7 +49,6 @@ def test_every_row_names_a_function_that_names_its_source(what, path, name):
     function = function_of(path, name)
     text = (inspect.getdoc(function) or "") + (ROOT / path).read_text().split('"""')[1]
     source = re.match(r"(Eq\. \(\d+)|(Sec\. III(?:-[A-F])?)", what)
-    assert source is not None
     named = source[0] if source[2] else source[1]
     assert named in text or (named == "Sec. III" and "Sec. III" in text)
 
@@ -135,7 +134,6 @@ def served(line, folder, environment):
         text=True,
     )
     try:
-        assert process.stdout is not None
         url = process.stdout.readline().removeprefix("sceneprint: serving ").strip()
         assert url.startswith("http://127.0.0.1:")
         yield

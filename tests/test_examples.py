@@ -135,10 +135,8 @@ def test_two_recordings_become_one_map(drives, example):
     base = start[1:3] - 0.1 * forward / np.linalg.norm(forward)
     assert np.linalg.norm([float(one) for one in found.groups()] - np.array([*base, 0])) < 0.05
     turn = re.search(r"turned by (\S+) deg, tilted by (\S+) deg", told)
-    assert turn is not None
     yaw = np.degrees(np.arctan2(forward[1], forward[0]))
     assert abs((float(turn[1]) - yaw + 180) % 360 - 180) < 1.5
     assert float(turn[2]) < 1.5
     agree = re.search(r"(strong|weak): (\d+) of (\d+) pairs agree", told)
-    assert agree is not None
     assert int(agree[2]) >= 0.9 * int(agree[3]) >= 5

@@ -46,7 +46,6 @@ def test_two_matches_guide_the_rest_to_the_truth(walk):
     assert kinds(matches) == ["correspondences"] * 2 + ["guided"] * 3
     for match in matches:
         v = match.validation
-        assert v.T_match_query is not None
         metres, radians = pose_difference(v.T_match_query, inverse(poses[match.index]) @ poses[0])
         assert metres < 0.03
         assert radians < np.radians(1.0)
@@ -57,8 +56,6 @@ def test_two_matches_guide_the_rest_to_the_truth(walk):
     first = matches[2].validation
     assert first.predicted is not None
     again = validate_guided(geometries[0], geometries[3], first.predicted)
-    assert again is not None
-    assert again.T_match_query is not None
     assert again.T_match_query.tobytes() == first.T_match_query.tobytes()
     assert (again.overlap, again.inliers) == (first.overlap, first.inliers)
 
@@ -67,8 +64,6 @@ def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk):
     geometries, poses = walk
     matches = asked_of(walk, [1, 2, 3, 4, 5], dict(enumerate(poses)))
     found = localize([QueryFrame(geometries[0], matches)], poses)
-    assert found is not None
-    assert found.average is not None
     assert (found.status, found.votes, len(found.members), found.guided) == ("found", 5, 5, 3)
     assert found.reason.endswith("including 3 guided by other matches")
     assert found.average.votes == 5
@@ -81,7 +76,6 @@ def test_guided_matches_make_the_pose_more_precise_and_are_no_votes(walk):
         for i in (1, 2, 3)
     ]
     unsure = localize([QueryFrame(geometries[0], [*matches, *against])], poses)
-    assert unsure is not None
     assert unsure.status == "ambiguous"
     assert unsure.alternatives[0].support == 2
 
@@ -117,7 +111,6 @@ def test_a_prediction_that_the_frames_do_not_bear_out_is_searched_for(walk):
     matches = asked_of(walk, [1, 2, 3], wrong)
     assert kinds(matches) == ["correspondences"] * 3
     T = matches[2].validation.T_match_query
-    assert T is not None
     assert pose_difference(T, inverse(poses[3]) @ poses[0])[0] < 0.03
     truth = inverse(poses[3]) @ poses[0]
     near = truth.copy()
@@ -132,7 +125,6 @@ def test_guided_matches_can_be_searched_for_after_all(walk):
     rows = [1, 2, 3]
     matches = asked_of(walk, rows, dict(enumerate(poses)))
     known = unguided_validations(matches)
-    assert known is not None
     assert sorted(known) == [1, 2]
     ranking = Ranking(np.array(rows, np.intp), np.zeros(3, np.int64), np.zeros(3))
     again = associate(

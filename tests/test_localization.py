@@ -99,8 +99,6 @@ def test_the_pose_of_a_match_leads_to_that_of_the_query(blank):
     turn = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], float)
     frame = QueryFrame(blank, [match(1, outcome(T=shifted(2.0)))])
     found = localize([frame], [np.eye(4), turn], ["here", "there"])
-    assert found is not None
-    assert found.average is not None
     np.testing.assert_allclose(found.average.T, turn @ shifted(2.0), atol=1e-12)
     assert (found.status, found.parent, found.votes, found.members) == ("found", "there", 1, (1,))
     assert found.reason == "one match determines the pose"
@@ -115,8 +113,6 @@ def test_the_covariance_of_an_earlier_frame_refers_to_the_localized_frame(blank)
     found = localize(
         [QueryFrame(blank, []), QueryFrame(blank, [match(0, certain)], shifted(2.0))], ROWS
     )
-    assert found is not None
-    assert found.average is not None
     np.testing.assert_allclose(found.average.T, shifted(1.0), atol=1e-12)
     assert found.covariance is not None
     np.testing.assert_allclose(np.diag(found.covariance)[:3], [1e-4, 5e-4, 5e-4], rtol=1e-6)
@@ -135,8 +131,6 @@ def test_near_views_and_certain_matches_count_more(blank):
             for i, (row, deviation) in enumerate(zip(rows, deviations, strict=True))
         ]  # fmt: skip
         found = by_pairs(blank, matches)
-        assert found is not None
-        assert found.average is not None
         return float(found.average.T[0, 3])
 
     # equal separations: 4 parts of the first, 1 of the second
@@ -159,11 +153,9 @@ def test_near_views_and_certain_matches_count_more(blank):
 def test_a_pose_is_found_where_it_outweighs_every_other(blank, here, there, status, alternatives):
     matches = seen_at(0.0, range(here)) + seen_at(5.0, range(here, here + there))
     found = by_pairs(blank, matches)
-    assert found is not None
     assert (found.status, len(found.alternatives)) == (status, alternatives)
     assert found.votes == here + there
     if status == "found":
-        assert found.average is not None
         assert (found.average.support, found.average.T[0, 3]) == (here, pytest.approx(0.0))
     else:
         assert found.average is None
@@ -174,13 +166,11 @@ def test_a_pose_is_found_where_it_outweighs_every_other(blank, here, there, stat
 
 def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank):
     weak = by_pairs(blank, seen_at(0.0, [0, 1, 2], "weak"))
-    assert weak is not None
     assert (weak.status, weak.strength) == ("ambiguous", None)
     assert weak.alternatives[0].support == 3
     assert "weak" in weak.reason
     # strength is that of the winning place: a strong match elsewhere lends none
     mixed = by_pairs(blank, seen_at(0.0, [0, 1, 2, 3, 4, 5], "weak") + seen_at(5.0, [6]))
-    assert mixed is not None
     assert mixed.status == "ambiguous"
     unsure = match(3, outcome("ambiguous", T=inverse(ROWS[3]) @ shifted(5.0)))
     assert by_pairs(blank, [*seen_at(0.0, [0]), unsure]).status == "found"
@@ -191,7 +181,6 @@ def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank):
 def test_rejected_matches_do_not_vote(blank):
     lost = replace(outcome("rejected"), T_match_query=None, hypotheses=np.empty((0, 4, 4)))
     found = by_pairs(blank, [*seen_at(0.0, [0]), match(1, outcome("rejected")), match(2, lost)])
-    assert found is not None
     assert (found.status, found.votes) == ("found", 1)
     assert by_pairs(blank, [match(1, outcome("rejected")), match(2, lost)]) is None
     assert by_pairs(blank, []) is None
@@ -203,20 +192,14 @@ def test_poses_of_one_parent_frame_are_compared(blank):
     poses = [shifted(0.0, y=float(i)) for i in range(6)]
     matches = [match(i, outcome(T=inverse(poses[i]) @ shifted(0.01 * i))) for i in range(5)]
     found = localize([QueryFrame(blank, matches)], poses, parents)
-    assert found is not None
-    assert found.average is not None
     assert (found.parent, found.votes) == ("hall", 3)
     assert found.average.T[0, 3] == pytest.approx((0.01 + 0.03 + 0.04) / 3)
     found = localize([QueryFrame(blank, matches[:4])], poses, parents)
-    assert found is not None
-    assert found.average is not None
     assert (found.parent, found.average.T[0, 3]) == ("flat", pytest.approx(0.01))
 
 
 def test_five_votes_are_averaged(blank):
     found = by_pairs(blank, [m for i in range(8) for m in seen_at(0.01 * i, [i])])
-    assert found is not None
-    assert found.average is not None
     assert (found.average.votes, len(found.members), found.votes) == (5, 8, 8)
     assert found.average.T[0, 3] == pytest.approx(0.02)
 
@@ -231,10 +214,8 @@ def test_a_copy_of_a_view_is_no_second_vote(blank):
     copy = match(12, outcome(T=inverse(rows[12]) @ shifted(0.0)))
     for matches in ([*both], [*both, copy], [*both, copy, copy]):
         found = localize([QueryFrame(blank, matches)], rows)
-        assert found is not None
         assert (found.status, {one.support for one in found.alternatives}) == ("ambiguous", {1})
     other = localize([QueryFrame(blank, [*both, *seen_at(0.0, [2])])], rows)
-    assert other is not None
     assert other.status == "found"
 
 
@@ -246,7 +227,6 @@ def test_the_order_of_candidates_changes_no_status(blank):
     statuses = set()
     for order in itertools.permutations(matches):
         found = by_pairs(blank, order)
-        assert found is not None
         statuses.add(
             (found.status, found.members if found.status != "found" else frozenset((0, 1)))
         )
@@ -350,7 +330,6 @@ def test_a_cube_is_ambiguous_by_quarter_turns_until_a_prior_decides(box_views, s
         start = turn.copy()
         start[:3, 3] += 0.12, -0.1, 0.05
         sure, _ = box_query(box_views, signer, PosePrior("", start, covariance))
-        assert sure.average is not None
         assert (sure.status, sure.verified_by) == ("found", "prior")
         np.testing.assert_allclose(sure.average.T, turn, atol=0.05)
     far = T.copy()
@@ -512,7 +491,6 @@ def test_evidence_by_hand():
     assert found.status == "found"
     [itself] = found.alternatives
     evidence = itself.evidence
-    assert evidence is not None
     # tiles 30 to 39 have two frames for them and one against, which leaves no violation
     assert (evidence.share, evidence.planes) == pytest.approx((40 / 60, 40.0))
     assert (evidence.score, evidence.excess) == pytest.approx((40 / 60, 0.0))
@@ -538,7 +516,6 @@ def test_a_pose_is_found_where_its_confidence_is_enough(rival, confidence, statu
     found = judged(matches, [picture((40, SAME))], [picture((rival, SAME))])
     assert found.status == status
     assert found.confidence == pytest.approx(confidence, abs=1e-4)
-    assert found.evidence is not None
     assert found.evidence.rival == pytest.approx(rival / 40)
     if status == "found":
         assert (found.verified_by, at_place(0, found)) == ("matches", True)
@@ -606,7 +583,6 @@ def test_violations_that_the_map_shows_of_itself_are_borne(same, missing, unlike
     ]  # fmt: skip
     noisy = replace(BY_HAND, map=MapParameters(n_refining=0), worth=0.0)
     found = judged(seen_at(0.0, [0]), frames, query=query, p=noisy)
-    assert found.alternatives[0].evidence is not None
     assert found.alternatives[0].evidence.excess == pytest.approx(excess)
 
 
@@ -620,9 +596,7 @@ def test_most_of_the_frames_that_agree_decide_what_a_map_is_made_of(rendered, st
     views_of = told_by(frames, [picture()], rendered=[*rendered, True])
     matches = seen_at(0.0, [0, 1, 2])
     found = localize([QueryFrame(query, matches)], ROWS, None, views_of, p=BY_HAND, overlap_p=FIXED)
-    assert found is not None
     assert found.status == status
-    assert found.evidence is not None
     assert found.evidence.rendered == (status == "found")
     assert found.evidence.excess == pytest.approx(0.1)
 
@@ -652,12 +626,10 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank):
     lost = replace(blank, surface=replace(blank.surface, camera=None))
     for geometry, status in ((blank, "ambiguous"), (lost, "found")):
         found = localize([QueryFrame(geometry, weak)], ROWS)
-        assert found is not None
         assert found.status == status
     assert (found.strength, found.verified_by) == ("weak", "matches")
     unsure = [suggested_at(0.0, row, "ambiguous") for row in range(3)]
     none = localize([QueryFrame(lost, unsure)], ROWS)
-    assert none is not None
     assert (none.status, none.reason) == ("ambiguous", "no match is accepted")
 
 
@@ -762,7 +734,6 @@ def test_a_prior_chooses_the_parent_frame_unless_matches_have():
         prior = PosePrior(parent, shifted(x), np.eye(6) * 0.01)
         frames = [QueryFrame(WHOLE, matches)]
         found = localize(frames, ROWS[:5], parents, views_of, prior, BY_HAND, FIXED)
-        assert found is not None
         return found.status, found.parent, found.verified_by
 
     tried = [suggested_at(0.0, row) for row in range(5)]  # three of them here
@@ -783,7 +754,6 @@ def test_the_parent_frame_is_that_of_the_strongest_matches(blank):
     tried = [suggested_at(0.0, 0), suggested_at(0.0, 1)]
     for matches in ([*weak, *strong], [*tried, *seen_at(0.0, [2], "weak")]):
         found = localize([QueryFrame(blank, matches)], ROWS[:3], parents)
-        assert found is not None
         assert (found.parent, found.votes) == ("there", 1)
 
 
@@ -797,8 +767,6 @@ def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(box_views, signer):
     prior = PosePrior("", off, np.diag([0.1**2] * 3 + [0.05**2] * 3))
     views_of = views_of_rows([], poses, views.__getitem__)
     found = localize([QueryFrame(query, [])], poses, None, views_of, prior)
-    assert found is not None
-    assert found.average is not None
     assert (found.status, found.votes) == ("found", 0)
     np.testing.assert_allclose(found.average.T, T, atol=0.03)
 
@@ -823,12 +791,9 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank):
     first = [match(i, outcome(T=inverse(ROWS[i]) @ truth @ before)) for i in (0, 1)]
     last = [match(2, outcome(T=inverse(ROWS[2]) @ truth))]
     alone = by_pairs(blank, [*last, *seen_at(9.0, [3])])
-    assert alone is not None
     assert alone.status == "ambiguous"
     frames = [QueryFrame(blank, first, before), QueryFrame(blank, [*last, *seen_at(9.0, [3])])]
     found = localize(frames, ROWS)
-    assert found is not None
-    assert found.average is not None
     assert (found.status, found.average.support, found.votes) == ("found", 3, 4)
     np.testing.assert_allclose(found.average.T, truth, atol=1e-12)
 
@@ -844,9 +809,7 @@ def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last():
         found = localize(
             [before, QueryFrame(query, [])], ROWS, None, views_of, None, BY_HAND, FIXED
         )
-        assert found is not None
         assert found.status == status
-    assert found is not None
     assert (found.verified_by, at_place(1, found)) == ("map", True)
 
 
@@ -880,7 +843,6 @@ def corridor_rivals(estimate, nearest, tried, *, ahead=True, distances=(1,) * 8,
 
 def test_rivals_are_the_first_of_the_ranking_elsewhere(blank):
     at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
-    assert at_origin is not None
     assert at_origin.members == (0, 1)
     # 0 stands there; 1 was tried; 6 is of another parent frame, 7 has no pose
     ranking = [6, 7, 0, 1, 4, 2, 3, 5]
@@ -908,7 +870,6 @@ def test_rivals_are_about_as_near_as_the_farthest_vote(blank):
 def test_rivals_are_asked_of_nothing_that_is_not_found(blank):
     assert corridor_rivals(None, [0, 1, 2, 3], []) == []
     unsure = by_pairs(blank, [*seen_at(0.0, [0]), *seen_at(9.0, [1])])
-    assert unsure is not None
     assert unsure.status == "ambiguous"
     assert corridor_rivals(unsure, [0, 1, 2, 3], [0, 1]) == []
     sure = by_pairs(blank, seen_at(0.0, [0, 1]))
@@ -918,7 +879,6 @@ def test_rivals_are_asked_of_nothing_that_is_not_found(blank):
 
 def test_what_was_not_compared_is_ambiguous(blank):
     sure = by_pairs(blank, seen_at(4.0, [0, 1]))
-    assert sure is not None
     assert sure.average is not None
     told = mark_unconfirmed(sure)
     assert (told.status, told.average, told.strength, told.members) == ("ambiguous", None, None, ())

@@ -79,7 +79,6 @@ def said(tmp_path):
             ["bash", "-c", f"exec {command}"], cwd=tmp_path / "here", env=environment,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
-        assert process.stdout is not None
         if lines:
             running.append(process)
             return [shown(process.stdout.readline()).rstrip() for _ in range(lines)]

@@ -30,7 +30,6 @@ def test_a_mesh_and_its_figures(sceneprint, service_url, walk, tmp_path, with_op
     said = sceneprint("make", "mesh", "walk", first, "--out", mesh, "--voxel", "0.05")
     lines = said.stdout.splitlines()
     total = re.search(r"(\d+) views show ([\d.]+) m2 of surface", lines[1])
-    assert total is not None
     views = [line for line in lines if re.search(r"\+ *[\d.]+ m2", line)]
     assert len(views) == int(total[1])
     assert "the frame itself" in views[0]

@@ -47,7 +47,6 @@ def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch):
         monkeypatch.setenv(f"SCENEPRINT_{name}", value)
     found = settings_of(argparse.Namespace())
     assert found.database == SERVER
-    assert found.blob_url is not None
     assert found.blob_url.get_secret_value() == "s3://bucket/prefix"
     assert found.index_url == "file:///srv/indexes"
     assert "hunter2" not in repr(found)

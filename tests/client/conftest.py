@@ -80,7 +80,6 @@ def walk(room_views, tmp_path_factory):
         for i, frame in enumerate(frames):
             write_depth_png(path, frame.depth, 1000.0)
             k = frame.intrinsics
-            assert frame.pose is not None
             pose = {"parent_frame": parent, "matrix": frame.pose.tolist()}
             fields = {
                 "intrinsics": {"width": k.width, "height": k.height, "fx": k.fx, "fy": k.fy,

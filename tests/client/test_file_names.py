@@ -74,7 +74,6 @@ def test_names_come_back_in_matches_and_are_searched(client, references, map_nam
     answer = client.query(map_name, references[1], explain=True)
     first = next(one for one in answer.matches if one.rank == 1)
     assert (first.name, first.sequence) == (names[1], 1)
-    assert answer.explanations is not None
     assert {one.name for one in answer.explanations} == set(names)
     details = client.match_details(answer.query_id, first.frame_id)
     assert (details.name, details.sequence) == (names[1], 1)

@@ -75,7 +75,6 @@ def test_all_ways_of_asking(client, map_name, references):
         "filter": {"exclude_frames": [ids[4]]}, "stages": "retrieve,diversify,validate",
     }  # fmt: skip
     explained = client.query(map_name, references[1], **options)
-    assert explained.explanations is not None
     assert len(explained.explanations) == 5
     asked = client.query(map_name, frame_id=ids[0], explain_frame=ids[4], deadline_ms=600_000)
     assert asked.explained_frame.frame_id == ids[4]

@@ -504,7 +504,6 @@ def child(*arguments):
 def add_until(path, first, count, acknowledged, room=0):
     """What a child said that is killed once it has said so many lines."""
     with child("add", path, first, count, room) as process:
-        assert process.stdout is not None
         said = []
         for line in process.stdout:
             said.append(line.decode().strip())

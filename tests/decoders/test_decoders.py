@@ -78,7 +78,6 @@ def test_errors_are_the_same_as_in_this_process(pool, data):
 def test_a_decoder_reaches_nothing(pool, tmp_path):
     found = do(pool, "escape", path=str(tmp_path / "escaped"))
     walls = pool.protections
-    assert walls is not None
     assert walls.no_new_privileges
     assert walls.seccomp == Path("/proc/sys/kernel/seccomp/actions_avail").exists()
     if not walls.seccomp:
@@ -123,7 +122,6 @@ def test_nothing_of_an_upload_stays_in_the_shared_memory(pool):
                 slot.samples(data)
         with suppress(errors.UnreadableCloud, errors.UselessFrame):
             slot.points(points, "kitti", UNSAID, 1.0)
-        assert slot.process is not None
         assert not np.frombuffer(slot.process._shared, np.uint8, 1 << 20).any()
 
 
@@ -169,7 +167,6 @@ def test_processes_end_with_the_pool_and_with_a_killed_parent():
     with subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as parent:
-        assert parent.stdout is not None
         child = int(parent.stdout.readline())
         os.kill(parent.pid, signal.SIGKILL)
         parent.wait()

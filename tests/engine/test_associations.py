@@ -49,7 +49,6 @@ def two_runs(tmp_path_factory, make_upload, work_off, room_views):
         engine.create_map(NewMap(name="hall", model="depth"))
         for i, frame in enumerate(room.frames):
             robot, session = (("ann", "a"), ("bob", "b"))[i % 2]
-            assert frame.pose is not None
             pose = inverse(ORIGINS[f"{robot}/{session}"]) @ frame.pose
             made = make_upload(
                 frame, room.name, robot=robot, session=session, pose={"matrix": pose.tolist()},
@@ -162,7 +161,6 @@ def test_edges_hold_against_the_truth(engine, work_off):
         metres, radians = pose_difference(inverse(there) @ here, np.array(edge.transform.matrix))
         assert metres < 0.05
         assert radians < np.radians(2.0)
-        assert edge.information is not None
         information = np.array(edge.information).reshape(6, 6)
         assert np.linalg.eigvalsh(information).min() > 0
         assert edge.consistent

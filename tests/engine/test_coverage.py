@@ -88,7 +88,6 @@ def rooms(tmp_path_factory, uploads, make_upload, work_off, room_views):
         shift = np.eye(4)
         shift[0, 3] = APART_M
         for i, frame in enumerate(path.frames[:10]):
-            assert frame.pose is not None
             pose = (np.eye(4), shift)[i % 2] @ frame.pose
             add("hall", replace(frame, pose=pose), path.name, "ab"[i % 2])
         for one in uploads[6:10]:
@@ -163,7 +162,6 @@ def test_an_answer_in_another_parent_frame_is_not_checked(engine, work_off, room
     edit_frame(engine.store, "hall", mine[0].frame_id, {"pose": {"parent_frame": "elsewhere"}})
     told = measured(engine, work_off, session="c", not_within_s=0.0)
     assert (told.result.frames, told.result.found, told.result.unchecked) == (4, 3, 1)
-    assert told.plans is not None
     of_parent = {one.parent_frame: one.cells for one in told.plans}
     assert sum(one.found for one in of_parent[rooms.parents[1]]) == 3
     assert sum(one.unchecked for one in of_parent["elsewhere"]) == 1

@@ -99,7 +99,6 @@ def secret(lived_in, ids, uploads):
     artifacts = [engine.store.blobs.get(blobs[n]) for n in numbers]
     folder = index_folder(engine.settings.indexes, row)
     version = newest(folder, row.model_id, len(vectors[0]))
-    assert version is not None
     assert len(version) == len(numbers)
     return {
         "upload": pieces(uploads[0].data, [one.data for one in uploads[1:]]),

@@ -25,7 +25,6 @@ def test_none_seen_is_the_rule_of_three():
 def test_a_curve_by_hand():
     right = np.array([True, True, False, True, False])
     curve = roc(np.array([5.0, 4.0, 3.0, 3.0, 1.0]), right)
-    assert curve is not None
     np.testing.assert_allclose(curve.true, [0, 1 / 3, 2 / 3, 1, 1])
     np.testing.assert_allclose(curve.false, [0, 0, 0, 1 / 2, 1])
     np.testing.assert_array_equal(curve.thresholds, [np.inf, 5, 4, 3, 1])
@@ -42,6 +41,5 @@ def test_the_area_is_the_share_of_couples_in_order():
     scores[:30] = -np.inf
     right = rng.random(400) < 0.3 + 0.3 * (scores > 0)
     curve = roc(scores, right)
-    assert curve is not None
     good, bad = scores[right][:, None], scores[~right]
     assert curve.area == pytest.approx(((good > bad) + (good == bad) / 2).mean())

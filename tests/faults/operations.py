@@ -171,7 +171,6 @@ def _import(engine, store, say):
 
 def _archive(uploads):
     packed, camera = io.BytesIO(), uploads[0].meta.intrinsics
-    assert camera is not None
     members = {
         "run/intrinsics.json": json.dumps(camera.model_dump(exclude={"distortion"})).encode()
     }

@@ -51,7 +51,6 @@ def test_a_known_transform_among_as_many_outliers(seed):
     true = rigid(rng, 10.0)
     votes = seen(rng, true, 30, 30)
     found = join_sessions(votes, seed)
-    assert found.T is not None
     assert (found.support, found.strength) == (30, "strong")
     assert at_places(votes, found.T, true) < 0.02
     assert pose_difference(found.T, true)[1] < math.radians(0.4)

@@ -59,7 +59,6 @@ def test_id_is_the_content_not_the_name(small_model):
 
 def test_a_whitening_is_part_of_the_content(small_model, small_whitened):
     own = small_whitened.whitening
-    assert own is not None
     others = [
         replace(small_whitened, whitening=changed)
         for changed in (

@@ -83,7 +83,6 @@ def test_pose(npy):
     rough = np.eye(4)
     rough[0, 1] = 1e-3
     pose = decode_cloud(npy(), pose=rough).pose
-    assert pose is not None
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     with pytest.raises(InvalidPose, match=r"^scan: The rotation"):
         decode_cloud(npy(), pose=np.diag([2.0, 2.0, 2.0, 1.0]), name="scan")

@@ -178,7 +178,6 @@ def starter(tmp_path_factory):
         server = Server(process, folder, errors)
         stack.callback(server.kill)
         if wait:
-            assert process.stdout is not None
             line = process.stdout.readline()
             assert re.match("sceneprint: serving https?://", line), errors.read_text()
             server.url = line.split()[-1]

@@ -121,7 +121,6 @@ def test_every_query_around_an_object_has_a_frame_beside_it_and_one_across():
     assert seen.least.max(axis=1).min() > 0.5
     where = np.array([d.pose[:2, 3] for d in site.map if d.pose is not None])
     for query in site.queries:
-        assert query.pose is not None
         across = np.linalg.norm(where + query.pose[:2, 3], axis=1)
         assert across.min() < 0.8
 
