@@ -342,6 +342,7 @@ RESTORE = "import sys; from sceneprint.cli import main; sys.exit(main(sys.argv[1
 
 
 @own_servers
+@pytest.mark.thorough
 def test_killed_half_way_it_can_be_restored_again(place, postgres_url, tmp_path):
     fleet = fleet_of(tmp_path / "fleet", postgres_url)
     with closing(psycopg.connect(postgres_url.replace("+psycopg", ""))) as holder:

@@ -186,6 +186,7 @@ def test_upload_refuses_what_would_mix(sceneprint, house, rooms, tmp_path):
     assert done.stdout == ""
 
 
+@pytest.mark.thorough
 def test_ctrl_c_keeps_what_was_received(service_url, rooms):
     with Client(service_url) as client:
         client.create_map("stopped")
@@ -374,6 +375,7 @@ def test_an_upload_waits_for_a_service_that_compiles(tmp_path, monkeypatch, caps
     assert "the service is compiling its kernels" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_an_upload_ends_at_its_timeout(sceneprint, tmp_path, rooms):
     with serving(tmp_path, 0) as url:
         arguments = ("late", rooms, "--every", "2", "--timeout", "0.2", "--url", url)

@@ -99,6 +99,7 @@ def test_closing_ends_streams_and_threads(tmp_path):
         client.maps()
 
 
+@pytest.mark.thorough
 def test_a_program_that_closes_nothing_ends(tmp_path):
     code = (
         "from sceneprint_client import Client\n"

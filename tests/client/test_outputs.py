@@ -70,17 +70,6 @@ def test_what_a_frame_is_made_of(client, map_name, ids, references):
     # the signature is made of the second level alone
     assert [len(level.mean) for level in patches.levels[1:]] == signature.n_patches
     assert len(base64.b64decode(signature.base64)) == signature.length
-    for ask in (
-        lambda: client.cloud(map_name, name, "base"),
-        lambda: client.cloud(map_name, name, "world"),
-        lambda: client.preview(map_name, name, "colour"),
-        lambda: client.preview(map_name, name, width=63),
-    ):
-        with pytest.raises(InvalidRequest) as told:
-            ask()
-        assert told.value.fields
-    with pytest.raises(UnknownFrame):
-        client.patches(map_name, "nobody")
 
 
 def test_what_is_not_signed_yet(embedded, references):

@@ -148,10 +148,3 @@ def test_what_an_answer_rests_on(client, map_name, references):
         for wrong in ("0" * 32, "..", "", "a/b"):
             with pytest.raises(UnknownQuery):
                 call(wrong)
-    with pytest.raises(UnknownFrame):
-        client.match_details(answer.query_id, "nobody")
-    for how in ({"color": "pink"}, {"transform": "best"}):
-        with pytest.raises(InvalidRequest, match=next(iter(how))):
-            client.overlay(answer.query_id, best, **how)
-    with pytest.raises(InvalidRequest, match="limit"):
-        client.similarities(answer.query_id, 0)

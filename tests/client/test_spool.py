@@ -512,6 +512,7 @@ def add_until(path, first, count, acknowledged, room=0):
     return said  # with what was in the pipe when it died
 
 
+@pytest.mark.thorough
 def test_kills_while_frames_are_added_and_uploaded_lose_and_double_nothing(
     remote, service_url, map_name, tmp_path
 ):

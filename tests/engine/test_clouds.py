@@ -132,6 +132,7 @@ def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(empty, uplo
     assert empty.inspection.cloud(answer.query_id).startswith(b"ply\n")
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("with_open3d")
 def test_a_cloud_that_cannot_be_unpacked_here_costs_no_reconstruction(
     empty, uploads, work_off, monkeypatch

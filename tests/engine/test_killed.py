@@ -41,6 +41,7 @@ def lease(engine):
     return float(until)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("step", "when", "artifact"), [("write_geometry", "after", 0), ("_store", "before", 1)]
 )

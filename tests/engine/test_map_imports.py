@@ -13,15 +13,13 @@ from sceneprint.engine.jobs.lifecycle import cancel
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.search.query import localization_of
-from sceneprint.errors import InvalidRequest, LostLease, QuotaExceeded, UnreadableCloud
+from sceneprint.errors import InvalidRequest, QuotaExceeded, UnreadableCloud
 from sceneprint.settings import Settings
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import files_of
 from sceneprint.types import ReferenceSurface
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
 from sceneprint_lab.synth.rooms import make_room
-from tests.engine.conftest import Between
 from tests.whole_engine import Engine
 
 #: A camera of few pixels, so that views are rendered and signed quickly.
@@ -149,35 +147,6 @@ def test_the_same_view_in_two_sessions_is_two_frames(chosen, monkeypatch):
     added = [slice_of(chosen, one, lambda: True).items for one in (task, other)]
     assert [one["status"] for items in added for one in items] == [202] * 4
     assert len({one["frame_id"] for items in added for one in items}) == 4
-
-
-def test_a_cancelled_import_adds_no_view_more(chosen, monkeypatch):
-    monkeypatch.setattr(map_import, "_AT_ONCE", 2)
-    task = claimed(chosen)
-    with chosen.store.database.read() as connection:
-        [file] = files_of(connection, task.job.number).values()
-    assert used_bytes(chosen) == file.bytes
-    with pytest.raises(LostLease):
-        slice_of(chosen, task, Between(lambda: cancel(chosen.store, task.job.id)))
-    frames = chosen.list_frames("hall").items
-    assert len(frames) == 2
-    assert used_bytes(chosen) == sum(one.bytes for one in frames)
-    assert not chosen.store.blobs.holds(file.blob)
-
-
-def test_a_map_that_is_made_anew_takes_no_view_of_an_import_into_the_one_before(
-    chosen, monkeypatch
-):
-    monkeypatch.setattr(map_import, "_AT_ONCE", 2)
-
-    def make_anew():
-        chosen.delete_map("hall")
-        chosen.create_map(NewMap(name="hall", model="depth"))
-
-    with pytest.raises(LostLease):
-        slice_of(chosen, claimed(chosen), Between(make_anew))
-    assert chosen.list_frames("hall").items == []
-    assert list(chosen.store.blobs.digests()) == []
 
 
 def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(chosen, monkeypatch):

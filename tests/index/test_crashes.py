@@ -7,6 +7,7 @@ import threading
 import time
 
 import numpy as np
+import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.index.index_manifest import newest_number
@@ -74,6 +75,7 @@ def is_whole(version):
     return True
 
 
+@pytest.mark.thorough
 def test_a_builder_killed_at_any_moment(tmp_path):
     delays, revision, unfinished = random.Random(4), 0, 0
     with subprocess.Popen(

@@ -350,6 +350,7 @@ def test_what_is_on_its_way_out_stays_doomed_for_all(
     assert engine.store.blobs.get(digest) == small[0].png
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dies", ["before", "after"])
 def test_what_a_killed_remover_leaves(
     engine, small, held, postgres_url, bucket, dies, remover, until, monkeypatch

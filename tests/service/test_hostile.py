@@ -275,6 +275,7 @@ def contents(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
+@pytest.mark.thorough
 @pytest.mark.sqlite_only("a database in a folder that may be read alone")
 def test_a_read_only_folder_is_served_as_it_is(sealed, stored, begin, small_shots, refused):
     before = contents(stored)

@@ -57,6 +57,7 @@ def test_to_interrupt_all_of_it_at_once_is_to_stop(begin):
     assert [line["logger"] for line in server.log() if line["level"] == "critical"] == []
 
 
+@pytest.mark.thorough
 def test_workers_whose_service_was_killed_leave_by_themselves(begin):
     server = begin("--workers", "2")
     server.ready(2)
@@ -202,6 +203,7 @@ sys.exit(cli.main(["serve", "--port", "0", "--data", sys.argv[1]]))
 """
 
 
+@pytest.mark.thorough
 def test_a_service_whose_workers_cannot_start_ends_with_the_reason(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", UNPREPARED, str(tmp_path)],

@@ -12,6 +12,7 @@ from sqlalchemy import text
 
 import migrations
 from sceneprint.cli import main
+from sceneprint.errors import NewerSchema
 from sceneprint.store import database, open_database
 from sceneprint.store.database import SchemaRange, known_revisions, reach_database
 
@@ -185,3 +186,11 @@ def test_the_command_makes_the_schema_once(kind, migrate_command, tmp_path, requ
     _set_schema(url, "9999", "9998")
     code, _, error = migrate_command(url, data)
     assert (code, "of a later version of sceneprint" in error) == (2, True)
+
+
+def test_no_process_begins_on_a_later_schema_that_does_not_allow_it(url, store):
+    assert store.database.dialect in url
+    _set_schema(url, "9999", "9999")
+    with pytest.raises(NewerSchema, match="has schema 9999 of a later version"):
+        open_database(url)
+    assert _range(url) == ("9999", "9999")

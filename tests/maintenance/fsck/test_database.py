@@ -23,6 +23,7 @@ def dump(path):
         return set(database.iterdump())
 
 
+@pytest.mark.thorough
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_flipped_byte_anywhere_in_it_breaks_no_check(house):
     """It is found, or harmless; and where it is found, a repair leaves every blob where it is."""
