@@ -23,7 +23,7 @@ from sceneprint_lab.synth.rooms import make_room
 from tests.whole_engine import Engine
 
 #: A camera of few pixels, so that views are rendered and signed quickly.
-CAMERA = {"fx": 146.0, "fy": 146.0, "cx": 79.5, "cy": 59.5, "width": 160, "height": 120}
+CAMERA = {"fx": 73.0, "fy": 73.0, "cx": 39.5, "cy": 29.5, "width": 80, "height": 60}
 
 
 def options_of(**more):

@@ -6,7 +6,6 @@ import warnings
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import norm
 
 from sceneprint.errors import TrainingError
 from sceneprint.geometry.signature.mixture import (
@@ -44,6 +43,8 @@ def drawn(rng, mixture, n):
 
 def naive(features, mixture):
     """log p_g + log N, one normal density at a time."""
+    from scipy.stats import norm  # slow to import
+
     result = np.zeros((len(features), len(mixture)))
     for i, f in enumerate(features):
         for g in range(len(mixture)):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import spearmanr
 
 from sceneprint.geometry.registration import patch_descriptors as patch_descriptors_module
 from sceneprint.geometry.registration.patch_descriptors import (
@@ -158,6 +157,8 @@ def learnt(scenes, rng):
 
 
 def test_bytes_keep_the_order_of_distances(scenes):
+    from scipy.stats import spearmanr  # slow to import
+
     rng = np.random.default_rng(6)
     rows = learnt(scenes, rng)
     by = fit_compression(rows, 128)

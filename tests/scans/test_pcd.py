@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sceneprint.errors import FrameError, UnreadableCloud
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan
-from sceneprint.formats.points.pcd import inflate
+from sceneprint.formats.points.pcd import inflate, read_pcd
 
 
 def test_viewpoint(pcd, points):
@@ -133,6 +133,9 @@ def test_bombs():
         UnreadableCloud, match="480000000 bytes of points, but the body states 4294967295"
     ):
         decode_cloud(wide)
+    wide = compressed(10, 240, zeros).replace(b"SIZE 4 4 4", b"SIZE 8 8 8")
+    with pytest.raises(UnreadableCloud, match="have 240 bytes; the limit is 200"):
+        read_pcd(wide, 10)
 
 
 def unpacked(packed):
