@@ -141,7 +141,8 @@ class QueryMethods(ServiceConnection):
         check_options(how)
         if metas is not None and len(metas) != len(frames):
             raise InvalidRequest(
-                f"There are {len(frames)} frames and {len(metas)} `metas`. Pass one per frame.",
+                f"The number of `metas`, {len(metas)}, is not the number of frames, {len(frames)}. "
+                "Pass one per frame.",
                 (("metas", "pass one for each frame"),),
             )
         request = await self._run(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 import re
@@ -9,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from playwright.sync_api import expect
 
 
@@ -25,10 +28,17 @@ def tiles(page, row: str) -> list[dict[str, Any]]:
     return found
 
 
+def colours(png: bytes) -> np.ndarray[Any, Any]:
+    """(h, w, 3) colours of a PNG."""
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+
 def key(one: dict[str, Any]) -> str:
     return f"{one['map']}/{one['frame_id']}"
 
 
+#: What is on a canvas as a PNG.
+PNG = "(canvas) => canvas.toDataURL('image/png').split(',')[1]"
 #: Where circles of a plan stand, in its pixels; and its projection: the origin, and a metre.
 SPOTS = "all => all.map(one => [Number(one.getAttribute('cx')), Number(one.getAttribute('cy'))])"
 VIEW = """() => { const view = document.querySelector(".plan").plan.view;
@@ -493,7 +503,11 @@ def test_a_file_is_asked_and_looked_at_again(station, page, settle, axe):
 
     page.goto(f"{station.home}#/queries/{answer['query_id']}?why=open")
     settle(page)
-    assert page.locator(".query-asked canvas").get_attribute("title") is None  # no fault
+    painted = page.locator(".query-asked canvas").evaluate(PNG)
+    depth = station.client.get(
+        f"/v1/queries/{answer['query_id']}/preview.png", params={"view": "depth", "width": 192}
+    )
+    assert np.array_equal(colours(base64.b64decode(painted)), colours(depth.content))
     assert "with an uploaded depth image" in page.locator(".query-note").first.inner_text()
     similar = station.client.get(f"/v1/queries/{answer['query_id']}/similarities").json()
     heat = page.locator("canvas.heatmap")

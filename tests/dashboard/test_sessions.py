@@ -91,11 +91,11 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(station, runs, pa
     # without a robot all frames of the session are meant, and that is said
     other = rows.filter(has_text="monday").filter(has_not_text="ann")
     other.get_by_role("button", name="Delete").click()
-    expect(dialog).to_contain_text("All its 5 frames")
+    expect(dialog).to_contain_text("its 5 frames")
     expect(dialog).to_contain_text("those of ann in this session are meant as well")
     page.keyboard.press("Escape")
     rows.filter(has_text="ann").get_by_role("button", name="Delete").click()
-    expect(dialog).to_contain_text("All its 4 frames")
+    expect(dialog).to_contain_text("its 4 frames")
     expect(dialog).not_to_contain_text("cannot be chosen alone")
     delete = page.get_by_role("button", name="Delete session", exact=True)
     expect(delete).to_be_disabled()

@@ -134,8 +134,8 @@ def choose_frames(path: Path) -> Choice:
             queries += frames[round((DATABASE_SHARE + GAP_SHARE) * n) :]
     if not database or not queries:
         raise DatasetError(
-            f"{path}: There are {len(database)} frames for the map and {len(queries)} queries; the "
-            "demo requires both. Use a longer sequence."
+            f"{path}: The demo requires frames for the map (found: {len(database)}) and for "
+            f"queries (found: {len(queries)}). Use a longer sequence."
         )
     return Choice(_thinned(database, MOST_DATABASE), _thinned(queries, MOST_QUERIES))
 

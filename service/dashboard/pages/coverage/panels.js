@@ -1,6 +1,6 @@
 // Beside the plan: what came of it in numbers, the worst areas, and what is in the one that is chosen.
 import { h } from "../lib/dom.js";
-import { count, degrees, metres, percent, shortId } from "../lib/format.js";
+import { count, degrees, metres, percent, shortId, things } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { checkedIn, outcomeMark, outcomeOf, outcomesIn, queriedIn, tally, TRENDS, worstCells } from "./outcomes.js";
@@ -37,7 +37,7 @@ export function worstCard(cells, wide, chosen, onchoose) {
       : h("ol", { class: "cover-worst" }, worst.slice(0, MOST_WORST).map((cell) => h("li", {},
         h("button", { type: "button", class: "cover-area", "aria-pressed": keyOf(cell) === chosen, id: `cell-${keyOf(cell)}`, onClick: () => onchoose(keyOf(cell)) },
           outcomeMark(worstOf(cell)), h("span", { class: "number" }, placeOfCell(cell, wide)),
-          h("span", { class: "muted" }, `${tally(cell)} · ${count(cell.frames)} ${cell.frames === 1 ? "frame" : "frames"} there`))))),
+          h("span", { class: "muted" }, `${tally(cell)} · ${things(cell.frames, "frame")} there`))))),
     worst.length > MOST_WORST && h("p", { class: "muted" }, `and ${count(worst.length - MOST_WORST)} more: see the table.`));
 }
 
@@ -51,7 +51,7 @@ const worstOf = (cell) => ["wrong", "not_found", "ambiguous"].find((name) => cel
 export function areaCard({ map, cell, key, wide, frames, chosen, onchoose, onoverlay, onclose }) {
   const [column, row] = key.split(",").map(Number);
   const sorted = frames.toSorted((a, b) => rankOf(b) - rankOf(a) || a.number - b.number);
-  const counts = cell ? `${count(cell.frames)} ${cell.frames === 1 ? "frame" : "frames"} there, ${count(queriedIn(cell))} queried: ${tally(cell)}.` : "No frame was taken here.";
+  const counts = cell ? `${things(cell.frames, "frame")} there, ${count(queriedIn(cell))} queried: ${tally(cell)}.` : "No frame was taken here.";
   const next = [...new Set(frames.map((one) => outcomeOf(one.outcome).next))].filter((text) => text !== null);
   return h("section", { class: "card cover-card cover-chosen-area", "aria-labelledby": "cover-area", tabindex: "-1" },
     h("div", { class: "cover-head" }, h("h2", { id: "cover-area" }, `Area at ${placeOfCell({ column, row }, wide)}`),

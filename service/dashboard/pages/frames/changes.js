@@ -1,7 +1,7 @@
 // Frames deleted and edited by one call each, repeated for what it had no time for, and undone.
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { count, time } from "../lib/format.js";
+import { things, time } from "../lib/format.js";
 import { toast } from "../lib/states.js";
 
 /** For how long a message offers to undo a change; the page of sessions lists deletions for longer. */
@@ -14,11 +14,6 @@ const offered = new Map();
  * @typedef {{frame_ids?: string[], filter?: Object<string, any>}} Selection one of the two
  * @typedef {(text: string) => void} Say of what is under way; "" when it is over
  */
-
-/** Words of a number of frames. @param {number} n */
-export function framesText(n) {
-  return `${count(n)} ${n === 1 ? "frame" : "frames"}`;
-}
 
 /**
  * Delete frames, and offer to restore them.
@@ -34,14 +29,14 @@ export async function deleteFrames(map, selection, { say = () => {}, changed = (
       const { data } = await send("POST", at("maps", map, "frames", "delete"), { json: selection });
       if (data.deletion) deletions.push(data.deletion);
       [done, left] = [done + data.frames, data.remaining];
-      say(left ? `Deleting: ${framesText(left)} left…` : "");
+      say(left ? `Deleting: ${things(left, "frame")} left…` : "");
     }
   } finally {
     say("");
     await changed(); // of one that broke off a part is gone
   }
   if (done === 0) { toast("No frame was left to delete."); return; }
-  offerRestore(map, `Deleted ${framesText(done)}.`, deletions, changed);
+  offerRestore(map, `Deleted ${things(done, "frame")}.`, deletions, changed);
 }
 
 /**
@@ -73,8 +68,8 @@ async function restore(map, deletions) {
       [done, left] = [done + data.frames, data.frames ? data.remaining : 0];
     }
   }
-  toast(`Restored ${framesText(done)}.`);
-  if (refused.size) toast(`${framesText(refused.size)} could not be restored: ${[...refused.values()][0]}.`, { kind: "bad" });
+  toast(`Restored ${things(done, "frame")}.`);
+  if (refused.size) toast(`${things(refused.size, "frame")} could not be restored: ${[...refused.values()][0]}.`, { kind: "bad" });
 }
 
 /**
@@ -94,7 +89,7 @@ export async function editFrames(map, edit, { say = () => {}, changed = () => {}
       const { data } = await send("POST", at("maps", map, "frames", "edit"), { json: { ...edit, after } });
       inverse.push(...data.inverse);
       [done, after] = [done + data.frames, data.remaining ? data.last_frame_id : undefined];
-      say(after ? `Editing: ${framesText(data.remaining)} left…` : "");
+      say(after ? `Editing: ${things(data.remaining, "frame")} left…` : "");
     } while (after !== undefined);
   } finally {
     say("");
@@ -102,10 +97,10 @@ export async function editFrames(map, edit, { say = () => {}, changed = () => {}
   }
   const act = async () => {
     for (const one of inverse) await send("POST", at("maps", map, "frames", "edit"), { json: one });
-    toast(`${framesText(done)} ${done === 1 ? "is" : "are"} as before.`);
+    toast(`${things(done, "frame")} ${done === 1 ? "is" : "are"} as before.`);
     await changed();
   };
-  toast(done ? `Changed ${framesText(done)}.` : "Nothing had to be changed.", done ? { action: { text: "Undo", act, seconds: UNDO_S } } : {});
+  toast(done ? `Changed ${things(done, "frame")}.` : "Nothing had to be changed.", done ? { action: { text: "Undo", act, seconds: UNDO_S } } : {});
   return done;
 }
 
@@ -122,8 +117,8 @@ export function recentDeletions(map, { signal, changed }) {
   async function look() {
     const { items } = await get(at("maps", map, "deletions"), { params: { limit: 20 }, signal });
     const undo = async (one) => { await restore(map, [one]); await Promise.all([look(), changed()]); };
-    put(list, items.map((one) => h("li", {}, h("span", {}, `${framesText(one.frames)}, deleted `, time(one.at), "; gone for good ", time(one.until), "."), " ",
-      h("button", { class: "button", type: "button", "aria-label": `Undo the deletion of ${framesText(one.frames)}`, onClick: () => undo(one) }, "Undo"))));
+    put(list, items.map((one) => h("li", {}, h("span", {}, `${things(one.frames, "frame")}, deleted `, time(one.at), "; gone for good ", time(one.until), "."), " ",
+      h("button", { class: "button", type: "button", "aria-label": `Undo the deletion of ${things(one.frames, "frame")}`, onClick: () => undo(one) }, "Undo"))));
     card.hidden = items.length === 0;
   }
   return Object.assign(card, { look });

@@ -1,7 +1,7 @@
 // Frames of a map, 24 at a time, by whatever the address says; their states change as they happen.
 import { at, get } from "../lib/api.js";
 import { h, put, throttle } from "../lib/dom.js";
-import { count } from "../lib/format.js";
+import { count, things } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { empty, failed, toast } from "../lib/states.js";
@@ -193,7 +193,7 @@ export async function render(root, { params, search, signal, go, title, actions 
     // a page that is not full fills by itself; a full one is not pulled away under the reader
     if (tiles.size < PAGE && clear.hidden) { fill(); return; }
     if (come.size < MOST_COME) come.add(id);
-    put(more, `${count(come.size)}${come.size < MOST_COME ? "" : " or more"} new ${come.size === 1 ? "frame" : "frames"}: show`);
+    put(more, `${come.size < MOST_COME ? things(come.size, "new frame") : `${count(come.size)} or more new frames`}: show`);
     if (!more.isConnected) put(news, more);
   }
 

@@ -1,6 +1,6 @@
 // The files of a queue as rows: how far each one is, and why it was refused in the API's words.
 import { h, put, throttle } from "../lib/dom.js";
-import { bytes, count, percent, seconds, shortId } from "../lib/format.js";
+import { bytes, count, percent, seconds, shortId, things } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { badge, isPending } from "./badge.js";
@@ -177,7 +177,7 @@ function reasonOf(item, queue, signal) {
 function importOf(item) {
   const { received = 0, there = 0, refused = 0, ignored = 0 } = item.job.result ?? {};
   const parts = [`${count(received)} imported`, there && `${count(there)} already there`, refused && `${count(refused)} refused`,
-    ignored && `${count(ignored)} files skipped`].filter(Boolean);
+    ignored && `${things(ignored, "file")} skipped`].filter(Boolean);
   const faults = item.refused ?? [];
   return [
     h("p", {}, `Frames: ${parts.join(", ")}.`),

@@ -1,9 +1,9 @@
 // Frames of the gallery that are ticked, or all that pass its filters: deleted, tagged or moved.
 import { h, put } from "../lib/dom.js";
-import { count } from "../lib/format.js";
+import { count, things } from "../lib/format.js";
 import { saveFrom } from "../lib/form.js";
 import { confirm, sheet } from "../lib/states.js";
-import { deleteFrames, editFrames, framesText } from "./changes.js";
+import { deleteFrames, editFrames } from "./changes.js";
 
 /**
  * The bar over the gallery, and the boxes of its tiles.
@@ -40,7 +40,7 @@ export function selectionBar(map, { filter, total, changed }) {
     for (const [id, input] of boxes) input.checked = all || ticked.has(id);
     const n = all ? total() : ticked.size;
     bar.hidden = !all && ticked.size === 0;
-    put(words, all ? `All ${n === null ? "frames" : framesText(n)} that match` : `${count(ticked.size)} selected`);
+    put(words, all ? `All ${n === null ? "frames" : things(n, "frame")} that match` : `${count(ticked.size)} selected`);
     every.hidden = all || filter() === null;
     put(every, "Select all that match the filters");
   }
@@ -54,7 +54,7 @@ export function selectionBar(map, { filter, total, changed }) {
 
   /** What is selected, as the API takes it. */
   const chosen = () => (all ? { filter: filter() ?? {} } : { frame_ids: [...ticked] });
-  const shown = () => (all ? (total() === null ? "all frames that match the filters" : framesText(total() ?? 0)) : framesText(ticked.size));
+  const shown = () => (all ? (total() === null ? "all frames that match the filters" : things(total() ?? 0, "frame")) : things(ticked.size, "frame"));
   const how = { say: (text) => put(busy, text), changed: async () => { clear(); await changed(); } };
 
   async function remove() {

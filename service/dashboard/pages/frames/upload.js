@@ -1,7 +1,7 @@
 // Upload: files dropped or chosen, what is said of them, and what became of each.
 import { at, get } from "../lib/api.js";
 import { h, put, throttle } from "../lib/dom.js";
-import { bytes, count } from "../lib/format.js";
+import { bytes, count, things } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may, me } from "../lib/session.js";
 import { empty } from "../lib/states.js";
@@ -57,7 +57,7 @@ export async function render(root, { params, signal, title, actions }) {
     if (told.length) words.push("The camera settings were read from the dropped files.");
     const beside = found.filter((one) => Object.keys(one.said).length).length;
     if (beside) words.push(`${count(beside)} of ${count(found.length)} use the intrinsics.json or clouds.json in their folder.`);
-    if (left.length) words.push(`${count(left.length)} ${left.length === 1 ? "file was" : "files were"} skipped, not a frame: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ", …" : ""}`);
+    if (left.length) words.push(`${things(left.length, "file was", "files were")} skipped, not a frame: ${left.slice(0, 3).join(", ")}${left.length > 3 ? ", …" : ""}`);
     if (!found.length && !told.length && !left.length && !faults.length) words.push("It contains nothing readable.");
     put(note, words.join(" "));
     put(said);
@@ -98,7 +98,7 @@ export async function render(root, { params, signal, title, actions }) {
     }
     const ready = states.ready ?? 0;
     const busy = (states.sending ?? 0) + (states.waiting ?? 0);
-    put(start, ready ? `Upload ${count(ready)} ${ready === 1 ? "file" : "files"}` : "Upload");
+    put(start, ready ? `Upload ${things(ready, "file")}` : "Upload");
     start.hidden = ready === 0;
     bar.hidden = queue.items.length === 0;
     place.toggleAttribute("data-small", queue.items.length > 0);

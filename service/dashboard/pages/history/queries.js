@@ -2,7 +2,7 @@
 // again.
 import { get, watch } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { confidence, count, ms, shortId, time } from "../lib/format.js";
+import { confidence, count, ms, shortId, things, time } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { empty, soon } from "../lib/states.js";
@@ -51,7 +51,7 @@ export async function render(root, { params, search, signal, go, title }) {
     card.hidden = found.length === 0;
     none.hidden = found.length > 0;
     news.hidden = fresh.size === 0;
-    put(news, `Show ${fresh.size === 1 ? "1 new query" : `${count(fresh.size)} new queries`}`);
+    put(news, `Show ${things(fresh.size, "new query", "new queries")}`);
   }
   async function newest() {
     const told = await page(null);

@@ -10,6 +10,11 @@ export function count(n) {
   return isNumber(n) ? WHOLE.format(n) : NONE;
 }
 
+/** A number with the name of what it counts: "1 frame", "2 queries". @param {number} n @param {string} one @param {string} [many] */
+export function things(n, one, many = `${one}s`) {
+  return `${count(n)} ${n === 1 ? one : many}`;
+}
+
 /** A size: "1.2 MB". @param {number | null | undefined} n bytes */
 export function bytes(n) {
   if (!isNumber(n)) return NONE;

@@ -1,7 +1,7 @@
 // A map as a card: its plan with the robots on it, its last answers, and what is in it.
 import { get } from "../lib/api.js";
 import { h, once, put, svg } from "../lib/dom.js";
-import { count, time } from "../lib/format.js";
+import { count, things, time } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { LOST, STATUSES } from "../lib/statuses.js";
@@ -70,7 +70,7 @@ export function mapCard(map, { signal, changed }) {
   function share() {
     const { recent_queries: counts } = card.map, of = (states) => states.reduce((n, one) => n + (counts[one] ?? 0), 0);
     const all = of(["found", ...LOST]), others = of(["unvalidated"]);
-    const queries = (n) => `${n === 0 ? "No" : count(n)} ${n === 1 ? "query" : "queries"}`;
+    const queries = (n) => (n === 0 ? "No queries" : things(n, "query", "queries"));
     put(parts.share, all === 0 ? h("span", { class: "muted" }, queries(others), others > 0 && " without validation", " in the last hour")
       : [h("strong", { class: "number" }, `${Math.floor((100 * of(["found"])) / all)} %`), ` of ${queries(all)} found in the last hour`]);
   }

@@ -1,5 +1,5 @@
 // The state of all maps in one sentence, and where to see what is wrong.
-import { count } from "../lib/format.js";
+import { things } from "../lib/format.js";
 import { link } from "../lib/router.js";
 
 const DAY_MS = 86_400_000; // a job that failed before is no news
@@ -25,18 +25,18 @@ export function waiting(map) {
 export function conditionOf(maps, jobs) {
   const failed = maps.filter((one) => lost(one) > 0), frames = failed.reduce((n, one) => n + lost(one), 0);
   const left = maps.reduce((n, one) => n + waiting(one), 0);
-  const queue = left === 0 ? "nothing waits" : `${things(left, "frame").toLowerCase()} ${left === 1 ? "waits" : "wait"}`;
+  const queue = left === 0 ? "nothing waits" : `${some(left, "frame").toLowerCase()} ${left === 1 ? "waits" : "wait"}`;
   if (frames > 0) {
     const [{ name }] = failed, many = failed.length > 1;
-    return { kind: "bad", text: `${things(frames, "frame")} of ${many ? `${failed.length} maps` : `\`${name}\``} failed permanently; ${queue}.`,
+    return { kind: "bad", text: `${some(frames, "frame")} of ${many ? `${failed.length} maps` : `\`${name}\``} failed permanently; ${queue}.`,
       href: many ? link("operations", { tab: "jobs", state: "dead" }) : link("maps", name, { state: "failed" }) };
   }
   if (jobs.length > 0) {
     const [{ kind, map, job_id: id }] = jobs, many = jobs.length > 1;
-    return { kind: "bad", text: many ? `${things(jobs.length, "job")} failed; ${queue}.` : `The \`${kind}\` job${map === null ? "" : ` of \`${map}\``} failed; ${queue}.`,
+    return { kind: "bad", text: many ? `${some(jobs.length, "job")} failed; ${queue}.` : `The \`${kind}\` job${map === null ? "" : ` of \`${map}\``} failed; ${queue}.`,
       href: many ? link("operations", { tab: "jobs", state: "dead" }) : link("operations", "jobs", id) };
   }
-  if (left > 0) return { kind: "neutral", text: `${things(left, "frame")} ${left === 1 ? "waits" : "wait"} for a signature; no job failed.`, href: null };
+  if (left > 0) return { kind: "neutral", text: `${some(left, "frame")} ${left === 1 ? "waits" : "wait"} for a signature; no job failed.`, href: null };
   return { kind: "good", text: "Everything is signed; no job failed.", href: null };
 }
 
@@ -45,6 +45,4 @@ function lost(map) {
   return (map.frames.failed ?? 0) + (map.reencoding?.dead ?? 0);
 }
 
-function things(n, name) {
-  return n === 1 ? `One ${name}` : `${count(n)} ${name}s`;
-}
+const some = (n, name) => (n === 1 ? `One ${name}` : things(n, name));

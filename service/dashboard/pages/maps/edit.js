@@ -1,7 +1,7 @@
 // Maps made, retitled and removed.
 import { at, get, send } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { bytes, count } from "../lib/format.js";
+import { bytes, things } from "../lib/format.js";
 import { saveFrom } from "../lib/form.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
@@ -73,7 +73,7 @@ export async function retitleMap(map, changed) {
 /** Ask for the name of a map to be typed, and remove it. */
 export async function deleteMap(map, changed) {
   const frames = Object.entries(map.frames).reduce((n, [state, one]) => n + (state === "deleted" ? 0 : one), 0);
-  const text = `Its ${count(frames)} ${frames === 1 ? "frame" : "frames"} with their uploads, signatures and index are permanently deleted. Only a snapshot can restore them.`;
+  const text = `This permanently deletes its ${things(frames, "frame")} with uploads, signatures and index. Only a snapshot can restore them.`;
   if (!(await confirm({ title: `Delete ${map.title ?? map.name}?`, text, word: map.name, action: "Delete map" }))) return;
   await send("DELETE", at("maps", map.name));
   toast(`${map.name} was deleted.`);

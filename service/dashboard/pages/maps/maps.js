@@ -1,7 +1,7 @@
 // The fleet: whether all is well, and a card for each map, whose robots and counts move by events.
 import { at, get, watch } from "../lib/api.js";
 import { h, once, put } from "../lib/dom.js";
-import { count } from "../lib/format.js";
+import { things } from "../lib/format.js";
 import { may, me } from "../lib/session.js";
 import { coded } from "../lib/prose.js";
 import { empty } from "../lib/states.js";
@@ -58,7 +58,7 @@ export async function render(root, { signal, go, title, actions }) {
   function sum() {
     const all = [...cards.values()].map((card) => card.map);
     const indexed = all.reduce((n, one) => n + (one.frames.indexed ?? 0), 0);
-    put(summary, `${count(all.length)} ${all.length === 1 ? "map" : "maps"} · ${count(indexed)} frames indexed`);
+    put(summary, `${things(all.length, "map")} · ${things(indexed, "frame")} indexed`);
     const { kind, text, href } = conditionOf(all, failures);
     if (health.dataset.text === text) return; // it is told to screen readers
     Object.assign(health.dataset, { kind, text });

@@ -1,6 +1,6 @@
 // Beside the view: the verdict, what it was reached from, and how far it can be trusted.
 import { h } from "../lib/dom.js";
-import { count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
+import { count, degrees, frameLabel, metres, percent, shortId, things } from "../lib/format.js";
 import { coded, sentence } from "../lib/prose.js";
 import { link } from "../lib/router.js";
 import { voteOf } from "../query/alternatives.js";
@@ -98,7 +98,7 @@ export function uncertaintyCard(details) {
     axes(optical, [["Shift", sigma.slice(0, 3).map((s) => `± ${metres(s)}`)],
       ["Turn", sigma.slice(3).map((s) => `± ${fine((s * 180) / Math.PI)}`)]]),
     free.length
-      ? h("div", {}, h("p", {}, h("span", { class: "badge", dataset: { kind: "warn" } }, `${free.length} free ${free.length === 1 ? "direction" : "directions"}`)),
+      ? h("div", {}, h("p", {}, h("span", { class: "badge", dataset: { kind: "warn" } }, things(free.length, "free direction"))),
         h("ul", { class: "overlay-free" }, free.map((one) => h("li", {}, freedom(one, optical)))))
       : h("p", { class: "muted" }, "All six directions are constrained."));
 }

@@ -2,7 +2,7 @@
 // runs are not in it, and why.
 
 import { h } from "../lib/dom.js";
-import { count } from "../lib/format.js";
+import { count, things } from "../lib/format.js";
 import { tintOf } from "./scene.js";
 
 /**
@@ -37,7 +37,7 @@ export function legend(paths, hidden, onchange) {
 /** @param {import("./data.js").Run} run */
 export const nameOf = (run) => run.session;
 
-const poses = ({ ids, posed }) => (ids.length < posed ? `${count(ids.length)} of ${count(posed)} poses` : `${count(posed)} ${posed === 1 ? "pose" : "poses"}`);
+const poses = ({ ids, posed }) => (ids.length < posed ? `${count(ids.length)} of ${count(posed)} poses` : things(posed, "pose"));
 
 /**
  * What of the map is not in the picture, in words.
@@ -46,8 +46,8 @@ const poses = ({ ids, posed }) => (ids.length < posed ? `${count(ids.length)} of
 export function leftOut(without) {
   if (!without.length) return null;
   return h("details", { class: "paths-left", open: without.length <= 4 },
-    h("summary", {}, `Not shown: ${count(without.length)} ${without.length === 1 ? "run" : "runs"}`),
+    h("summary", {}, `Not shown: ${things(without.length, "run")}`),
     h("ul", {}, without.slice(0, 50).map((one) => h("li", {},
-      h("strong", {}, one.name), h("span", { class: "muted" }, ` · ${count(one.frames)} ${one.frames === 1 ? "frame" : "frames"}: ${one.why}`)))),
+      h("strong", {}, one.name), h("span", { class: "muted" }, ` · ${things(one.frames, "frame")}: ${one.why}`)))),
     without.length > 50 && h("p", { class: "muted" }, `and ${count(without.length - 50)} more`));
 }

@@ -3,7 +3,7 @@
 
 import { at } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { count } from "../lib/format.js";
+import { count, things } from "../lib/format.js";
 import { followJob, goesOn } from "../lib/products.js";
 import { plain } from "../lib/prose.js";
 import { go } from "../lib/router.js";
@@ -164,7 +164,7 @@ export class Runs {
     put(list, legend(this.#drawn, this.#hidden, () => this.scene.hide(this.#hidden)));
     const many = this.more && h("p", { class: "muted" }, `From the first ${count(MOST_RUNS)} runs of the map.`);
     put(this.runsBox, list, leftOut(without), many);
-    put(this.said, `${count(this.#drawn.length)} runs are drawn in ${this.parent}, ${count(without.length)} are not.`);
+    put(this.said, `${things(this.#drawn.length, "run is", "runs are")} drawn in ${this.parent}, ${count(without.length)} not.`);
   }
 
   #ask() {

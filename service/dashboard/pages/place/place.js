@@ -3,7 +3,7 @@
 
 import { at, send, watch } from "../lib/api.js";
 import { h, once, put } from "../lib/dom.js";
-import { count } from "../lib/format.js";
+import { count, things } from "../lib/format.js";
 import { picture } from "../lib/picture.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
@@ -236,7 +236,7 @@ class Place {
   #state() {
     const { record } = this.surface, write = may("write", this.map);
     const begin = (text) => write && h("button", { class: "button", type: "button", onClick: once(() => this.#begin()) }, text);
-    const left = `${count(record.frames_left)} ${record.frames_left === 1 ? "frame" : "frames"}`;
+    const left = things(record.frames_left, "frame");
     const whole = record.frames + record.frames_left;
     this.notice.hidden = record.state === "ready" || (record.state === "none" && record.frames_left === 0);
     if (record.state === "none") put(this.notice, record.error && h("p", {}, record.error), h("span", {}, `The surface of ${left} is not built yet.`), begin("Build it now"));

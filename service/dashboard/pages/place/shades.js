@@ -1,7 +1,7 @@
 // What the colours of the surface mean, and which heights of it are drawn.
 
 import { h, put } from "../lib/dom.js";
-import { count, time } from "../lib/format.js";
+import { count, things, time } from "../lib/format.js";
 import { tintOf } from "../paths/scene.js";
 
 export const COLOURS = [["height", "Height"], ["session", "Session"], ["seen", "Times seen"], ["age", "Last seen"]];
@@ -64,7 +64,7 @@ export function shades(surface, onchange) {
     [low, high].forEach((height, i) => { ends[i].value = String(Math.min(Math.max(stepAt(height), 0), STEPS)); });
     tell();
     put(ceiling, !surface.isChosen && surface.cut !== null && "The upper part is not drawn: it covers the rest.");
-    put(facts, `${count(record.frames)} ${record.frames === 1 ? "frame" : "frames"}, updated `, time(record.updated_at));
+    put(facts, `${things(record.frames, "frame")}, updated `, time(record.updated_at));
   }
 
   return { element, draw };

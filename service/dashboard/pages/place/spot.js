@@ -2,7 +2,7 @@
 
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { count, frameLabel, frameTitle, metres, time } from "../lib/format.js";
+import { frameLabel, frameTitle, metres, things, time } from "../lib/format.js";
 import { picture } from "../lib/picture.js";
 import { link } from "../lib/router.js";
 import { failed } from "../lib/states.js";
@@ -47,7 +47,7 @@ export function sightings({ map, signal, onclose }) {
           cursor = page.next_cursor;
         } while (cursor !== null && added < AT_ONCE);
         found += added;
-        put(said, found === 0 ? none : `${count(found)} ${found === 1 ? "frame" : "frames"}${cursor === null ? "" : ", and more"}`);
+        put(said, found === 0 ? none : `${things(found, "frame")}${cursor === null ? "" : ", and more"}`);
       } catch (error) {
         if (error.name === "AbortError" || own !== turn) return;
         put(said, failed(error));

@@ -1,6 +1,6 @@
 // The poses of an ambiguous answer: of one rank, each with what speaks for it; none is the answer.
 import { h } from "../lib/dom.js";
-import { confidence, count, degrees, metres, percent } from "../lib/format.js";
+import { confidence, degrees, metres, percent, things } from "../lib/format.js";
 import { apart } from "../overlay/words.js";
 import { evidenceOf, number } from "./words.js";
 
@@ -50,7 +50,7 @@ function alternative(one, i, first, view) {
     h("dl", {},
       figure("Confidence", confidence(sure), sure),
       evidence && figure("Score", percent(evidence.score), evidence.score),
-      figure("Support", support === 0 ? "the map alone" : `${count(support)} ${support === 1 ? "match" : "matches"}`)),
+      figure("Support", support === 0 ? "the map alone" : things(support, "match", "matches"))),
     h("p", { class: "alternatives-why muted" }, evidenceOf(one)));
 }
 

@@ -1,7 +1,7 @@
 // An answer as it is shown: the verdict, plan and overlay, and folded below why it is so.
 import { at, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
+import { count, degrees, frameLabel, metres, percent, shortId, things } from "../lib/format.js";
 import { heatmap } from "../lib/heatmap.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
@@ -128,7 +128,7 @@ function poseOf(location, kind) {
       ahead && ["Viewing direction", ahead],
       ["In the frame", parent], ["Of", location.pose.child_frame],
       sure && ["One standard deviation", `${metres(sure.m)}, ${degrees(sure.deg)} (worst axis)`],
-      free.length > 0 && ["Poorly constrained", `${free.length} ${free.length === 1 ? "direction" : "directions"}`],
+      free.length > 0 && ["Poorly constrained", things(free.length, "direction")],
     ].filter(Boolean).map(([term, value]) => h("div", {}, h("dt", {}, term), h("dd", { class: "number" }, value)))));
 }
 

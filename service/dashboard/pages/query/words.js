@@ -1,5 +1,5 @@
 // What an answer says, in one line a lost person understands, and in figures.
-import { confidence, count, degrees, frameLabel, metres, percent, shortId } from "../lib/format.js";
+import { confidence, count, degrees, frameLabel, metres, percent, shortId, things } from "../lib/format.js";
 import { sentence } from "../lib/prose.js";
 
 const STATUS = {
@@ -127,7 +127,7 @@ export function grounds({ support, guided, votes, strength, verified_by: by, spr
   else told.push(support === 1 ? "one view" : `${count(support)} of ${count(votes)} accepted matches agree on this pose${guided > 0 ? `, ${count(guided)} of them guided by the others` : ""}, within ${metres(shift)}, ${degrees(turn)}`);
   if (support > 0) told.push(`${strength} match${support === 1 ? "" : "es"}`);
   const apart = votes - support;
-  if (apart > 0) told.push(`${count(apart)} accepted ${apart === 1 ? "match votes" : "matches vote"} for another pose`);
+  if (apart > 0) told.push(`${things(apart, "accepted match votes", "accepted matches vote")} for another pose`);
   return told;
 }
 
@@ -139,10 +139,6 @@ export function evidenceOf({ evidence, verified_by: by }) {
   const place = by === "prior" ? "place that the prior expects" : "place";
   const next = rival < 0.05 ? `no other ${place} fits` : `the next best ${place} fits ${percent(rival)} as well`;
   return `${things(Math.round(planes), "plane")} and ${things(frames, "frame")} of the map agree, ${missing} is missing, ${next}`;
-}
-
-function things(n, name) {
-  return `${count(n)} ${name}${n === 1 ? "" : "s"}`;
 }
 
 /**
@@ -164,7 +160,7 @@ function reasons(matches) {
     const text = validation.reason.replace(/-?\d+(\.\d+)?( ?%| m| deg)/g, "…$2");
     tally.set(text, (tally.get(text) ?? 0) + 1);
   }
-  return [...tally].sort((a, b) => b[1] - a[1]).slice(0, 3).map(([text, n]) => `${count(n)} ${n === 1 ? "candidate" : "candidates"}: ${text}`);
+  return [...tally].sort((a, b) => b[1] - a[1]).slice(0, 3).map(([text, n]) => `${things(n, "candidate")}: ${text}`);
 }
 
 /** Standard deviations of the worst axes of a covariance in the order of ROS. */

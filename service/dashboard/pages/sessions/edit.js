@@ -1,7 +1,8 @@
 // A session renamed, tagged or deleted, each of which can be undone.
-import { deleteFrames, editFrames, framesText as of } from "../frames/changes.js";
+import { deleteFrames, editFrames } from "../frames/changes.js";
 import { h, put } from "../lib/dom.js";
 import { reasonOf, saveFrom } from "../lib/form.js";
+import { things } from "../lib/format.js";
 import { confirm, sheet } from "../lib/states.js";
 
 /**
@@ -48,7 +49,7 @@ export function tagSession(map, one, all, how) {
 /** Ask for the name of a session to be typed, and delete all its frames. @param {string} map
  * @param {Session} one @param {Session[]} all @param {How} how */
 export async function deleteSession(map, one, all, how) {
-  const text = [h("p", {}, `All its ${of(framesOf(one, all))} are deleted, and queries no longer find them. You can undo this for a while: the message that follows says until when.`), others(one, all)];
+  const text = [h("p", {}, `Queries no longer find its ${things(framesOf(one, all), "frame")}. You can undo this for a while: the message that follows says until when.`), others(one, all)];
   if (!(await confirm({ title: `Delete ${one.session}?`, text, word: one.session, action: "Delete session" }))) return;
   await deleteFrames(map, { filter: chosen(one) }, how);
   if (document.activeElement === document.body) document.getElementById("title").focus({ preventScroll: true }); // its row is gone
@@ -65,7 +66,7 @@ function form(one, all, { title, label, value, action, hint = "", save }) {
   const input = h("input", { id: "session-field", autocomplete: "off", spellcheck: "false", value, "aria-describedby": "session-why session-hint" });
   const why = h("p", { class: "field-error", id: "session-why", role: "alert" });
   const dialog = sheet({ title, buttons: h("button", { class: "button primary" }, action), children: [
-    h("p", { class: "dialog-text muted" }, `${one.session}: ${of(framesOf(one, all))}`), others(one, all),
+    h("p", { class: "dialog-text muted" }, `${one.session}: ${things(framesOf(one, all), "frame")}`), others(one, all),
     h("div", { class: "field" }, h("label", { for: input.id }, label), input, why, h("p", { class: "muted", id: "session-hint" }, hint)),
     h("p", { class: "muted sessions-left", role: "status" }),
   ] });

@@ -3,7 +3,7 @@
 import { recentDeletions } from "../frames/changes.js";
 import { at, get, watch } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
-import { count, seconds } from "../lib/format.js";
+import { count, seconds, things } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { empty } from "../lib/states.js";
@@ -89,7 +89,7 @@ export async function render(root, { params, signal, title, actions }) {
     show(found);
     more.hidden = cursor === null;
     const frames = found.reduce((n, one) => n + sum(one.frames), 0);
-    put(summary, cursor === null ? `${count(found.length)} ${found.length === 1 ? "session" : "sessions"} · ${count(frames)} frames` : `The first ${count(found.length)} sessions`);
+    put(summary, cursor === null ? `${things(found.length, "session")} · ${things(frames, "frame")}` : `The first ${count(found.length)} sessions`);
     if (!card.isConnected) put(root, h("div", { class: "toolbar" }, summary, said), card, more, deleted);
   }
 
