@@ -54,18 +54,6 @@ def test_labels_stand_at_whole_minutes_of_the_clock(call):
     assert call("lib/scales", "return m.timeTicks([], 5)") == []
 
 
-def test_a_sparkline_is_of_all_values_from_nothing_to_the_most(call):
-    told = call("lib/sparkline", "return m.sparkPoints([0, 2, 1, 4], 90, 20, 2)")
-    assert told == [[0, 18], [30, 10], [60, 14], [90, 2]]
-    assert call("lib/sparkline", "return m.sparkPoints([0, 0], 90, 20, 2)") == [
-        [0, 18],
-        [90, 18],
-    ]
-    drawn = """const e = m.sparkline([5], {label: "<b>grown</b>"}), line = e.lastElementChild;
-        return [e.getAttribute("role"), e.getAttribute("aria-label"), line.getAttribute("d")]"""
-    assert call("lib/sparkline", drawn) == ["img", "<b>grown</b>", "M0 1.5L96 1.5"]
-
-
 def test_a_chart_reads_out_what_the_keys_point_at_and_keeps_it(call, page):
     call("lib/charts", """
         const one = m.chart({title: "Apples", kind: "bars", format: (n) => `${n} pc`,

@@ -34,14 +34,14 @@ export async function renderTab(root, { search, signal }) {
   const whole = map === null;
   const line = health(signal);
   const failures = failureList(map, signal);
-  const now = tiles(whole), figures = h("div", {});
+  const figures = h("div", {});
   const hour = history(whole);
   const columns = h("div", { class: "columns" });
   const show = rows(columns, ({ part }) => part, ({ part, ...stats }) => CARDS[part](stats));
 
   async function look() {
     const [stats] = await Promise.all([get("stats", { params: { map }, signal }), line.look(signal), failures.look()]);
-    put(figures, now(stats));
+    put(figures, tiles(whole, stats));
     hour.update(stats);
     show(["indexes", whole ? "workers" : "use", "bytes"].map((part) => ({ part, [part]: stats[part] })));
   }

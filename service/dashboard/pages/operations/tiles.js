@@ -1,33 +1,20 @@
 // The figures of this moment, large: what waits, who works, what was refused, how full the disk is.
 import { h } from "../lib/dom.js";
 import { bytes, count, percent, seconds } from "../lib/format.js";
-import { sparkline } from "../lib/sparkline.js";
 import { gauge } from "./machines.js";
 
-const REMEMBERED = 60; // polls of the queue that the little line shows
 const OLD_S = 300; // a frame that waits longer than this needs attention
 
-/**
- * Tiles for the whole service, or for one map where `whole` is false.
- * @param {boolean} whole
- * @returns {(stats: Object<string, any>) => HTMLElement} draws them
- */
-export function tiles(whole) {
-  const waited = [];
-  return (stats) => {
-    waited.push(stats.waiting);
-    if (waited.length > REMEMBERED) waited.shift();
-    const line = waited.length > 1 && Math.max(...waited) > 0
-      && sparkline(waited, { label: `Waiting jobs since this page was opened: now ${stats.waiting}, at most ${Math.max(...waited)}`, width: 88 });
-    const old = stats.oldest_waiting_s.sign ?? null;
-    const shown = [
-      tile("Waiting jobs", "waiting", count(stats.waiting), [`${count(stats.jobs.running ?? 0)} running`, line]),
-      tile("Oldest frame not signed", "oldest", old === null ? "–" : seconds(old), old === null ? "up to date" : "since its upload", old > OLD_S ? "warn" : null),
-      tile("Indexed frames", "indexed", count(stats.frames.indexed ?? 0), others(stats.frames)),
-    ];
-    // of which answer these figures are
-    return h("section", { class: "tiles", "aria-label": "Now", dataset: { at: stats.at } }, shown, whole && ofService(stats));
-  };
+/** Tiles for the whole service, or for one map where `whole` is false. @param {boolean} whole @param {Object<string, any>} stats */
+export function tiles(whole, stats) {
+  const old = stats.oldest_waiting_s.sign ?? null;
+  const shown = [
+    tile("Waiting jobs", "waiting", count(stats.waiting), `${count(stats.jobs.running ?? 0)} running`),
+    tile("Oldest frame not signed", "oldest", old === null ? "–" : seconds(old), old === null ? "up to date" : "since its upload", old > OLD_S ? "warn" : null),
+    tile("Indexed frames", "indexed", count(stats.frames.indexed ?? 0), others(stats.frames)),
+  ];
+  // of which answer these figures are
+  return h("section", { class: "tiles", "aria-label": "Now", dataset: { at: stats.at } }, shown, whole && ofService(stats));
 }
 
 /** @param {Object<string, any>} stats */
