@@ -215,6 +215,11 @@ def test_it_is_measured_and_frames_are_boxed(page, station, built, settle, until
     assert picture.getpixel((round(x), round(y))) != ground
 
 
+FOLLOWED = """([css, p]) => {
+  const { viewer, scene } = document.querySelector(css), { target, distance } = viewer.camera;
+  return [Math.hypot(...scene.near(p).map((x, k) => x - target[k])), distance]; }"""
+
+
 @pytest.fixture(scope="module")
 def patrolled(station):
     """A map that two robots asked: spot was found twice, cart once, and then not any more."""
@@ -293,10 +298,29 @@ def test_robots_stand_where_their_queries_found_them(page, station, patrolled, s
     page.goto(f"{station.home}#/maps/patrolled/place")
     settle(page)
     assert station.client.get("/v1/queries", params=listed).json()["items"] == before
-    # a query that is answered meanwhile moves its robot
+
+    def followed(answer: dict[str, Any]) -> list[float]:
+        """How far the robot of an answer is from the middle of the picture; the distance to it."""
+        at = [answer["location"]["pose"]["translation"][axis] for axis in "xyz"]
+        off, far = page.evaluate(FOLLOWED, [CANVAS, at])
+        return [round(off, 6), far]
+
+    follow = page.get_by_role("button", name="Follow cart")
+    follow.click()
+    expect(follow).to_have_attribute("aria-pressed", "true")
+    assert followed(second)[0] == 0
+    page.locator(CANVAS).press("+")
+    _, near = followed(second)
+    # a query that is answered meanwhile moves its robot, and the camera with it
     moved = ask(station, "cart", 0)
     until(lambda: stands("robot", "cart", moved))
     expect(rows.first).to_contain_text("cart")
+    assert followed(moved) == [0, near]
+    follow.press("Enter")  # and no longer
+    expect(follow).to_have_attribute("aria-pressed", "false")
+    left = ask(station, "cart", 2)
+    until(lambda: stands("robot", "cart", left))
+    assert followed(moved) == [0, near]
 
 
 @pytest.mark.thorough

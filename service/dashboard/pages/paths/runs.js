@@ -91,7 +91,7 @@ export class Runs {
       map: this.map, signal: this.signal, onchoose: (one) => this.choose(one),
       onapproach: () => { const one = this.card.chosen; if (one) this.scene.approach(this.#drawn[one.path].world[one.place]); },
     });
-    this.parents = h("select", { id: "paths-parent", onChange: () => { this.parent = this.parents.value; this.draw(); } });
+    this.parents = h("select", { id: "paths-parent", onChange: () => this.show(this.parents.value) });
     this.together = h("input", { type: "checkbox", id: "paths-joined", checked: this.joined, onChange: () => { this.joined = this.together.checked; this.draw(); } });
     this.ups = h("select", { id: "paths-up", onChange: () => { this.up = this.ups.value || null; this.draw(); } },
       [["", "Auto"], ["z", "z"], ["y", "y"], ["-y", "−y"]].map(([value, text]) => h("option", { value, selected: (this.up ?? "") === value }, text)));
@@ -105,6 +105,12 @@ export class Runs {
         h("label", { class: "field" }, h("span", {}, "Up axis"), this.ups)),
       h("label", { class: "paths-check" }, this.together, h("span", {}, "and frames joined to it by associations")),
       this.runsBox);
+  }
+
+  /** Draw another parent frame. @param {string} parent */
+  show(parent) {
+    this.parent = parent;
+    return this.draw();
   }
 
   /** Draw what the choices say; what was fetched before is not fetched again. */
@@ -178,7 +184,7 @@ export class Runs {
     const { asked } = this, join = this.#reached.get(asked.parent)?.matrix;
     const drawn = Boolean(join);
     put(this.asks, askedPanel(asked, {
-      drawn, onshow: () => { this.parent = asked.parent; this.draw(); },
+      drawn, onshow: () => this.show(asked.parent),
       onclose: () => { this.asked = null; this.#ask(); this.onchange(); },
     }));
     const camera = this.#drawn.find((one) => one.camera)?.camera ?? null;

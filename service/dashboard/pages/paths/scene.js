@@ -239,9 +239,10 @@ export class Scene {
     this.#moved();
   }
 
-  /** Look at one place from near by. @param {number[]} pose in the picture's frame */
-  approach(pose) {
-    this.#viewer.look({ target: this.near(placeOf(pose)), distance: 12 * this.#size });
+  /** Look at one place, from near by or from as far as now. @param {number[]} pose in the picture's frame
+   * @param {boolean} [isNear] */
+  approach(pose, isNear = true) {
+    this.#viewer.look({ target: this.near(placeOf(pose)), distance: isNear ? Math.max(12 * this.#size, this.#wide / 2) : undefined });
     this.#moved();
   }
 
@@ -336,7 +337,7 @@ export class Scene {
     });
     const shown = this.#labels.flatMap((one, i) => (seen[i] ? [{ node: one.node, ...one.size, x: seen[i][0], y: seen[i][1] }] : []));
     for (const { node } of this.#labels) node.hidden = true;
-    spread(shown).forEach((spot, i) => {
+    spread(shown, { width: this.canvas.clientWidth, height }).forEach((spot, i) => {
       const { node, x, y } = shown[i];
       node.hidden = spot === null;
       if (spot === null) return;

@@ -58,6 +58,10 @@ export class Robots {
   /** @type {Timer} */
   #player = null;
   #later;
+  /** @type {string | null} the robot that the camera follows, and the frame in which it came near */
+  #followed = null;
+  /** @type {string | null} */
+  #near = null;
   /** @type {string | null | undefined} the period that the list of periods tells */
   #period;
   /** @type {any} elements of the section */
@@ -180,7 +184,6 @@ export class Robots {
 
   #row({ name, token, last, found, lost }) {
     const [kind, word] = STATUSES[last.status] ?? ["neutral", last.status];
-    const pose = found && this.#pose(found);
     const failures = lost.slice(-MOST_FAILURES).reverse();
     return h("li", { dataset: { robot: name } },
       h("div", { class: "paths-row" }, h("span", { class: "place-robot", style: { "--robot": `var(${token})` } }), h("strong", { class: "paths-name" }, name), h("span", { class: "badge", dataset: { kind } }, word)),
@@ -191,7 +194,7 @@ export class Robots {
         h("li", {}, h("a", { href: linkOf(record, this.map) }, STATUSES[record.status][1], ", ", time(record.at))))),
       lost.length > failures.length && h("a", { href: link("maps", this.map, "queries", { robot: last.robot, status: "lost" }) }, `All its ${count(lost.length)} failures`),
       h("div", { class: "toolbar" },
-        pose && h("button", { class: "button quiet", type: "button", "aria-label": `Go to ${name}`, onClick: () => this.scene.approach(pose) }, "Go to it"),
+        found && this.runs.names.includes(found.pose.parent_frame) && h("button", { class: "button quiet", type: "button", "aria-label": `Follow ${name}`, "aria-pressed": this.#followed === name, onClick: () => this.#follow(name) }, "Follow"),
         h("a", { class: "button quiet", href: linkOf(last, this.map), "aria-label": `Last query of ${name}` }, "Last query")));
   }
 
@@ -201,6 +204,20 @@ export class Robots {
     if (!matrix) return null;
     const { translation: t, rotation: q } = pose;
     return multiply(matrix, ofQuaternion([q.x, q.y, q.z, q.w], [t.x, t.y, t.z]));
+  }
+
+  // look at a robot, and after it with each answer; once more: no longer
+  #follow(name) {
+    this.#followed = this.#followed === name ? null : name;
+    this.#near = null;
+    this.draw();
+  }
+
+  #look(found) {
+    const { parent_frame: parent } = found.pose, pose = this.#pose(found);
+    if (pose === null) { if (this.runs.names.includes(parent)) this.runs.show(parent); return; } // which draws this again
+    this.scene.approach(pose, this.#near !== this.runs.parent);
+    this.#near = this.runs.parent;
   }
 
   #marks(robots) {
@@ -224,6 +241,8 @@ export class Robots {
     }
     this.scene.sensors("robots", drawn);
     this.scene.mark("robots", marks);
+    const followed = robots.find((one) => one.name === this.#followed)?.found;
+    if (followed) this.#look(followed);
   }
 
   #go(shown) {
