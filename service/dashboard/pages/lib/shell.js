@@ -49,6 +49,7 @@ export function drawHead(route, params) {
     const href = section === "frames" ? link("maps", map) : link("maps", map, section);
     return h("a", { href, "aria-current": section === route.section && "page" }, text);
   }));
+  tabs.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest", inline: "center" }); // they are wider than a phone
 }
 
 /** Navigation, theme, and whose key is shown. @param {any} route @param {() => void} again */
