@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -60,15 +61,15 @@ def test_sessions_that_share_no_frame_are_joined_on_the_page_where_that_is_sure(
 
 
 def test_two_sessions_are_compared_and_seen_side_by_side(station, weeks, page, settle, axe):
-    page.goto(f"{station.home}#/maps/weeks/sessions")
+    page.goto(f"{station.home}#/maps/weeks/difference?before=monday&after=tuesday")
     settle(page)
-    page.get_by_role("link", name="Compare session tuesday").click()
-    settle(page)
-    assert "difference?before=monday&after=tuesday" in page.url
     expect(page.get_by_role("heading", name="Not compared yet")).to_be_visible()
     assert station.client.get(f"{weeks}/differences").json()["items"] == []  # looking begins none
     assert axe(page) == []
-    page.get_by_role("button", name="Compare").click()
+    page.goto(f"{station.home}#/maps/weeks/sessions")
+    settle(page)
+    page.get_by_role("link", name="Compare session tuesday").click()  # which begins one
+    expect(page).to_have_url(re.compile(r"difference\?before=monday&after=tuesday$"))
     legend = page.get_by_role("list", name="Legend")
     expect(legend).to_be_visible()
     settle(page)
@@ -99,6 +100,11 @@ def test_two_sessions_are_compared_and_seen_side_by_side(station, weeks, page, s
     expect(page.get_by_role("button", name="Before", exact=True)).to_have_attribute(
         "aria-pressed", "true"
     )
+    page.go_back()
+    settle(page)
+    page.get_by_role("link", name="Compare session tuesday").click()  # and only one
+    expect(legend).to_be_visible()
+    assert len(station.client.get(f"{weeks}/differences").json()["items"]) == 1
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     page.get_by_role("link", name="To the sessions").click()

@@ -18,14 +18,14 @@ def card(page: Page, name: str) -> Any:
     return page.locator(f"[data-map='{name}']")
 
 
-def test_a_card_tells_what_the_api_does(station, page, settle):
+def test_a_card_tells_what_the_api_does(station, page, settle, axe):
     station.make_map("marked-up", title=MARKUP)
     page.goto(station.home)
     settle(page)
     one, record = card(page, "building"), station.client.get("/v1/maps/building").json()
     assert record["frames"] == {"indexed": 16}
     expect(one.get_by_role("heading")).to_have_text("Two rooms")
-    expect(one.locator(".map-number")).to_have_text("16")
+    expect(one.locator(".map-count")).to_have_text("16 indexed frames")
     expect(one).to_contain_text(record["model"])
     expect(one.get_by_role("link", name="Upload frames")).to_have_count(0)
     empty = card(page, "marked-up")
@@ -52,6 +52,13 @@ def test_a_card_tells_what_the_api_does(station, page, settle):
     expect(empty.get_by_role("link", name="Upload frames")).to_have_attribute(
         "href", "#/maps/marked-up/upload"
     )
+    one.get_by_role("button", name="Back up or copy building").click()
+    commands = page.get_by_role("dialog").locator("pre")
+    expect(commands).to_have_text([
+        "sceneprint snapshot --to backup",
+        f"sceneprint pull --map building --url {station.url}/ --data copy",
+    ])  # fmt: skip
+    assert axe(page) == []
 
 
 def test_a_map_is_made(station, page, settle, axe):

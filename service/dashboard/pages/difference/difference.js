@@ -42,7 +42,7 @@ export async function render(root, { params: { map }, search, signal, go, title,
     return;
   }
   const page = new Page(root, { map, path, signal, go, names, all: told.items, wanted: search });
-  await page.show();
+  await (search.has("begin") ? page.compare() : page.show());
 }
 
 class Page {
@@ -71,10 +71,19 @@ class Page {
     signal.addEventListener("abort", () => this.#viewer?.destroy(), { once: true });
   }
 
+  /** Compare the two sessions unless they are compared already. */
+  compare() {
+    this.#address(); // what is loaded again begins nothing
+    return this.#newest() ? this.show() : this.begin();
+  }
+
+  #newest() {
+    return this.all.find(({ request: { before, after } }) => before === this.seen.before && after === this.seen.after);
+  }
+
   /** Show the newest comparison of the two sessions, or that there is none. */
   async show() {
-    const turn = this.#turn += 1, { before, after } = this.seen;
-    const one = this.all.find(({ request }) => request.before === before && request.after === after);
+    const turn = this.#turn += 1, { before, after } = this.seen, one = this.#newest();
     this.#viewer?.destroy();
     this.#viewer = null;
     this.button.disabled = before === after || Boolean(one && goesOn(one));

@@ -74,7 +74,11 @@ export async function measure(map, item, change) {
   let now = {};
   if (summary.poses >= 2) {
     change({ step: "Measuring coverage" });
-    await repeat(async () => { now = (await send("POST", at("maps", map, "coverage"), { json: {}, signal })).data; return true; }, signal);
+    await repeat(async () => {
+      await send("POST", at("maps", map, "surface"), { signal }); // the plan is drawn on it
+      now = (await send("POST", at("maps", map, "coverage"), { json: {}, signal })).data;
+      return true;
+    }, signal);
     if (signal.aborted) return;
     await followJob(at("maps", map, "coverage", now.job_id), (told) => {
       now = told ?? { state: "cancelled" };
@@ -90,7 +94,9 @@ export async function measure(map, item, change) {
 export function measuredPlan(map, coverage, signal) {
   const place = h("div", { class: "row-plan" });
   fill(place, map, coverage, signal);
+  const { found, frames } = coverage.result;
   return [place, countsCard(coverage.result),
+    found < frames / 2 && h("p", {}, "Each frame is queried among frames taken at least 10 s before or after it. A single pass through a place has few of them: drive through it twice."),
     h("p", {}, h("a", { href: link("maps", map, "place") }, "Place"), " · ", h("a", { href: link("maps", map, "coverage", { result: coverage.job_id }) }, "Coverage, cell by cell"),
       " · ", h("a", { href: link("maps", map, "query") }, "Query"))];
 }

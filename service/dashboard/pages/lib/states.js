@@ -109,7 +109,7 @@ export function confirm({ title, text, word, action = "Continue" }) {
  * @returns {HTMLDialogElement}
  */
 export function sheet({ title, children, buttons }) {
-  const cancel = h("button", { class: "button", type: "button", onClick: () => dialog.close() }, "Cancel");
+  const cancel = h("button", { class: "button", type: "button", onClick: () => dialog.close() }, buttons ? "Cancel" : "Close");
   const dialog = h("dialog", { class: "dialog", "aria-label": title },
     h("form", { novalidate: true }, h("h2", {}, title), children, h("div", { class: "dialog-foot" }, cancel, buttons)));
   const before = /** @type {HTMLElement | null} */ (document.activeElement);

@@ -9,6 +9,7 @@ import { waiting } from "./condition.js";
 import { thumbnail } from "./thumbnail.js";
 
 const PENCIL = "M4 20h4L19 9l-4-4L4 16zM13 7l4 4";
+const COPY = "M9 9h11v11H9zM15 9V4H4v11h5";
 const BIN = "M5 7h14M10 7V4h4v3M7 7l1 13h8l1-13M10 11v5M14 11v5";
 const ANSWERS = 3;
 /** Queries that the robots on the plan are known by, and how old they may be. */
@@ -30,16 +31,16 @@ export function mapCard(map, { signal, changed }) {
   const id = `map-${map.name}`, { name } = map;
   const parts = {
     title: h("a", { href: link("maps", name, "place") }), name: h("p", { class: "muted mono map-name" }),
-    number: h("strong", { class: "map-number" }), badges: h("div", { class: "toolbar badges" }),
+    count: h("a", { class: "map-count", href: link("maps", name) }), badges: h("div", { class: "toolbar badges" }),
     share: h("p", { class: "map-share" }), answers: h("ul", { class: "map-answers", "aria-label": `Last answers of ${name}` }), model: h("p", { class: "map-model muted" }),
   };
   const plan = thumbnail(name, signal);
-  const tools = may("admin", name) && h("div", { class: "map-tools" },
+  const tools = h("div", { class: "map-tools" }, tool(COPY, `Back up or copy ${name}`, async () => (await edit()).copyMap(name)), may("admin", name) && [
     tool(PENCIL, `Rename ${name}`, async () => (await edit()).retitleMap(card.map, changed)),
-    tool(BIN, `Delete ${name}`, async () => (await edit()).deleteMap(card.map, changed)));
+    tool(BIN, `Delete ${name}`, async () => (await edit()).deleteMap(card.map, changed))]);
   const element = h("article", { class: "card map", "aria-labelledby": id, dataset: { map: name } }, plan.element,
     h("div", { class: "map-head" }, h("div", {}, h("h2", { id }, parts.title), parts.name), tools),
-    h("div", { class: "map-figures" }, h("a", { class: "map-count", href: link("maps", name) }, parts.number, h("span", { class: "muted" }, " indexed frames")), parts.badges),
+    h("div", { class: "map-figures" }, parts.count, parts.badges),
     h("div", {}, parts.share, parts.answers), parts.model);
   let isFilled = false;
   /** @type {Object<string, any>[]} queries of the last hour in the order of time */
@@ -52,7 +53,7 @@ export function mapCard(map, { signal, changed }) {
     const { title, frames, model, reencoding, posed_frames: posed, parent_frames: parents } = next;
     put(parts.title, title ?? name); // the link itself stays, and with it the focus
     put(parts.name, title === null || title === name ? "" : name);
-    put(parts.number, count(frames.indexed ?? 0));
+    put(parts.count, h("strong", { class: "map-number" }, count(frames.indexed ?? 0)), h("span", { class: "muted" }, frames.indexed === 1 ? " indexed frame" : " indexed frames"));
     const badges = [
       badge(name, "neutral", waiting(next), "waiting", "received"),
       badge(name, "bad", frames.failed, "failed", "failed"),
@@ -86,7 +87,8 @@ export function mapCard(map, { signal, changed }) {
 
   async function fill() {
     isFilled = true;
-    await Promise.all([read(), plan.load().catch(passed)]);
+    const come = read();
+    await Promise.all([come, plan.load(come).catch(passed)]);
   }
 
   async function read() {

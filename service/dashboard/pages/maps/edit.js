@@ -5,6 +5,7 @@ import { bytes, things } from "../lib/format.js";
 import { saveFrom } from "../lib/form.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
+import { me } from "../lib/session.js";
 import { confirm, sheet, toast } from "../lib/states.js";
 
 // what the models that ship are for; their size comes from the API
@@ -68,6 +69,15 @@ export async function retitleMap(map, changed) {
       return "title";
     },
   });
+}
+
+/** Show the commands that copy a map, and all maps: a map can be larger than what a browser saves. @param {string} name */
+export function copyMap(name) {
+  const command = (text, line) => [h("p", {}, text), h("pre", { class: "dialog-text mono" }, line)];
+  sheet({ title: `Back up or copy ${name}`, buttons: null, children: [
+    command("To keep all maps, with their uploads and keys, on the machine of the service:", "sceneprint snapshot --to backup"),
+    command(`To query ${name} on a robot without a network, or to keep it without its uploads:`,
+      `sceneprint pull --map ${name} --url ${new URL(".", location.href)}${me() ? " --key KEY" : ""} --data copy`)] });
 }
 
 /** Ask for the name of a map to be typed, and remove it. */

@@ -14,8 +14,8 @@ const clamp = (share) => Math.min(Math.max(share, 0), 1);
 /**
  * @param {string} map
  * @param {AbortSignal} signal
- * @returns {{element: HTMLElement, load: () => Promise<void>, show: (records: Object<string, any>[]) => void, say: (text: any) => void}}
- *   load: fetch the plan; show: the robots of queries in the order of time; say: what stands in place of a plan
+ * @returns {{element: HTMLElement, load: (come?: Promise<any> | null) => Promise<void>, show: (records: Object<string, any>[]) => void, say: (text: any) => void}}
+ *   load: fetch the plan where the last robot was, when `come`, the queries, are there; show: the robots of queries in the order of time; say: what stands in place of a plan
  */
 export function thumbnail(map, signal) {
   const ways = svg("svg", { class: "map-ways", preserveAspectRatio: "none" });
@@ -28,8 +28,9 @@ export function thumbnail(map, signal) {
   /** @type {Object<string, any>[]} */
   let shown = [];
 
-  async function load() {
-    const { parents } = await get(at("maps", map, "surface"), { signal });
+  /** @param {Promise<any> | null} [come] */
+  async function load(come = null) {
+    const [{ parents }] = await Promise.all([get(at("maps", map, "surface"), { signal }), come]);
     const asked = shown.findLast((one) => one.pose)?.pose.parent_frame;
     surface = parents.find((one) => one.parent_frame === asked) ?? parents[0] ?? null;
     if (surface === null) return;

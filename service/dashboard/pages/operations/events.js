@@ -85,12 +85,13 @@ function eventRow(event) {
       event.map && h("a", { href: link("maps", event.map), dataset: { part: "map" } }, event.map),
       event.frame_id && [" / ", h("a", { class: "mono", href: link("maps", event.map, "frames", event.frame_id), title: event.frame_id, dataset: { part: "frame" } }, shortId(event.frame_id))],
       gist(event.data) && h("span", { class: "muted event-data" }, gist(event.data))),
+    event.data?.query_id && h("a", { class: "event-job", href: link("queries", event.data.query_id) }, "answer"),
     event.job_id && h("a", { class: "event-job", href: link("operations", "jobs", event.job_id), dataset: { part: "job" } }, "job"));
 }
 
 /** What more an event says, in a line. */
 function gist(data) {
-  const parts = Object.entries(data ?? {}).filter(([, value]) => value !== null && typeof value !== "object");
+  const parts = Object.entries(data ?? {}).filter(([name, value]) => name !== "query_id" && value !== null && typeof value !== "object");
   const text = parts.map(([name, value]) => `${name} ${value}`).join(", ");
   return text.length > 120 ? `${text.slice(0, 119)}…` : text;
 }

@@ -35,7 +35,7 @@ export function voteOf({ location, alternatives }, { pose_in_map: own, validatio
 export function alternativesList(alternatives, view = () => null) {
   const [first] = alternatives;
   return h("div", { class: "alternatives" },
-    h("p", { class: "muted" }, "In ", h("span", { class: "mono" }, first.pose.parent_frame), ", metres. At most one is right."),
+    h("p", { class: "muted" }, "In ", h("span", { class: "mono" }, first.pose.parent_frame), ", metres.", alternatives.length > 1 && " At most one is right."),
     h("ol", { "aria-label": "Alternatives" }, alternatives.map((one, i) => alternative(one, i, first, view(i)))));
 }
 

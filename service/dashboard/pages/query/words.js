@@ -137,7 +137,7 @@ export function evidenceOf({ evidence, verified_by: by }) {
   const { planes, frames, excess, rival } = evidence;
   const missing = excess < 0.005 ? "nothing" : percent(excess);
   const place = by === "prior" ? "place that the prior expects" : "place";
-  const next = rival < 0.05 ? `no other ${place} fits` : `the next best ${place} fits ${percent(rival)} as well`;
+  const next = rival < 0.05 ? `no other ${place} fits` : rival > 1.005 ? `another ${place} fits better` : `the next best ${place} fits ${percent(rival)} as well`;
   return `${things(Math.round(planes), "plane")} and ${things(frames, "frame")} of the map agree, ${missing} is missing, ${next}`;
 }
 

@@ -21,7 +21,7 @@ export async function render(root, { params, signal, title, actions }) {
   const path = at("maps", params.map);
   const canWrite = may("write", params.map);
   const body = h("tbody", {});
-  const card = h("div", { class: "card sessions-scroll", tabindex: "0", role: "region", "aria-label": "Sessions" }, h("table", { class: "table" },
+  const card = h("div", { class: "card sessions-scroll", tabindex: "0", role: "region", "aria-label": "Sessions" }, h("table", { class: "table stack" },
     h("thead", {}, h("tr", {}, COLUMNS.map(([text, number]) => h("th", { scope: "col", class: number && "number" }, text)),
       h("th", { scope: "col" }, h("span", { class: "visually-hidden" }, "Actions")))), body));
   const summary = h("p", { class: "muted number" });
@@ -57,7 +57,7 @@ export async function render(root, { params, signal, title, actions }) {
       h("td", {}, h("span", { class: "sessions-tags" }, one.tags.map((tag) => h("a", { class: "chip", href: link("maps", params.map, { session, robot, tag }) }, tag)))),
       // frames without a session cannot be named, and so not changed together
       h("td", {}, session !== null && h("span", { class: "sessions-actions" },
-        before !== null && h("a", { class: "button", href: link("maps", params.map, "difference", { before, after: session }), "aria-label": `Compare session ${session}` }, "Compare"),
+        before !== null && h("a", { class: "button", href: link("maps", params.map, "difference", { before, after: session, begin: canWrite ? 1 : null }), "aria-label": `Compare session ${session}` }, "Compare"),
         canWrite && [button("Rename", "renameSession"), button("Tag", "tagSession"), button("Delete", "deleteSession", "danger")])));
   }
 
