@@ -27,7 +27,6 @@ def database(room_frames, tmp_path_factory):
         )
         for number, frame in enumerate(room_frames[:3], start=1):
             lens, pose = frame.intrinsics, frame.pose
-            assert pose is not None
             K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
             head = struct.pack("<11i", 0, 21, 4, 0, lens.width, lens.height, 9, 0, 0, 0, 12)
             calibration = head + K.tobytes() + LOCAL[:3].astype("<f4").tobytes()

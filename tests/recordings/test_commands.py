@@ -55,7 +55,6 @@ def record(ros, place, name, frames):
     def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
         for i, one in enumerate(frames):
-            assert one.pose is not None
             k = one.camera.intrinsics
             t = 0.2 * i
             T_odom_base = one.pose @ np.linalg.inv(ros.camera)
