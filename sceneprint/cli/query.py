@@ -473,8 +473,8 @@ def _frames_before(
     """Return up to K - 1 earlier frames of the same folder to query together with a frame.
 
     K is --last; the default is 3, or 1 with --up. The frames have poses, are spaced as in
-    `spaced_views`, and are in chronological order. Without --last, a frame without a pose has none.
-    Raise DatasetError if --last exceeds 1, but the frame has no pose.
+    `spaced_views`, and are in chronological order. If the frame has no pose, return none, or raise
+    DatasetError if --last exceeds 1.
     """
     most = options.last or (_LAST if options.up is None else 1)
     if most == 1:

@@ -229,7 +229,7 @@ def sample_range_of(frame: FrameRow) -> SampleRange | None:
 
 
 def _sensor_record(frame: FrameRow) -> dict[str, Any]:
-    """Return the fields of a frame record that depend on its kind."""
+    """Return the fields of a frame record that depend on the kind of the frame."""
     if frame.cloud is None:
         trusted = None if frame.samples is None else frame.samples["trusted"]
         return {"kind": "depth", "trust_depth": trusted}

@@ -80,7 +80,7 @@ class Signers:
             return self._open[model_id]
 
     def of(self, model: Model) -> Signer:
-        """Return the signer of a model, stored or not; raise Busy while kernels are compiled."""
+        """Return the signer of any model, stored or not; raise Busy while kernels are compiled."""
         self.require_kernels()
         with self._lock:
             if model.id not in self._open:

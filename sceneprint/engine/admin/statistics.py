@@ -212,7 +212,7 @@ def _size(path: Path | os.DirEntry[str]) -> int:
 
 
 def _free_of(folder: Path) -> tuple[int, int]:
-    """Return the free and total bytes of the disk for a folder, which need not exist."""
+    """Return the free and total bytes of the disk of a folder; the folder need not exist."""
     try:
         usage = shutil.disk_usage(nearest_folder(folder))
     except OSError:

@@ -104,7 +104,7 @@ class MapCopies:
 
         Raises
         ------
-        UnknownMap, NotFound : If no frame of the map has the artifact.
+        UnknownMap, NotFound : If the map does not exist, or none of its frames has the artifact.
         DamagedBlob : If the artifact is damaged or was removed meanwhile.
         """
         with self._store.database.read() as connection:

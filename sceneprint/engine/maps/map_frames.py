@@ -73,7 +73,7 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
 
     Raises
     ------
-    UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+    UnknownMap, UnknownFrame : If the map or the frame does not exist, or the frame was deleted.
     NotIndexed : If the frame has another state.
     """
     with store.database.read() as connection:
@@ -398,7 +398,7 @@ class FrameFiles:
 
         Raises
         ------
-        UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+        UnknownMap, UnknownFrame : If the map or the frame does not exist, or the frame was deleted.
         NotIndexed : If the frame is not indexed.
         InvalidRequest : If the frame lacks the pose or the base that `within` requires.
         """
@@ -499,7 +499,7 @@ class FrameFiles:
 
         Raises
         ------
-        UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+        UnknownMap, UnknownFrame : If the map or the frame does not exist, or the frame was deleted.
         NotIndexed : If the frame is redundant, so its upload is not stored.
         DamagedBlob : If the upload is lost.
         """

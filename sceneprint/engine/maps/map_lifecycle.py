@@ -154,7 +154,7 @@ def edit_frame(
 
     Raises
     ------
-    UnknownMap, UnknownFrame : If the frame does not exist or was deleted.
+    UnknownMap, UnknownFrame : If the map or the frame does not exist, or the frame was deleted.
     InvalidRequest : If a field is unknown, not editable or not valid.
     InvalidPose : If a transform is not rigid.
     PreconditionFailed : If the entity tag of the frame is not in `if_match`.
@@ -460,8 +460,8 @@ class Catalogue:
 
         Parameters
         ----------
-        may_read : function that returns whether the caller may read a map. The records contain only
-            names of these maps
+        may_read : function that returns whether the caller may read a map. The records name only
+            maps that the caller may read
         """
         with self._database.read() as connection:
             by_id = {model.id: model for model in self._stored(connection)}

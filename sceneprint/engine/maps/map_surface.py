@@ -172,7 +172,7 @@ class MapSurfaces:
 
         Raises
         ------
-        UnknownMap, NotFound : If the map has no tile with this digest.
+        UnknownMap, NotFound : If the map does not exist, or has no tile with this digest.
         """
         with self._store.database.read() as connection:
             row, surface = stored.living_surface(connection, map_name)

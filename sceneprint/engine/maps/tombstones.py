@@ -94,7 +94,7 @@ class Tombstones:
 
         Raises
         ------
-        UnknownMap, UnknownFrame : If the frame cannot be restored.
+        UnknownMap, UnknownFrame : If the map does not exist, or the frame cannot be restored.
         Conflict : If the same content was uploaded again.
         QuotaExceeded : If the map has no room for the frame.
         """
@@ -125,7 +125,8 @@ class Tombstones:
 
         Raises
         ------
-        UnknownMap, UnknownDeletion : If the deletion does not exist or cannot be undone.
+        UnknownMap, UnknownDeletion : If the map or the deletion does not exist, or the deletion
+            cannot be undone.
         QuotaExceeded : If the map has no room for all frames; none was restored.
         """
         until, done, last, remaining = time.monotonic() + seconds, 0, 0, 1

@@ -73,8 +73,8 @@ def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
 def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> list[list[PathFrame]]:
     """Return the frames of each session that pass the filter of a request, in chronological order.
 
-    Raise InvalidRequest if a session has no such frame or frames of several robots, or the sessions
-    have more than MOST_FRAMES frames.
+    Raise InvalidRequest if a session has no such frame, or has frames of several robots, or the
+    sessions have more than MOST_FRAMES frames.
     """
     sides, runs = sessions_of(request), []
     numbers = [numbers_of_session(connection, row.number, *side) for side in sides]
@@ -274,7 +274,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         Raises
         ------
         UnknownMap, UnknownJob : If the map or the association does not exist.
-        NotIndexed : If it has not succeeded.
+        NotIndexed : If the association has not succeeded.
         """
         with self._store.database.write() as connection:
             job = self.find(connection, map_name, job_id)
@@ -348,7 +348,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
         Raises
         ------
-        UnknownMap, UnknownJob, NotIndexed : If the association does not exist or has not succeeded.
+        UnknownMap, UnknownJob, NotIndexed : If the map or the association does not exist, or the
+            association has not succeeded.
         """
         with self._store.database.read() as connection:
             job = self.find(connection, map_name, job_id)

@@ -216,7 +216,8 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
 
         Raises
         ------
-        UnknownMap, UnknownJob, NotIndexed : If a job does not exist or has not succeeded.
+        UnknownMap, UnknownJob, NotIndexed : If the map or a job does not exist, or a job has not
+            succeeded.
         InvalidRequest : If the results have different options, cells or axes.
         """
         with self._store.database.read() as connection:

@@ -113,7 +113,8 @@ class Pairs:
         Raises
         ------
         UnknownQuery : If the answer is not stored.
-        UnknownMap, UnknownFrame : If the answer has no such match, or the match was deleted.
+        UnknownMap, UnknownFrame : If the answer has no such match, or the match or its map was
+            deleted.
         NotIndexed : If the query ran without validation, or the map has another model now.
         """
         stored = self._log.find(query_id)
@@ -331,7 +332,7 @@ class Inspection:
         Raises
         ------
         UnknownQuery, UnknownMap, UnknownFrame, NotIndexed : See `Pairs.find`.
-        DamagedBlob, UnreadableGeometry : If geometry and upload of the match are damaged.
+        DamagedBlob, UnreadableGeometry : If both geometry and upload of the match are damaged.
         """
         pair = self.pairs.find(query_id, frame_id, map_name)
         stored, match, p = pair.stored, pair.match, self.pairs.parameters(pair)

@@ -65,7 +65,7 @@ from sceneprint_client.api.query import Cause
 
 @dataclass
 class _Clock:
-    """Clock of the stages of a query, in milliseconds; a stage may be timed several times."""
+    """Durations of the stages of a query, milliseconds; a stage may be timed several times."""
 
     spent: dict[str, float]
     _since: float = field(default_factory=time.perf_counter)

@@ -133,7 +133,7 @@ def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -
 
     Raises
     ------
-    UnknownMap, UnknownFrame : If a stored frame does not exist.
+    UnknownMap, UnknownFrame : If a stored frame or its map does not exist.
     FrameError : If an upload cannot be used.
     InvalidRequest : If a stored frame is not indexed, or the models differ.
     """
@@ -208,7 +208,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
 
 
 def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
-    """Return the names of both sensor frames, with the ids `a` and `b` if their ids are equal."""
+    """Return the names of both sensor frames; `a` and `b` replace frame ids that are equal."""
     ids = [x if side.frame is None else side.frame[1] for x, side in (("a", a), ("b", b))]
     if ids[0] == ids[1]:
         ids = ["a", "b"]

@@ -285,7 +285,7 @@ class Deadline:
         self.reached: bool | None = None if milliseconds is None else False
 
     def allows(self) -> bool:
-        """Return whether another validation is expected to end in time; call this before each."""
+        """Return whether the next validation will probably end in time; call this before each."""
         if self._ends is None:
             return True
         now = time.perf_counter()

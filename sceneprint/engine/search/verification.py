@@ -3,7 +3,7 @@
 query Geometry, candidates  --validated-->  Validated  --placed-->  PoseEstimate
 
 Candidates are validated in order until enough are accepted or the deadline passes, Sec. III-E. The
-poses that they imply are checked against the frames of the map near these poses.
+poses that the matches imply are checked against the frames of the map near these poses.
 """
 
 from __future__ import annotations
