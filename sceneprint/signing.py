@@ -149,8 +149,8 @@ def hierarchy_of(seen: Surface, p: ModelParameters, name: str = "") -> Hierarchy
         samples, advice = "depth samples", "Check that the image is depth and its scale is right"
     if finest.max(initial=-1) < 0:
         raise UselessFrame(
-            f"{_prefix(name)}the {samples} lie on no surface: they are too scattered for a patch. "
-            f"{advice}, or send another frame."
+            f"{_prefix(name)}the {samples} do not lie on a surface: they are too scattered to form "
+            f"a patch. {advice}, or send another frame."
         )
     return hierarchy(seen, finest, p.hierarchy)
 

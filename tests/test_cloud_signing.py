@@ -135,7 +135,7 @@ DEGENERATE = {
     "ten points": (lambda: np.eye(10, 3) + 1, "10 points are too few"),
     "no points": (lambda: np.zeros((0, 3)), "0 points are too few"),
     "one point": (lambda: np.ones((5000, 3)), "fill 1 voxels"),
-    "one line": (lambda: np.linspace([2, -2, 0], [2, 2, 0], 5000), "lie on no surface"),
+    "one line": (lambda: np.linspace([2, -2, 0], [2, 2, 0], 5000), "do not lie on a surface"),
     "one ray": (lambda: np.linspace([0, 0, 0.5], [0, 0, 9], 5000), "voxels"),
     "millimetres": (lambda: wall() * 1000, "millimetres"),
     "at the viewpoint": (lambda: np.zeros((5000, 3)), "0 of its 5000 points"),

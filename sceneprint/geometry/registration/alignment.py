@@ -393,10 +393,10 @@ def contradiction(
         for name, frame, up in (("query", query, ups[0]), ("match", match, ups[1]))
         if up is not None and p.refined_tilt < floor_error(frame, up, p) < 0.95 * p.floor_tilt
     ]
-    whose = f" of the {wrong[0]}, whose own floor disagrees with it" if len(wrong) == 1 else ""
+    clue = f" (the floor of the {wrong[0]} disagrees with it)" if len(wrong) == 1 else ""
     return (
         f"the surfaces fit only if tilted by {math.degrees(tilt):.0f} deg against `up`: either the "
-        f"place only looks similar, or `up` is wrong{whose}. Check the IMU's calibration and the "
+        f"place only looks similar, or `up` is wrong{clue}. Check the IMU's calibration and the "
         "axes of `up`"
     )
 

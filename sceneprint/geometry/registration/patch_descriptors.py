@@ -3,10 +3,10 @@
     Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
     descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
 
-The properties resemble those of Eq. (1) and have the same scale. Those of another patch within
-reach are its distance in the plane of this patch, its height over that plane, and the angles
-between its normal and, first, this patch's normal and, second, the direction from this patch to it
-in the plane. All are invariant under rigid motion.
+The properties resemble those of Eq. (1) and have the same scale. For each other patch within reach,
+they are its distance in the plane of the patch, its height over that plane, and the angles of its
+normal to the patch's normal and to the direction in the plane from the patch to it. All are
+invariant under rigid motion.
 
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching is public. A random sample
 of the source's patches is compared with all patches of the target; a patch corresponds to the

@@ -125,9 +125,9 @@ def range_image(cloud: Cloud, p: CloudParameters) -> Surface:
     q, u = _average_pixels(angles, camera, p)
     if int(np.count_nonzero(q)) < p.minimum_points:
         raise UselessFrame(
-            f"{cloud.name or 'The cloud'}: {np.count_nonzero(q)} pixels of "
-            f"{math.degrees(camera.step):.2g} degrees show all its points, too few for a "
-            "surface. Send a cloud that shows more of the scene, or check its viewpoint."
+            f"{cloud.name or 'The cloud'}: all its points lie in {np.count_nonzero(q)} pixels of "
+            f"{math.degrees(camera.step):.2g} degrees, too few to show a surface. "
+            "Send a cloud that shows more of the scene, or check its viewpoint."
         )
     gates = np.array([p.range_gate, p.noise_gate, p.plane_gate])
     limits = np.array([p.minimum_samples, p.minimum_spread * camera.step**4])
