@@ -444,8 +444,6 @@ def _overlap(row: dict[str, Any]) -> str:
 
 def _recalls(report: dict[str, Any]) -> list[str]:
     """Return lines of text about the recall and the times of all rankings."""
-    if "recall" not in report:  # figures of an older version
-        return []
     within = report["recall"]["within_m"]
     place = "overlap by half" if within is None else f"taken within {within:g} m"
     able = report["recall"]["R"]["queries"]
@@ -482,8 +480,6 @@ _ANSWERS = {
 
 def _answers(report: dict[str, Any]) -> list[str]:
     """Return lines of text about the answers."""
-    if "answers" not in report:  # figures of an older version
-        return []
     shares = report["answers"]
     lines = [f"{'answers':18}{'share':>10}"]
     lines += [f"{name:18}{decimal(shares[key]):>10}" for key, name in _ANSWERS.items()]
