@@ -1,6 +1,7 @@
 """Tests of associations of two runs with separate origins, including lost slices."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -23,6 +24,7 @@ from sceneprint.store.parent_joins import ParentJoin, join_parent, posed_runs
 from sceneprint.store.tables import events, frames, job_items, jobs
 from sceneprint_client.api import Filter, JobState, NewMap
 from sceneprint_client.api.sessions import NewAssociation
+from sceneprint_lab.synth.lookalikes import synthesise_lookalike
 from tests.whole_engine import Engine
 
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
@@ -109,6 +111,22 @@ def test_two_robots_maps_are_joined(engine, work_off):
         kind = events.c.kind == "association.found"
         data = connection.execute(select(events.c.data).where(kind)).scalar_one()
     assert data["edges"] == result.edges
+
+
+def test_sessions_of_rooms_that_look_alike_are_not_strongly_joined(empty, make_upload, work_off):
+    site = synthesise_lookalike("unmapped", 41, 8, queries=20)  # the queries show another room
+    for session, views in (("a", site.map), ("b", site.queries)):
+        for frame in views:
+            sent = make_upload(frame, session, robot=session, session=session)
+            empty.add_frame("hall", sent.data, sent.meta)
+    work_off(empty)
+    begun = empty.associations.begin("hall", NewAssociation(sessions=["b", "a"]))
+    work_off(empty)
+    (join,) = empty.associations.get("hall", begun.job_id).result.joins
+    assert join.support >= 10  # enough for a strong join
+    assert (join.strength, join.root) == ("weak", None)
+    share = int(re.search(r"but (\d+)% of the surfaces contradict", join.reason)[1])
+    assert 30 <= share <= 90
 
 
 def test_parent_frames_are_associated_unasked(engine, work_off):

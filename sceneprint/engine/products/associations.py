@@ -32,7 +32,11 @@ from sceneprint.geometry.retrieval.ranking import (
     similarity,
 )
 from sceneprint.geometry.rigid import inverse
-from sceneprint.geometry.validation.map_verification import MapParameters
+from sceneprint.geometry.validation.map_verification import (
+    MapParameters,
+    MapViews,
+    median_contradiction,
+)
 from sceneprint.index.part_files import Keys
 from sceneprint.models import Model
 from sceneprint.pipeline import PairMatch, associate
@@ -62,6 +66,10 @@ from sceneprint_client.api.sessions import APART, Association, Edge, GraphFormat
 
 #: Maximum total number of frames in both sessions.
 MOST_FRAMES = 5000
+#: Number of frames of a session that are compared with the other session before a strong join.
+CHECKED_FRAMES = 12
+#: Maximum median share of contradicting surfaces in a strong join.
+MOST_CONTRADICTION = 0.2
 
 
 def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:
@@ -211,6 +219,15 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         model = self._context.signers(task.of_map.model_id).model
         scale = model.answer.map.same_m / MapParameters().same_m
         verdicts, counts, joins = finish_association(edges, source, target, stops, request, scale)
+        for join in joins:
+            if join["strength"] == "strong":
+                share = self._contradiction(task.of_map, model, join, (source, target), stops)
+                if share > MOST_CONTRADICTION:
+                    join["strength"] = "weak"
+                    join["reason"] += (
+                        f", but {share:.0%} of the surfaces contradict each other: the places may "
+                        "only look alike"
+                    )
         rooted = self._rooted(task, joins) if request.join and len(request.sessions) == 2 else []
         result = {
             "frames": len(source), "skipped": progress["skipped"],
@@ -220,6 +237,36 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
             True, progress, items + verdicts, result=result, event="association.found",
             write=partial(_apply, task, rooted) if rooted else None,
         )  # fmt: skip
+
+    def _contradiction(
+        self, row: MapRow, model: Model, join: dict[str, Any], runs: tuple[list[int], list[int]],
+        stops: dict[int, PathFrame],
+    ) -> float:  # fmt: skip
+        """Return the share of surfaces on which the sessions of a join contradict each other.
+
+        In rooms that look alike, enough edges may agree on a wrong transform.
+        """
+        p, agreement = model.answer.map, model.parameters.validation.agreement
+        own, others = (
+            [n for n in run if n in stops and stops[n].parent == join[end] and stops[n].pose]
+            for run, end in zip(runs, ("from_parent", "to_parent"), strict=True)
+        )
+        if len(own) > CHECKED_FRAMES:
+            own = [own[i] for i in np.linspace(0, len(own) - 1, CHECKED_FRAMES).astype(int)]
+        with self._store.database.read() as connection:
+            blobs = geometry_blobs(connection, [*own, *others], row.model_id)
+        views = MapViews(
+            np.array([stops[n].pose for n in others]),
+            lambda i: self._geometry(row, others[i], blobs), p, agreement,
+            ahead=[not stops[n].is_cloud for n in others],
+        )  # fmt: skip
+        T = np.array(join["transform"]["matrix"])
+        frames = (
+            (geometry, T @ np.array(stops[n].pose))
+            for n in own
+            if (geometry := self._geometry(row, n, blobs)) is not None
+        )
+        return median_contradiction(frames, views, p, agreement)
 
     def _rooted(self, task: LongJob, joins: list[dict[str, Any]]) -> list[ParentJoin]:
         """Return the transforms of strong joins to the root, the parent frame with the oldest

@@ -11,7 +11,7 @@ space in most of them contradicts a wrong pose.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -301,6 +301,38 @@ def refine_pose(
         if T is not None:
             refined.append(view.T @ T @ inverse(frame.T))
     return average_poses(np.stack(refined)).T if refined else None
+
+
+def median_contradiction(
+    frames: Iterable[tuple[Geometry, Floats]], views: MapViews, p: MapParameters,
+    overlap_p: OverlapParameters,
+) -> float:  # fmt: skip
+    """Return the median share of surfaces on which frames contradict the map at their poses.
+
+    Between two places that look alike, some pairs of frames agree, but most frames show surfaces
+    where the other place has free space. Poses are refined first, because maps drift.
+
+    Parameters
+    ----------
+    frames : geometries with their poses (4, 4) in the parent frame of `views`; frames that share no
+        surface with the map are ignored
+
+    Returns
+    -------
+    median of the violations of both sides, minus those among the map's frames; 0 if no frame counts
+    """
+    shares = []
+    for geometry, T in frames:
+        frame = map_frame(geometry, np.eye(4), p, overlap_p)
+        pose = score_pose([frame], T, views, p, overlap_p)
+        refined = refine_pose([frame], pose, views, p)
+        if refined is not None:
+            again = score_pose([frame], refined, views, p, overlap_p)
+            pose = max(pose, again, key=lambda scored: scored.score)
+        if pose.views:
+            noise = map_noise(pose, views, p, overlap_p)
+            shares.append(pose.violations + pose.hidden - noise)
+    return float(np.median(shares)) if shares else 0.0
 
 
 def prior_starts(T: Floats, covariance: Floats, p: MapParameters) -> Floats:
