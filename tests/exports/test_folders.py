@@ -249,10 +249,10 @@ def test_record3d_with_a_camera_for_each_frame(room, tmp_path):
 
 def test_broken_captures_of_record3d_are_refused(room, tmp_path):
     for change, message in (
-        ({"poses": None}, "not contain a list of poses.*export the capture as .r3d"),
+        ({"poses": None}, "there is no list of poses.*export the capture as .r3d"),
         ({"poses": [[0, 0, 0, 0, 1, 2, 3]] * 3}, "does not have unit length"),
         ({"K": [1, 2]}, "K and perFrameIntrinsicCoeffs are missing"),
-        ({"dw": 10**9}, "depth of 1000000000 x 60|not a size"),
+        ({"dw": 10**9}, "1000000000 x 60 pixels are too large|not a size"),
     ):
         folder = record3d(tmp_path / "a", room, **change)
         with pytest.raises(DatasetError, match=message):

@@ -171,7 +171,7 @@ def test_a_damaged_scan_is_left_out(tmp_path, ros):
     assert [len(one.read().points) for one in (*sequence.frames[:2], sequence.frames[3])] == [
         20, 40, 60
     ]  # fmt: skip
-    with pytest.raises(UnreadableCloud, match="The scan is damaged, or its odometry has a gap"):
+    with pytest.raises(UnreadableCloud, match="The scan is damaged, or the odometry has a gap"):
         sequence.frames[2].read()
 
 

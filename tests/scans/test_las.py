@@ -43,7 +43,7 @@ def changed(data, at, form, value):
         (131, "d", 0.0, "scale"),
         (139, "d", np.nan, "scale"),
         (155, "d", np.inf, "scale"),
-        (104, "B", 0x81, "how its points are packed"),
+        (104, "B", 0x81, "how its points are compressed"),
     ],
 )
 def test_lies(las, at, form, value, message):
@@ -116,9 +116,9 @@ def test_packed_lies(laz, form):
         (vlr, "H", 1, "contradictory or not supported"),  # compressor
         (vlr + 2, "H", 7, "contradictory or not supported"),  # coder
         (vlr + 34, "H", 12, "contradictory or not supported"),  # first value
-        (vlr + 12, "I", 0, "how its points are packed"),  # chunk size
-        (vlr + 32, "H", 65_535, "how its points are packed"),  # values
-        (100, "I", 0, "how its points are packed"),  # records before the points
+        (vlr + 12, "I", 0, "how its points are compressed"),  # chunk size
+        (vlr + 32, "H", 65_535, "how its points are compressed"),  # values
+        (100, "I", 0, "how its points are compressed"),  # records before the points
         (start, "q", 2**62, "chunk table of the LAZ file"),
         (table + 4, "I", 2**31, "chunk table of the LAZ file"),
     ]
