@@ -390,7 +390,7 @@ def changed_gltf(change):
             lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]),
             "extension 'KHR_draco.*without compression",
         ),
-        (lambda t: t["accessors"][0].pop("bufferView"), "without bytes"),
+        (lambda t: t["accessors"][0].pop("bufferView"), "without a buffer view"),
         (lambda t: t["accessors"][0].update(count=10**15), "cannot be read"),
         (lambda t: t.update(accessors=7), "no list of objects as its accessors"),
         (lambda t: t.update(scenes=[{"nodes": []}], scene=0), "neither triangles nor points"),
