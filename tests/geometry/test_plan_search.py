@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
+    ScanPlan,
     _draw_slices,
     _height_offsets,
     _slice_heights,
@@ -170,6 +171,22 @@ def test_slices_propose_the_true_transform(yaw):
     assert degrees < 3.0
     assert rank < 4
     assert len(found) <= P.n_sliced * P.n_heights
+
+
+def test_slices_find_a_shift_although_most_points_are_near_the_scanners():
+    rng = np.random.default_rng(0)
+    posts, shift = rng.uniform(-40, 40, (200, 2)), np.array([18.0, 6.0])
+
+    def plan(shared):
+        level = np.concatenate([shared, rng.normal(0, 8, (2000, 2))])
+        points = np.pad(level, ((0, 0), (0, 1))).astype(np.float32)
+        n = 2 * round(P.height_range / P.height_step)
+        slices = np.ones(len(points), np.uint8)
+        return ScanPlan(np.eye(3), points, 0 * points, slices, np.ones(P.n_yaws), np.ones((2, n)))
+
+    found = slice_hypotheses(plan(posts), plan(posts + shift), P)
+    best = found[0, :2, 3]
+    assert np.abs(best - shift).max() <= 1.0  # cells of 1 m
 
 
 def test_a_scanner_on_its_side_is_found_by_the_other_axes():

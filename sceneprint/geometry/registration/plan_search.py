@@ -62,6 +62,7 @@ class PlanParameters:
     sliced_yaws: int = 18  #: number of yaws (modulo half turns) whose slices are correlated
     n_sliced: int = 25  #: `n_kept` for slices
     slice_blur: float = 0.5  #: `blur` for slices
+    slice_trend: float = 0.866  #: `blur` of the low frequencies that are subtracted from slices
 
 
 @dataclass(frozen=True, eq=False)
@@ -335,13 +336,16 @@ def _spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.compl
 
 
 def _slice_spectrum(plan: ScanPlan, yaw: float, p: PlanParameters) -> NDArray[np.complex64]:
-    """Return the Fourier transform of a plan's slice images, (n_slices, side, side / 2 + 1)."""
+    """Return the Fourier transform of a plan's slice images, (n_slices, side, side / 2 + 1).
+
+    Magnitudes are replaced by their square roots. Most points are near the scanner, so otherwise
+    the correlation would be highest where both scanners coincide.
+    """
     image = np.zeros((len(_SLICE_EDGES) - 1, p.side, p.side), np.float32)
     _draw_slices(plan.points, plan.slices, math.cos(yaw), math.sin(yaw), 2 * p.cell, image)
-    counts = np.bincount(plan.slices, minlength=len(_SLICE_EDGES))[1:, None, None]
-    # square roots limit the influence of a slice with many points
-    image /= np.sqrt(np.sqrt(np.maximum(counts, 1), dtype=np.float32))
-    return np.fft.rfft2(image).astype(np.complex64, copy=False)
+    spectrum = np.fft.rfft2(image).astype(np.complex64, copy=False)
+    spectrum /= np.sqrt(np.abs(spectrum) + 1e-6)
+    return spectrum
 
 
 def _blur(spectrum: NDArray[np.complex64], blur: float) -> NDArray[np.complex64]:
@@ -398,13 +402,14 @@ def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> F
     agreement = _yaw_agreement(source, target)
     pairs = np.argsort(-(agreement[:half] + agreement[half : 2 * half]), kind="stable")
     angles = 2 * math.pi * pairs[: p.sliced_yaws] / p.n_yaws
-    blurred = _blur(_slice_spectrum(target, 0.0, p), p.slice_blur)
+    spectrum = _slice_spectrum(target, 0.0, p)
+    onto = _blur(spectrum, p.slice_blur) - _blur(spectrum, p.slice_trend)
 
     def products() -> Iterator[NDArray[np.complex64]]:
         for angle in angles:
             spectrum = _slice_spectrum(source, float(angle), p)
-            yield blurred * spectrum.conj()
-            yield blurred * spectrum
+            yield onto * spectrum.conj()
+            yield onto * spectrum
 
     both = np.stack([angles, angles + math.pi], axis=1).ravel()
     return _transforms_at_peaks(source, target, both, products(), 2 * p.cell, p.n_sliced, p)[0]
