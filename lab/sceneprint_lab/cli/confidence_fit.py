@@ -34,7 +34,7 @@ SHARES: dict[str, dict[str, float]] = {
         "unmapped": 2,
     },
     "lidar": {
-        "sites": 70, "absent": 10, "bays": 6, "streets": 6, "halls": 4, "unmapped": 4,
+        "sites": 80, "absent": 10, "bays": 2.5, "streets": 2.5, "halls": 2.5, "unmapped": 2.5,
     },
 }  # fmt: skip
 #: Factors by which there are more sites of those kinds whose decisive evidence is rare.
