@@ -128,7 +128,8 @@ def test_demo_needs_frames_for_the_map_and_to_look_up(demo, rooms):
     _, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2
     assert len(err.splitlines()) == 1
-    assert "1 frames for the map and 0 queries" in err
+    assert "(found: 1)" in err
+    assert "(found: 0)" in err
 
 
 @pytest.fixture
