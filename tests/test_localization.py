@@ -28,6 +28,7 @@ from sceneprint.geometry.validation.map_verification import (
 from sceneprint.geometry.validation.validation import PairValidation
 from sceneprint.localization import (
     PosedFrame,
+    decide,
     localize,
     mark_unconfirmed,
     rival_rows,
@@ -757,6 +758,24 @@ def test_the_parent_frame_is_that_of_the_strongest_matches(blank):
         assert (found.parent, found.votes) == ("there", 1)
 
 
+@pytest.mark.parametrize(("cost", "confirmed"), [(6.2, True), (6.6, False)])
+def test_a_prior_stands_for_a_second_view_and_for_odds_of_twenty(cost, confirmed):
+    """Odds of 20 e^1.8 reach .99, and odds of 20 e^1.4 do not; with a third view both would."""
+    costs = replace(_OF_FRAMES, suggested=Penalty(8.0, 8.0, cost))
+    p = replace(BY_HAND, judgement=ConfidenceModel(costs, costs))
+    found = judged([suggested_at(0.0, 0)], [WHOLE] * 3, prior=near_place(0), p=p)
+    assert (found.verified_by == "prior") is confirmed
+
+
+def test_a_prior_may_confirm_the_best_of_equal_poses_alone():
+    matches = [suggested_at(APART * k, row) for k in range(2) for row in (k, 2 + k)]
+    best = replace(BY_HAND, prior_share=1.0)
+    for second, confirmed in ((36, True), (35, False)):
+        places = [picture((36, SAME))], [picture((second, SAME))]
+        found = judged(matches, *places, prior=near_place(1), p=best)
+        assert (found.verified_by == "prior") is confirmed
+
+
 def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(box_views, signer):
     """Also where no candidate suggests any."""
     poses, views = box_views
@@ -867,6 +886,17 @@ def test_rivals_are_about_as_near_as_the_farthest_vote(blank):
     assert without == [2]
 
 
+@pytest.mark.parametrize(("ahead", "reach"), [(True, 3.5), (False, 4.0)])
+def test_rivals_stand_beyond_the_reach_of_a_view(blank, ahead, reach):
+    at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
+    poses = {4: shifted(reach - 0.01), 5: shifted(reach + 0.01)}
+    rows = rival_rows(
+        at_origin, Ranking(np.array([0, 1, 4, 5]), np.ones(4, int), np.zeros(4)), {0, 1},
+        lambda rows: {row: PosedFrame("", poses[row], ahead) for row in rows}, ahead,
+    )  # fmt: skip
+    assert rows == [5]
+
+
 def test_rivals_are_asked_of_nothing_that_is_not_found(blank):
     assert corridor_rivals(None, [0, 1, 2, 3], []) == []
     unsure = by_pairs(blank, [*seen_at(0.0, [0]), *seen_at(9.0, [1])])
@@ -882,7 +912,107 @@ def test_what_was_not_compared_is_ambiguous(blank):
     assert sure.average is not None
     told = mark_unconfirmed(sure)
     assert (told.status, told.average, told.strength, told.members) == ("ambiguous", None, None, ())
+    assert (told.covariance, told.verified_by, told.guided) == (None, None, 0)
     [pose] = told.alternatives
     np.testing.assert_allclose(pose.T, shifted(4.0), atol=1e-12)
     assert pose.support == 2
     assert mark_unconfirmed(told) is told
+
+
+# All that may change an answer
+
+
+class Shelf:
+    """Frames at ROWS, but row 5 a bit aside; what searches return is given, and calls are noted."""
+
+    def __init__(self, unguided=None, elsewhere=()):
+        self.unguided, self.elsewhere = unguided, elsewhere
+        self.searched, self.compared = [], []
+
+    def locate(self, frames):
+        return localize(frames, ROWS)
+
+    def search(self, frame, known):
+        self.searched.append((frame, sorted(known)))
+        return self.unguided
+
+    def posed(self, rows):
+        return {row: PosedFrame("", shifted(3.6) if row == 5 else ROWS[row], True) for row in rows}
+
+    def compare(self, rows):
+        self.compared.append(rows)
+        return self.elsewhere
+
+
+def decided(frames, shelf, rows=(0, 1)):
+    n = len(rows)
+    ranking = Ranking(np.array(rows), np.ones(n, np.int64), np.zeros(n))
+    return decide(frames, ranking, shelf, LocalizationParameters())
+
+
+def guided_at(x, row):
+    [one] = seen_at(x, [row])
+    return replace(one, validation=replace(one.validation, predicted=np.eye(4)))
+
+
+def test_guided_matches_are_searched_where_no_pose_is_found(blank):
+    """Of the frame that has them; its other matches are known."""
+    before = QueryFrame(blank, [suggested_at(0.0, 3)])
+    frames = [
+        before,
+        QueryFrame(blank, [*seen_at(0.0, [0]), guided_at(0.0, 1), *seen_at(5.0, [2])]),
+    ]
+    shelf = Shelf([*seen_at(0.0, [0, 1]), *seen_at(5.0, [2])])
+    found = decided(frames, shelf)
+    assert (found.status, found.members, found.guided) == ("found", (0, 1), 0)
+    assert shelf.searched == [(1, [0, 2])]
+    late = decided(frames, Shelf(None))  # the deadline has passed
+    assert (late.status, len(late.alternatives)) == ("ambiguous", 2)
+
+
+def test_guided_matches_of_a_found_pose_are_not_searched(blank):
+    shelf = Shelf([])
+    found = decided([QueryFrame(blank, [*seen_at(0.0, [0]), guided_at(0.0, 1)])], shelf)
+    assert (found.status, found.guided, shelf.searched) == ("found", 1, [])
+    lost = replace(guided_at(0.0, 1), validation=replace(outcome("rejected"), predicted=np.eye(4)))
+    assert decided([QueryFrame(blank, [lost])], shelf) is None
+    assert (shelf.searched, shelf.compared) == ([], [])
+
+
+def test_frames_elsewhere_are_compared_before_a_pose_is_found(blank):
+    """Those that the last frame has not tried vote for its pose, in its coordinates."""
+    before = QueryFrame(
+        blank, [match(5, outcome(T=inverse(ROWS[5]) @ shifted(-1.0)))], shifted(-1.0)
+    )
+    frames = [replace(before, geometry=replace(blank, surface=replace(blank.surface, camera=None))),
+              QueryFrame(blank, seen_at(0.0, [0, 1]))]  # fmt: skip
+    shelf = Shelf(elsewhere=seen_at(9.0, [4, 5]))
+    unsure = decided(frames, shelf, (0, 1, 4, 5))
+    assert shelf.compared == [[4, 5]]
+    assert unsure.status == "ambiguous"
+    assert [(one.support, one.T[0, 3]) for one in unsure.alternatives] == [(3, 0.0), (2, 9.0)]
+    alone = Shelf()
+    assert decided(frames, alone, (0, 1, 4)).status == "found"
+    assert alone.compared == [[4]]
+    assert decided(frames, alone).status == "found"
+    assert alone.compared == [[4]]  # no frame is left
+
+
+def test_views_of_rows_are_the_frames_of_one_parent():
+    opened = []
+    views_of = views_of_rows(
+        seen_at(0.0, [1, 4]), ROWS[:6], opened.append, list("abbaba"),
+        ahead=[True] * 4 + [False, True], rendered=[False, True, True, False, False, False],
+    )  # fmt: skip
+    views = views_of("b", np.empty((0, 4, 4)))
+    np.testing.assert_array_equal(views.poses, [ROWS[1], ROWS[2], ROWS[4]])
+    assert views.candidates.tolist() == [0, 2]
+    assert [views[k] for k in range(3)] == [None] * 3
+    assert opened == [1, 2, 4]
+    assert [views.mostly_rendered([k]) for k in range(3)] == [True, True, False]
+    # a camera at x = 4 has its view 1.5 m from where the scan of row 4 stands: 1.5 m of 4
+    assert views.near(ROWS[4], True) == [2, 1, 0]
+    assert views.near(ROWS[3], False) == [2, 1, 0]
+    every = views_of_rows([], ROWS[:2], opened.append)("", np.empty((0, 4, 4)))
+    assert (len(every.poses), len(every.candidates)) == (2, 0)
+    assert not every.mostly_rendered([])
