@@ -178,6 +178,7 @@ STEPS = (
     (range(60, 62), frozenset(range(5, 50)), 0),
     (range(62, 70), frozenset[int](), 1 << 30),
 )
+N_STEPS = len(STEPS)
 
 
 def expected(number):
@@ -215,13 +216,13 @@ def read(folder):
 def lost_versions(recorded, after_crash, tmp_path):
     """Publish five versions, and say which promises a loss of power breaks."""
 
-    def run(deaf=""):
+    def run(deaf="", steps=N_STEPS):
         root = tmp_path / f"index-{deaf}"
         root.mkdir()
         done = [0]  # the state after which each version was published
         with recorded(root, deaf) as disk:
             previous = None
-            for number in range(1, len(STEPS) + 1):
+            for number in range(1, steps + 1):
                 previous = publish_step(root / "map", number, previous)
                 disk.mark("published")
                 done.append(len(disk.states) - 1)
@@ -236,15 +237,13 @@ def lost_versions(recorded, after_crash, tmp_path):
             number = 0 if found is None else found.revision // 10
             if number not in (published, published + 1):
                 broken.add(f"{number or 'none'} after {published} ({what})")
-            if what.endswith("nothing unsure") and number < len(STEPS) and number == published:
+            if what.endswith("nothing unsure") and number < steps and number == published:
                 again = publish_step(folder, number + 1, found)  # and it goes on from there
                 assert read(folder) is not None
                 assert again.revision == 10 * (number + 1)
             seen.add((published, number))
         if not broken:  # in every stretch some crashes keep the old one, and some the new one
-            assert seen >= {(n, n) for n in range(len(STEPS))} | {
-                (n, n + 1) for n in range(len(STEPS))
-            }
+            assert seen >= {(n, n) for n in range(steps)} | {(n, n + 1) for n in range(steps)}
         return broken
 
     return run
