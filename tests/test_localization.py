@@ -531,6 +531,20 @@ def test_a_pose_is_found_where_its_confidence_is_enough(rival, confidence, statu
         assert again.status == ("found" if rival == 24 else "ambiguous")
 
 
+def test_a_confidence_that_equals_the_limit_suffices():
+    """For a pose that is found, with and without a prior, and for an alternative."""
+    matches = [*seen_at(0.0, [0, 1]), *(suggested_at(APART, row) for row in (5, 6))]
+    places = [picture((40, SAME))], [picture((24, SAME))]
+    for prior in (None, near_place(0)):
+        least = judged(matches, *places, prior=prior).confidence
+        for limit, by in ((least, "matches" if prior is None else "prior"), (least + 1e-9, None)):
+            found = judged(matches, *places, prior=prior, p=replace(BY_HAND, confidence=limit))
+            assert found.verified_by == by
+    least = judged(matches, *places).confidence
+    for limit, status in ((least, "ambiguous"), (least + 1e-9, "not_found")):
+        assert judged(matches, *places, p=replace(BY_HAND, worth=limit)).status == status
+
+
 def test_alternatives_are_told_with_their_confidences_the_best_first():
     """Equal places share what is left; what is not worth a look is not told."""
     matches = [suggested_at(APART * k, row) for k in range(3) for row in (2 * k, 2 * k + 1)]
@@ -556,6 +570,7 @@ def test_few_planes_and_violations_lower_a_confidence():
         found = judged(votes, [there])
         assert found.confidence == pytest.approx(1 / (1 + math.exp(-logit)), abs=2e-3)
         assert (found.status == "found") is (logit > 4.6)
+        assert found.evidence.acceptance == 1.0  # of two votes for one frame
         assert found.status == "found" or found.reason.startswith(why)
 
 
@@ -565,7 +580,9 @@ def test_a_pose_that_one_view_alone_suggests_is_not_sure():
         found = judged(matches, [WHOLE] * 3)
         assert found.status == status
         assert [one.support for one in found.alternatives] == [1]
+        assert (found.evidence.rival, found.evidence.rival_weight) == (0.0, 0.0)
         assert status == "found" or "views of the place suggests this pose" in found.reason
+    assert judged(alone, [WHOLE]).evidence.acceptance == 1.0  # the only frame
 
 
 @pytest.mark.parametrize(
@@ -655,6 +672,32 @@ def test_the_map_alone_may_decide_where_no_match_votes():
 def test_a_copy_of_a_view_suggests_nothing_new():
     for rows, status in (((0, 0), "ambiguous"), ((0, 2), "found")):
         assert judged([suggested_at(0.0, row) for row in rows], [WHOLE] * 8).status == status
+
+
+def test_the_first_poses_of_all_candidates_come_before_their_second():
+    both = outcome("rejected", T=inverse(ROWS[0]))
+    both = replace(
+        both, hypotheses=np.stack([both.T_match_query, inverse(ROWS[0]) @ shifted(APART)])
+    )
+    matches = [match(0, both), suggested_at(2 * APART, 1)]
+    for n, at in ((2, [0.0, 2 * APART]), (3, [0.0, APART, 2 * APART])):
+        p = replace(BY_HAND, map=replace(BY_HAND.map, n_poses=n))
+        found = judged(matches, *[[WHOLE]] * 3, p=p)
+        assert sorted(place.T[0, 3] for place in found.places) == at
+
+
+def test_a_place_that_the_map_does_not_show_loses_to_any_rival():
+    """Whether its pose was scored on all frames, or was not hopeful."""
+    matches = [*seen_at(0.0, [0, 1]), *seen_at(APART, [2])]
+    for hopeful, excess in ((0.0, 0.0), (0.2, 1.0)):
+        p = replace(BY_HAND, map=replace(BY_HAND.map, hopeful=hopeful))
+        found = judged(matches, [WHOLE], [picture()], p=p)
+        [here, there] = sorted(found.places, key=lambda place: place.T[0, 3])
+        assert (here.evidence.rival, here.evidence.rival_weight) == (0.0, 1.0)
+        assert (there.evidence.rival, there.evidence.rival_weight) == (1.0, 2.0)
+        assert (there.evidence.score, there.evidence.frames, there.score) == (0.0, 0, 0.0)
+        assert (there.evidence.share, there.evidence.planes, there.evidence.viewpoints) == (0, 0, 0)
+        assert there.evidence.excess == excess
 
 
 def test_a_pose_against_which_up_speaks_is_not_suggested():
@@ -774,6 +817,20 @@ def test_a_prior_may_confirm_the_best_of_equal_poses_alone():
         places = [picture((36, SAME))], [picture((second, SAME))]
         found = judged(matches, *places, prior=near_place(1), p=best)
         assert (found.verified_by == "prior") is confirmed
+        # the only pose that the prior expects has no rival
+        assert not confirmed or (found.evidence.rival, found.evidence.rival_weight) == (0.0, 0.0)
+
+
+def test_the_parent_frame_of_rejected_matches_is_that_of_most():
+    tried = [suggested_at(0.0, row) for row in range(3)]
+    for parents, parent in (
+        (["there", "here", "here"], "here"),
+        (["there", "there", "here"], "there"),
+    ):
+        views_of = told_by([WHOLE] * 3, parent=parent)
+        frames = [QueryFrame(WHOLE, tried)]
+        found = localize(frames, ROWS[:3], parents, views_of, None, BY_HAND, FIXED)
+        assert (found.status, found.parent) == ("found", parent)
 
 
 def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(box_views, signer):
@@ -815,6 +872,12 @@ def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank):
     found = localize(frames, ROWS)
     assert (found.status, found.average.support, found.votes) == ("found", 3, 4)
     np.testing.assert_allclose(found.average.T, truth, atol=1e-12)
+
+
+def test_the_best_matches_of_all_frames_vote_first(blank):
+    before = QueryFrame(blank, seen_at(0.0, [0, 1], "weak"))
+    found = localize([before, QueryFrame(blank, seen_at(0.0, [2]))], ROWS)
+    assert (found.status, found.members) == ("found", (2, 0, 1))
 
 
 def test_candidates_of_an_earlier_frame_suggest_poses_of_the_last():
@@ -889,7 +952,7 @@ def test_rivals_are_about_as_near_as_the_farthest_vote(blank):
 @pytest.mark.parametrize(("ahead", "reach"), [(True, 3.5), (False, 4.0)])
 def test_rivals_stand_beyond_the_reach_of_a_view(blank, ahead, reach):
     at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
-    poses = {4: shifted(reach - 0.01), 5: shifted(reach + 0.01)}
+    poses = {4: shifted(reach - 0.01), 5: shifted(reach)}
     rows = rival_rows(
         at_origin, Ranking(np.array([0, 1, 4, 5]), np.ones(4, int), np.zeros(4)), {0, 1},
         lambda rows: {row: PosedFrame("", poses[row], ahead) for row in rows}, ahead,
@@ -1013,6 +1076,8 @@ def test_views_of_rows_are_the_frames_of_one_parent():
     # a camera at x = 4 has its view 1.5 m from where the scan of row 4 stands: 1.5 m of 4
     assert views.near(ROWS[4], True) == [2, 1, 0]
     assert views.near(ROWS[3], False) == [2, 1, 0]
-    every = views_of_rows([], ROWS[:2], opened.append)("", np.empty((0, 4, 4)))
+    assert not views.mostly_rendered([1, 2])  # half of them
+    every = views_of_rows([], ROWS[:2], lambda _: WHOLE)("", np.empty((0, 4, 4)))
     assert (len(every.poses), len(every.candidates)) == (2, 0)
+    np.testing.assert_array_equal(every[1].T, ROWS[1])
     assert not every.mostly_rendered([])
