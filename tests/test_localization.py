@@ -458,6 +458,21 @@ def test_a_score_by_hand():
     assert told.score == pytest.approx(40 / 60 * (1 - 2 * (violations + hidden)))
 
 
+def test_the_best_places_are_refined_and_hopeless_ones_left_out():
+    views = told_by(*[[picture((n, SAME))] for n in (40, 36, 20, 19)])("", np.empty((0, 4, 4)))
+    query = map_frame(WHOLE, np.eye(4), BY_HAND.map, FIXED)
+    poses = np.stack([shifted(APART * k) for k in (3, 2, 1, 0)])
+    for numbers, planes, refined in (
+        ({}, [40, 36, 20, 19], [1, 1, 1, 0]),
+        ({"n_places": 2, "n_refined": 1}, [40, 36], [1, 0]),
+        ({"hopeful": 0.5}, [40, 36, 20], [1, 1, 1]),
+    ):
+        p = replace(BY_HAND.map, **numbers)
+        ranked = compare_poses([query], poses, views, p, FIXED)
+        assert [one.planes for one in ranked] == planes
+        assert [len(one.starts) for one in ranked] == refined
+
+
 def test_frames_that_look_the_same_way_are_asked_first():
     """Of a camera the middle of what it sees counts, 1.5 m ahead, and its direction."""
     back, aside = shifted(0.0), shifted(0.0)
@@ -467,6 +482,7 @@ def test_frames_that_look_the_same_way_are_asked_first():
     views = MapViews(poses, lambda _: None, MapParameters(), FIXED)
     assert views.near(np.eye(4), True) == [2, 0, 1]
     assert views.near(np.eye(4), True, np.array([4, 1, 2])) == [2, 1]
+    assert views.near(shifted(-2.5), True) == []  # frame 2 is 3.5 m off, too far
     # of a scan where it stands, 1.5, 1.5, 1.8, 3.7 and 3.9 m from what the cameras see
     assert views.near(np.eye(4), False) == [0, 4, 2, 1, 3]
     scans = MapViews(poses, lambda _: None, MapParameters(), FIXED, ahead=[False] * 5)
