@@ -347,11 +347,11 @@ def _forbidden(caller: Caller, scope: Scope, what: str) -> Forbidden:
 
 # Refused requests in the audit log.
 
-#: Status codes of requests that were refused because of their caller.
+#: Status codes of responses that refuse a request because of who sent it.
 REFUSED = (401, 403)
 #: Number of refusals per caller and address to log at once, and seconds until one more is logged.
 AT_ONCE, AGAIN_S = 10, 600.0
-#: Number of refusals of all callers to log at once, and per second. Each line is a commit.
+#: Number of refusals of all callers to log at once, and per second. Each takes a transaction.
 ALL_AT_ONCE, ALL_PER_S = 20, 1.0
 
 

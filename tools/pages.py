@@ -46,9 +46,9 @@ def settings_page() -> str:
         f"Service and workers read these {len(fields)} environment variables when they start. "
         "All have defaults. An invalid value prevents the start, and a one-line "
         "message is printed. The names in the tables follow `SCENEPRINT_`: `SCENEPRINT_PORT`.",
-        "Secrets can come from files of one line. Append `_FILE` to the variable and set it to the "
-        "path: `SCENEPRINT_DATABASE_URL_FILE`, `PGPASSWORD_FILE`, `AWS_ACCESS_KEY_ID_FILE`, "
-        "`AWS_SECRET_ACCESS_KEY_FILE` and `AZURE_STORAGE_ACCOUNT_KEY_FILE`.",
+        "A secret can come from a file of one line: set `SCENEPRINT_DATABASE_URL_FILE`, "
+        "`PGPASSWORD_FILE`, `AWS_ACCESS_KEY_ID_FILE`, `AWS_SECRET_ACCESS_KEY_FILE` or "
+        "`AZURE_STORAGE_ACCOUNT_KEY_FILE` to its path.",
         "Clients take the defaults of `--url` and `--key` from `SCENEPRINT_URL` and "
         "`SCENEPRINT_KEY`. If `SSL_CERT_FILE` names a PEM file, clients trust its authorities "
         "instead of the public ones.",

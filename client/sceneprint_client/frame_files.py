@@ -335,10 +335,10 @@ def sendable(
     frame: FrameInput, meta: MetaInput | None, *, with_pose: bool,
     up: Sequence[float] | None = None,
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
-    """Return the bytes and metadata of a frame; those of a file come from its sidecar files.
+    """Return the bytes and metadata of a frame; without `meta`, sidecar files describe a file.
 
-    `with_pose` includes the pose, the file's name and its index in the sequence. `up` overrides
-    `meta` and the sidecar file.
+    `with_pose` includes the file's name, its index in the sequence and, without `meta`, its pose.
+    `up` overrides `meta` and the sidecar file.
 
     Raises
     ------

@@ -118,7 +118,7 @@ class MapMethods(ServiceConnection):
         ------
         UnknownMap : If the map does not exist.
         InvalidRequest : If the model does not exist.
-        Conflict : If the map has this model, or is being signed with a third model.
+        Conflict : If the map already uses this model, or is already switching to a different one.
         """
         return await self._call(
             Map, "POST", f"{map_path(map_name)}/reencoding", json={"model": model}

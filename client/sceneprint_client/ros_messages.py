@@ -264,7 +264,7 @@ def topic_without_transport(topic: str) -> str:
 
 
 def _distortion(info: Any) -> tuple[float, ...]:
-    """Return the coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of a lens; none if all are 0.
+    """Return the lens coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; () if all are 0.
 
     Raise InvalidIntrinsics for another lens model.
     """

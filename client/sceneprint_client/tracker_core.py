@@ -521,7 +521,10 @@ class TrackerCore:
             self._belief = replace(self._belief, undecided=mark.distance)
 
     def _correct(self, mark: _Mark, pose: PoseEvidence, factor: float) -> None:
-        """Correct the belief by an independent view; `factor` multiplies the view's deviations."""
+        """Correct the belief by a view; `factor` multiplies the view's deviations.
+
+        Do nothing if there is no belief, or the view is not independent of it.
+        """
         belief = self._belief
         if belief is None or not self._are_independent(belief.mark, mark):
             return

@@ -74,7 +74,8 @@ def column_names(table: Table) -> str:
 def read_table(connection: Connection, table: Table) -> Iterator[Row]:
     """Yield all rows of a table in the order of their keys, with equal values for both databases.
 
-    JSON documents are text, and Boolean values are integers.
+    JSON documents are text, and Boolean values are integers. Events that PostgreSQL has not
+    numbered yet get numbers after the last one.
     """
     server = connection.dialect.name == "postgresql"
     columns = ", ".join(

@@ -188,7 +188,7 @@ def _wait_for_import(client: Client, options: argparse.Namespace, name: str, job
 
 
 def _show_progress(bar: tqdm[Any], name: str, progress: Progress) -> None:
-    """Update a bar with the progress of an import or, for a map, of its phase."""
+    """Update a bar with the progress of an import; for a whole map, of its current phase."""
     done, total = progress.done, progress.total
     if progress.phase is not None:
         steps = {"render": progress.rendered, "sign": progress.signed, "test": progress.tested}

@@ -193,7 +193,7 @@ def add_frame_options(
     )  # fmt: skip
     command.add_argument(
         "--robot", metavar="NAME",
-        help="robot that took the frames; also a prefix of the parent frame of the poses",
+        help="robot that took the frames; its name also prefixes the parent frame of the poses",
     )  # fmt: skip
     command.add_argument(
         "--session", metavar="NAME", help="session of the frames (default: the sequence's name)"

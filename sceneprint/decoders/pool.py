@@ -163,18 +163,19 @@ class DecoderProcess:
         )
 
     def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
-        """Run a task on an upload; return its unchecked reply.
+        """Run a task on an upload; return its reply, an object with unchecked content.
 
         Parameters
         ----------
         request : name of the task and its parameters
         data : bytes of the upload
-        seconds : maximum processor time
+        seconds : maximum processor time, and maximum idle time
 
         Raises
         ------
-        DecoderEnded : If the process ends during the task.
-        DecoderFailure : If the task takes too long.
+        DecoderEnded : If the process ends during the task, or the reply is not an object.
+        DecoderFailure : If the task exceeds `seconds`, or takes eight times as long in all; the
+            process continues.
         """
         self._sent, self._used = len(data), SHARED_BYTES  # upper bound until the reply arrives
         self._shared[: len(data)] = data

@@ -49,14 +49,14 @@ def compile_kernels(
 ) -> None:  # fmt: skip
     """Compile missing parts, each in its own process, and wait for the processes.
 
-    If a process fails, its kernels are compiled on first use. The target is x86-64-v3, since wider
-    vector instructions are slower on processors with slow gather instructions
-    (docs/performance.md). On other architectures, and if NUMBA_CPU_NAME is set, it is the actual
-    processor.
+    If a process fails, its kernels are compiled on first use. Numba caches the machine code. The
+    target is NUMBA_CPU_NAME, if set, otherwise x86-64-v3, since wider vector instructions are
+    slower on processors with slow gather instructions (docs/performance.md); processors that lack
+    x86-64-v3 are their own target.
 
     Parameters
     ----------
-    cache_dir : folder of pair tables, where a table is created
+    cache_dir : folder of pair tables; calling the kernels creates a table there
     say : function that receives progress messages
     stop : event that cancels the compilation
     """

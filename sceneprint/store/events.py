@@ -217,8 +217,8 @@ def newest_number(connection: Connection) -> int:
     return int(connection.execute(select(func.max(events.c.number))).scalar() or 0)
 
 
-def newest_seen(connection: Connection, criteria: EventFilter) -> int:
-    """Return the number of the newest event, of any kind, that the caller may read, or 0.
+def newest_selected(connection: Connection, criteria: EventFilter) -> int:
+    """Return the number of the newest event of the selected maps, of any kind, or 0.
 
     It serves as a position in the list, because it does not reveal hidden events.
     """

@@ -290,12 +290,12 @@ def fused_range(connection: Connection, map_number: int) -> tuple[float | None, 
 
 
 def spread_fused(connection: Connection, map_number: int, parent: str, most: int) -> list[int]:
-    """Return the numbers of evenly spaced fused frames in a parent frame, fewer than 2 * `most`."""
+    """Return the numbers of up to `most` evenly spaced fused frames in a parent frame."""
     c = surface_frames.c
     own = (c.map_number == map_number) & (c.parent == parent)
     statement = select(c.frame_number).where(own).order_by(c.frame_number)
     numbers = list(connection.execute(statement).scalars())
-    return numbers[:: max(len(numbers) // most, 1)]
+    return numbers[:: max(-(-len(numbers) // most), 1)]
 
 
 @dataclass(frozen=True)

@@ -78,8 +78,8 @@ def retry_dead_jobs(
 ) -> RetriedJobs:
     """Retry a page of the dead jobs. Jobs that were already retried are skipped.
 
-    Without `map`, this requires `write` for `*`; jobs that belong to no map require `admin` for
-    `*`.
+    Without `map`, this requires `write` for `*`. Jobs that belong to no map are skipped unless the
+    key has `admin` for `*`.
     """
     if map_name is not None:
         caller.require(map_name, "write")

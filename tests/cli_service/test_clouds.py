@@ -53,7 +53,7 @@ def test_rows_of_five_are_named_or_refused(sceneprint, scans, tmp_path):
     (tmp_path / "0.bin").write_bytes(np.c_[rows, ring].astype("<f4").tobytes())
     without = ("--no-wait", "--model", "depth")
     done = sceneprint("upload", "rows", tmp_path, *without, expect=2)
-    assert "/0: According to the values, a row of the file has 5 numbers" in done.stderr
+    assert "/0: Judging by its values, the file has 5 numbers per row" in done.stderr
     done = sceneprint("upload", "rows", tmp_path, "--row", "x,y,z,i,ring", *without)
     assert "1 frames: 1 received" in done.stdout
     assert "1 of the frames are point clouds" in done.stdout

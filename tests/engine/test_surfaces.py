@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 from PIL import Image
-from sqlalchemy import func, select
+from sqlalchemy import func, select, update
 
 from sceneprint.engine.maps import map_surface, surface_job
 from sceneprint.engine.maps.map_surface import SurfaceUpkeep
@@ -20,6 +20,7 @@ from sceneprint.store.events import number_events
 from sceneprint.store.frame_queries import numbers_of_runs, path_frames
 from sceneprint.store.frames import refers_to, write_frame
 from sceneprint.store.maps import find_frame, find_map, geometry_blobs
+from sceneprint.store.surface_rows import spread_fused
 from sceneprint.store.tables import (
     events,
     jobs,
@@ -290,6 +291,17 @@ def test_another_model_begins_anew(engine, work_off, whitened_model):
     with engine.store.database.read() as connection:
         after = set(connection.execute(select(surface_tiles.c.number)).scalars())
     assert not before & after
+
+
+def test_fused_frames_are_sampled_evenly(engine):
+    with engine.store.database.write() as connection:
+        number = find_map(connection, "hall").number
+        connection.execute(update(surface_frames).values(parent="hall"))
+        every = spread_fused(connection, number, "hall", 12)
+        assert len(every) == 12
+        for most, step in ((1, 12), (4, 3), (5, 3), (7, 2), (11, 2), (20, 1)):
+            assert spread_fused(connection, number, "hall", most) == every[::step]
+        assert spread_fused(connection, number, "nowhere", 4) == []
 
 
 def test_a_deleted_map_leaves_nothing(engine):

@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import insert, select, update
 
 from sceneprint.store.deletion import remove_map
-from sceneprint.store.events import EventFilter, list_events, newest_seen, removal_floor
+from sceneprint.store.events import EventFilter, list_events, newest_selected, removal_floor
 from sceneprint.store.maps import add_map, find_map, store_model
 from sceneprint.store.store_counts import count_events
 from sceneprint.store.tables import events
@@ -95,7 +95,7 @@ def test_the_database_and_the_stream_pick_the_same(empty):
             wanted = EventFilter(named, begun, of_maps)
             assert list_events(connection, wanted) == [one for one in every if wanted(one)]
             seen = [one.number for one in every if wanted.sees(one)]
-            assert newest_seen(connection, wanted) == max(seen, default=0)
+            assert newest_selected(connection, wanted) == max(seen, default=0)
         newest = list_events(connection, EventFilter(), before=50, limit=7, newest_first=True)
         assert [one.number for one in newest] == list(range(49, 42, -1))
 
@@ -139,7 +139,7 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
         wanted = EventFilter(frozenset(names), since=since)
         with store.database.read() as connection:
             found = [(one.kind, one.map) for one in list_events(connection, wanted)]
-            newest = newest_seen(connection, wanted)
+            newest = newest_selected(connection, wanted)
             lost = removal_floor(connection, wanted, 1, 0)
             numbers = connection.execute(select(events.c.number, events.c.kind, events.c.map))
             last = [row.number for row in numbers if (row.kind, row.map) in found]

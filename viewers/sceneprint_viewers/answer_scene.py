@@ -71,7 +71,7 @@ _GENERATED_ID = re.compile(r"[0-9a-f]{32}", re.ASCII)
 SHORT_ID = 8
 #: Path of the text about an answer, which is not a space.
 SUMMARY: EntityPath = ("answer",)
-#: Height of a label over its sensor, metres.
+#: Height of a label above its sensor, metres.
 _LABEL_M = 0.12
 
 

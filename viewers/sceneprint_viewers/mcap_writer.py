@@ -82,7 +82,7 @@ class _OutputFile:
 
 @contextmanager
 def mcap_file(path: Path) -> Iterator[McapWriter]:
-    """Yield a writer for an MCAP file, which is created at the end unless it is empty.
+    """Yield a writer for an MCAP file, which replaces `path` at the end unless it is empty.
 
     Raise OSError if the file cannot be written. No partial file remains.
     """

@@ -76,7 +76,7 @@ def _require_relative(name: str) -> str:
     return name
 
 
-#: Name of an original file or message. It is a label and never opened as a path.
+#: Name of an original file or message. It is only a label; it is never opened as a path.
 FileName = Annotated[
     str,
     StringConstraints(min_length=1, max_length=MOST_OF_NAME, pattern=_FILE_NAME),
@@ -370,7 +370,7 @@ class Intrinsics:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise InvalidIntrinsics(
-                f"The image size {self.width} x {self.height} is empty. "
+                f"The image size {self.width} x {self.height} is invalid: both must be at least 1. "
                 "Specify the width and height of the depth image in pixels."
             )
         if self.width * self.height > MAXIMUM_SAMPLES:

@@ -96,7 +96,10 @@ def read_samples(path: Path) -> list[JudgedQuery]:
 
 
 def main() -> None:
-    """Collect samples, fit the parameters of a preset, and write them to a model file."""
+    """Fit the parameters of a preset to samples, and write them to the model file of `--out`.
+
+    If the file of `--evidence` does not exist, create it with samples from generated sites.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m sceneprint_lab.cli.confidence_fit", description=__doc__
     )

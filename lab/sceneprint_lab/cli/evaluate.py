@@ -52,8 +52,8 @@ def add_evaluate(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--7scenes", type=Path, dest="seven_scenes", metavar="DIR",
         help="evaluate the scenes of 7-Scenes in this folder with their official splits, and print "
-        "the figures beside those of the paper; without intrinsics.json, use the Kinect's camera "
-        "(585 pixels, centre 320, 240)",
+        "the figures beside those of the paper; without intrinsics.json, use the Kinect's "
+        "intrinsics (focal length 585 pixels, principal point 320, 240)",
     )  # fmt: skip
     add_model_options(command)
     _add_frames(command)
@@ -118,7 +118,8 @@ def _add_method(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     command.add_argument(
         "--candidates", type=positive, default=10, metavar="N",
-        help="size of C, and number of frames of R to validate (default: 10)",
+        help="number of frames in the selection (C), and of first frames in the ranking (R) to "
+        "validate (default: 10)",
     )  # fmt: skip
     command.add_argument("--seed", type=whole_number, default=0, metavar="S", help="default: 0")
     command.add_argument(
@@ -377,6 +378,8 @@ def _limit(text: str) -> float:
 def run_evaluate_pairs(options: argparse.Namespace) -> int:
     """Sample pairs of frames by their true overlap, validate each, and compare the result with
     the true poses: success by overlap, precision, recall, false accepts.
+
+    Print the figures, and write them to the file of `--json`.
     """
     from sceneprint_lab.evaluation.pair_report import pair_figures, pair_table
     from sceneprint_lab.evaluation.pair_run import Drawing, PairSettings, evaluate_pairs

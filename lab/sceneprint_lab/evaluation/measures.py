@@ -140,7 +140,7 @@ class Roc:
         return float(self.true[self.false <= false].max())
 
     def thinned(self, most: int = CURVE) -> list[list[float]]:
-        """Return at most `most` points (false, true, threshold), including both ends."""
+        """Return at most `most` points (false, true, threshold) of the curve, with both ends."""
         n = len(self.true)
         selected = np.arange(n)
         if n > most:
@@ -296,7 +296,11 @@ def validation(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None
 
 
 def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | None]:
-    """Return the figures of `validation` for pairs; precision is null if no pair is accepted."""
+    """Return counts, precision and recall of the verdicts on pairs; without accepted pairs,
+    precision is null.
+
+    Strong matches and pairs of different scenes are also counted separately.
+    """
     accepted = [p for p in pairs if p.accepted]
     right = [p for p in pairs if p.right]
     clear = [p for p in right if p.overlap_least >= OVERLAPS]

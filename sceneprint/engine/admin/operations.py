@@ -28,7 +28,7 @@ from sceneprint.store.events import (
     EventRow,
     list_events,
     newest_number,
-    newest_seen,
+    newest_selected,
     number_events,
     removal_floor,
     remove_events,
@@ -85,7 +85,7 @@ def begin(
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
-        seen = newest_seen(connection, event_filter)
+        seen = newest_selected(connection, event_filter)
         lost = after is not None and removal_floor(connection, event_filter, minimum, after) > after
     if after is None:
         return EventSlice([], newest, seen)
@@ -102,7 +102,7 @@ def next_events(database: Database, event_filter: EventFilter, place: int, most:
         rows = list_events(connection, event_filter, after=place, limit=most)
         if len(rows) == most:
             return EventSlice(rows, rows[-1].number, rows[-1].number)
-        return EventSlice(rows, max(newest, place), newest_seen(connection, event_filter))
+        return EventSlice(rows, max(newest, place), newest_selected(connection, event_filter))
 
 
 def missed(place: int) -> EventRow:
@@ -175,7 +175,7 @@ class Events:
             least, before = (least, place) if newest_first else (max(least, place), None)
         number_events(self._store.database)
         with self._store.database.read() as connection:
-            newest = newest_seen(connection, event_filter)
+            newest = newest_selected(connection, event_filter)
             rows = list_events(
                 connection, event_filter, after=least, before=before, limit=limit + 1,
                 newest_first=newest_first,

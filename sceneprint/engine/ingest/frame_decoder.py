@@ -267,7 +267,8 @@ def _refuse(meta: FrameMeta, kind: str, defaults: dict[str, object]) -> None:
     if extra:
         raise errors.InvalidRequest(
             f"The frame is a {kind}, and {' and '.join(f'`{name}`' for name in extra)} would have "
-            "no effect. Omit them, or check that you sent the right file.",
+            f"no effect. Omit {'them' if extra[1:] else 'it'}, or check that you sent the right "
+            "file.",
             tuple((name, f"does not apply to a {kind}") for name in extra),
         )
 

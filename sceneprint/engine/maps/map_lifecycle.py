@@ -291,7 +291,7 @@ def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Pat
     ------
     UnknownMap : If the map does not exist.
     UnreadableModel : If the model does not exist or cannot be read.
-    Conflict : If the map already has this model, or is switching to a third model.
+    Conflict : If the map already has this model, or is switching to a different one.
     """
     next_model = model if isinstance(model, Model) else read_model(model)
     with store.database.write() as connection:

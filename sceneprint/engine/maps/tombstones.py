@@ -116,7 +116,7 @@ class Tombstones:
         self._wake()
 
     def restore(self, map_name: str, deletion_id: str, seconds: float = CALL_S) -> FramesRestored:
-        """Restore the frames of a deletion in blocks.
+        """Restore, block by block, the frames that a deletion removed.
 
         Parameters
         ----------

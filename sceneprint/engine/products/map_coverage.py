@@ -68,7 +68,7 @@ class _Measurement:
     plans: list[CoveragePlan]
 
 
-#: Maximum number of parent frames with a plan: those with the most queried frames.
+#: Maximum number of plans; the parent frames with the most queried frames get one.
 MOST_PLANS = 20
 #: A duration, in seconds, that exceeds any session.
 _FOREVER_S = 1e12

@@ -103,7 +103,8 @@ def _place_vertices(
 ) -> tuple[list[Floats | None], list[str | None]]:
     """Return the pose and the parent frame of each vertex; None if unknown.
 
-    Joins convert poses to the most common parent frame; edges give vertices without a pose one.
+    Poses are converted to the most common parent frame among those that joins connect to theirs.
+    Edges give poses to vertices without one.
     """
     counted = Counter(stop.parent for stop in stops if stop.pose is not None)
     parents = sorted((name for name in counted if name), key=lambda name: (-counted[name], name))
@@ -147,7 +148,7 @@ def _neighbours(parent: str, joins: Sequence[Mapping[str, Any]]) -> list[tuple[s
 def _spread(
     poses: list[Floats | None], frames: list[str | None], edges: Sequence[PoseEdge]
 ) -> None:
-    """Set unknown poses by breadth-first search along the edges, in place."""
+    """Set unknown poses and parent frames by breadth-first search along the edges, in place."""
     near: dict[int, list[tuple[int, Floats]]] = {}
     for edge in edges:
         near.setdefault(edge.first, []).append((edge.second, edge.T))

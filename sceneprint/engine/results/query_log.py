@@ -86,7 +86,8 @@ TIDY_S, TIDY_MOST, BLOCK = 60.0, 20_000, 100
 MOST_QUERIES, MOST_KEPT = 100_000, 1000
 #: Minimum age, in seconds, at which a file without a row is removed.
 _ORPHAN_S = 60.0
-#: Share of the space for answers: writing this much triggers a removal, which frees this much.
+#: Share of the space for answers. After this much was written, space is checked; if it is used up,
+#: the oldest answers are removed until this much is free.
 _SHARE = 1 / 16
 
 

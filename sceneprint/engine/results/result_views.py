@@ -145,13 +145,15 @@ class Pairs:
         )  # fmt: skip
 
     def load(self, pair: StoredPair) -> tuple[Geometry, Geometry]:
-        """Return the geometries of query and match; rebuild and repair a damaged geometry of the
-        match.
+        """Return the geometries of query and match.
+
+        If the match's geometry is damaged, rebuild it for this call and, unless the map has
+        changed its model, queue a job that repairs it.
 
         Raises
         ------
         DamagedBlob : If the upload of the match is damaged as well.
-        UnknownFrame : If the match was deleted.
+        UnknownFrame : If the match's geometry is damaged and the match was deleted.
         """
         query = geometry_of_query(pair.stored)
         try:

@@ -258,11 +258,11 @@ def validation_record(v: PairValidation) -> ValidationRecord:
 def explain(
     candidates: Candidates, checks: Validated, among: Ints64 | None, p: DiversityParameters | None
 ) -> list[Explanation]:
-    """Explain for each frame of R which stage it reached last, and why.
+    """Explain for each frame of the ranking R which stage it reached last, and why.
 
     Parameters
     ----------
-    candidates : candidates with the rows of all frames of R
+    candidates : candidates with the rows of the frames of R; frames without a row are skipped
     checks : validations of the candidates
     among : (R, R) distances within R; None if diversification was not requested
     p : parameters of the selection
@@ -359,7 +359,7 @@ def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
     Raise UnknownFrame if the frame is not in the queried maps.
     """
     part, row = _locate_frame(case, frame_id)
-    absent = _absent(case, part, row)
+    absent = _unsearchable(case, part, row)
     name = part.place.row.name
     if absent is not None:
         return ExplainedFrame(
@@ -432,10 +432,10 @@ def _locate_frame(case: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSea
     )
 
 
-def _absent(
+def _unsearchable(
     case: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[Lost, str] | None:
-    """Return the stage and the reason why the search excludes a frame; None if it does not."""
+    """Return stage and reason if a frame is the query or not in the index; otherwise None."""
     view, prepared = part.place.view, case.prepared
     if prepared.frame is not None and prepared.frame[0] == row.number:
         return "query", "it is the queried frame, which the search excludes"

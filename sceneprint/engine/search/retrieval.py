@@ -253,8 +253,8 @@ def check_origin(origin: QueryOrigin, query: Query) -> QueryOrigin:
         if missing:
             raise errors.InvalidRequest(
                 "The filter has `not_within_s`, but the query frame has no "
-                f"{' and no '.join(missing)}. Send the frame with both in its meta, or omit "
-                "`not_within_s`.",
+                f"{' and no '.join(missing)}. Send {'both' if missing[1:] else 'it'} in its meta, "
+                "or omit `not_within_s`.",
                 tuple((name, "needed by filter.not_within_s") for name in missing),
             )
     return origin

@@ -88,7 +88,7 @@ def list_folder(folder: Path) -> tuple[list[str], list[str]]:
 def natural(name: str) -> tuple[list[tuple[int, str]], str]:
     """Return a sort key for natural order: digits are compared as numbers, ties as text."""
     parts = re.split(r"(\d+)", name, flags=re.ASCII)
-    # digits are compared by length and then as text: a number may be arbitrarily long
+    # compare runs of digits by length, then as text, because a number may be arbitrarily long
     key = [
         (len(part.lstrip("0")), part.lstrip("0")) if i % 2 else (0, part)
         for i, part in enumerate(parts)
@@ -575,7 +575,10 @@ def _single_frame(file: Path) -> FrameSequence:
 
 
 def _split(folder: Path) -> Split | None:
-    """Return the use of a sequence according to its scene's split files; None if not listed."""
+    """Return whether the scene's split files list a sequence for training or testing; None if not.
+
+    Raise DatasetError if both list it.
+    """
     match = _SEQUENCE_FOLDER.fullmatch(folder.name)
     number = int(match[1]) if match else -1
     uses: list[Split] = []

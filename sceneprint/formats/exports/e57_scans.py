@@ -102,7 +102,7 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
                     left_out["clouds without a viewpoint"] += 1
                 else:
                     frames.append(_make_frame(path, name, place, scan))
-            thick = sum(scan.count > MOST_POINTS for scan in scans)
+            dense = sum(scan.count > MOST_POINTS for scan in scans)
     except UnreadableCloud as cause:
         raise DatasetError(f"{path}: {cause}") from cause
     reasons = ", ".join(f"{count} {reason}" for reason, count in left_out.items())
@@ -113,7 +113,7 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
         )
     note = f"{len(frames)} of {len(scans)} scans taken"
     note += f"; skipped: {reasons}" if reasons else ""
-    note += f"; {thick} scans with more than {MOST_POINTS} points are thinned" if thick else ""
+    note += f"; {dense} scans with more than {MOST_POINTS} points are thinned" if dense else ""
     lost = count_lost(left_out)
     return FrameSequence(name, path, Layout.E57, name, None, tuple(frames), note, lost=lost)
 

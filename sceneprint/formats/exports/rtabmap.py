@@ -371,7 +371,8 @@ def _read_value(path: Path, column: str, node: int) -> bytes:
         row = database.execute(f"SELECT {column} FROM Data WHERE id = ?", (node,)).fetchone()
     if row is None or not isinstance(row[0], bytes):
         raise DatasetError(
-            f"{path}: Node {node} no longer has the column {column}. Read the database again."
+            f"{path}: The column {column} of node {node} no longer has a value. Read the database "
+            "again."
         )
     return row[0]
 

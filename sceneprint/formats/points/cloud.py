@@ -52,8 +52,8 @@ def read_kitti(data: bytes) -> FilePoints:
     if (floats := _row_length(data)) is not None:
         row = ",".join(("x", "y", "z", "i", "ring", "time", "a", "b")[:floats])
         raise UnreadableCloud(
-            f"According to the values, a row of the file has {floats} numbers, but a row of a "
-            f'KITTI scan has 4. Specify it with `--row {row}` or with "row" in clouds.json, or '
+            f"Judging by its values, the file has {floats} numbers per row, but a KITTI scan has "
+            f'4. Specify them with `--row {row}` or with "row" in clouds.json, or '
             "send x, y and z as NPY with the shape (N, 3)."
         )
     if rest or not count:
@@ -407,8 +407,9 @@ def _select_viewpoint(
         abs(value) <= _FARTHEST_VIEWPOINT_M for value in viewpoint
     ):
         raise UnreadableCloud(
-            f"The viewpoint {viewpoint} is not finite, or not on Earth. Specify the position of "
-            "the sensor, in metres along the axes of the points."
+            f"The viewpoint {viewpoint} has a coordinate that is not finite or exceeds "
+            f"{_FARTHEST_VIEWPOINT_M / 1e3:,.0f} km. Specify the position of the sensor, in metres "
+            "along the axes of the points."
         )
     return viewpoint
 

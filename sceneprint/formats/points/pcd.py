@@ -251,7 +251,8 @@ def _parse_fields(entries: dict[str, list[str]]) -> list[Field]:
         if dtype is None or values > _MAXIMUM_COUNT:
             raise UnreadableCloud(
                 f"The PCD field {name!r:.40} has COUNT {count}, TYPE {kind!r:.20} and SIZE "
-                f"{size!r:.20}; F of 4 and 8 bytes and I and U of 1 to 8 are supported. {_AGAIN}"
+                f"{size!r:.20}. Supported are COUNT up to {_MAXIMUM_COUNT}, TYPE F with SIZE 4 "
+                f"or 8, and TYPE I or U with SIZE 1, 2, 4 or 8. {_AGAIN}"
             )
         fields.append(Field(name, dtype, values))
     return fields

@@ -409,7 +409,10 @@ def _look_up_near(
     source: Floats32, points: Floats32, normals: Floats32, camera: Floats, heads: Ints32,
     chain: Ints32, T: Floats, tolerances: Floats, verdicts: Bytes,
 ) -> None:  # fmt: skip
-    """Write the verdicts (N,) of a target with unordered points on points (N, 6) under T."""
+    """Write AGREES or UNKNOWN for each of the points (N, 6) under T; the target is unordered.
+
+    `camera` is that of `LookupTarget`.
+    """
     at, facing = np.empty(3), np.empty(3)
     for i in range(len(source)):
         verdicts[i] = UNKNOWN

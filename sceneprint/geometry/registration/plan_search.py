@@ -152,12 +152,12 @@ def _gather_normals(normals: Floats, up: Floats, near: float, level: float, spre
 def draw_plan(
     surface: Surface, p: PlanParameters, axis: Floats | None = None, up: Floats | None = None
 ) -> ScanPlan:
-    """Draw the plan of a scan.
+    """Return the plan of a scan: levelled points and histograms, but no image.
 
     Parameters
     ----------
     surface : surface with at least one valid point
-    axis : (3,) expected up; None selects the scanner's axis
+    axis : (3,) expected up, unused with `up`; None selects the scanner's axis
     up : (3,) unit vector in the scanner's coordinates; None estimates it
     """
     shown = surface.fitted
@@ -298,11 +298,12 @@ def _take_peaks(scores: Floats32, n: int, values: Floats, cells: Ints32) -> None
 def _draw_slices(
     points: Floats32, slices: Bytes, cosine: float, sine: float, cell: float, image: Floats32
 ) -> None:
-    """Write the roots of the point counts per cell, at most sqrt(3), to (n_slices, side, side).
+    """Rotate points by a yaw, and add them to an image (n_slices, side, side), which starts as 0.
 
-    The square root and the limit reduce the influence of a single wall. Cell 0 is centred on the
-    scanner, and negative cells come after the positive cells, so that a half turn reverses both
-    axes.
+    Cells contain the square root of their number of points, at most sqrt(3). Points of slice 0 are
+    skipped. The square root and the limit reduce the influence of a single wall. Cell 0 is centred
+    on the scanner, and negative cells come after the positive cells, so that a half turn reverses
+    both axes.
     """
     side = image.shape[1]
     for i in range(len(points)):
@@ -393,9 +394,9 @@ def _correlate_plans(
 
 
 def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> Floats:
-    """Return T_target_source (n, 4, 4) that align the surfaces above the ground, best first.
+    """Return T_target_source (n, 4, 4) that align the points in the height slices, best first.
 
-    Only the `sliced_yaws` pairs of opposite yaws at which the plans agree best are tried. A half
+    Only the `sliced_yaws` pairs of opposite yaws at which the azimuths agree best are tried. A half
     turn of an image conjugates its spectrum, so both yaws of a pair share a spectrum.
     """
     half = p.n_yaws // 2

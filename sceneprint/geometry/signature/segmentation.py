@@ -126,7 +126,7 @@ def _assign(
 def _sums(
     points: Floats32, normals: Floats32, weights: Floats32, labels: Ints32, n: int
 ) -> NDArray[np.float64]:
-    """Return each label's sums of weights, weighted points, normals and pixels, (n, 8)."""
+    """Return (n, 8) sums per label: weights, weighted points, weighted normals, and pixels."""
     height, width = labels.shape
     sums = np.zeros((n, 8))
     for y in range(height):
@@ -596,7 +596,7 @@ def _seeds(seen: Voxels, spacing: float) -> Ints32:
 def _grow_patches(
     seen: Voxels, labels: Ints32, spacing: float, least: float, p: SegmentationParameters
 ) -> tuple[Ints32, int]:
-    """Grow patches, except those below `least` voxels; return labels (V,) and their number."""
+    """Grow patches and drop those below `least` voxels; return labels (V,) and the patch count."""
     points, normals, links = seen.points[0], seen.normals[0], seen.links
     centres = np.zeros((int(labels.max(initial=-1)) + 1, 8))
     grown = labels.copy()

@@ -200,7 +200,8 @@ def metric_cell(x: float, y: float, z: float, size: float) -> int:
 def hash_key(key: int, secret: int) -> int:
     """Return the hash of a key, for tables whose size is a power of two.
 
-    The secret prevents attacks by clouds whose cells share a slot. Results must not depend on it.
+    The secret prevents attacks with clouds that are crafted so that their cells share a slot.
+    Results must not depend on it.
     """
     h = (key ^ secret) * 0x9E3779B97F4A7C1
     h ^= h >> 31

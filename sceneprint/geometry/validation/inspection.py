@@ -29,7 +29,7 @@ from sceneprint.geometry.registration.overlap import (
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint.types import Bytes, Floats, Floats32, Geometry, Ints32, Patches, Surface
 
-#: Verdicts on a point: unobserved or beside the surface; on the surface; in free space.
+#: Verdicts on a point: unobserved, or beside or behind the surface; on it; in free space.
 NEITHER, AGREES, VIOLATES = 0, 1, 2
 #: Maximum residual, and codes of verdicts, in the encoding of `sceneprint.formats.export`.
 TOLERANCE, OUTSIDE, VIOLATION = 250, 253, 254

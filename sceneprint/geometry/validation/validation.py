@@ -578,7 +578,7 @@ def _tilt_objection(tilt: float | None, p: ValidationParameters) -> tuple[Status
 def _combine_directions(
     there: Alignment | None, back: Alignment | None, p: AcceptanceParameters
 ) -> tuple[tuple[float, float], dict[tuple[Direction, ...], Floats]]:
-    """Return the residual of the two directions, and T_match_query by the directions it is from.
+    """Return the residual of the two directions, and each T_match_query with its directions as key.
 
     If the directions agree, there is a single transform, halfway between theirs; otherwise, each
     direction has its own.

@@ -221,7 +221,9 @@ def _cover(
 ) -> tuple[list[int], float]:  # fmt: skip
     """Select views greedily until gains are small; return their indices and the share covered.
 
-    Gains can only decrease during the selection, so most need not be recomputed.
+    The share is of the elements that any of `views` shows. The second view of an element also
+    gains, see `_WORTH`. Gains can only decrease during the selection, so most need not be
+    recomputed.
 
     Parameters
     ----------
@@ -229,7 +231,7 @@ def _cover(
     views : place and direction of each view
     universe : number of elements
     most : maximum number of views
-    least_gain : share of the first view's gain at which the selection ends
+    least_gain : share of the first view's gain at which the selection ends; it also ends below 1
     """
     counts = np.zeros(universe, np.uint8)
 

@@ -135,7 +135,10 @@ class Folder:
 def read_rows(
     folder: Folder, numbers: list[int], read: Callable[[Connection, list[int]], list[T]]
 ) -> Iterator[T | tuple[int, Exception]]:
-    """Yield the results of `read` for some rows, or number and error of an unreadable row."""
+    """Yield the results of `read` for some rows, and number and error of each unreadable row.
+
+    If the rows cannot be read at once, `read` gets them one by one. Other errors propagate.
+    """
     try:
         with folder.store.database.read() as connection:
             rows = read(connection, numbers)

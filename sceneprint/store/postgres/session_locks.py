@@ -65,7 +65,7 @@ class SessionLocks(Locks):
         self._alone = threading.Lock()  # lock of the thread that removes blobs
         self._remover, self._reader = _Connection(database), _Connection(database)
         self._uncertain = False
-        # last odd number of `_COUNTER`, and time of its first read by this process
+        # last odd value of `_COUNTER`, and when this process first read it
         self._odd: tuple[int, float] | None = None
 
     def close(self) -> None:

@@ -51,7 +51,7 @@ export const FIELDS = [
   { name: "plane_overlap", group: "validation", within: "validation", label: "Overlap by planes", kind: "range", min: 0, max: 1, step: 0.01,
     hint: "Minimum with equal weight for every plane: a floor alone is not enough." },
   { name: "strong", group: "validation", within: "validation", label: "Strong from", kind: "range", min: 0, max: 1, step: 0.01,
-    hint: "Evidence below which an accepted match is weak." },
+    hint: "Minimum evidence of a strong match." },
   { name: "weak", group: "validation", within: "validation", label: "Weak from", kind: "range", min: 0, max: 1, step: 0.01,
     hint: "Ambiguity from which an accepted match is weak." },
   { name: "ambiguous", group: "validation", within: "validation", label: "Ambiguous from", kind: "range", min: 0, max: 1, step: 0.01,
