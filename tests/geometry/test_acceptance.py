@@ -235,3 +235,18 @@ def test_a_violation_costs_three_inliers():
     every = AlignmentParameters(score_stride=1)
     scores = _score(frames[0], frames[1], np.eye(4)[None], every, p)
     assert scores == pytest.approx([(5 - 3 * 2) / 7 + 4 / 4])
+
+
+def test_evidence_at_every_limit_suffices():
+    p = AcceptanceParameters(violation_weight=0.0, net_weight=0.0, net=0.15, planes=5.0)
+    e = Evidence(
+        p.residual_m, p.residual_rad, p.evidence, p.plane_overlap, 0.0, p.stiffness,
+        planes=p.planes, plane_violations=p.plane_violations, worst_violations=p.worst_violations,
+    )  # fmt: skip
+    assert objection(e, p, "full") is None
+
+
+def test_without_free_space_three_quarters_of_the_plane_overlap_are_ambiguous():
+    e = Evidence(0.0, 0.0, 0.8, 0.4, None, 1.0)
+    for ambiguity, status in ((0.29, "accepted"), (0.31, "ambiguous")):
+        assert belief(e, ambiguity, AcceptanceParameters())[0] == status
