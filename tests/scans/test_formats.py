@@ -50,7 +50,7 @@ def scan_rows(values):
 @pytest.mark.parametrize("values", [3, 5, 6, 7, 8])
 def test_rows_of_another_length_are_no_kitti(values):
     data = scan_rows(values).tobytes()
-    with pytest.raises(UnreadableCloud, match=rf"row of the file has {values} .*--row x,y,z"):
+    with pytest.raises(UnreadableCloud, match=rf"file has {values} numbers .*--row x,y,z"):
         decode_cloud(data, file_format="kitti")
 
 
