@@ -41,7 +41,7 @@ BARE = {
     "RefinementParameters": {"normal_cosine"},
     "AlignmentParameters": {"violation_weight", "rank_violations", "same_rad"},
     "GravityParameters": {"gate", "proposed_tilt", "refined_tilt", "rival_tilt", "floor_tilt"},
-    "PlanParameters": {"tilt", "blur", "flat_weight", "slice_blur"},
+    "PlanParameters": {"tilt", "blur", "flat_weight", "slice_blur", "slice_trend"},
     "ConsensusParameters": {"angle_tolerance", "inlier_cosine"},
     "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
     "OverlapParameters": {"normal_cosine"},
