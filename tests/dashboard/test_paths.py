@@ -209,7 +209,7 @@ def test_alternatives_are_drawn_alike_and_none_as_the_answer(
     page.goto(f"{station.home}#/maps/four-sides/place?query={four_sides['query_id']}")
     settle(page)
     card = page.locator("section", has=page.locator("#paths-asked"))
-    expect(card.locator(".badge")).to_have_text("ambiguous")
+    expect(card.locator(".badge")).to_have_text("Ambiguous")
     expect(card.locator(".alternatives li")).to_have_count(len(several))
     expect(card).to_contain_text("Do not act on any of these poses")
     voting = [m for m in four_sides["matches"] if m["validation"]["status"] != "rejected"]

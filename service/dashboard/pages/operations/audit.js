@@ -11,7 +11,7 @@ export async function renderTab(root, { search, signal }) {
   const asked = { actor: search.get("actor"), map: search.get("map") };
   const to = (change) => link("operations", { tab: "audit", ...asked, ...change });
   const body = h("tbody", {});
-  const table = h("table", { class: "table" }, h("thead", {}, h("tr", {}, ["When", "Who", "What", "Map", "Target", "From", "More"].map((text) => h("th", { scope: "col" }, text)))), body);
+  const table = h("table", { class: "table stack audit" }, h("thead", {}, h("tr", {}, ["When", "Who", "What", "Map", "Target", "From", "More"].map((text) => h("th", { scope: "col" }, text)))), body);
   const card = h("div", { class: "card scroll" }, table);
   const none = h("div", { hidden: true }, empty({ title: "No changes", text: "Changes appear here with their author." }));
   const more = h("button", { class: "button", type: "button", hidden: true, onClick: () => older() }, "Show older changes");

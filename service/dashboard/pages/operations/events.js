@@ -8,7 +8,7 @@ import { rows } from "./poll.js";
 
 const KIND = {
   indexed: "good", created: "good", done: "good", found: "good", reencoded: "good",
-  failed: "bad", rejected: "warn", missed: "warn", deleted: "warn", revoked: "warn",
+  failed: "bad", damaged: "bad", rejected: "warn", missed: "warn", deleted: "warn", revoked: "warn",
 };
 const KINDS = [["", "All kinds"], ["frame.", "Frames"], ["frame.failed", "Failures"], ["map.", "Maps"], ["query.", "Queries"], ["import.", "Imports"], ["association.", "Associations"], ["coverage.", "Coverage"], ["difference.", "Differences"], ["surface.", "Surfaces"], ["key.", "Keys"]];
 const AT_ONCE = 100;

@@ -10,7 +10,7 @@ import { rows } from "./poll.js";
 /** See operations.js. */
 export async function renderTab(root, { signal, actions }) {
   const body = h("tbody", {});
-  const table = h("table", { class: "table stack" }, h("thead", {}, h("tr", {}, ["Name", "Tenant", "Permissions", "Created", "Expires", "Last used", ""].map((text) => h("th", { scope: "col" }, text || h("span", { class: "visually-hidden" }, "Actions"))))), body);
+  const table = h("table", { class: "table stack keys" }, h("thead", {}, h("tr", {}, ["Name", "Tenant", "Permissions", "Created", "Expires", "Last used", ""].map((text) => h("th", { scope: "col" }, text || h("span", { class: "visually-hidden" }, "Actions"))))), body);
   const card = h("div", { class: "card scroll" }, table);
   const none = h("div", { hidden: true }, empty({ title: "No key yet", text: "Without a key, the service answers only on its own machine. Give the first key admin access to all maps, so that it can create the others." }));
   const more = h("button", { class: "button", type: "button", hidden: true, onClick: () => older() }, "Show more keys");

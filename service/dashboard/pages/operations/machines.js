@@ -18,7 +18,7 @@ function indexes({ indexes: found }) {
     h("td", { class: "number" }, recall(one)));
   return card("indexes", "Search indexes", found.length === 0 ? h("p", { class: "muted" }, "No maps yet.") : h("div", { class: "scroll" }, h("table", { class: "table" },
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Map"), h("th", { scope: "col", class: "number" }, "Version"),
-      h("th", { scope: "col", class: "number", title: "Indexed frames that are not in this version yet; queries compare them one by one" }, "Tail"),
+      h("th", { scope: "col", class: "number", title: "Indexed frames that are not in this version yet; queries compare them one by one" }, "Newer frames"),
       h("th", { scope: "col", class: "number", title: "Share of the 10 nearest frames that a query finds" }, "Recall@10"))), h("tbody", {}, found.map(row)))),
   h("p", { class: "note muted" }, "A query compares every frame, except in large maps. For these, recall is measured when a version is published, on a sample of its frames."));
 }
@@ -34,7 +34,7 @@ function workers({ workers: found }) {
   return card("workers", "Workers",
     found.length === 0 && h("p", {}, h("span", { class: "badge", dataset: { kind: "bad" } }, "none"), " Frames wait until a worker runs: ", h("code", {}, "sceneprint work"), "."),
     h("ul", { class: "list" }, found.map((one) => h("li", { class: "worker" },
-      h("span", { class: "badge", dataset: { kind: one.job_id === null ? "neutral" : "good" } }, one.job_id === null ? "waits" : "works"),
+      h("span", { class: "badge", dataset: { kind: one.job_id === null ? "neutral" : "good" } }, one.job_id === null ? "idle" : "busy"),
       h("span", { class: "mono" }, one.name),
       one.job_id !== null && h("a", { href: link("operations", "jobs", one.job_id), dataset: { part: `job ${one.name}` } }, "its job")))));
 }

@@ -22,7 +22,7 @@ function ofService({ workers, total, bytes: { free, disk } }) {
   const busy = workers.filter((one) => one.job_id !== null).length, isIdle = workers.length === 0;
   const full = disk > 0 ? 1 - free / disk : null, bar = full === null ? null : gauge(full);
   return [
-    tile("Workers", "workers", count(workers.length), isIdle ? "idle" : `${count(busy)} busy`, isIdle ? "bad" : null),
+    tile("Workers", "workers", count(workers.length), isIdle ? "none running" : `${count(busy)} busy`, isIdle ? "bad" : null),
     tile("Requests, last hour", "requests", count(total.requests), [part(total.refused, "refused"), part(total.busy, "busy"), part(total.broken, "broken", "bad")]),
     tile("Disk", "disk", full === null ? "–" : `${percent(full)} full`, [`${bytes(free)} free of ${bytes(disk)}`, bar], bar?.dataset.kind),
   ];

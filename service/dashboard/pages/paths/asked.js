@@ -1,10 +1,10 @@
 // The query of an answer that is kept: where it is among the paths, how surely, and what it matched.
-
 import { at, get } from "../lib/api.js";
 import { h } from "../lib/dom.js";
 import { confidence, count, metres, shortId } from "../lib/format.js";
 import { coded } from "../lib/prose.js";
 import { link } from "../lib/router.js";
+import { STATUSES } from "../lib/statuses.js";
 import { alternativesList } from "../query/alternatives.js";
 import { evidenceOf, grounds, mapOf, verdict } from "../query/words.js";
 import { inverseRigid, multiply, ofRows } from "../viewer/matrix.js";
@@ -60,7 +60,7 @@ export function askedPanel(asked, { drawn, onshow, onclose }) {
   return h("section", { class: "card paths-section", "aria-labelledby": "paths-asked" },
     h("div", { class: "paths-row" },
       h("h2", { id: "paths-asked" }, h("span", { class: "paths-key", dataset: { kind: "query" } }), "Query"),
-      h("span", { class: "badge", dataset: { kind: said.kind } }, status.replace("_", " "))),
+      h("span", { class: "badge", dataset: { kind: said.kind } }, STATUSES[status][1])),
     location && foundFacts(asked),
     status !== "found" && [h("p", {}, coded(said.text)), said.next && h("p", { class: "muted" }, coded(said.next))],
     alternatives.length > 0 && alternativesList(alternatives),

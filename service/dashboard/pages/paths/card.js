@@ -35,7 +35,7 @@ export function chooser({ map, signal, onchoose, onapproach }) {
     const path = one && drawn[one.path];
     put(where, path ? `${count(one.place + 1)} of ${count(path.ids.length)}` : "");
     if (!path) {
-      put(card, h("p", { class: "muted" }, "Click near a frustum, or step along a run here."));
+      put(card, h("p", { class: "muted" }, "Select a frame in the picture, or step along a run here."));
       return;
     }
     runs.value = String(one.path);

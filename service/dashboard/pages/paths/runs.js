@@ -103,7 +103,7 @@ export class Runs {
     this.section = h("section", { class: "card paths-section", "aria-labelledby": "paths-runs" }, h("h2", { id: "paths-runs" }, "Runs"),
       h("div", { class: "paths-frames" }, h("label", { class: "field" }, h("span", {}, "Drawn in the frame"), this.parents),
         h("label", { class: "field" }, h("span", {}, "Up axis"), this.ups)),
-      h("label", { class: "paths-check" }, this.together, h("span", {}, "and frames joined to it by associations")),
+      h("label", { class: "paths-check" }, this.together, h("span", {}, "Include frames joined to it by associations")),
       this.runsBox);
   }
 

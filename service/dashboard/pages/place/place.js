@@ -60,7 +60,7 @@ function missing(error, query) {
 
 function nothing(map, without) {
   const text = without.length
-    ? "None of its frames has a pose, so where they were taken is not known. Send `pose` with a frame, or add poses to those that are there."
+    ? "None of its frames has a pose, so where they were taken is not known. Upload frames with poses, or add poses to those that are there."
     : "Upload frames with poses to see the place here, and the paths of robots through it.";
   const box = empty({ title: without.length ? "This map has no poses" : "This map is empty", text, actions: [
     may("write", map) && h("a", { class: "button primary", href: link("maps", map, "upload") }, "Upload frames"),
