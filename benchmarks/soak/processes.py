@@ -30,8 +30,9 @@ SETTINGS = {
 }  # fmt: skip
 #: Delays of a message to the database, and to the object store, in a slow network, seconds.
 DATABASE_S, STORE_S = 0.0005, 0.01
-#: Size of the disk to be filled, a file system in memory, bytes.
-DISK_BYTES = 384 << 20
+#: Minimum size of the disk to be filled, a file system in memory, and size per second of the run:
+#: a longer run stores more frames. Bytes.
+DISK_BYTES, DISK_BYTES_PER_S = 384 << 20, 1 << 20
 #: Script that creates a key with all permissions.
 _CREATE_KEY = """
 import sys
@@ -141,7 +142,7 @@ class Fleet:
         if plan.count("full-disk"):
             disk = self.folder / ("host-1" if plan.store == "sqlite" else "blobs")
             disk.mkdir()
-            size = f"size={DISK_BYTES}"
+            size = f"size={max(DISK_BYTES, round(plan.seconds * DISK_BYTES_PER_S))}"
             subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(disk)], check=True)
             self._disk = disk
             self._opened.callback(subprocess.run, ["umount", str(disk)], check=True)
