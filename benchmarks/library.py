@@ -59,7 +59,7 @@ class Library:
         estimate = clock.run("locate", lambda: self._locate(geometry, matches))
         before = unguided_validations(matches)
         if before is not None and estimate is not None and estimate.status != "found":
-            matches = validate(known=before)
+            matches = validate(validations=before)
         return clock.stages, [
             (match.index, match.validation.T_match_query.tolist())
             for match in matches

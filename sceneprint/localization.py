@@ -157,13 +157,15 @@ class QueryDatabase(Protocol):
     def locate(self, frames: Sequence[QueryFrame]) -> PoseEstimate | None:
         """Return the pose of the last frame, estimated from all frames' matches; see `localize`."""
 
-    def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
+    def search(
+        self, frame: int, validations: Mapping[int, PairValidation]
+    ) -> Sequence[PairMatch] | None:
         """Validate a frame's candidates, without guidance by other matches.
 
         Parameters
         ----------
         frame : index of the frame
-        known : existing validations of candidates, by row; they are not repeated
+        validations : existing validations of candidates, by row, which are reused
 
         Returns
         -------

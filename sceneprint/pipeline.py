@@ -342,7 +342,7 @@ def associate(
     up: Floats | None = None,
     up_of: Callable[[int], Floats | None] = lambda _: None,
     pose_of: PoseOf = lambda _: None,
-    known: Mapping[int, PairValidation] | None = None,
+    validations: Mapping[int, PairValidation] | None = None,
     retry: bool = True,
 ) -> list[PairMatch]:
     """Validate candidates in the order of R until `k` matches are accepted: Sec. III-E.
@@ -350,7 +350,7 @@ def associate(
     If two strong matches from different viewpoints agree on the query's pose, the map's poses
     predict the transforms of later candidates. A predicted transform is refined and checked; only
     if the check fails is the transform searched for. If no match is accepted, the first candidates
-    are validated again: without `up`, if it is known, and then scans with other axes.
+    are validated again without `up` (if it is known), and scans then with other axes.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ def associate(
     up : (3,) unit vector that points up in the query's sensor frame; None if unknown
     up_of : function that returns `up` of a database row
     pose_of : see PoseOf; by default, no row has a pose, and every transform is searched for
-    known : existing validations by row, which are reused
+    validations : existing validations, by row, which are reused
     retry : whether to validate the first candidates again if no match is accepted
 
     Returns
@@ -383,7 +383,7 @@ def associate(
     accepted = 0
     for position in among:
         index = int(ranking.indices[position])
-        validation = known.get(index) if known else None
+        validation = validations.get(index) if validations else None
         if validation is None and not go_on():
             break
         geometry = open_geometry(index)

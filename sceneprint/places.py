@@ -1,4 +1,4 @@
-"""Evidence for the places at which a query may have been taken, from matches, map and prior.
+"""Evidence for the possible places of a query, from its matches, the map and a prior.
 
 matches, poses, MapViews  --judge_places-->  Place, ...
 

@@ -1,4 +1,4 @@
-"""Records that modules exchange: frames, and what is computed from frames.
+"""Records that modules exchange: frames, and the data computed from them.
 
 Lengths are metres, angles radians, times seconds; other units are in the name. Camera frames are
 optical: x right, y down, z forward. Clouds use their sensor's axes.

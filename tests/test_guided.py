@@ -128,7 +128,7 @@ def test_guided_matches_can_be_searched_for_after_all(walk):
     assert sorted(known) == [1, 2]
     ranking = Ranking(np.array(rows, np.intp), np.zeros(3, np.int64), np.zeros(3))
     again = associate(
-        geometries[0], ranking, range(3), geometries.__getitem__, 3, known=known,
+        geometries[0], ranking, range(3), geometries.__getitem__, 3, validations=known,
     )  # fmt: skip
     by_row = {match.index: match.validation for match in again}
     assert by_row[1] is known[1]

@@ -22,6 +22,7 @@ from sceneprint.geometry.validation.map_verification import (
     MapViews,
     compare_poses,
     map_frame,
+    median_contradiction,
     prior_starts,
     score_pose,
 )
@@ -294,6 +295,33 @@ def test_a_room_bears_out_the_true_pose_alone(signer, room_views):
     start[:3, 3] += 0.05, -0.04, 0.03
     (drawn, *_) = compare_poses([earlier], start[None], views, p, overlap_p)
     np.testing.assert_allclose(drawn.T, poses[0] @ inverse(before), atol=0.02)
+
+
+def test_frames_of_another_room_contradict_the_map(room_views, signer):
+    p, overlap_p = MapParameters(), OverlapParameters()
+    frames = room_views(21, 0, 4, along_path=True).frames[:3]
+    (other, *_) = room_views(21, 2, 4, along_path=True).frames
+    here, *seen = (prepare(frame, signer)[1] for frame in frames)
+    wrong, T = prepare(other, signer)[1], frames[0].pose
+    views = MapViews(np.stack([frame.pose for frame in frames[1:]]), seen.__getitem__, p, overlap_p)
+
+    def contradiction(*posed):
+        return median_contradiction(posed, views, p, overlap_p)
+
+    drifted = shifted(0.15) @ T  # contradicts the map until the pose is refined
+    scored = score_pose([map_frame(here, np.eye(4), p, overlap_p)], drifted, views, p, overlap_p)
+    assert scored.violations + scored.hidden > 0.2
+    assert contradiction((here, T)) == pytest.approx(0.0, abs=0.02)
+    assert contradiction((here, drifted)) == pytest.approx(0.0, abs=0.02)
+    scored = score_pose([map_frame(wrong, np.eye(4), p, overlap_p)], T, views, p, overlap_p)
+    most = contradiction((wrong, T))
+    assert most == pytest.approx((scored.violations + scored.hidden) / 2.0, abs=0.05)
+    assert 0.6 < most <= 1.0
+    assert contradiction((here, T), (wrong, T), (here, T)) == contradiction((here, T))
+    assert contradiction((wrong, T), (here, T), (wrong, T)) == most
+    far = shifted(50.0) @ T  # no frame of the map agrees there, so it does not count
+    assert contradiction((here, far), (wrong, T)) == most
+    assert contradiction((here, far)) == 0.0
 
 
 def box_query(box_views, signer, prior=None):

@@ -116,7 +116,7 @@ def newest(
     model_id: str,
     dimension: int,
     *,
-    known: IndexVersion | None = None,
+    previous: IndexVersion | None = None,
     sound: Mapping[str, int] | None = None,
 ) -> IndexVersion | None:
     """Open the newest sound version in a folder; return None if there is none.
@@ -127,8 +127,8 @@ def newest(
     ----------
     folder : folder of the map's index; it may be missing
     model_id, dimension : model and length of the signatures; versions of other models are skipped
-    known : open version of this folder: it is returned if it is the newest, and its parts are not
-        verified again
+    previous : open version of this folder; if it is the newest, it is returned, and its parts are
+        not verified again
     sound : inodes, by name, of parts that this process has verified
     """
     while True:
@@ -137,7 +137,7 @@ def newest(
             try:
                 manifest = read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    version = open_version(folder, manifest, known, sound)
+                    version = open_version(folder, manifest, previous, sound)
                     break
             except DamagedIndex as error:
                 errors.append(error)
@@ -149,30 +149,32 @@ def newest(
 
 
 def open_version(
-    folder: Path, manifest: IndexManifest, known: IndexVersion | None = None,
+    folder: Path, manifest: IndexManifest, previous: IndexVersion | None = None,
     sound: Mapping[str, int] | None = None,
 ) -> IndexVersion:  # fmt: skip
     """Open the parts in a manifest; raise DamagedIndex if one is missing or damaged.
 
     Parameters
     ----------
-    known, sound : see `newest`
+    previous, sound : see `newest`
     """
-    verified = {**(known.inodes if known is not None else {}), **(sound or {})}
+    verified = {**(previous.inodes if previous is not None else {}), **(sound or {})}
     inodes = {name: _inode(folder / name) for name, _ in manifest.files}
-    if known is not None and known.manifest == manifest and known.inodes == inodes:
-        return known
+    if previous is not None and previous.manifest == manifest and previous.inodes == inodes:
+        return previous
     for name, size in manifest.files:
         if inodes[name] != verified.get(name, -1):
             for _ in verify(folder, name, size):
                 pass
     # reuse open segments with their caches, unless a damaged part was written again
-    reusable = {} if known is None else {segment.record: segment for segment in known.segments}
+    reusable = (
+        {} if previous is None else {segment.record: segment for segment in previous.segments}
+    )
     segments = tuple(
         reusable[record]
         if record in reusable
-        and known is not None
-        and all(known.inodes[name] == inodes[name] for name, _ in record.files)
+        and previous is not None
+        and all(previous.inodes[name] == inodes[name] for name, _ in record.files)
         else open_segment(folder, record, manifest.dimension)
         for record in manifest.segments
     )
@@ -441,7 +443,7 @@ def _write_segments(
 
 def _is_overtaken(folder: Path, previous: IndexVersion) -> bool:
     """Return whether the newest version in a folder is no longer `previous`."""
-    version = newest(folder, previous.model_id, previous.manifest.dimension, known=previous)
+    version = newest(folder, previous.model_id, previous.manifest.dimension, previous=previous)
     return version is None or version.number != previous.number
 
 

@@ -300,7 +300,7 @@ def test_robots_stand_where_their_queries_found_them(page, station, patrolled, s
     assert station.client.get("/v1/queries", params=listed).json()["items"] == before
 
     def followed(answer: dict[str, Any]) -> list[float]:
-        """How far the robot of an answer is from the middle of the picture; the distance to it."""
+        """Return the robot's offset from the middle of the picture, and its distance."""
         at = [answer["location"]["pose"]["translation"][axis] for axis in "xyz"]
         off, far = page.evaluate(FOLLOWED, [CANVAS, at])
         return [round(off, 6), far]

@@ -133,7 +133,7 @@ def test_readers_go_on_while_versions_pass(walk, published, tmp_path):
     def follow():
         known = None
         while not done.is_set():
-            found = newest(folder, "model", LENGTH, known=known)
+            found = newest(folder, "model", LENGTH, previous=known)
             if found is None or (known is not None and found.number < known.number):
                 errors.append(f"{found and found.number} after {known and known.number}")
                 continue

@@ -80,7 +80,7 @@ def test_what_is_open_does_not_vouch_for_what_is_gone(folder):
     """The next version must not name a file that is mapped here and nowhere else."""
     second = newest(folder, "model", LENGTH)
     own_files(folder)["faiss"].unlink()
-    found = newest(folder, "model", LENGTH, known=second)
+    found = newest(folder, "model", LENGTH, previous=second)
     assert found.number == 1
 
 

@@ -147,14 +147,14 @@ def test_two_versions_are_kept_and_only_our_files_removed(walk, published, tmp_p
 def test_what_is_open_is_taken_from_there(walk, published, tmp_path, monkeypatch):
     folder, signatures = tmp_path / "map", walk(150)
     first = published(np.arange(100), signatures[:100])
-    assert newest(folder, "model", LENGTH, known=first) is first
+    assert newest(folder, "model", LENGTH, previous=first) is first
     assert newest(folder, "model", LENGTH) is not first
     second = published(np.arange(100, 150), signatures[100:], first)
     read = []
     monkeypatch.setattr(
         "sceneprint.index.index_version.verify", lambda _, name, __: read.append(name) or iter(())
     )
-    found = newest(folder, "model", LENGTH, known=first)
+    found = newest(folder, "model", LENGTH, previous=first)
     assert found is not None
     assert holds(found, frames_of(np.arange(150), signatures))
     assert read == [name for name, _ in second.manifest.files if name not in first.inodes]
@@ -163,7 +163,9 @@ def test_what_is_open_is_taken_from_there(walk, published, tmp_path, monkeypatch
     assert read == []
     read.clear()
     published(np.arange(0), signatures[:0], second, revision=3)  # the same files
-    again = newest(folder, "model", LENGTH, known=newest(folder, "model", LENGTH, known=second))
+    again = newest(
+        folder, "model", LENGTH, previous=newest(folder, "model", LENGTH, previous=second)
+    )
     assert again.revision == 3
 
 

@@ -99,7 +99,7 @@ def test_what_is_open_stays_open(walk, published, tmp_path):
     signatures = walk(130)
     first = published(np.arange(100), signatures[:100])
     second = published(np.arange(100, 110), signatures[100:110], first)
-    found = newest(tmp_path / "map", "model", 256, known=first)
+    found = newest(tmp_path / "map", "model", 256, previous=first)
     assert [one is first.segments[0] for one in found.segments] == [True, False]
     assert second.segments[0] is first.segments[0]
     third = published(*([part[:0] for part in (np.arange(0), signatures)]), second,

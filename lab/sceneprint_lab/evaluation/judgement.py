@@ -251,8 +251,8 @@ class _Recording:
         asks_map = views_of if self._judging.mode == "full" else None
         return localize(frames, self._poses, self._scenes, asks_map, self._prior, p, agreement)
 
-    def search(self, frame: int, known: Mapping[int, PairValidation]) -> list[PairMatch]:  # noqa: ARG002
-        return self._validated(self.selected, known=known)
+    def search(self, frame: int, validations: Mapping[int, PairValidation]) -> list[PairMatch]:  # noqa: ARG002
+        return self._validated(self.selected, validations=validations)
 
     def posed(self, rows: Sequence[int]) -> dict[int, PosedFrame]:
         return {

@@ -217,7 +217,7 @@ def _check_used(protocol: EvaluationProtocol, prepared: Prepared) -> None:
 def _scenes(
     protocol: EvaluationProtocol, prepared: Prepared, settings: EvaluationSettings
 ) -> Iterator[tuple[str, NDArray[np.intp], NDArray[np.intp]]]:
-    """For a 7-Scenes table, yield each scene's name, query indices and database indices."""
+    """Yield name, query indices and database indices of each scene of a 7-Scenes table."""
     scenes = list(dict.fromkeys(q.scene for q in prepared.queries))
     if not protocol.split or len(scenes) < 2 or settings.absent:
         return

@@ -69,7 +69,7 @@ MOST_FRAMES = 5000
 #: Number of frames of a session that are compared with the other session before a strong join.
 CHECKED_FRAMES = 12
 #: Maximum median share of contradicting surfaces in a strong join.
-MOST_CONTRADICTION = 0.15
+MOST_CONTRADICTION = 0.075
 
 
 def sessions_of(request: NewAssociation) -> list[tuple[str, str | None]]:

@@ -177,9 +177,11 @@ class _StoredDatabase:
             self._model, self._query,
         )  # fmt: skip
 
-    def search(self, frame: int, known: Mapping[int, PairValidation]) -> Sequence[PairMatch] | None:
+    def search(
+        self, frame: int, validations: Mapping[int, PairValidation]
+    ) -> Sequence[PairMatch] | None:
         before = self.attempts[frame]
-        checks = self._validated(before, before.checks.chosen, known)
+        checks = self._validated(before, before.checks.chosen, validations)
         if checks.late:
             return None
         self.attempts[frame] = replace(

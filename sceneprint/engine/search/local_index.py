@@ -373,7 +373,7 @@ class Reader:
         if number is None:
             return None
         length = self._model.signature_bytes
-        version = newest(self._folder, row.model_id, length, known=previous)
+        version = newest(self._folder, row.model_id, length, previous=previous)
         if version is None or version.number < number:
             self._unsound = number, time.monotonic() + _AGAIN_S
         return trusted(connection, row, version)

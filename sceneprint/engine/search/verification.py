@@ -97,7 +97,7 @@ def thresholds(
 def validated(
     store: Store, searched: Searched, chosen: Sequence[int], geometry: Geometry | None,
     query: Query, deadline: Deadline, p: ValidationParameters, up: Floats | None = None,
-    known: Mapping[int, PairValidation] | None = None, *, k: int = VERDICT_MATCHES,
+    validations: Mapping[int, PairValidation] | None = None, *, k: int = VERDICT_MATCHES,
     guided: bool = True, retry: bool = True,
 ) -> Validated:  # fmt: skip
     """Validate candidates in order until `k` are accepted or the deadline passes.
@@ -109,7 +109,7 @@ def validated(
     chosen : positions in R of the candidates
     geometry : geometry of the query; None without validation
     up : (3,) up vector in the sensor frame of the query; None if unknown
-    known : validations to reuse, by frame number
+    validations : validations to reuse, by frame number
     k : number of accepted matches after which validation stops
     guided : whether earlier matches predict transforms of later candidates
     """
@@ -139,7 +139,7 @@ def validated(
     matches = associate(
         geometry, ranking, chosen, open_geometry, k, query.seed,
         *thresholds(query.validation, p), deadline.allows, up=up, up_of=ups.get, pose_of=posed.get,
-        known=known, retry=retry,
+        validations=validations, retry=retry,
     )  # fmt: skip
     owner = dict(zip(ranking.indices.tolist(), searched.owners.tolist(), strict=True))
     for i, part in enumerate(searched.parts):

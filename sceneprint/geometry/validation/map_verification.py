@@ -314,12 +314,13 @@ def median_contradiction(
 
     Parameters
     ----------
-    frames : geometries with their poses (4, 4) in the parent frame of `views`; frames that share no
-        surface with the map are ignored
+    frames : geometries with their poses (4, 4) in the parent frame of `views`; frames with which no
+        frame of the map agrees are ignored
 
     Returns
     -------
-    median of the violations of both sides, minus those among the map's frames; 0 if no frame counts
+    median of the mean violations of both sides, minus those among the map's frames; 0 if no frame
+    counts
     """
     shares = []
     for geometry, T in frames:
@@ -331,7 +332,7 @@ def median_contradiction(
             pose = max(pose, again, key=lambda scored: scored.score)
         if pose.views:
             noise = map_noise(pose, views, p, overlap_p)
-            shares.append(pose.violations + pose.hidden - noise)
+            shares.append((pose.violations + pose.hidden - noise) / 2.0)
     return float(np.median(shares)) if shares else 0.0
 
 

@@ -232,8 +232,7 @@ def validate(
     mode : "full", or "paper" to accept or reject by the residual of the two directions only
     matching : method of matching
     ups : (3,) unit vectors that point up in the query's and in the match's coordinates; None if
-        unknown. If both are known, transforms that tilt are excluded; for scans, even one of them
-        helps
+        unknown. If both are known, transforms that tilt are excluded; scans use one of them too
     other_axes : for two scans with unknown `ups`, whether to try hypotheses for scanners that were
         not upright
 
