@@ -332,7 +332,7 @@ def median_contradiction(
             pose = max(pose, again, key=lambda scored: scored.score)
         if pose.views:
             noise = map_noise(pose, views, p, overlap_p)
-            shares.append((pose.violations + pose.hidden - noise) / 2.0)
+            shares.append((pose.violations + pose.hidden - noise) / 2)
     return float(np.median(shares)) if shares else 0.0
 
 
