@@ -139,6 +139,7 @@ def test_a_python_that_cannot_do_it_is_named(machine, python, message):
     assert calls == []
 
 
+@pytest.mark.thorough
 def test_type_checkers_find_the_client(tmp_path):
     """As of a user's script in the environment of `make demo`."""
     script = tmp_path / "script.py"

@@ -123,10 +123,9 @@ def test_demo_that_is_stopped_leaves_nothing(demo, tmp_path, rooms, stage, numbe
     leaves_nothing(temporary)
 
 
-def test_demo_needs_frames_for_the_map_and_to_look_up(demo, rooms):
-    process = demo("--dataset", rooms / "room-0/seq-01/frame-000000.depth.png")
-    _, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 2
+def test_demo_needs_frames_for_the_map_and_to_look_up(run_command, rooms):
+    one = rooms / "room-0/seq-01/frame-000000.depth.png"
+    err = run_command("demo", "--dataset", one, expect=2).stderr
     assert len(err.splitlines()) == 1
     assert "(found: 1)" in err
     assert "(found: 0)" in err

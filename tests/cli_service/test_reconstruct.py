@@ -6,15 +6,15 @@ import pytest
 
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
 from sceneprint_client import Client
-from sceneprint_lab.synth import synthesise_room
+from tests.conftest import halved
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory):
-    """Six views of one room that overlap."""
+def walk(tmp_path_factory, room_views):
+    """Six small views of one room that overlap."""
     folder = tmp_path_factory.mktemp("walk") / "room" / "seq-01"
     folder.mkdir(parents=True)
-    for number, frame in enumerate(synthesise_room(33, 1, 6).frames):
+    for number, frame in enumerate(map(halved, room_views(33, 1, 6).frames)):
         write_intrinsics(folder, Camera(frame.intrinsics))
         write_depth_png(folder / f"frame-{number:06d}.depth.png", frame.depth, 1000.0)
     return folder
@@ -24,8 +24,7 @@ def test_a_mesh_and_its_figures(sceneprint, service_url, walk, tmp_path, with_op
     with Client(service_url) as client:
         client.create_map("walk", model="depth")
     first, *rest = sorted(walk.glob("*.png"))
-    for path in rest:
-        sceneprint("upload", "walk", path)
+    sceneprint("upload", "walk", *rest)
     mesh = tmp_path / "mesh.ply"
     said = sceneprint("make", "mesh", "walk", first, "--out", mesh, "--voxel", "0.05")
     lines = said.stdout.splitlines()

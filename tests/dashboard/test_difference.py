@@ -60,6 +60,7 @@ def test_sessions_that_share_no_frame_are_joined_on_the_page_where_that_is_sure(
     expect(card.get_by_role("link", name="2 frames of reference")).to_be_visible()
 
 
+@pytest.mark.thorough
 def test_two_sessions_are_compared_and_seen_side_by_side(station, weeks, page, settle, axe):
     page.goto(f"{station.home}#/maps/weeks/difference?before=monday&after=tuesday")
     settle(page)

@@ -192,6 +192,7 @@ def test_gallery_pages_by_cursor_and_says_why_frames_were_rejected(page, station
     expect(page.locator(".tile").first).to_have_attribute("data-frame", new[0])
 
 
+@pytest.mark.thorough
 def test_states_change_as_they_happen(page, station, settle, until):
     path = station.make_map("coming")
     with page.expect_request(lambda one: "/v1/events" in one.url):
@@ -220,6 +221,7 @@ def shown(page, station, settle):
     return found
 
 
+@pytest.mark.thorough
 def test_frame_page_tells_what_the_api_tells(page, station, shown, settle, axe, pixels):
     path = f"/v1/maps/building/frames/{shown['frame_id']}"
     facts = dict(

@@ -67,6 +67,7 @@ def answer(station):
     return ask(station, 3, k=3)
 
 
+@pytest.mark.thorough
 def test_what_is_shown_is_what_the_api_says(page, station, answer, settle, axe):
     best = answer["matches"][0]
     page.goto(address(station, answer, best))

@@ -55,6 +55,7 @@ def click_at(page: Page, point: Any) -> None:
     page.locator(CANVAS).click(position={"x": x, "y": y})
 
 
+@pytest.mark.thorough
 def test_runs_are_joined_from_here(page, apart, station, settle):
     """Before and after: what nothing joins is told, and then drawn where the join says."""
     asked = []

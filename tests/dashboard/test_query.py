@@ -256,6 +256,7 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
+@pytest.mark.thorough
 def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, settle):
     page.set_viewport_size({"width": 1440, "height": 900})
     answer = ask(why="")

@@ -37,6 +37,7 @@ def listed(station: Any, path: str) -> dict[tuple[str | None, str | None], tuple
     }
 
 
+@pytest.mark.thorough
 def test_sessions_are_listed_renamed_tagged_joined_and_deleted(station, runs, page, settle, axe):
     page.allowed.append("422")
     page.goto(f"{station.home}#/maps/runs")

@@ -85,6 +85,7 @@ def test_the_page_recognises_the_formats_of_the_table(run):
     assert kind_of("a.exe", b"MZ") == {"kind": "other"}
 
 
+@pytest.mark.thorough
 def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(page, station, settle, axe, until):
     page.allowed.append("422")
     chooser = open_upload(page, station, "dropped", settle)

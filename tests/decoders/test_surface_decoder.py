@@ -46,7 +46,9 @@ def assert_equal(here, there):
     assert [getattr(here, name) for name in names] == [getattr(there, name) for name in names]
 
 
-@pytest.mark.parametrize("name", ["ball.ply", "ball.obj", "map.npy"])
+@pytest.mark.parametrize(
+    "name", ["ball.ply", "map.npy", pytest.param("ball.obj", marks=pytest.mark.thorough)]
+)
 def test_surfaces_are_the_same_as_in_this_process(tmp_path, name):
     data = rows() if name == "map.npy" else ball(name[-3:])
     path, options = tmp_path / "upload", STATED if name == "ball.ply" else None
@@ -56,7 +58,7 @@ def test_surfaces_are_the_same_as_in_this_process(tmp_path, name):
     assert_equal(read_surface(data, name, options), there)
 
 
-@pytest.mark.parametrize("form", ["gltf", "stl"])
+@pytest.mark.parametrize("form", ["gltf", pytest.param("stl", marks=pytest.mark.thorough)])
 def test_what_meshes_need_is_loaded_before_the_walls(tmp_path, form):
     """A glTF file with lines and points beside triangles: trimesh imports more for them."""
     data = next(data for data, one in mesh_samples() if one == form)

@@ -54,7 +54,7 @@ def test_calls_fail_one_after_another(tmp_path):
 
 
 def test_kills_at_some_calls():
-    found = counts("--store", "sqlite", "--fault", "kill", "--first", "3", "--step", "29")
+    found = counts("--store", "sqlite", "--fault", "kill", "--first", "3", "--step", "97")
     assert found.keys() == OPERATIONS.keys()
     assert min(tried["kill"] for tried in found.values()) > 0
 

@@ -103,6 +103,7 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, s
     assert [line for line in busy.log() if line["level"] == "error"] == []
 
 
+@pytest.mark.thorough
 def test_slow_uploads_hold_their_places_for_a_while_and_no_queries(busy, small_shots, refused):
     """Two of them take both places for uploads, until their time is over."""
     request = busy.client.build_request("POST", "/v1/maps/hall/frames", **small_shots[20].form())

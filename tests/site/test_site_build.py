@@ -12,15 +12,13 @@ from functools import partial
 from html.parser import HTMLParser
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import unquote, urlsplit
 
 import pytest
 
 from tools.site.reference import generated_pages
 
-if TYPE_CHECKING:
-    pass
+pytestmark = pytest.mark.thorough  # builds the site, which takes longest of all
 
 ROOT = Path(__file__).resolve().parents[2]
 #: What axe finds in the theme's own markup (two landmarks of one name, tables that scroll and that
@@ -145,7 +143,6 @@ def browser():
         one.close()
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 1280), ("light", 390)])
 def test_pages_are_read_and_searched_in_a_browser(address, browser, scheme, width):
     from axe_playwright_python.sync_playwright import Axe

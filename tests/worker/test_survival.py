@@ -103,6 +103,7 @@ def test_a_worker_that_does_not_stop_gives_its_job_back(crew, frames):
     assert crew.engine.get_frame("hall", crew.engine.get_job(job).frame_id).state == "received"
 
 
+@pytest.mark.thorough
 def test_waiting_workers_leave_with_the_one_who_started_them(hire, script, alive):
     with hire(script) as crew:
         pids = [int(line["worker"].rpartition(":")[2]) for line in crew.log("worker ready")]

@@ -59,7 +59,7 @@ def test_a_job_that_takes_many_leases_is_kept_by_its_worker(crew, slow):
     holder, job_id = crew.pid(job.added.job_id), job.added.job_id
     (first,) = crew.job(job_id, "leased_until")
     until(
-        lambda: crew.job(job_id, "leased_until")[0] > first + 4 * crew.engine.settings.job_lease_s
+        lambda: crew.job(job_id, "leased_until")[0] > first + 2 * crew.engine.settings.job_lease_s
     )
     assert crew.job(job_id, "state, attempts, token") == ("running", 1, 1)
     job.give()
