@@ -18,6 +18,7 @@ from tests.faults.injection import Injector
 from tests.faults.operations import (
     ACKNOWLEDGED,
     OPERATIONS,
+    RESTORED,
     Store,
     contents,
     fill,
@@ -132,7 +133,10 @@ class Enumeration:
             folder.mkdir(parents=True)
         else:
             shutil.copytree(self._work / template, folder, symlinks=True)
-        url = None if self._server is None else self._server.create(name, template)
+        url = None
+        if self._server is not None:
+            url = self._server.create(name, template)
+            self._server.create(f"{name}{RESTORED}")
         return Store(folder, url, self._uploads)
 
     def run(self, operation, fault, *, first=1, step=1):
@@ -190,7 +194,8 @@ class Enumeration:
             broken += [line.removeprefix("! ") for line in checked.lines]
         shutil.rmtree(store.folder)
         if self._server is not None:
-            self._server.drop(store.folder.name)
+            for suffix in ("", RESTORED):
+                self._server.drop(f"{store.folder.name}{suffix}")
         return failed, broken, "last" in child.lines
 
 

@@ -17,9 +17,9 @@ from sqlalchemy import select, update
 from benchmarks.soak.recordings import recordings, walks
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.place import BundlePlace
-from sceneprint.bundle.restoration import restore_to_folder, verify_bundle
+from sceneprint.bundle.restoration import restore_to_folder, restore_to_server, verify_bundle
 from sceneprint.engine.ingest.uploads import Upload
-from sceneprint.errors import SceneprintError
+from sceneprint.errors import BundleError, SceneprintError
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 from sceneprint.store.events import number_events
@@ -32,6 +32,8 @@ from tests.whole_engine import Engine
 STORED = 4
 #: Name of the map, and of the folder of bundles within the data folder.
 MAP, BUNDLES = "hall", "bundles"
+#: Suffix of the database that a restore fills.
+RESTORED = "-restored"
 #: Findings of `fsck` that a repair removes without loss: files that nothing refers to.
 _LEFTOVERS = {"unreferenced-file"}
 
@@ -63,6 +65,12 @@ class Store:
             data_dir=self.folder, database_url=None if self.url is None else SecretStr(self.url),
             index_dir=None, undo_window_s=0, unindexed_frames=1, decoders=0,
         )  # fmt: skip
+
+    @property
+    def restored(self):
+        """The store that a restore of this one fills."""
+        url = None if self.url is None else f"{self.url}{RESTORED}"
+        return Store(self.folder / "restored", url, self.uploads)
 
 
 @dataclass(frozen=True)
@@ -156,7 +164,11 @@ def _back_up_once(engine, store):
 
 
 def _restore(engine, store, say):
-    restored = restore_to_folder(str(store.folder / BUNDLES), store.folder / "restored")
+    place, new = str(store.folder / BUNDLES), store.restored
+    if new.url is None:
+        restored = restore_to_folder(place, new.folder)
+    else:
+        restored = restore_to_server(place, new.settings)
     say(f"restored {restored.manifest.name}")
 
 
@@ -299,10 +311,9 @@ def _wrong_bundles(store, operation, said):
         if verify_bundle(place, name).lost:
             yield f"bundle {name} lacks blobs"
     take_backup(store.settings, place)
-    restored = store.folder / "restored"
-    if not (restored / "sceneprint.db").exists():
+    with suppress(BundleError):  # the store is restored
+        _restore(None, store, lambda _: None)
         if "restored" in said:
             yield "an acknowledged restore is missing"
-        restore_to_folder(place, restored)
-    if len(contents(Store(restored, None, store.uploads))) != STORED:
+    if len(contents(store.restored)) != STORED:
         yield "the restored store lacks frames"
