@@ -16,7 +16,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 from benchmarks.machine import measured_on
-from benchmarks.soak.attacks import attack_table
+from benchmarks.soak.attacks import ATTACKS, attack_table
 from benchmarks.soak.broken_uploads import broken_table
 from benchmarks.soak.faults import CUT_OFF, CUT_OFF_S, FROZEN, FROZEN_S, FULL, FULL_S
 from benchmarks.soak.operations import operation_table
@@ -168,6 +168,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--store", choices=("sqlite", "postgresql"))
     parser.add_argument("--faults", nargs="*", type=parse_fault, metavar="FAULT=N",
                         help=", ".join(FAULTS))  # fmt: skip
+    parser.add_argument("--attacks", nargs="+", choices=list(ATTACKS), metavar="ATTACK",
+                        help="only these attacks")  # fmt: skip
     for name in ("seconds", "rate", "retention_s", "most_turn_ms", "most_query_ms"):
         parser.add_argument(f"--{name.replace('_', '-')}", type=float)
     for name in ("robots", "readers", "services", "workers", "seed"):

@@ -102,7 +102,7 @@ def _attack(attack: Attack) -> tuple[int, int]:
 
 def run_attacks(
     url: str, secrets: Sequence[str], shots: list[Shot], seconds: float, log: RequestLog,
-    drain: Callable[[], None],
+    drain: Callable[[], None], names: Sequence[str] = (),
 ) -> Iterator[AttackFigures]:  # fmt: skip
     """Yield the figures of every attack, each after an equally long period without an attack.
 
@@ -111,12 +111,13 @@ def run_attacks(
     seconds : duration of each attack
     log : requests of the other tenants
     drain : function that removes the jobs of an attack from the queue
+    names : names of the attacks; default: all
     """
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     with ProcessPoolExecutor(1, spawn, _prepare, (stop,)) as pool:
         pool.submit(os.getpid).result()  # waits until the process has started
-        for name in ATTACKS:
+        for name in names or ATTACKS:
             stop.clear()
             begun = time.monotonic()
             time.sleep(seconds)
@@ -342,6 +343,7 @@ ATTACKS: dict[str, Callable[[Attack], None]] = {
     ),
     "edits, each audited": _repeat(_rename),
     "unknown keys": _repeat(_unknown_key),
+    "refused requests, audited": _repeat(_posts("/v1/keys", {})),
     "sessions deleted and restored": _repeat(_session, 4),
     "coverage": _repeat(_posts(f"{_MAP}/coverage", {}), 4),
     "associations": _repeat(_posts(f"{_MAP}/associations", {"sessions": [SESSION]}), 4),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -28,6 +28,7 @@ class Plan:
     Parameters
     ----------
     faults : number of each fault; for the offline hour, the number of frames that a robot spools
+    attacks : names of the attacks; default: all
     seconds : duration of the walks; attacks may end earlier
     robots, rate : number of robots, and frames per second of each
     signed : whether robots wait until their frame is signed
@@ -44,6 +45,7 @@ class Plan:
 
     store: Literal["sqlite", "postgresql"] = "postgresql"
     faults: Mapping[str, int] = field(default_factory=dict)
+    attacks: Sequence[str] = ()
     seconds: float = 120.0
     robots: int = 8
     rate: float = 1.0

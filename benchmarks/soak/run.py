@@ -294,7 +294,7 @@ class _Run:
         if plan.count("attack"):
             figures.attacks += run_attacks(
                 fleet.urls[0], noisy, self._stable[:8], float(plan.count("attack")), self._log,
-                partial(self._empty_queue, client),
+                partial(self._empty_queue, client), plan.attacks,
             )  # fmt: skip
         if plan.count("broken-upload"):
             client.create_map("siege", model=MODEL)
