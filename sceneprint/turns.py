@@ -37,15 +37,15 @@ class TurnOrder(Generic[Waiter]):
     beside : maximum number of turns per tenant if several tenants are present; None selects half of
         `count`
     clock : monotonic clock, seconds
-    rests : whether a tenant, after its turns, rests for as long as they took (at most ACTIVE_S)
-        while another tenant is active, so that it uses at most half of the processor time
+    rest : time for which a tenant rests after its turns while another tenant is active, as a
+        multiple of their duration (at most ACTIVE_S); with 1, it uses at most half of the time
     """
 
     def __init__(
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
-        *, rests: bool = False,
+        *, rest: float = 0.0,
     ) -> None:  # fmt: skip
-        self._count, self._clock, self._rests = count, clock, rests
+        self._count, self._clock, self._rest = count, clock, rest
         self._beside = max(count // 2, 1) if beside is None else beside
         self._held: Counter[str] = Counter()
         self._waiting: dict[str, deque[tuple[int, Waiter]]] = {}
@@ -107,8 +107,8 @@ class TurnOrder(Generic[Waiter]):
         if not self._held[tenant]:
             del self._held[tenant]
             now, began = self._clock(), self._began.pop(tenant)
-            if self._rests and self._is_beside(tenant, now):
-                self._resting[tenant] = now + min(now - began, ACTIVE_S)
+            if self._rest and self._is_beside(tenant, now):
+                self._resting[tenant] = now + min(self._rest * (now - began), ACTIVE_S)
 
     def rest_s(self) -> float | None:
         """Return the seconds until the first rest of a waiting tenant ends; None if none rests."""

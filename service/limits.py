@@ -77,9 +77,9 @@ class Turns:
 
     def __init__(
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
-        *, rests: bool = False,
+        *, rest: float = 0.0,
     ) -> None:  # fmt: skip
-        self._order: TurnOrder[asyncio.Future[None]] = TurnOrder(count, beside, clock, rests=rests)
+        self._order: TurnOrder[asyncio.Future[None]] = TurnOrder(count, beside, clock, rest=rest)
         self._timer: asyncio.TimerHandle | None = None
 
     async def acquire(self, tenant: str, weight: int = 1) -> int:
@@ -157,14 +157,14 @@ class Gate:
     waiting : maximum number of requests that wait for their bodies or for a turn
     longest_s : maximum wait for a turn, seconds
     beside : maximum number of running calls of a tenant while others wait; default: half
-    rests : whether tenants rest between turns; see TurnOrder
+    rest : rest of tenants between turns; see TurnOrder
     """
 
     def __init__(
         self, running: int, waiting: int, longest_s: float, beside: int | None = None,
-        *, rests: bool = False,
+        *, rest: float = 0.0,
     ) -> None:  # fmt: skip
-        self._turns = Turns(running, beside, rests=rests)
+        self._turns = Turns(running, beside, rest=rest)
         self._threads = anyio.CapacityLimiter(running)
         self._longest_s = longest_s
         self._places = running + waiting

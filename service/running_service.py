@@ -38,8 +38,8 @@ UPLOADS = 12
 #: Number of separate threads that look up keys.
 LOOKUPS = 4
 #: Maximum number of concurrent requests in shared threads, such as lists: of all tenants, and of
-#: one tenant while others wait.
-READS, READS_BESIDE = 8, 1
+#: one tenant while others wait; and its rest (see TurnOrder): a turn is half of a request's work.
+READS, READS_BESIDE, READS_REST = 8, 1, 2.0
 #: Maximum age of the result of `/readyz`, seconds.
 READY_S = 1.0
 
@@ -87,11 +87,13 @@ class Service:
         self.catalogue, self.key_uses = Catalogue(store.database), KeyUses()
 
         self.wait_s = settings.queue_timeout_s
-        self.gate = Gate(settings.concurrent_requests, settings.queued_requests, self.wait_s)
+        self.gate = Gate(
+            settings.concurrent_requests, settings.queued_requests, self.wait_s, rest=1.0
+        )
         # Uploads mostly wait for the disk; the store limits concurrent decoding.
         self.upload_gate = Gate(
             max(UPLOADS, settings.concurrent_requests), settings.queued_requests, self.wait_s,
-            max(settings.concurrent_requests // 2, 1), rests=True,
+            max(settings.concurrent_requests // 2, 1), rest=1.0,
         )  # fmt: skip
         self.keys = settings.asks_for_keys
         self.feed = Feed(store.database, settings.max_event_streams, settings.events_per_map)
@@ -100,7 +102,7 @@ class Service:
         self.wrong_keys = TokenBucket("wrong keys", wrong / 60, wrong)
         self.places = settings.concurrent_requests + settings.queued_requests
         self.requests, self.spool = Holdings(), BodySpool()
-        self.reads = Turns(READS, READS_BESIDE, rests=True)
+        self.reads = Turns(READS, READS_BESIDE, rest=READS_REST)
         self.lookups, self.checks = CapacityLimiter(LOOKUPS), SharedChecks(READY_S)
 
     def find_key(self, secret: str) -> KeyRow | None:

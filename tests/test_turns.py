@@ -108,7 +108,7 @@ def test_who_asks_for_several_gets_them_beside_another_too_where_it_holds_none()
 
 def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns():
     clock = Clock()
-    order = TurnOrder(4, 1, clock, rests=True)
+    order = TurnOrder(4, 1, clock, rest=1.0)
     order.enter("b", "b1")
     order.enter("a", "a1")
     assert order.admit() == ["a1", "b1"]
@@ -130,9 +130,21 @@ def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns():
     assert order.rest_s() is None
 
 
+def test_a_rest_is_a_multiple_of_the_turns():
+    clock = Clock()
+    order = TurnOrder(4, 1, clock, rest=2.0)
+    order.enter("b", "b1")
+    order.enter("a", "a1")
+    order.admit()
+    order.enter("a", "a2")
+    clock.now = 0.25
+    order.release("a")
+    assert (order.admit(), order.rest_s()) == ([], 0.5)
+
+
 def test_one_rests_for_its_latest_turn_and_a_second_at_most():
     clock = Clock()
-    order = TurnOrder(4, 2, clock, rests=True)
+    order = TurnOrder(4, 2, clock, rest=1.0)
     order.enter("a", "a1")
     order.admit()
     clock.now = 100.0
@@ -157,7 +169,7 @@ def test_one_rests_for_its_latest_turn_and_a_second_at_most():
 
 def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once():
     clock = Clock()
-    order = TurnOrder(4, 1, clock, rests=True)
+    order = TurnOrder(4, 1, clock, rest=1.0)
     order.enter("b", "b1")
     order.enter("a", "a1")
     order.admit()
@@ -173,7 +185,7 @@ def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once():
 
 def test_nobody_rests_for_a_tenant_that_asked_long_ago():
     clock = Clock()
-    order = TurnOrder(4, 1, clock, rests=True)
+    order = TurnOrder(4, 1, clock, rest=1.0)
     order.enter("b", "b1")
     order.enter("a", "a1")
     order.admit()

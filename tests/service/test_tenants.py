@@ -166,7 +166,7 @@ def test_turns_alternate_between_tenants_and_leave_half_to_others():
 
 def test_who_rested_gets_its_turn_though_nobody_asks_meanwhile():
     async def test():
-        turns, clock = Turns(4, 1, rests=True), time.monotonic
+        turns, clock = Turns(4, 1, rest=1.0), time.monotonic
         await turns.acquire("b")
         await turns.acquire("a")
         began = clock()
@@ -182,7 +182,7 @@ def test_who_rested_gets_its_turn_though_nobody_asks_meanwhile():
 
 def test_everybody_gets_a_turn_however_the_rests_fall():
     async def test():
-        turns, done = Turns(4, 1, rests=True), 0
+        turns, done = Turns(4, 1, rest=1.0), 0
 
         async def ask(tenant, number):
             nonlocal done
