@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -71,10 +72,12 @@ def leaves_nothing(temporary):
     assert list(temporary.iterdir()) == []
 
 
-def test_demo_goes_the_whole_way_and_leaves_nothing(demo, tmp_path, rooms):
-    process = demo("--dataset", rooms)
-    out, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0, err
+def test_demo_goes_the_whole_way_and_leaves_nothing(run_command, tmp_path, rooms, monkeypatch):
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    monkeypatch.setattr(tempfile, "tempdir", None)  # so that TMPDIR is read again
+    arguments = ("--dataset", rooms, "--workers", 1, "--out", tmp_path / "out")
+    out = run_command("demo", *arguments).stdout
     service, uploaded, sent, queries, head, *lines = out.splitlines()
     assert re.match(r"service: http://127\.0\.0\.1:\d+, empty data folder, 1 worker", service)
     assert uploaded.startswith("map: 4 of 4 frames uploaded, signed and indexed in ")

@@ -14,7 +14,7 @@ def walk(tmp_path_factory, room_views):
     """Six small views of one room that overlap."""
     folder = tmp_path_factory.mktemp("walk") / "room" / "seq-01"
     folder.mkdir(parents=True)
-    for number, frame in enumerate(map(halved, room_views(33, 1, 6).frames)):
+    for number, frame in enumerate(map(halved, room_views(33, 1, 8).frames[:6])):
         write_intrinsics(folder, Camera(frame.intrinsics))
         write_depth_png(folder / f"frame-{number:06d}.depth.png", frame.depth, 1000.0)
     return folder

@@ -4,9 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,23 +14,8 @@ from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import decode_png, find_sequences
 from sceneprint.formats.recording import bag
 from sceneprint_client import Client
-from sceneprint_lab.cli.demo import serving
 
-Run = Callable[..., Any]
 FRAMES = 8
-
-
-@pytest.fixture(scope="module")
-def service_url(tmp_path_factory):
-    with serving(tmp_path_factory.mktemp("service"), 1) as url:
-        yield url
-
-
-@pytest.fixture
-def sceneprint(service_url, run_command, monkeypatch):
-    """Runs a command in this process against the service and checks its exit code."""
-    monkeypatch.setenv("SCENEPRINT_URL", service_url)
-    return run_command
 
 
 @pytest.fixture(scope="module")
