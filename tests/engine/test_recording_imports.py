@@ -81,7 +81,7 @@ def engine(make_engine):
     return engine
 
 
-@pytest.mark.parametrize("container", ["mcap", "ros1"])
+@pytest.mark.parametrize("container", ["mcap", pytest.param("ros1", marks=pytest.mark.thorough)])
 def test_frames_are_those_of_an_upload(engine, ros, tmp_path, container):
     path = write_drive(ros, tmp_path, container)
     job = begun(engine, path, robot="r1", tags=["seen"])

@@ -124,8 +124,6 @@ class Enumeration:
             name: (bytes.fromhex(upload), bytes.fromhex(vector))
             for name, upload, vector in map(str.split, _done(partial(_say_contents, base)))
         }
-        for name, operation in OPERATIONS.items():
-            _done(partial(_prepare, operation, self._store(name, "base")))
 
     def _store(self, name, template):
         folder = self._work / name
@@ -141,6 +139,8 @@ class Enumeration:
 
     def run(self, operation, fault, *, first=1, step=1):
         """Try a fault at calls `first`, `first + step` and so on, to the end of the operation."""
+        if not (self._work / operation).exists():
+            _done(partial(_prepare, OPERATIONS[operation], self._store(operation, "base")))
         trials, at = Trials(), first
         is_over = False
         while not is_over:
