@@ -60,7 +60,7 @@ class TurnOrder(Generic[Waiter]):
     def enter(self, tenant: str, waiter: Waiter, weight: int = 1) -> int:
         """Add a waiter for `weight` turns (at most half of all) at once; return their number."""
         weight = min(weight, max(self._count // 2, 1))
-        self._record_request(tenant)
+        self.see(tenant)
         self._waiting.setdefault(tenant, deque()).append((weight, waiter))
         return weight
 
@@ -133,7 +133,8 @@ class TurnOrder(Generic[Waiter]):
         latest = next(others, None)
         return latest is not None and latest > now - ACTIVE_S
 
-    def _record_request(self, tenant: str) -> None:
+    def see(self, tenant: str) -> None:
+        """Record a request of a tenant, also one that needs no turn: others then share and rest."""
         now = self._clock()
         self._seen[tenant] = now, self._seen.pop(tenant, (now, 0))[1]
         while True:

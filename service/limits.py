@@ -79,18 +79,18 @@ class Turns:
         self, count: int, beside: int | None = None, clock: Callable[[], float] = time.monotonic,
         *, rest: float = 0.0,
     ) -> None:  # fmt: skip
-        self._order: TurnOrder[asyncio.Future[None]] = TurnOrder(count, beside, clock, rest=rest)
+        self.order: TurnOrder[asyncio.Future[None]] = TurnOrder(count, beside, clock, rest=rest)
         self._timer: asyncio.TimerHandle | None = None
 
     async def acquire(self, tenant: str, weight: int = 1) -> int:
         """Wait for `weight` turns; return the number of turns to release."""
         turn: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        weight = self._order.enter(tenant, turn, weight)
+        weight = self.order.enter(tenant, turn, weight)
         self._admit()
         try:
             await turn
         except asyncio.CancelledError:
-            if self._order.leave(tenant, turn):
+            if self.order.leave(tenant, turn):
                 self._admit()  # other requests may have waited for the cancelled one
             else:
                 self.release(tenant, weight)
@@ -99,16 +99,16 @@ class Turns:
 
     def release(self, tenant: str, weight: int = 1) -> None:
         """Release turns."""
-        self._order.release(tenant, weight)
+        self.order.release(tenant, weight)
         self._admit()
 
     def _admit(self) -> None:
-        for turn in self._order.admit():
+        for turn in self.order.admit():
             if not turn.cancelled():
                 turn.set_result(None)
         if self._timer is not None:
             self._timer.cancel()
-        rest_s = self._order.rest_s()
+        rest_s = self.order.rest_s()
         if rest_s is None:
             self._timer = None
         else:

@@ -24,14 +24,7 @@ from service.browser_security import (
     forwarded,
     security_headers,
 )
-from service.limits import (
-    Broken,
-    RefusalDelays,
-    RequestBody,
-    is_import,
-    network_of,
-    too_large,
-)  # fmt: skip
+from service.limits import Broken, RefusalDelays, RequestBody, is_import, network_of, too_large
 from service.metrics import Metrics
 from service.problems import error_problem
 

@@ -130,6 +130,18 @@ def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns():
     assert order.rest_s() is None
 
 
+def test_a_request_without_a_turn_makes_others_share_and_rest():
+    clock = Clock()
+    order = TurnOrder(4, 1, clock, rest=1.0)
+    order.enter("a", "a1")
+    order.enter("a", "a2")
+    order.see("b")
+    assert order.admit() == ["a1"]
+    clock.now = 0.25
+    order.release("a")
+    assert (order.admit(), order.rest_s()) == ([], 0.25)
+
+
 def test_a_rest_is_a_multiple_of_the_turns():
     clock = Clock()
     order = TurnOrder(4, 1, clock, rest=2.0)
