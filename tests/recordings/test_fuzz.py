@@ -22,13 +22,13 @@ def read_all(path):
     count = 0
     for topic in (DEPTH, POINTS):
         try:
-            (sequence,) = find_sequences(
+            sequences = find_sequences(
                 path, RecordingOptions(topic=topic, keyframe_m=0, keyframe_s=0)
             )
         except SceneprintError as error:
             check(error)
             continue
-        for frame in sequence.frames:
+        for frame in (frame for sequence in sequences for frame in sequence.frames):
             try:
                 frame.read()
                 count += 1

@@ -151,6 +151,8 @@ class Bag:
             return
         with self._lock, _dataset_errors(self.path):
             for connection, log_ns, data in self._reader.messages(connections, start_ns, stop_ns):
+                if connection.topic not in topics:  # rosbags, if an index is damaged
+                    continue
                 if len(data) > MAXIMUM_MESSAGE_BYTES:
                     raise DatasetError(
                         f"{self.path}: A message of {connection.topic} has {len(data)} bytes; the "
