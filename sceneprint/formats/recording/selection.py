@@ -75,7 +75,7 @@ def _relative_motion(a: Floats, b: Floats) -> tuple[float, float]:
     turn = a[:3, :3].T @ b[:3, :3]
     cosine = (float(np.trace(turn)) - 1.0) / 2.0
     sine = math.hypot(turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]) / 2
-    return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), math.atan2(sine, cosine)
+    return math.dist(a[:3, 3], b[:3, 3]), math.atan2(sine, cosine)
 
 
 @dataclass(frozen=True)
