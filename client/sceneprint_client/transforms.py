@@ -8,6 +8,7 @@ As in tf, a transform converts coordinates of the child frame to those of its pa
 
 from __future__ import annotations
 
+import math
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
@@ -110,7 +111,7 @@ class TransformTree:
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)
-        length = float(np.linalg.norm(row[3:]))
+        length = math.hypot(*row[3:])  # does not overflow
         far = float(np.abs(row[:3]).max())
         if parent == child:
             return False
