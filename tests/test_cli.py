@@ -235,7 +235,7 @@ def test_two_paths_keep_their_names_apart(rooms, model_file, tmp_path):
     ("arguments", "message"),
     [
         (["sign", "/nowhere/at/all"], "does not exist"),
-        (["sign", "README.md"], "There is no intrinsics.json here"),
+        (["sign", "README.md"], "The file is neither a depth image (PNG, NPY"),
         (["sign", "{rooms}", "--model", "/nowhere.safetensors"], "Specify one of the presets"),
         (["train", "--out", "{tmp}/m", "--rooms", "1", "--jobs", "1"], "fewer than two places"),
         (["synth", "/dev/null/x"], "/dev/null"),

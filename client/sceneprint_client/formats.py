@@ -76,7 +76,8 @@ _NUMPY_ROWS = (
 )
 #: CDR header of either byte order, followed anywhere by the field names x, y and z.
 _CDR = r"\x00[\x00\x01]\x00[\x00-\x03]" + "".join(
-    rf"(?=[\s\S]*?(?:\x02\x00\x00\x00|\x00\x00\x00\x02){axis}\x00)" for axis in "xyz"
+    rf"(?=[\s\S]*?(?:\x02\x00\x00\x00|\x00\x00\x00\x02){axis}\x00)"
+    for axis in ("[xX]", "[yY]", "[zZ]")
 )
 _ESTIMATED = "Units and up are estimated"
 _SQLITE = r"SQLite format 3\x00"

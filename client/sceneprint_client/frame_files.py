@@ -35,7 +35,14 @@ from sceneprint_client.errors import (
     UnreadableFrame,
 )
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES, MAXIMUM_IMAGE_BYTES, naming, read_bytes
-from sceneprint_client.formats import HEAD, format_named, format_of, is_cloud
+from sceneprint_client.formats import (
+    HEAD,
+    format_at,
+    format_named,
+    format_of,
+    is_cloud,
+    titles_of,
+)
 from sceneprint_client.sidecars import (
     CLOUDS_FILE,
     Camera,
@@ -154,7 +161,20 @@ def find_frame_file(file: Path) -> FrameFile:
         source = find_cloud_source(folder)
         return FrameFile(name, file, None, pose_source=pose, cloud=source)
     # Any other file counts as a depth image; decoding checks its content.
-    return FrameFile(name, file, find_camera(folder), pose_source=pose, sequence=number)
+    try:
+        camera = find_camera(folder)
+    except DatasetError as cause:
+        if file.suffix.lower() == ".npy":
+            raise DatasetError(
+                f"{cause} If the file holds points, its shape must be (N, 3) or (N, 4)."
+            ) from cause
+        if format_named(file.name, "depth") or format_at(_head(file), "depth"):
+            raise
+        raise DatasetError(
+            f"{file}: The file is neither a depth image ({titles_of('depth')}) nor a point cloud "
+            f"({titles_of('cloud')}). Convert it."
+        ) from cause
+    return FrameFile(name, file, camera, pose_source=pose, sequence=number)
 
 
 #: Names of folders that contain pose files, beside the frames.
@@ -198,11 +218,16 @@ def _is_npy_of_points(file: Path) -> bool:
         pass
     else:
         return False
+    return format_of(_head(file)) == "npy"
+
+
+def _head(file: Path) -> bytes:
+    """Return the first `HEAD` bytes of a file; none if it cannot be read: later errors say why."""
     try:
         with file.open("rb") as opened:
-            return format_of(opened.read(HEAD)) == "npy"
-    except OSError:  # reading the frame later raises an error with the reason
-        return False
+            return opened.read(HEAD)
+    except OSError:
+        return b""
 
 
 def meta_of(

@@ -419,6 +419,10 @@ def _point_type(message: Any, step: int) -> np.dtype[Any]:
         if kind is not None and int(field.count) in (0, 1):
             fields[str(field.name)] = (order + kind, int(field.offset))
     names = list("xyz")
+    if fields.keys().isdisjoint(names):  # some drivers write X, Y and Z
+        fields = {
+            name.lower() if name in ("X", "Y", "Z") else name: fields[name] for name in fields
+        }
     if not fields.keys() >= set(names):
         listed = ", ".join(str(field.name) for field in message.fields[:20])
         raise UnreadableCloud(

@@ -429,13 +429,15 @@ def contradictions(
     Returns
     -------
     too_fast : (N - 1,) whether neighbouring samples imply a speed above `FASTEST`
-    disputed : (N,) whether the sample lies between a jump and its reversal, as of two publishers
+    disputed : (N,) whether the sample lies between a jump and its reversal, as of two publishers,
+        or is too fast from and to all its neighbours
     """
-    disputed = np.zeros(len(times), np.bool_)
     gap = np.diff(times)
     steps = _steps(rows[:-1], rows[1:])
     reach = motion(rows[:-1], rows[1:])
     too_fast = reach > _JITTER + FASTEST * gap
+    ends = np.full(1, len(gap) > 0)
+    disputed = np.concatenate([ends, too_fast]) & np.concatenate([too_fast, ends])
     # A jump differs from the motion before and after it.
     rate = steps / np.maximum(gap, 1e-3)[:, None]
     change = np.full(len(gap), np.inf if len(gap) > 1 else 0.0)

@@ -21,7 +21,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from sceneprint.errors import InvalidIntrinsics, UnreadableFrame, UselessFrame
-from sceneprint.formats.depth_plausibility import check_depth
+from sceneprint.formats.depth_plausibility import check_camera, check_depth
 from sceneprint.geometry.surface.camera import ray_to_axis, undistort
 from sceneprint.types import MAXIMUM_SAMPLES, DepthFrame, Floats, Floats32, Intrinsics
 from sceneprint_client.files import (
@@ -431,7 +431,7 @@ def decode_frame(
     Parameters
     ----------
     samples_of : decoder of the file; None selects `decode_samples`
-    trust_depth : whether to accept samples that do not look like depth
+    trust_depth : whether to accept samples that do not look like depth, and implausible cameras
 
     Raises
     ------
@@ -441,6 +441,7 @@ def decode_frame(
     with naming(name):
         samples = (samples_of or decode_samples)(data)
         if not trust_depth:
+            check_camera(intrinsics)
             check_depth(samples, depth_scale)
         frame = make_frame(
             samples, intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose

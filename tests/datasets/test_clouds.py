@@ -224,3 +224,12 @@ def test_a_real_hall(data_root):
     rows = np.frombuffer(data[data.index(b"DATA binary\n") + 12 :], "<f4").reshape(-1, 4)
     np.testing.assert_array_equal(points_of(last), rows[:, :3])
     assert last.pose is not None
+
+
+def test_files_that_are_neither_depth_nor_points_are_named_as_such(tmp_path):
+    (tmp_path / "points.csv").write_text("x,y,z\n1,2,3\n")
+    with pytest.raises(DatasetError, match=r"points\.csv: The file is neither a depth image \("):
+        find_sequences(tmp_path / "points.csv")
+    np.save(tmp_path / "points.npy", np.ones((3, 500), np.float32))
+    with pytest.raises(DatasetError, match=r"no intrinsics\.json.*must be \(N, 3\) or \(N, 4\)"):
+        find_sequences(tmp_path / "points.npy")

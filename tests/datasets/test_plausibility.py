@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sceneprint.errors import UnreadableFrame
+from sceneprint.errors import InvalidIntrinsics, UnreadableFrame
 from sceneprint.formats.dataset import decode_frame
 from sceneprint.formats.depth_file import encode_npy, encode_png
 from sceneprint.types import Intrinsics
@@ -38,6 +38,9 @@ DEPTH = {
     "clean": room(0.0),
     "of a Kinect": room() // 5 * 5,
     "of 2 % noise": room(0.02),
+    "of 2 % noise without holes": (
+        2000.0 * (1.0 + 0.02 * RANDOM.standard_normal((480, 640)))
+    ).astype(np.uint16),
     "of 80 x 60": room(width=80, height=60),
     "of 8 bits": (room(0.0) // 16).astype(np.uint16) << 8,
     "sparse": np.where(RANDOM.random((240, 320)) < 0.1, room(), 0).astype(np.uint16),
@@ -80,3 +83,63 @@ def test_infrared_is_refused():
             UnreadableFrame, match=r"not seem to be depth: .*infrared.* --trust-depth"
         ):
             decode(samples)
+
+
+def infrared(texture, width=640, height=480):
+    """A smooth image (H, W) without noise or holes: a lit wall with sinusoidal reflectance, whose
+    waves are a tenth of the width long.
+    """
+    v, u = np.mgrid[:height, :width] / width
+    waves = np.sin(20 * np.pi * (u + 0.3 * v)) * np.sin(20 * np.pi * (v - 0.2 * u))
+    return 2000.0 / (1.0 + u) ** 2 * (1.0 + texture * waves)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+def test_smooth_infrared_with_texture_is_refused_if_it_has_no_holes(kind):
+    image = infrared(0.3) / (1.0 if kind is np.uint16 else 1000.0)
+    image[:, :13] = 0.0  # 2.03 % of the samples
+    assert (decode(image.astype(kind)) > 0).mean() == 627 / 640
+    image[:, 0] = image[:, 13]
+    with pytest.raises(UnreadableFrame, match=r"not seem to be depth: .*infrared"):
+        decode(image.astype(kind))
+
+
+def test_the_limits_of_texture():
+    assert decode(infrared(0.05).astype(np.uint16)).all()
+    with pytest.raises(UnreadableFrame, match="infrared"):
+        decode(infrared(0.07).astype(np.uint16))
+
+
+def test_images_of_8_bits_are_refused_unless_their_scale_is_coarse():
+    samples = (infrared(0.0) / 8).astype(np.uint16)
+    assert samples.max() == 250
+    with pytest.raises(UnreadableFrame, match=r"255 at most.* 8 bits.* --trust-depth"):
+        decode(samples)
+    samples[240, 320] = 256
+    assert decode(samples).max() == np.float32(0.256)
+    assert decode(samples // 2, depth_scale=50.0).max() == np.float32(2.56)
+
+
+@pytest.mark.parametrize("limit", [1023, 2047, 8191, 32767])
+def test_images_with_many_samples_at_a_limit_of_bits_are_refused(limit):
+    samples = np.minimum(room(0.0), limit - 1)
+    samples[room(0.0) == 0] = 0
+    few = 5  # of 240 sampled columns and rows: 5 of 240 columns are 2.1 %
+    samples[:, :7] = limit
+    with pytest.raises(UnreadableFrame, match=f"Many samples are {limit}, the maximum of"):
+        decode(samples)
+    samples[:, few:7] = 0
+    assert decode(samples).max() == np.float32(limit / 1000)
+
+
+def test_cameras_with_rays_across_the_optical_axis_are_refused():
+    data = encode_png(room())
+    for fx, cx in ((32.0, 160.0), (300.0, -1180.0)):
+        assert decode_frame(data, Intrinsics(320, 240, fx, 300.0, cx, 120.0)).depth.any()
+    for fx, cx in ((31.9, 160.0), (0.9, 0.5), (300.0, -1181.5), (300.0, 1500.5)):
+        with pytest.raises(InvalidIntrinsics, match="implausible for 320 pixels"):
+            decode_frame(data, Intrinsics(320, 240, fx, 300.0, cx, 120.0))
+    with pytest.raises(InvalidIntrinsics, match="implausible for 240 pixels"):
+        decode_frame(data, Intrinsics(320, 240, 300.0, 23.9, 160.0, 120.0))
+    odd = Intrinsics(320, 240, 0.9, 1.2, 0.5, 0.5)
+    assert decode_frame(data, odd, trust_depth=True).intrinsics == odd

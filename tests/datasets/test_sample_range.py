@@ -47,6 +47,10 @@ def test_a_range_is_doubted_where_the_unit_is_wrong(near, median, far):
     for scale in (4.0, 5.0, 10.0, 0.1):  # 0.25 mm, TUM's, 0.1 mm, and centimetres for millimetres
         assert of(scale * near, scale * median, scale * far).is_doubtful
     assert not of(10 * near, 10 * median, 10 * far, valid=None).is_doubtful  # of a scanner
+    for scale in (0.01, 1000.0):  # the median is 1.05 to 2.8
+        doubted = of(scale * near, scale * median, scale * far, valid=None)
+        assert doubted.is_doubtful
+        assert "is unusual for a scanner: check that the coordinates are metres" in str(doubted)
 
 
 def test_a_summary_is_one_line():

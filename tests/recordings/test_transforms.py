@@ -129,6 +129,45 @@ def test_frames_within_a_jump_are_left_out(tmp_path, ros):
     assert "skipped: 1 without a pose" in found.note
 
 
+def test_samples_at_the_stamps_of_frames_are_too_fast(tmp_path, ros):
+    x = [0.0, 100.0, 200.0, 201.0, 202.0, 303.0]  # metres, in seconds
+
+    def fill(writer):
+        writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
+        for i, at in enumerate(x):
+            writer.transforms(1.0 * i, {("odom", "base_link"): ros.transform(at, 0, 0)})
+            writer.image(1.0 * i, IMAGE)
+
+    (found,) = sequences(ros, tmp_path, fill)
+    assert positions(found) == [[at, 0, 0] for at in (200.0, 201.0, 202.0)]
+    assert "3 without: samples of odom -> base_link contradict each other" in found.note
+    assert found.lost == 3
+
+
+@pytest.mark.parametrize(
+    ("child", "frame", "shift_s", "why"),
+    [
+        ("base_link", "velodyne", 0.0, "there are no transforms from velodyne to a frame in which"),
+        ("base_link", "", 0.0, "their messages do not name a coordinate frame (frame_id)"),
+        ("base_link", "camera", 1e6, "no sample of odom -> base_link within 20 ms (nearest 1e+06"),
+        ("", "camera", 0.0, "/odom is ignored because its child_frame_id is empty"),
+    ],
+)
+def test_frames_that_miss_the_poses_of_the_recording_are_lost(
+    child, frame, shift_s, why, tmp_path, ros
+):
+    def fill(writer):
+        writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
+        for i in range(3):
+            writer.image(1.0 * i, IMAGE, frame=frame)
+        for i in range(3):
+            writer.odometry(i + shift_s, ros.transform(1.0 * i, 0, 0), child=child)
+
+    (found,) = sequences(ros, tmp_path, fill)
+    assert found.lost == len(found.frames) == 3
+    assert why in found.note
+
+
 @pytest.mark.parametrize("length", [0.0, 0.5, 1.02, float("nan")])
 def test_quaternions_that_are_not_of_length_1(length, tmp_path, ros):
     def fill(writer):

@@ -54,6 +54,13 @@ def test_rows_of_another_length_are_no_kitti(values):
         decode_cloud(data, file_format="kitti")
 
 
+@pytest.mark.parametrize("values", [3, 4])
+def test_float64_is_no_kitti(values):
+    data = scan_rows(values).astype(np.float64).tobytes()
+    with pytest.raises(UnreadableCloud, match=r"also if the numbers are float64|so the type, byte"):
+        decode_cloud(data, file_format="kitti")
+
+
 def test_rows_of_four_are_kitti():
     rows = scan_rows(4)
     for scale in (1.0, 1 / 255, 0.0):

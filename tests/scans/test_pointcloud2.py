@@ -75,7 +75,7 @@ def test_what_a_sensor_missed_is_left_out(serialize, points):
     scan = decode_scan(serialize(rows))
     np.testing.assert_array_equal(scan.cloud.points, (points + 10).astype(np.float32))
     assert scan.cloud.note == "5 missing points skipped"
-    with pytest.raises(UselessFrame, match="0 of 0 points are missing"):
+    with pytest.raises(UselessFrame, match="0 of 0 points are valid"):
         decode_scan(serialize(rows[:0]))
 
 
@@ -176,3 +176,10 @@ def test_damaged_messages_are_refused_or_read_in_bounded_memory(serialize, point
     finally:
         tracemalloc.stop()
     assert min(read, refused) > 100
+
+
+def test_axes_may_be_upper_case(serialize, points):
+    rows = np.zeros(len(points), [("X", "<f4"), ("Z", "<f4"), ("Y", "<f4")])
+    rows["X"], rows["Y"], rows["Z"] = (points + 10).T
+    scan = decode_scan(serialize(rows))
+    np.testing.assert_array_equal(scan.cloud.points, (points + 10).astype(np.float32))

@@ -42,7 +42,7 @@ def test_coordinates_of_a_map(las, points):
 def test_a_scale_beyond_all_numbers(las):
     data = bytearray(las())
     data[131:139] = struct.pack("<d", 1e308)
-    with pytest.raises(UselessFrame, match="12 of 12 points are missing"):
+    with pytest.raises(UselessFrame, match="0 of 12 points are valid"):
         decode_cloud(bytes(data))
 
 
@@ -64,11 +64,11 @@ def test_missing_points(pcd, npy, points):
     with pytest.raises(UnreadableCloud, match=r"1e\+300 m from"):
         decode_cloud(npy(points))
     points[:3] = np.nan
-    with pytest.raises(UselessFrame, match=r"4 of 12 points are missing\. 8 valid"):
+    with pytest.raises(UselessFrame, match="8 of 12 points are valid"):
         decode_cloud(npy(points))
-    with pytest.raises(UselessFrame, match="12 of 12 points are missing"):
+    with pytest.raises(UselessFrame, match="0 of 12 points are valid"):
         decode_cloud(npy(np.full((12, 3), np.nan)))
-    with pytest.raises(UselessFrame, match="0 of 0 points are missing"):
+    with pytest.raises(UselessFrame, match="0 of 0 points are valid"):
         decode_cloud(npy(np.empty((0, 3))))
 
 

@@ -46,6 +46,8 @@ Kind = Literal["depth", "cloud"]
 #: 2.8, .65 to 1.6 and 2.8 to 6.4; pooled over nine consecutive frames, .83 to 3.6, .39 to 2.24 and
 #: at most 6.9. Depth in quarters of a millimetre, read as millimetres, is four times too large.
 _MEDIAN_M, _NEAR_M, _FAR_M = (0.2, 5.0), (0.3, 2.3), 10.0
+#: Usual medians of scanners, metres; in 453 scans of three LiDARs, they are 3.3 to 26.
+_SCANNED_M = (0.2, 500.0)
 
 
 class SampleRange(ApiRecord):
@@ -61,8 +63,10 @@ class SampleRange(ApiRecord):
 
     @property
     def is_doubtful(self) -> bool:
-        """Return whether the range is unusual for a depth camera."""
-        return self.valid is not None and not (
+        """Return whether the range is unusual for a depth camera, or a scanner."""
+        if self.valid is None:
+            return not _SCANNED_M[0] < self.median < _SCANNED_M[1]
+        return not (
             _MEDIAN_M[0] < self.median < _MEDIAN_M[1]
             and _NEAR_M[0] < self.near < _NEAR_M[1]
             and self.far < _FAR_M
@@ -70,16 +74,23 @@ class SampleRange(ApiRecord):
 
     def __str__(self) -> str:
         what = "range" if self.valid is None else "depth"
-        text = f"{what} {self.near:.2g} to {self.far:.2g} m (5th to 95th percentile)"
-        if self.valid is None:
-            return f"{text}, {self.count} points"
-        text += f", {_percent(self.valid)} of pixels valid"
+        text = f"{what} {self.near:.2g} to {self.far:.2g} m (5th to 95th percentile), "
+        text += (
+            f"{self.count} points"
+            if self.valid is None
+            else (f"{_percent(self.valid)} of pixels valid")
+        )
         if not self.is_doubtful:
             return text
+        if self.valid is None:
+            return (
+                f"{text}; a median of {self.median:.2g} m is unusual for a scanner: check that the "
+                "coordinates are metres"
+            )
         return (
             f"{text}; a median of {self.median:.2g} m and a 5th percentile of {self.near:.2g} m "
-            "are unusual for a depth camera: check the unit, and specify the depth scale if the "
-            "unit is not the millimetre"
+            "are unusual for a depth camera: check that the images are depth, not infrared or "
+            "disparity, and specify the depth scale if the unit is not the millimetre"
         )
 
 

@@ -54,7 +54,7 @@ def read_kitti(data: bytes) -> FilePoints:
         raise UnreadableCloud(
             f"Judging by its values, the file has {floats} numbers per row, but a KITTI scan has "
             f'4. Specify them with `--row {row}` or with "row" in clouds.json, or '
-            "send x, y and z as NPY with the shape (N, 3)."
+            "send x, y and z as NPY with the shape (N, 3), also if the numbers are float64."
         )
     if rest or not count:
         raise UnreadableCloud(
@@ -326,8 +326,9 @@ def decode_scan(
         points, missing = raw.points, raw.file_points - len(raw.points)
         if len(points) < FEWEST_POINTS:
             raise UselessFrame(
-                f"{missing} of {raw.file_points} points are missing. {len(points)} valid points "
-                f"remain, but {FEWEST_POINTS} are required. Check that the sensor saw surfaces."
+                f"{len(points)} of {raw.file_points} points are valid, but {FEWEST_POINTS} are "
+                "required; others are at the sensor or not finite. Check that the sensor saw "
+                "surfaces."
             )
         note = f"{missing} missing points skipped" if missing else ""
         if len(points) > MOST_POINTS:
@@ -429,6 +430,11 @@ def _relative_points(raw: FilePoints, place: Position, units: float) -> Floats32
 
 
 def _check_reach(far: float) -> None:
+    if far > 1e12:
+        raise UnreadableCloud(
+            f"A coordinate is {far:.6g} m, so the type, byte order or number of the values per "
+            "point is wrong. Specify the actual format."
+        )
     if far > FARTHEST_M:
         raise UnreadableCloud(
             f"A point is {far:.6g} m from the viewpoint along an axis; the limit is "

@@ -346,6 +346,11 @@ def _compute_motion(
             motion.remarks.append(
                 f"{parent} -> {child} is normalised: its quaternion has the length {length:.3g}"
             )
+    motion.remarks += [
+        f"{topic} is ignored because its child_frame_id is empty"
+        for topic, samples in part.odometry.items()
+        if not samples
+    ]
     if world is not None:
         poses = tree.lookup(world, sensor, stamps)
         ends = poses
@@ -519,8 +524,13 @@ def _describe_selection(frames: FrameTopic, scan: BagScan, motions: list[_Motion
 
 def _count_lost(scan: BagScan, motions: list[_Motion]) -> int:
     """Return the number of unexpectedly omitted frames or poses, and of damaged messages."""
-    has_poses = any(motion.poses for motion in motions)
-    if not has_poses and any(motion.is_broken for motion in motions):
+    if not any(motion.poses for motion in motions) and (
+        any(motion.is_broken or motion.unknown for motion in motions)
+        or any(
+            part.odometry or any(map(part.tree.moves_below, part.tree.frames()))
+            for part in scan.parts
+        )
+    ):
         return len(scan.stamps_ns)
     return _count_without_pose(scan, motions) + scan.damaged
 
@@ -551,8 +561,7 @@ def _describe_unknown(frames: FrameTopic, motions: list[_Motion]) -> str:
             reason = f"no sample of {transform}{f' {within}' if math.isfinite(nearest) else ''}"
         reasons.append(reason if len(whys) == count else f"{reason}: {count}")
     if not reasons:
-        return (
-            f"there are no transforms from {frames.frame or 'their frame'} to a frame in which it "
-            "moves"
-        )
+        if not frames.frame:
+            return "their messages do not name a coordinate frame (frame_id)"
+        return f"there are no transforms from {frames.frame} to a frame in which it moves"
     return ", ".join(reasons)
