@@ -475,6 +475,8 @@ def array_sendable(
     UnreadableFrame, UnreadableCloud : If the array has another shape or type.
     InvalidIntrinsics : If `meta` does not describe a camera.
     """
+    # masked samples are missing
+    array = np.asarray(np.ma.filled(array, np.nan if array.dtype.kind == "f" else 0))
     size = (array.shape[1], array.shape[0]) if array.ndim == 2 else None
     if meta is None or isinstance(meta, FrameMeta):
         metadata = meta or FrameMeta()
@@ -542,7 +544,7 @@ def camera_of(
     if K.shape != (4,) or not np.isfinite(K).all() or not (K[:2] > 0).all():
         raise InvalidIntrinsics(
             "The camera is invalid. Pass CameraIntrinsics, a matrix [[fx, 0, cx], [0, fy, cy], "
-            "[0, 0, 1]], or (fx, fy, cx, cy), in pixels."
+            "[0, 0, 1]], or (fx, fy, cx, cy), in pixels; or FrameMeta with other metadata too."
         )
     fx, fy, cx, cy = K.tolist()
     width, height = size

@@ -10,7 +10,7 @@ from sceneprint.errors import InvalidIntrinsics, InvalidRequest, UnreadableCloud
 from sceneprint_client import Client
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, Prior
 from sceneprint_client.api.base import checked
-from sceneprint_client.frame_files import camera_of, sendable
+from sceneprint_client.frame_files import array_sendable, camera_of, sendable
 
 QUARTER = 0.5**0.5
 CAMERA = CameraIntrinsics(width=4, height=3, fx=5, fy=6, cx=1.5, cy=1)
@@ -196,3 +196,16 @@ def test_unknown_options_are_refused_before_the_frame_is_looked_at():
         pytest.raises(TypeError, match="no option camera; its options are candidates"),
     ):
         client.localize("hall", np.zeros((3, 4), np.uint16), camera=CAMERA)
+
+
+def test_masked_samples_are_missing():
+    camera = (300.0, 300.0, 2.0, 1.0)
+    samples = np.arange(1, 13, dtype=np.uint16).reshape(3, 4)
+    for masked, missing in (
+        (np.ma.masked_equal(samples, 5), 0),
+        (np.ma.masked_equal(samples / 8, 0.625), np.nan),
+    ):
+        sent = np.load(io.BytesIO(array_sendable(masked, camera)[0]))
+        expected = np.array(masked.data)
+        expected[1, 0] = missing
+        np.testing.assert_array_equal(sent, expected)
