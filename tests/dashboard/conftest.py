@@ -18,26 +18,19 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
-from playwright.sync_api import (
-    Browser,
-    BrowserContext,
-    Page,
-    Request,
-    ViewportSize,
-    expect,
-    sync_playwright,
-)
 
 from benchmarks.rooms import circled, send
 from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.formats.dataset import write_depth_png
 from sceneprint_lab.synth import SynthRoom
+
+if TYPE_CHECKING:  # only the process that runs these tests loads Playwright, which takes a second
+    from playwright.sync_api import Browser, BrowserContext, Page, Request, ViewportSize
 
 FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -49,7 +42,14 @@ VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
 ROOMS, VIEWS = 2, 8
 #: Capture time of the first frame; frames are one second apart.
 TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
-Settle = Callable[[Page], None]
+Settle = Callable[["Page"], None]
+
+
+def expect(what: Any) -> Any:
+    """Return Playwright's assertions about a page or an element."""
+    from playwright.sync_api import expect
+
+    return expect(what)
 
 
 @dataclass(frozen=True)
@@ -162,6 +162,8 @@ def chromium() -> str:
 @pytest.fixture(scope="session")
 def browser(chromium: str, folder_stack: ExitStack) -> Browser:
     """A browser for all tests of this folder; no other event loop may run while it exists."""
+    from playwright.sync_api import expect, sync_playwright
+
     playwright = folder_stack.enter_context(sync_playwright())
     one = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
     expect.set_options(timeout=1000 * PATIENCE_S)
@@ -365,6 +367,8 @@ def settle() -> Settle:
 @pytest.fixture(scope="session")
 def axe() -> Callable[[Page], list[str]]:
     """Return axe's findings on a page; the dark theme is checked only for colours."""
+    from axe_playwright_python.sync_playwright import Axe
+
     judge = Axe()
 
     def look(page: Page) -> list[str]:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+
+from tests.dashboard.conftest import expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 OUTCOMES = ("found", "wrong", "ambiguous", "not_found")
 CELLS = """all => all.map(one => ({cell: one.dataset.cell, outcome: one.dataset.outcome,

@@ -8,7 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+
+from tests.dashboard.conftest import expect
 
 SIDES = ("monday", "tuesday")
 

@@ -5,12 +5,16 @@ from __future__ import annotations
 import base64
 import io
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Locator, Page, expect
+
+from tests.dashboard.conftest import expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Locator, Page
 
 Sent = dict[str, Any]
 #: What is on a canvas as a PNG: a million numbers one by one would take seconds.

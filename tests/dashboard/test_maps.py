@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from playwright.sync_api import Page, expect
 
 from benchmarks.rooms import Shot, send, shots
+from tests.dashboard.conftest import expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 MARKUP = "<img src=x onerror=alert(1)> & co"
 

@@ -6,14 +6,16 @@ import io
 import json
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import Page
 
 from sceneprint_client.surface_encoding import HEADER, POINT
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 
 def ask(station: Any, frame: int, **more: object) -> dict[str, Any]:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
 
 from sceneprint.formats.dataset import write_depth_png
+from tests.dashboard.conftest import expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 #: bob's odometry begins elsewhere, and turned.
 _A = np.deg2rad(40)

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import expect
+
+from tests.dashboard.conftest import expect
 
 
 def tiles(page, row: str) -> list[dict[str, Any]]:

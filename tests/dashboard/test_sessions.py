@@ -6,7 +6,8 @@ import json
 from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+
+from tests.dashboard.conftest import expect
 
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
 #: Session and robot of each of six frames.

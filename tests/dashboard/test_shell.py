@@ -8,7 +8,8 @@ import signal
 from typing import Any
 
 import pytest
-from playwright.sync_api import expect
+
+from tests.dashboard.conftest import expect
 
 PROXIED = {"X-Forwarded-For": "192.0.2.7"}
 BUDGET = 40_000

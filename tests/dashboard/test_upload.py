@@ -7,16 +7,19 @@ import io
 import json
 import zipfile
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from playwright.sync_api import FilePayload, Locator, Page, Response, Route, expect
 
 from benchmarks.rooms import circled
 from sceneprint.decoders.child_process import array_samples, text_samples
 from sceneprint.formats.depth_file import encode_npy
+from tests.dashboard.conftest import expect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import FilePayload, Locator, Page, Response, Route
 
 LENS = {"width": 64, "height": 48, "fx": 60.0, "fy": 60.0, "cx": 32.0, "cy": 24.0}
 

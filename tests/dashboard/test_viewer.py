@@ -5,14 +5,16 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page
 
 from sceneprint.formats.export import encode_points
 from sceneprint.geometry.validation.inspection import STEP_COLOURS
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 #: Of the canvas, CSS pixels, and pixels of an angle whose tangent is 1.
 WIDTH, HEIGHT = 400, 300
