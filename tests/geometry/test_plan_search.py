@@ -164,13 +164,14 @@ def test_a_half_turn_conjugates_the_spectrum_of_slices():
 def test_slices_propose_the_true_transform(yaw):
     source, target = pose(4, 5, 1.2, 12, 8, -5), pose(10, 3, 2.0, 12 + yaw, -4, 10)
     a, b = draw_plan(seen_from(source), P), draw_plan(seen_from(target), P)
-    found = slice_hypotheses(a, b, P)
+    found, values = slice_hypotheses(a, b, P)
     metres, degrees, rank = nearest(found, inverse(target) @ source)
     # half a cell of 1 m along both axes, half a yaw (2.5 degrees), half a step of height
     assert metres < 1.2
     assert degrees < 3.0
     assert rank < 4
-    assert len(found) <= P.n_sliced * P.n_heights
+    assert len(found) == len(values) <= P.n_sliced * P.n_heights
+    assert (np.diff(values) <= 0).all()
 
 
 def test_slices_find_a_shift_although_most_points_are_near_the_scanners():
@@ -184,7 +185,7 @@ def test_slices_find_a_shift_although_most_points_are_near_the_scanners():
         slices = np.ones(len(points), np.uint8)
         return ScanPlan(np.eye(3), points, 0 * points, slices, np.ones(P.n_yaws), np.ones((2, n)))
 
-    found = slice_hypotheses(plan(posts), plan(posts + shift), P)
+    found, _ = slice_hypotheses(plan(posts), plan(posts + shift), P)
     best = found[0, :2, 3]
     assert np.abs(best - shift).max() <= 1.0  # cells of 1 m
 

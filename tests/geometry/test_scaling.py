@@ -31,7 +31,8 @@ BARE = {
         "many_planes", "many_planes_net", "plane_violations", "worst_violations", "sparse_evidence",
         "sparse_plane_overlap", "sparse_planes", "sparse_plane_violations",
         "sparse_worst_violations", "alone_planes",
-        "apart_rad", "apart_planes", "apart_plane_overlap",
+        "apart_rad", "apart_planes", "apart_plane_overlap", "sliced_planes",
+        "sliced_violations", "sliced_plane_violations",
     },
     "AmbiguityParameters": {
         "same_direction", "least_crossing", "hopeful_share", "hopeful_violations", "refuted",
@@ -41,7 +42,10 @@ BARE = {
     "RefinementParameters": {"normal_cosine"},
     "AlignmentParameters": {"violation_weight", "rank_violations", "same_rad"},
     "GravityParameters": {"gate", "proposed_tilt", "refined_tilt", "rival_tilt", "floor_tilt"},
-    "PlanParameters": {"tilt", "blur", "flat_weight", "slice_blur", "slice_trend"},
+    "PlanParameters": {
+        "tilt", "blur", "flat_weight", "slice_blur", "slice_trend", "slice_share", "slice_margin",
+        "slice_distance",
+    },
     "ConsensusParameters": {"angle_tolerance", "inlier_cosine"},
     "SequenceParameters": {"angle_scale", "gap_cost", "swap_cost"},
     "OverlapParameters": {"normal_cosine"},

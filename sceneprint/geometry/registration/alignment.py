@@ -67,6 +67,7 @@ from sceneprint.geometry.registration.sequence_alignment import (
     SequenceParameters,
     sequence_correspondences,
 )
+from sceneprint.geometry.registration.slice_support import refine_by_slices
 from sceneprint.geometry.rigid import (
     GravityParameters,
     Ups,
@@ -477,6 +478,7 @@ class Alignment:
     refined : result of the last refinement; None if it failed
     search : source of the transform
     proposed : (n, 4, 4) all hypotheses before refinement, best first; for scans only
+    supported : whether the points in height slices support T much more than any other transform
     """
 
     T: Floats
@@ -485,6 +487,7 @@ class Alignment:
     refined: Refinement | None
     search: Search = "correspondences"
     proposed: Floats = field(default_factory=lambda: np.empty((0, 4, 4)))
+    supported: bool = False
 
 
 def align(
@@ -552,7 +555,7 @@ def align_scans(
     a, b = query.geometry, match.geometry
     ups = query.up, match.up
     voted = _vote_hypotheses(a, b, rng, p, matching, ups)
-    planned, sliced = _search_plans(query, match, p.plan, other_axes=other_axes)
+    planned, sliced, values = _search_plans(query, match, p.plan, other_axes=other_axes)
     hypotheses = np.concatenate([voted, sliced, planned])
     scores = _score(query, match, hypotheses, p, overlap_p)
     priorities = scores.copy()  # slices are too coarse to be scored, so the best slices come first
@@ -574,27 +577,32 @@ def align_scans(
     order = _rank(query, match, transforms, p, overlap_p)
     T, others = transforms[order[0]], transforms[order[1:]]
     search: Search = "plans" if is_planned[order[0]] else "correspondences"
+    supported = False
+    if len(sliced):
+        plans = query.plan(p.plan), match.plan(p.plan)
+        T, supported = refine_by_slices(*plans, T, sliced, values, p.plan)
     there = _refine_finally(query, match, T, others, p, search)
     back = _refine_finally(match, query, inverse(T), inverses(others), p, search)
-    return replace(there, proposed=hypotheses[np.argsort(-scores, kind="stable")]), back
+    proposed = hypotheses[np.argsort(-scores, kind="stable")]
+    return replace(there, proposed=proposed, supported=supported), back
 
 
 def _search_plans(
     query: FrameSamples, match: FrameSamples, p: PlanParameters, *, other_axes: bool
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """Return hypotheses (n, 4, 4) from plans and, if both scanners see all around, from slices.
 
-    Streets require slices; with `other_axes` there are none, because scanners in streets are
-    upright.
+    The last result is the correlations of the hypotheses from slices. Streets require slices; with
+    `other_axes` there are none, because scanners in streets are upright.
     """
     a, b = query.geometry.surface, match.geometry.surface
     if other_axes:
-        return plan_hypotheses(other_plans(a, b, p), p), np.empty((0, 4, 4))
+        return plan_hypotheses(other_plans(a, b, p), p), np.empty((0, 4, 4)), np.empty(0)
     pair = query.plan(p), match.plan(p)
     planned = plan_hypotheses([pair], p)
     if a.spread is None or b.spread is None:
-        return planned, np.empty((0, 4, 4))
-    return planned, slice_hypotheses(*pair, p)
+        return planned, np.empty((0, 4, 4)), np.empty(0)
+    return planned, *slice_hypotheses(*pair, p)
 
 
 def align_guided(

@@ -2,6 +2,7 @@
 
     Surface  --draw_plan-->  ScanPlan
     ScanPlan, ScanPlan  --plan_hypotheses, slice_hypotheses-->  (n, 4, 4)
+    ScanPlan, ScanPlan, T  --slice_correlation-->  correlation
 
 Scans from distant viewpoints have few patches with similar surroundings in common, so
 correspondences may yield no correct transform although the plans of the scans fit. Upright surfaces
@@ -63,6 +64,10 @@ class PlanParameters:
     n_sliced: int = 25  #: `n_kept` for slices
     slice_blur: float = 0.5  #: `blur` for slices
     slice_trend: float = 0.866  #: `blur` of the low frequencies that are subtracted from slices
+    slice_share: float = 0.7  #: minimum ratio of a transform's slice correlation to all others' for
+    #: its refinement by the points in slices
+    slice_margin: float = 1.4  #: minimum ratio for slices to support a transform
+    slice_distance: float = 16.0  #: minimum distance between scanners for both, cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,8 +398,12 @@ def _correlate_plans(
     return _transforms_at_peaks(source, target, angles, products, p.cell, p.n_kept, p)
 
 
-def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> Floats:
+def slice_hypotheses(
+    source: ScanPlan, target: ScanPlan, p: PlanParameters
+) -> tuple[Floats, Floats]:
     """Return T_target_source (n, 4, 4) that align the points in the height slices, best first.
+
+    Their correlations (n,) are returned too.
 
     Only the `sliced_yaws` pairs of opposite yaws at which the azimuths agree best are tried. A half
     turn of an image conjugates its spectrum, so both yaws of a pair share a spectrum.
@@ -403,8 +412,7 @@ def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> F
     agreement = _yaw_agreement(source, target)
     pairs = np.argsort(-(agreement[:half] + agreement[half : 2 * half]), kind="stable")
     angles = 2 * math.pi * pairs[: p.sliced_yaws] / p.n_yaws
-    spectrum = _slice_spectrum(target, 0.0, p)
-    onto = _blur(spectrum, p.slice_blur) - _blur(spectrum, p.slice_trend)
+    onto = _slice_target(target, p)
 
     def products() -> Iterator[NDArray[np.complex64]]:
         for angle in angles:
@@ -413,7 +421,29 @@ def slice_hypotheses(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> F
             yield onto * spectrum
 
     both = np.stack([angles, angles + math.pi], axis=1).ravel()
-    return _transforms_at_peaks(source, target, both, products(), 2 * p.cell, p.n_sliced, p)[0]
+    return _transforms_at_peaks(source, target, both, products(), 2 * p.cell, p.n_sliced, p)
+
+
+def slice_correlation(source: ScanPlan, target: ScanPlan, T: Floats, p: PlanParameters) -> float:
+    """Return the correlation of the slices under T_target_source (4, 4): see `slice_hypotheses`.
+
+    The result is the highest value among the cell of the shift and its neighbours.
+    """
+    R = target.R @ T[:3, :3] @ source.R.T
+    yaw = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
+    shift = np.rint(target.R[:2] @ T[:3, 3] / (2 * p.cell)).astype(int)
+    if np.abs(shift).max() >= p.side // 2:
+        return 0.0
+    product = _slice_target(target, p) * _slice_spectrum(source, yaw, p).conj()
+    scores = np.fft.irfft2(product.sum(axis=0), s=(p.side, p.side))
+    around = (shift[:, None] + np.arange(-1, 2)) % p.side
+    return float(scores[np.ix_(around[1], around[0])].max())
+
+
+def _slice_target(target: ScanPlan, p: PlanParameters) -> NDArray[np.complex64]:
+    """Return the filtered spectrum with which the spectra of source slices are correlated."""
+    spectrum = _slice_spectrum(target, 0.0, p)
+    return _blur(spectrum, p.slice_blur) - _blur(spectrum, p.slice_trend)
 
 
 def _transforms_at_peaks(

@@ -43,8 +43,9 @@ class AcceptanceParameters:
     """Parameters of acceptance; docs/evaluation.md describes how they were tuned.
 
     "blind" limits apply if free space is unknown, "sparse" limits if the frames share little
-    surface or only one search found the transform, and "apart" limits if the two refinements of
-    such a transform differ by more than `residual_m`.
+    surface or only one search found the transform, "apart" limits if the two refinements of such a
+    transform differ by more than `residual_m`, and "sliced" limits if height slices of two scans
+    support the transform.
     """
 
     residual_m: float = 0.08  #: epsilon_val: maximum residual of the composed directions, metres
@@ -80,6 +81,9 @@ class AcceptanceParameters:
     apart_rad: float = math.radians(4.0)  #: maximum residual of the two refinements, radians
     apart_planes: float = 12.0  #: minimum number of distinct planes
     apart_plane_overlap: float = 0.2  #: minimum plane overlap
+    sliced_planes: float = 3.0  #: minimum number of distinct planes
+    sliced_violations: float = 0.03  #: maximum share of violations
+    sliced_plane_violations: float = 0.2  #: maximum `plane_violations`
 
 
 @dataclass(frozen=True)
@@ -201,6 +205,24 @@ def sparse_evidence_suffices(
         and e.plane_overlap >= p.apart_plane_overlap
         and e.planes >= max(p.planes, p.apart_planes)
         and e.worst_violations <= p.worst_violations
+    )
+
+
+def sliced_evidence_suffices(e: Evidence, p: AcceptanceParameters) -> bool:
+    """Return whether the evidence suffices for a transform that height slices of scans support.
+
+    Slices support a transform much more than any other, so no rivals are sought, and a few planes
+    and little free space suffice to confirm it.
+    """
+    return (
+        e.violations is not None
+        and not e.one_sided
+        and e.violations <= p.sliced_violations
+        and e.plane_violations <= p.sliced_plane_violations
+        and e.planes >= p.sliced_planes
+        and e.residual_m <= p.residual_m
+        and e.residual_rad <= p.residual_rad
+        and e.stiffness >= p.stiffness
     )
 
 

@@ -72,6 +72,7 @@ from sceneprint.geometry.validation.acceptance import (
     belief,
     best_alternative,
     objection,
+    sliced_evidence_suffices,
     sparse_evidence_suffices,
 )
 from sceneprint.types import Floats, Geometry, Sphere, kind_of
@@ -442,6 +443,8 @@ def _decide(
     if verdict.status == "rejected" and mode == "full":
         sparse = _accept_sparse(query, match, proposal, there, back, p)
         proposal, verdict = sparse or (proposal, verdict)
+        if there is not None and there.supported:
+            verdict = _accept_sliced(proposal, (query.up, match.up), p) or verdict
     e, rival, ups = proposal.evidence, verdict.rival, (query.up, match.up)
     covariance = proposal.covariance(p) if verdict.status == "accepted" else None
     return PairValidation(
@@ -533,6 +536,17 @@ def _accept_sparse(
     if alone:
         reason += ", but only one direction found it"
     return proposal, _Verdict("accepted", "weak", reason, rival)
+
+
+def _accept_sliced(proposal: _Proposal, ups: Ups, p: ValidationParameters) -> _Verdict | None:
+    """Accept a transform between scans as weak if height slices support it; None if they do not."""
+    e = proposal.evidence
+    if not sliced_evidence_suffices(e, p.acceptance) or _tilt_objection(
+        tilt_of(proposal.T, ups), p
+    ):
+        return None
+    reason = f"{e.overlap:.0%} of the surfaces agree, and the points above the ground fit best here"
+    return _Verdict("accepted", "weak", reason)
 
 
 def _refine_proposal(
