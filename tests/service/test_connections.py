@@ -95,7 +95,9 @@ def opened(monkeypatch, request, certificate):
                 one.close()
 
 
-by_both = pytest.mark.parametrize("opened", ["http", "https"], indirect=True)
+by_both = pytest.mark.parametrize(
+    "opened", ["http", pytest.param("https", marks=pytest.mark.thorough)], indirect=True
+)
 by_tls = pytest.mark.parametrize("opened", ["https"], indirect=True)
 
 

@@ -65,6 +65,7 @@ def test_readyz_is_at_most_a_second_old(house, truth):
         seen = house.portal.call(house.client.get, "/readyz")
         while seen.status_code != status:
             assert time.monotonic() - changed < 60
+            time.sleep(0.02)  # leaves the processor to others
             asked = time.monotonic()
             seen = house.portal.call(house.client.get, "/readyz")
             assert seen.status_code == status or asked - changed <= READY_S
