@@ -99,6 +99,8 @@ def test_poses_beside_plain_images(image, pose, tmp_path):
     ("name", "is_beside"),
     [
         ("ir", True), ("IRImages", True), ("left_ir", True), ("infra1", True), ("confidence", True),
+        ("normal", True), ("disparity", True), ("disp_0", True), ("thermal", True),
+        ("left_intensity", True), ("segmentation", True), ("abnormal", False), ("display", False),
         ("depthIR", True), ("depth_confidence", True), ("label-filt", True), ("rgb", True),
         ("color_aligned_to_depth", True), ("colour", True), ("x_RGB.png", True),
         ("rgb_depth_0001.png", True), ("depth", False), ("aligned_depth_to_color", False),

@@ -169,7 +169,7 @@ def test_a_near_pose_stands_where_nothing_is_interpolated():
 
 def test_trajectory_files(tmp_path):
     path = tmp_path / "groundtruth.txt"
-    path.write_text("# a\n\n2.5 4 5 6 0 0 0.7071 0.7071\n1.5 1 2 3 0 0 0 1\n1.5 9 9 9 0 0 0 1\n")
+    path.write_text("# a\n\n2.5 4 5 6 0 0 0.7071 0.7071\n1.5 1 2 3 0 0 0 1\n1.5 1.09 2 3 0 0 0 1\n")
     trajectory = read_trajectory(path)
     assert trajectory.stamps.tolist() == [1.5, 2.5]
     assert trajectory.positions.tolist() == [[1, 2, 3], [4, 5, 6]]
@@ -186,6 +186,8 @@ def test_trajectory_files(tmp_path):
         ("1 2 3 4 0 0 0 0", "line 2: .*unit length"),
         ("1 2 3 4 1e200 0 0 1e200", "line 2: .*unit length"),
         ("# only comments", "has no pose"),
+        ("1.7e18 2 3 4 0 0 0 1", r"time stamp 1\.7e\+18 is not in seconds"),
+        ("2 1.11 2 3 0 0 0 1", r"line 3: The position is 0\.11 m from that of an earlier line"),
     ],
 )
 def test_bad_trajectories(line, message, tmp_path):

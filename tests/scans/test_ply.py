@@ -104,7 +104,7 @@ LIES = {
     ),
     "more before": (
         described(f"element camera 999999999999\nproperty int a\nelement vertex 10\n{XYZ}"),
-        "999999999999 rows of camera",
+        "999999999999 rows of 'camera'",
     ),
     "nothing, often": (
         described(f"element camera 999999999999999\nelement vertex 10\n{XYZ}"),
@@ -162,3 +162,9 @@ def test_rows_that_are_none(rows, message):
     header = f"ply\nformat ascii 1.0\nelement vertex 10\n{XYZ}end_header\n"
     with pytest.raises(UnreadableCloud, match=message):
         decode_cloud((header + rows).encode())
+
+
+def test_errors_are_printable():
+    data = f"{BINARY}element vertex\x1b[31m 9\n{XYZ}element vertex 0\n{XYZ}end_header\n".encode()
+    with pytest.raises(UnreadableCloud, match=r"9 rows of 'vertex\\x1b\[31m', at least 108 bytes"):
+        decode_cloud(data)

@@ -16,12 +16,13 @@ _OF_DEPTH = re.compile(
 )
 #: Words in the names of images that are not depth.
 _NO_DEPTH = re.compile(
-    r"rgb|colou?r|infra|confidence|(?<![a-z])(n?ir|conf|amplitude|labels?|instances?|semantics?|masks?)(?![a-z])"
+    r"rgb|colou?r|infra|confidence|disparity|intensity|thermal|(?<![a-z])"
+    r"(n?ir|conf|disp|amplitude|normals?|labels?|instances?|segmentation|semantics?|masks?)(?![a-z])"
 )
 #: Boundary between two words of a camel-case name, such as depthIR.
 _CAMEL_CASE = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
-OMITTED_IMAGES = "colour, infrared, confidence or label images according to their names"
+OMITTED_IMAGES = "colour, infrared or other images than depth according to their names"
 
 
 def is_beside_depth(name: str) -> bool:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from sceneprint_client.api.frames import ImportOptions
 
 _TOLERANCE = 1e-2  #: maximum deviation of a quaternion's length from 1
+_LATEST_S = 1e11  #: maximum time stamp, seconds; greater ones have another unit
+_APART_M = 0.1  #: maximum distance of two positions at the same time along an axis, metres
 _MAXIMUM_TRAJECTORY_BYTES = 2**26  #: size of an hour of poses at 200 Hz
 
 
@@ -33,8 +35,9 @@ def read_trajectory(path: Path) -> SensorTrajectory:
 
     The poses are sorted by time. Of several lines with the same time stamp, the first is used.
 
-    Raise InvalidPose if the file cannot be read or has no pose, or a line does not consist of 8
-    finite numbers with a quaternion of unit length. The message names file and line.
+    Raise InvalidPose if the file cannot be read or has no pose, a line does not consist of 8 finite
+    numbers with a quaternion of unit length, a time stamp is not in seconds, or two lines with the
+    same stamp contradict each other. The message names file and line.
     """
     numbers, rows = [], []
     for number, line in data_lines(read_text(path, _MAXIMUM_TRAJECTORY_BYTES, InvalidPose)):
@@ -58,7 +61,18 @@ def read_trajectory(path: Path) -> SensorTrajectory:
             "quaternion does not have unit length. Write t tx ty tz qx qy qz qw, or remove the "
             "line."
         )
-    stamps, first = np.unique(table[:, 0], return_index=True)
+    if (late := float(table[:, 0].max())) > _LATEST_S:
+        raise InvalidPose(
+            f"{path}: The time stamp {late:.10g} is not in seconds. Write seconds, and poses as tx "
+            "ty tz qx qy qz qw; EuRoC files have nanoseconds, and qw first."
+        )
+    stamps, first, places = np.unique(table[:, 0], return_index=True, return_inverse=True)
+    apart = np.abs(table[:, 1:4] - table[first[places], 1:4]).max(axis=1)
+    if apart.max() > _APART_M:
+        raise InvalidPose(
+            f"{path}, line {numbers[int(np.argmax(apart))]}: The position is {apart.max():.3g} m "
+            "from that of an earlier line with the same time stamp. Remove one of them."
+        )
     quaternions = table[first, 4:]
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     return SensorTrajectory(stamps, table[first, 1:4], quaternions)

@@ -205,7 +205,7 @@ def element_end(data: FileBytes, start: int, element: Element, order: str) -> in
     remaining = len(data) - start
     if element.count * element.least > remaining:
         raise UnreadableCloud(
-            f"The PLY header declares {element.count} rows of {element.name}, at least "
+            f"The PLY header declares {element.count} rows of {element.name!r:.40}, at least "
             f"{element.count * element.least} bytes, but {remaining} bytes remain. {_AGAIN}"
         )
     if not element.has_lists:
