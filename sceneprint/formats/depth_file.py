@@ -441,11 +441,12 @@ def decode_frame(
     with naming(name):
         samples = (samples_of or decode_samples)(data)
         if not trust_depth:
-            check_camera(intrinsics)
             check_depth(samples, depth_scale)
         frame = make_frame(
             samples, intrinsics, depth_scale=depth_scale, along_ray=along_ray, pose=pose
         )
+        if not trust_depth:
+            check_camera(intrinsics)
     return replace(frame, name=name)
 
 

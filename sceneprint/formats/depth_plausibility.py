@@ -40,7 +40,7 @@ _SWAPPED = 0.9  #: maximum share of differing neighbours that are closer with th
 _ROUGH, _SMOOTH = 0.05, 0.025  #: maximum median bend of depth, and of depth with restored bits
 _DENSE = 0.98  #: share of valid samples from which an image has no holes
 _SATURATED = 0.02  #: maximum share of samples with the maximum of a number of bits
-_STEEPEST = 5.0  #: maximum tangent of the angle between a ray and the optical axis
+_STEEPEST = 20.0  #: maximum tangent of the angle between a ray and the optical axis
 _SHIFTED = 0.8  #: maximum share of multiples of 8; in depth images, it is about one eighth
 
 _TRUST = "If the samples are correct, use --trust-depth, or `trust_depth` in the metadata."
@@ -49,7 +49,7 @@ Rows = NDArray[Any]
 
 
 def check_camera(intrinsics: Intrinsics) -> None:
-    """Check that the rays of all pixels are at most 78 degrees from the optical axis.
+    """Check that the rays of all pixels are at most 87 degrees from the optical axis.
 
     Raise InvalidIntrinsics if they are not, as for a focal length in another unit than pixels.
     """
@@ -60,7 +60,7 @@ def check_camera(intrinsics: Intrinsics) -> None:
         if max(abs(c), abs(size - 1 - c)) > _STEEPEST * f:
             raise InvalidIntrinsics(
                 f"A focal length of {f:g} and a principal point of {c:g} are implausible for "
-                f"{size} pixels: rays would be more than 78 degrees from the optical axis. Specify "
+                f"{size} pixels: rays would be more than 87 degrees from the optical axis. Specify "
                 "both in pixels of this image, as in the sensor's calibration."
             )
 

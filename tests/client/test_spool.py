@@ -417,7 +417,7 @@ def test_a_request_that_is_too_large_is_halved(remote, map_name, tmp_path):
     sizes = {"a": 600, "b": 600, "c": 1100, "d": 600}
     with Spool(tmp_path / "spool") as spool:
         for number, (name, side) in enumerate(sizes.items()):
-            lens = CAMERA.model_copy(update={"width": side, "height": side})
+            lens = CAMERA.model_copy(update=dict.fromkeys(("width", "height", "fx", "fy"), side))
             image = np.full((side, side), 2000 + number, np.uint16)
             known = meta(number, name=name).model_copy(update={"intrinsics": lens})
             spool.add(image, known)
