@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from sqlalchemy import Connection
 
 from sceneprint.store.deletion import DAY_S, count_old_frames, without_content
-from sceneprint.store.frames import count_states
+from sceneprint.store.frames import count_states, count_states_by_map
 from sceneprint.store.maps import model_names
 from sceneprint.store.parent_joins import count_poses
 from sceneprint.store.query_rows import count_statuses
@@ -131,34 +131,42 @@ RECENT_S = 3600.0
 
 
 def map_records(connection: Connection, rows: Sequence[MapRow]) -> list[Map]:
-    """Return the API records of maps."""
-    counts = count_statuses(connection, time.time() - RECENT_S)
-    return [map_record(connection, row, counts.get(row.number, {})) for row in rows]
+    """Return the API records of all maps, with few statements even for many maps."""
+    recent = count_statuses(connection, time.time() - RECENT_S)
+    names, states = model_names(connection), count_states_by_map(connection)
+    poses = count_poses(connection)
+    return [_map(connection, row, names, states.get(row.number, {}), poses, recent) for row in rows]
 
 
-def map_record(connection: Connection, row: MapRow, recent: Mapping[str, int] | None = None) -> Map:
-    """Return the API record of a map; `recent` contains its recent query counts by status."""
-    if recent is None:
-        since = time.time() - RECENT_S
-        recent = count_statuses(connection, since, row.number).get(row.number, {})
-    names, reencoding, overdue = model_names(connection), None, None
+def map_record(connection: Connection, row: MapRow) -> Map:
+    """Return the API record of a map."""
+    recent = count_statuses(connection, time.time() - RECENT_S, row.number)
+    states, poses = count_states(connection, row.number), count_poses(connection, row.number)
+    return _map(connection, row, model_names(connection), states, poses, recent)
+
+
+def _map(
+    connection: Connection, row: MapRow, names: Mapping[str, str], states: dict[str, int],
+    poses: Mapping[int, tuple[int, int]], recent: Mapping[int, dict[str, int]],
+) -> Map:  # fmt: skip
+    reencoding, overdue = None, None
     if row.retention_days is not None:
         overdue = count_old_frames(connection, row.number, time.time() - DAY_S * row.retention_days)
     if row.next_model_id is not None:
         label = model_label(names[row.next_model_id], row.next_model_id)
         now = switch_progress(connection, row)
         reencoding = Reencoding(model=label, model_id=row.next_model_id, **asdict(now))
-    posed, parents = count_poses(connection, row.number)
+    posed, parents = poses.get(row.number, (0, 0))
     return copy_fields(
         Map,
         row,
         model=model_label(names[row.model_id], row.model_id),
         reencoding=reencoding,
         created_at=when(row.created_at),
-        frames=count_states(connection, row.number),
+        frames=states,
         posed_frames=posed,
         parent_frames=parents,
-        recent_queries=dict(recent),
+        recent_queries=recent.get(row.number, {}),
         up=row.up and direction(row.up),
         overdue=overdue,
         etag=map_tag(row),

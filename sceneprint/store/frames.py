@@ -123,6 +123,17 @@ def count_states(connection: Connection, map_number: int | None = None) -> dict[
     return {row[0]: row[1] for row in connection.execute(counts)}
 
 
+def count_states_by_map(connection: Connection) -> dict[int, dict[str, int]]:
+    """Count the frames of each map that has any, by map number and state."""
+    by = (frames.c.map_number, frames.c.state)
+    counts: dict[int, dict[str, int]] = {}
+    for number, state, n in connection.execute(
+        select(*by, func.count()).group_by(*by).order_by(*by)
+    ):
+        counts.setdefault(number, {})[state] = n
+    return counts
+
+
 def _update_usage(
     connection: Connection, number: int, state: FrameState | None, size: int | None
 ) -> None:

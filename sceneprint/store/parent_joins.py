@@ -88,14 +88,20 @@ def posed_runs(connection: Connection, map_number: int) -> list[ParentRun]:
     return [ParentRun(*row) for row in rows]
 
 
-def count_poses(connection: Connection, map_number: int) -> tuple[int, int]:
-    """Return the number of indexed frames with a pose, and the number of their parent frames."""
+def count_poses(
+    connection: Connection, map_number: int | None = None
+) -> dict[int, tuple[int, int]]:
+    """Return the number of indexed frames with a pose and of their parent frames by map number.
+
+    The result contains the maps that have such frames; `map_number` selects one.
+    """
     c = frames.c
-    statement = select(func.count(c.pose_x), func.count(c.pose_parent.distinct())).where(
-        c.map_number == map_number, c.state == FrameState.INDEXED, c.pose_x.is_not(None)
-    )
-    posed, parents = connection.execute(statement).one()
-    return posed, parents
+    statement = select(c.map_number, func.count(c.pose_x), func.count(c.pose_parent.distinct()))
+    statement = statement.where(c.state == FrameState.INDEXED, c.pose_x.is_not(None))
+    if map_number is not None:
+        statement = statement.where(c.map_number == map_number)
+    found = connection.execute(statement.group_by(c.map_number))
+    return {number: (posed, parents) for number, posed, parents in found}
 
 
 def root_columns(connection: Connection, frame: FrameRow) -> dict[str, Any]:

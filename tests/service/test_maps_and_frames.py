@@ -101,3 +101,10 @@ def test_what_asks_for_no_wait_is_not_waited_for(served, small_shots, prefer):
     shot = small_shots[80 + numbers.get(prefer, 5)]
     sent = served.client.post("/v1/maps/hurried/frames", **shot.form(), headers={"Prefer": prefer})
     assert (sent.status_code, sent.headers.get("preference-applied")) == (202, None)
+
+
+def test_a_list_of_maps_is_the_maps_one_by_one(served):
+    """The list counts frames, poses and queries of all maps together."""
+    listed = served.client.get("/v1/maps").json()["items"]
+    assert any(one["frames"].get("indexed") for one in listed)
+    assert listed == [served.client.get(f"/v1/maps/{one['name']}").json() for one in listed]
