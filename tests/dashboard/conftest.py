@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -390,6 +391,17 @@ def axe() -> Callable[[Page], list[str]]:
 def pixels() -> Callable[..., Image.Image]:
     """A function that returns a screenshot of an element or a page."""
     return lambda shown: Image.open(io.BytesIO(shown.screenshot())).convert("RGB")
+
+
+@pytest.fixture(scope="session")
+def written() -> Callable[[str], str]:
+    """A function that returns a reason of the API as pages write it: 0.23° and 7.5 mm."""
+
+    def short(found: re.Match[str]) -> str:
+        length = float(found[1])
+        return f"{1000 * length:.{1 if length < 0.01 else 0}f} mm"
+
+    return lambda text: re.sub(r"\b(0\.0\d+) m\b", short, re.sub(r"(\d) deg\b", r"\1°", text))
 
 
 @pytest.fixture(scope="session")

@@ -274,7 +274,7 @@ def test_frame_page_tells_what_the_api_tells(page, station, shown, settle, axe, 
     )
     points = station.client.get(f"{path}/points").content
     count = int.from_bytes(points[8:12], "little")
-    expect(page.locator(".scene > p")).to_contain_text(f"{count:,}")
+    expect(page.locator(".scene-told")).to_contain_text(f"{count:,}")
     colours = pixels(page.locator(".scene-canvas")).getcolors(1 << 20)
     assert colours is not None
     assert len(colours) > 50, "nothing was drawn in 3-D"

@@ -43,7 +43,9 @@ def records(station, **params):
     return station.client.get("/v1/queries", params={"map": "seen", **params}).json()["items"]
 
 
-def test_the_rows_are_the_records_and_filters_are_in_the_address(station, asked, page, settle, axe):
+def test_the_rows_are_the_records_and_filters_are_in_the_address(
+    station, asked, page, settle, axe, written
+):
     page.goto(f"{station.home}#/maps/seen/queries")
     settle(page)
     told = records(station)
@@ -56,7 +58,7 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(station, asked,
     assert (failed[1:5], failed[7]) == (["not named", "Failed", "–", "–"], "no answer")
     assert failed[6] == told[0]["reason"]
     assert lost[2] == "Not found"
-    assert lost[6] == asked[2]["reason"][0].upper() + asked[2]["reason"][1:] + "."
+    assert lost[6] == written(asked[2]["reason"][0].upper() + asked[2]["reason"][1:]) + "."
     assert (second[1], first[1]) == ("cart\nrun", "spot\nrun")
     place = asked[0]["location"]["pose"]["translation"]
     there = ", ".join(f"{place[axis]:.2f}" for axis in "xyz")

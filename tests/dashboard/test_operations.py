@@ -94,7 +94,7 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     assert shown["workers"] == str(len(stats["workers"])) == "2"
     assert shown["requests"] == f"{total['requests']:,}"
     assert shown["refused"] == f"{total['refused']} refused"
-    assert shown["broken"] == f"{total['broken']} broken" == "0 broken"
+    assert shown["failed"] == f"{total['broken']} failed" == "0 failed"
     assert total["refused"] >= 1
     full = 1 - stats["bytes"]["free"] / stats["bytes"]["disk"]
     assert abs(float(shown["disk"].split()[0]) - 100 * full) < 1

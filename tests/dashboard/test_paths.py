@@ -295,9 +295,11 @@ def test_numbers_behind_the_picture(run):
     # cameras look level along x: their down is the map's -z; a camera's own axes: down is y
     level = [0, -1, 0, 0, 0, 0, -1, 0, 1, 0, 0, 0, 5, 5, 5, 1]
     itself = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
-    for matrix, is_cloud, up in ((level, False, "z"), (itself, False, "-y"), (itself, True, "z")):
-        pose = {"matrix": matrix, "isCloud": is_cloud}
-        assert run("paths/shapes", "m.upright([given[0]])", pose) == up
+    for matrix, is_cloud, up in (
+        (level, False, [0, 0, 1]), (itself, False, [0, -1, 0]), (itself, True, [0, 0, 1])
+    ):  # fmt: skip
+        runs = [{"poses": [matrix], "isCloud": is_cloud}]
+        assert run("plan/axes", "m.uprightOf(given[0])", runs) == up
     level = {"right": [1, 0, 0], "ahead": [0, 1, 0], "above": [0, 0, 1]}
     grid = run("paths/shapes", "m.grid(given[0], given[1], 0, [10, 20, 1])",
                {"low": [0, 0, 0], "high": [10, 4, 1]}, level)  # fmt: skip
@@ -348,8 +350,9 @@ def test_numbers_behind_the_picture(run):
 def test_colours_of_runs_stay_when_sessions_come(run):
     def colours(*days: int) -> dict[str, int]:
         sessions = [
-            {"session": f"run {day}", "robot": None, "with_pose": 3, "frames": {"indexed": 3},
-             "parent_frames": ["map"], "first_captured_at": f"2026-11-{day:02d}T09:00:00Z",
+            {"session": f"run {day}", "robot": None, "tags": [], "with_pose": 3,
+             "frames": {"indexed": 3}, "parent_frames": ["map"],
+             "first_captured_at": f"2026-11-{day:02d}T09:00:00Z",
              "last_captured_at": f"2026-11-{day:02d}T10:00:00Z"}
             for day in sorted(days, key=str)  # as the API lists them, by name
         ]  # fmt: skip

@@ -1,5 +1,5 @@
 // The shell: finds the page of an address, renders it, and shows what came of it.
-import { get, lives, Problem } from "./lib/api.js";
+import { at, get, lives, Problem } from "./lib/api.js";
 import { h, put } from "./lib/dom.js";
 import { ago } from "./lib/format.js";
 import { keepPresses } from "./lib/press.js";
@@ -14,6 +14,7 @@ const AGES_MS = 20_000; // "just now" is not true for long
 const PULSE_MS = 2500; // with what `lives` waits and LATE_MS, within ten seconds
 const main = document.getElementById("main");
 const sheets = new Map(); // address -> <link> of styles
+const titles = new Map(); // of maps that were shown
 let turn = new AbortController(); // aborts what the page that is shown began
 /** @type {any} */
 let shownPath = null;
@@ -46,6 +47,7 @@ async function show() {
       put(root, empty({ title: "Page not found", text: "There is no page at this address.", actions: back }));
       return;
     }
+    const about = params.map ? called(route, params, signal) : null;
     const [page] = await Promise.all([import(new URL(route.page, PAGES).href).catch(unloaded), identify(get)]);
     drawRail(route, show);
     const styles = await Promise.all((page.styles ?? []).map(styled));
@@ -54,8 +56,8 @@ async function show() {
     for (const link of sheets.values()) if (link.sheet) link.sheet.disabled = !styles.includes(link);
     const actions = (...nodes) => { if (!signal.aborted) put(document.getElementById("actions"), nodes); };
     const title = (text) => { if (!signal.aborted) setTitle(text); };
-    const home = (map) => { if (!signal.aborted) drawCrumbs(route, { ...params, map }); };
-    await page.render(root, { params, search, signal, go, title, actions, home });
+    const home = (map) => called(route, { ...params, map }, signal);
+    await page.render(root, { params, search, signal, go, title, actions, home, about });
   } catch (error) {
     if (!signal.aborted && error.name !== "AbortError") await fault(root, error, signal);
   } finally {
@@ -66,6 +68,15 @@ async function show() {
       if (document.activeElement === document.body) (document.getElementById(before?.id) ?? (inside ? main : null))?.focus({ preventScroll: true });
     }
   }
+}
+
+/** Name the map of a page by its title as soon as that is known. @returns {Promise<any>} the map */
+function called(route, params, signal) {
+  const { map } = params, about = get(at("maps", map), { signal });
+  const draw = () => { if (!signal.aborted) drawCrumbs(route, params, titles.get(map) ?? map); };
+  draw();
+  about.then(({ title }) => { titles.set(map, title); draw(); }, () => {}); // the page tells of faults
+  return about;
 }
 
 /** Show in place of a page why it is not there. */

@@ -20,13 +20,12 @@ const MOST_ASKED = 12; // look-alikes whose places are asked for at once
 const FOREVER_S = 1e9;
 
 /** The page: #/maps/NAME/coverage?result=&since=&parent=&cell=&frame= */
-export async function render(root, { params: { map }, search, signal, go, title, actions }) {
+export async function render(root, { params: { map }, search, signal, go, actions, about }) {
   const path = at("maps", map, "coverage");
-  const [told, sessions, about, surface] = await Promise.all([
-    get(path, { params: { limit: 100 }, signal }), get(at("maps", map, "sessions"), { params: { limit: 1000 }, signal }), get(at("maps", map), { signal }), surfaceOf(map, signal)]);
-  title(`Coverage of ${about.title ?? map}`);
+  const [told, sessions, { frames }, surface] = await Promise.all([
+    get(path, { params: { limit: 100 }, signal }), get(at("maps", map, "sessions"), { params: { limit: 1000 }, signal }), about, surfaceOf(map, signal)]);
   const page = new Page(root, { map, search, signal, go, all: told.items, surface,
-    names: { sessions: distinct(sessions.items, "session"), robots: distinct(sessions.items, "robot") }, indexed: about.frames.indexed ?? 0 });
+    names: { sessions: distinct(sessions.items, "session"), robots: distinct(sessions.items, "robot") }, indexed: frames.indexed ?? 0 });
   actions(may("write", map) && page.indexed > 0 && h("button", { class: "button primary", type: "button", id: "cover-begin", onClick: () => page.begin() }, "Measure coverage…"));
   await page.show();
   for (const one of told.items.filter(goesOn)) page.follow(one.job_id);

@@ -6,8 +6,7 @@ import { sheet } from "../lib/states.js";
 
 /**
  * Ask what to measure, and begin it.
- * @param {string} map
- * @param {{sessions: string[], robots: string[]}} names that can be chosen
+ * @param {string} map @param {{sessions: string[], robots: string[]}} names that can be chosen
  * @param {(begun: Object<string, any>) => void} onbegun
  */
 export function beginCoverage(map, { sessions, robots }, onbegun) {

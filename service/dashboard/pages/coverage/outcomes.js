@@ -22,20 +22,16 @@ const WORST_FIRST = ["not_found", "ambiguous", "found", "unchecked"];
 /** @param {string} name */
 export const outcomeOf = (name) => OUTCOMES.find((one) => one.name === name) ?? OUTCOMES[3];
 
-/** Queried frames of a cell. @param {Object<string, any>} cell */
+/** Queried frames of a cell. */
 export const queriedIn = (cell) => NAMES.reduce((sum, name) => sum + cell[name], 0);
 
-/** The outcomes that counts are listed by. @param {Object<string, any>[]} counts */
+/** The outcomes that counts are listed by. */
 export const outcomesIn = (...counts) => OUTCOMES.filter(({ name }) => name !== "unchecked" || counts.some((one) => one.unchecked > 0));
 
-/** Of queried frames those of which it is known what came of them: a share that is found is one of these. @param {Object<string, any>} counts */
+/** Of queried frames those of which it is known what came of them: a share that is found is one of these. */
 export const checkedIn = (counts) => queriedIn(counts) - counts.unchecked;
 
-/**
- * What colours a cell: `wrong` where any frame is, else what most queried frames have; null where none was queried.
- * @param {Object<string, any>} cell
- * @returns {string | null}
- */
+/** What colours a cell: `wrong` where any frame is, else what most queried frames have; null where none was queried. */
 export function outcomeIn(cell) {
   if (queriedIn(cell) === 0) return null;
   if (cell.wrong > 0) return "wrong";
@@ -45,7 +41,6 @@ export function outcomeIn(cell) {
 /**
  * Cells in which robots get lost, the worst first: by the share that is found less the share that is wrong, then by
  * how many were queried.
- * @param {Object<string, any>[]} cells
  */
 export function worstCells(cells) {
   const worth = (cell) => (cell.found - cell.wrong) / checkedIn(cell);
@@ -53,7 +48,7 @@ export function worstCells(cells) {
     .sort((a, b) => worth(a) - worth(b) || checkedIn(b) - checkedIn(a) || a.row - b.row || a.column - b.column);
 }
 
-/** "2 found, 1 not found". @param {Object<string, any>} cell */
+/** "2 found, 1 not found". */
 export const tally = (cell) => OUTCOMES.filter(({ name }) => cell[name] > 0)
   .map(({ name, text }) => `${cell[name]} ${text.toLowerCase()}`).join(", ") || "none queried";
 

@@ -11,8 +11,7 @@ export const keyOf = ({ column, row }) => `${column},${row}`;
 
 /**
  * Draw a plan's cells.
- * @param {import("../plan/plan.js").Plan} plan
- * @param {Object<string, any>[]} cells of a plan, or changes of cells
+ * @param {import("../plan/plan.js").Plan} plan @param {Object<string, any>[]} cells of a plan, or changes of cells
  * @param {number} wide of a cell, metres
  * @param {string | null} chosen key of a cell
  */
@@ -34,8 +33,7 @@ export function drawCells(plan, cells, wide, chosen) {
 
 /**
  * Draw queried frames, and lines from some to what they are mistaken for.
- * @param {import("../plan/plan.js").Plan} plan
- * @param {{outcome: string, at: import("../plan/plan.js").Place}[]} frames
+ * @param {import("../plan/plan.js").Plan} plan @param {{outcome: string, at: import("../plan/plan.js").Place}[]} frames
  * @param {{from: import("../plan/plan.js").Place, to: import("../plan/plan.js").Place}[]} links
  */
 export function drawFrames(plan, frames, links) {

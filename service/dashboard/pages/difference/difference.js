@@ -29,12 +29,10 @@ const VIEWS = {
 const NAMES = { before: "Before", difference: "Difference", after: "After" };
 
 /** The page: #/maps/NAME/difference?before=&after=&show= */
-export async function render(root, { params: { map }, search, signal, go, title, actions }) {
+export async function render(root, { params: { map }, search, signal, go, actions }) {
   const path = at("maps", map, "differences");
-  const [sessions, told, about] = await Promise.all([
-    get(at("maps", map, "sessions"), { params: { limit: 1000 }, signal }),
-    get(path, { params: { limit: 1000 }, signal }), get(at("maps", map), { signal })]);
-  title(`Difference in ${about.title ?? map}`);
+  const [sessions, told] = await Promise.all([
+    get(at("maps", map, "sessions"), { params: { limit: 1000 }, signal }), get(path, { params: { limit: 1000 }, signal })]);
   actions(h("a", { class: "button", href: link("maps", map, "sessions") }, "To the sessions"));
   const names = [...new Set(sessions.items.filter((one) => one.session !== null && one.with_pose > 0).map((one) => one.session))];
   if (names.length < 2) {

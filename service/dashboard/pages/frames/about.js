@@ -10,7 +10,6 @@ import { badge, sentence } from "./badge.js";
  * @param {Object<string, any>} frame
  * @param {Object<string, any> | null} job that made it; null where it may not be seen, or is gone
  * @param {{edit?: () => void}} actions edit: null where the key may not
- * @returns {HTMLElement[]}
  */
 export function about(frame, job, { edit }) {
   const who = [

@@ -29,7 +29,7 @@ export function isPending(state) {
   return state === "received" || state === "signing";
 }
 
-/** A state of a frame or a job. @param {string} state @returns {HTMLElement} */
+/** A state of a frame or a job. @param {string} state */
 export function badge(state) {
   return h("span", { class: "badge", dataset: { kind: KINDS[state] ?? "neutral", state } }, state);
 }

@@ -17,8 +17,7 @@ const offered = new Map();
 
 /**
  * Delete frames, and offer to restore them.
- * @param {string} map
- * @param {Selection} selection
+ * @param {string} map @param {Selection} selection
  * @param {{say?: Say, changed?: () => any}} [how] changed: called when it is done, and when it is undone
  */
 export async function deleteFrames(map, selection, { say = () => {}, changed = () => {} } = {}) {
@@ -41,9 +40,7 @@ export async function deleteFrames(map, selection, { say = () => {}, changed = (
 
 /**
  * Say that frames were deleted, with a button that restores them while that can be done.
- * @param {string} map
- * @param {string} text
- * @param {Object<string, any>[]} deletions as the API tells them
+ * @param {string} map @param {string} text @param {Object<string, any>[]} deletions as the API tells them
  * @param {() => any} changed
  */
 function offerRestore(map, text, deletions, changed) {
@@ -55,7 +52,7 @@ function offerRestore(map, text, deletions, changed) {
   for (const { deletion_id: id } of deletions) offered.set(`${map}/${id}`, close);
 }
 
-/** Restore the frames of deletions. @param {string} map @param {Object<string, any>[]} deletions */
+/** Restore the frames of deletions. @param {string} map */
 async function restore(map, deletions) {
   const refused = new Map();
   let done = 0;
@@ -74,8 +71,7 @@ async function restore(map, deletions) {
 
 /**
  * Edit frames, and offer to undo it.
- * @param {string} map
- * @param {Selection & Object<string, any>} edit as the API takes it
+ * @param {string} map @param {Selection & Object<string, any>} edit as the API takes it
  * @param {{say?: Say, changed?: () => any}} [how] see `deleteFrames`
  * @returns {Promise<number>} how many were changed
  */
@@ -106,8 +102,7 @@ export async function editFrames(map, edit, { say = () => {}, changed = () => {}
 
 /**
  * Deletions of a map that can still be undone; `look()` asks for them again.
- * @param {string} map
- * @param {{signal: AbortSignal, changed: () => any}} how
+ * @param {string} map @param {{signal: AbortSignal, changed: () => any}} how
  * @returns {HTMLElement & {look: () => Promise<void>}}
  */
 export function recentDeletions(map, { signal, changed }) {

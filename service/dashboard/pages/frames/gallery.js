@@ -8,7 +8,6 @@ import { empty, failed, toast } from "../lib/states.js";
 import { isPending } from "./badge.js";
 import { countOf, filterBar, FILTERS } from "./filters.js";
 import { follow } from "./following.js";
-import { before, remember } from "./pages.js";
 import { selectionBar } from "./selection.js";
 import { tile } from "./tile.js";
 import { viewSwitch } from "./views.js";
@@ -20,13 +19,14 @@ const FILL_MS = 300; // frames come in bursts
 const MOST_COME = 1000;
 
 /** The page: #/maps/NAME?view=&find=&robot=&session=&state=&tag=&captured_after=&captured_before=&order=&cursor=&page= */
-export async function render(root, { params, search, signal, go, title, actions }) {
+export async function render(root, { params, search, signal, go, actions }) {
   const path = at("maps", params.map);
-  title(params.map);
   const canWrite = may("write", params.map);
   actions(canWrite && h("a", { class: "button primary", href: link("maps", params.map, "upload") }, "Upload frames"));
 
   let wanted = search;
+  /** @type {(string | null)[]} cursors of the pages before this one, as far as the history knows them */
+  let earlier = history.state?.earlier ?? [];
   /** @type {any} null until they have come */
   let runs = null; // of the map's sessions: 100,000 frames are counted for them, and the list need not wait
   /** @type {AbortController | null} */
@@ -41,7 +41,7 @@ export async function render(root, { params, search, signal, go, title, actions 
   const place = h("div", { class: "gallery-place" });
   const news = h("div", { class: "gallery-news", role: "status" });
   const [over, under] = [h("div", { class: "pager" }), h("nav", { class: "pager", "aria-label": "Pages" })];
-  const views = viewSwitch(viewOf(wanted), (view) => change({ view: view === "depth" ? null : view }, { sameList: true }));
+  const views = viewSwitch(viewOf(wanted), (view) => change({ view: view === "depth" ? null : view }, earlier, true));
   const order = h("select", { id: "order", "aria-label": "Order", onChange: () => turn({ order: order.value || null }) },
     h("option", { value: "" }, "Newest first"), h("option", { value: "asc" }, "Oldest first"));
   let bar = filterBar(wanted, [], turn);
@@ -63,11 +63,11 @@ export async function render(root, { params, search, signal, go, title, actions 
     change({ ...asked, cursor: null, page: null });
   }
 
-  function change(asked, { sameList = false } = {}) {
+  function change(asked, before = [], sameList = false) {
     const next = new URLSearchParams(wanted);
     for (const [name, value] of Object.entries(asked)) if (value === null) next.delete(name); else next.set(name, value);
-    wanted = next;
-    go(link("maps", params.map, wanted), { quiet: true });
+    [wanted, earlier] = [next, before];
+    go(link("maps", params.map, wanted), { quiet: true, state: { earlier } });
     show();
     if (!sameList) { fetchList().catch(shownFault); return; }
     for (const one of tiles.values()) one.show(one.frame, viewOf(wanted));
@@ -98,7 +98,6 @@ export async function render(root, { params, search, signal, go, title, actions 
     for (const name of FILTERS) asked[name] = wanted.getAll(name);
     grid.setAttribute("aria-busy", "true");
     const page = await get(`${path}/frames`, { params: asked, signal: both });
-    remember(params.map, wanted, page.next_cursor);
     put(news);
     come.clear();
     tiles.clear();
@@ -155,11 +154,10 @@ export async function render(root, { params, search, signal, go, title, actions 
     const until = from + page.items.length;
     const of = total !== null && total >= until ? ` of ${count(total)}` : page.next_cursor ? " and more" : ` of ${count(until)}`;
     const words = page.items.length ? [h("strong", {}, `${count(from + 1)}–${count(until)}`), of] : [];
-    const previous = before(params.map, wanted);
-    const back = number > 1 && previous === undefined
+    const back = number > 1 && earlier.length === 0
       ? first("First page")
-      : button("Previous", number > 1, () => change({ cursor: previous, page: number > 2 ? String(number - 1) : null }));
-    const forth = button("Next", Boolean(page.next_cursor), () => change({ cursor: page.next_cursor, page: String(number + 1) }));
+      : button("Previous", number > 1, () => change({ cursor: earlier.at(-1) ?? null, page: number > 2 ? String(number - 1) : null }, earlier.slice(0, -1)));
+    const forth = button("Next", Boolean(page.next_cursor), () => change({ cursor: page.next_cursor, page: String(number + 1) }, [...earlier, wanted.get("cursor")]));
     put(over, h("span", { class: "pager-count" }, words));
     put(under, page.items.length > 0 && (number > 1 || page.next_cursor) && [back, h("span", { class: "muted" }, `Page ${count(number)}`), forth]);
   }
@@ -174,14 +172,13 @@ export async function render(root, { params, search, signal, go, title, actions 
   }
 
   show();
-  const named = get(path, { signal }).then((map) => { if (map.title) title(map.title); });
   const counted = fetchRuns(); // begun before 24 pictures queue up for the browser's few connections
   counted.catch(() => {}); // told below, if the list is there to be filtered
-  await Promise.all([named, fetchList().catch((error) => {
+  await fetchList().catch((error) => {
     // another list may have been asked for meanwhile
     if (error.status === 422) shownFault(error);
     else if (error.name !== "AbortError" || signal.aborted) throw error;
-  })]);
+  });
   counted.catch((error) => { if (error.name !== "AbortError") toast(error.message, { kind: "bad" }); });
   const isFirst = () => !wanted.has("cursor") && wanted.get("order") !== "asc";
   const look = () => { Promise.all([fetchList(), fetchRuns()]).catch(shownFault); };

@@ -13,8 +13,7 @@ const TAIL = 1 << 20; // bytes at the end of a recording, where its types of mes
  * Take files to the page Upload.
  * @param {{entries: any[], files: File[]}} drop files: where there are no entries
  * @param {{route: any, params: Object<string, string>}} where the page that is shown
- * @param {(hash: string) => void} go
- * @param {AbortSignal} signal of that page
+ * @param {(hash: string) => void} go @param {AbortSignal} signal of that page
  */
 export async function handOver({ entries, files }, { route, params }, go, signal) {
   const given = [];

@@ -14,8 +14,7 @@ const PARENTS = 4; // folders above a frame that are looked into, as `sceneprint
 
 /**
  * Files of a drop; to be called while the event is handled, its entries are gone afterwards.
- * @param {DataTransfer} transfer
- * @returns {AsyncGenerator<Dropped>}
+ * @param {DataTransfer} transfer @returns {AsyncGenerator<Dropped>}
  */
 export function dropped(transfer) {
   const entries = [...transfer.items].map((item) => item.webkitGetAsEntry?.()).filter(Boolean);
@@ -48,8 +47,7 @@ export async function* walk(entries) {
 
 /**
  * Sort what came: frames and archives, what they lack and what belongs to none of them.
- * @param {AsyncIterable<Dropped>} files
- * @param {AbortSignal} signal
+ * @param {AsyncIterable<Dropped>} files @param {AbortSignal} signal
  * @returns {Promise<{found: Found[], fields: Object<string, any>[], left: string[], faults: string[]}>}
  *   fields: of files that were dropped without a folder, for the form; left: paths of what is not
  *   sent; faults: files that should say something and do not

@@ -61,10 +61,7 @@ function byName(name) {
   return found.signature ? { kind: found.kind } : { kind: found.kind, format: found.name };
 }
 
-/**
- * What a frame's file is called without what tells its format: its pose is NAME.pose.txt.
- * @param {string} name
- */
+/** What a frame's file is called without what tells its format: its pose is NAME.pose.txt. @param {string} name */
 export function stemOf(name) {
   return name.replace(/\.(pose\.txt|depth\.png|[^.]+)$/i, "");
 }

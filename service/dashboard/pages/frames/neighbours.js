@@ -1,9 +1,9 @@
 // The frames nearest to one, by signature alone: what a query would begin with.
 import { at, send } from "../lib/api.js";
-import { h, put } from "../lib/dom.js";
+import { h } from "../lib/dom.js";
 import { count, frameLabel, frameTitle, percent } from "../lib/format.js";
 import { link } from "../lib/router.js";
-import { failed, loading } from "../lib/states.js";
+import { fill } from "../lib/states.js";
 import { preview, who } from "./tile.js";
 
 const K = 8;
@@ -11,29 +11,20 @@ const K = 8;
 /**
  * A card with the nearest frames of the same map.
  * @param {Object<string, any>} frame indexed
- * @param {AbortSignal} signal
- * @returns {HTMLElement} it fills itself
+ * @param {AbortSignal} signal @returns {HTMLElement} it fills itself
  */
 export function neighbours(frame, signal) {
-  const place = h("div", {}, loading("Loading neighbours"));
+  const place = h("div", {});
   const card = h("section", { class: "card", "aria-labelledby": "neighbours-title" },
     h("h2", { id: "neighbours-title" }, "Neighbours"),
     h("p", { class: "muted" }, "The nearest signatures in this map. They are not validated: run a query for that."), place);
-  async function ask() {
-    try {
-      const { data } = await send("POST", `${at("maps", frame.map)}/queries`, {
-        json: { frame_id: frame.frame_id, k: K, stages: "retrieve", keep: false, record: false }, signal,
-      });
-      put(place, data.matches.length
-        ? h("ol", { class: "neighbours" }, data.matches.map((one) => tileOf(one, signal)))
-        : h("p", { class: "muted" }, "This is the only searchable frame of the map."));
-    } catch (error) {
-      if (error.name === "AbortError") return;
-      if (error.status === 401) throw error;
-      put(place, failed(error, ask));
-    }
-  }
-  ask();
+  fill(place, async () => {
+    const { data } = await send("POST", `${at("maps", frame.map)}/queries`, {
+      json: { frame_id: frame.frame_id, k: K, stages: "retrieve", keep: false, record: false }, signal,
+    });
+    return data.matches.length ? h("ol", { class: "neighbours" }, data.matches.map((one) => tileOf(one, signal)))
+      : h("p", { class: "muted" }, "This is the only searchable frame of the map.");
+  }, "Loading neighbours");
   return card;
 }
 

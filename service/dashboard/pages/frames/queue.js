@@ -233,7 +233,7 @@ export class Queue {
     this.change(item, { state: "refused", problem: error, share: 0 });
   }
 
-  /** What became of a frame of this queue. @param {Object<string, any>} frame */
+  /** What became of a frame of this queue. */
   became(frame) {
     for (const item of this.byFrame.get(frame.frame_id) ?? []) {
       if (isPending(item.state)) this.change(item, { state: frame.state, reason: frame.reason });

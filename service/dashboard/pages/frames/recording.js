@@ -11,7 +11,7 @@ import { placeOf } from "../paths/shapes.js";
 import { Plan } from "../plan/plan.js";
 import { countsCard } from "../coverage/panels.js";
 import { drawCells } from "../coverage/sheet.js";
-import { remember } from "./source.js";
+import { settingField, settingsForm } from "./source.js";
 
 // as `sceneprint upload` names them; empty: as the service chooses
 const OPTIONS = [
@@ -22,10 +22,8 @@ const OPTIONS = [
 
 /** Fields of a form, which write into settings as they change. @param {any} given settings of source.js */
 export function recordingFields(given) {
-  return h("div", { class: "source-fields" }, h("details", {}, h("summary", {}, "ROS recordings"),
-    h("div", { class: "source-row" }, OPTIONS.map(([name, label, placeholder]) => h("label", { class: "field" }, h("span", {}, label),
-      h("input", { type: "text", name: `bag_${name}`, autocomplete: "off", placeholder, value: given[`bag_${name}`] ?? "",
-        onInput: (event) => { given[`bag_${name}`] = event.target.value; remember(given); } }))))));
+  return settingsForm(given, h("div", { class: "source-fields" }, h("details", {}, h("summary", {}, "ROS recordings"),
+    h("div", { class: "source-row" }, OPTIONS.map(([name, label, placeholder]) => settingField(`bag_${name}`, label, { placeholder }))))));
 }
 
 /** Query parameters of the import of a recording. @param {Object<string, any>} given settings of source.js */

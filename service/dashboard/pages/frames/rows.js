@@ -24,8 +24,7 @@ export function groupOf(state) {
 
 /**
  * The list of a queue; `update(item)` after one has changed, `update(null)` after many have.
- * @param {import("./queue.js").Queue} queue
- * @param {AbortSignal} signal
+ * @param {import("./queue.js").Queue} queue @param {AbortSignal} signal
  * @returns {HTMLElement & {update: (item: Object<string, any> | null) => void}}
  */
 export function rowsOf(queue, signal) {

@@ -3,7 +3,7 @@
 import { at, bytes, get } from "../lib/api.js";
 import { h, put } from "../lib/dom.js";
 import { count, metres } from "../lib/format.js";
-import { failed, loading } from "../lib/states.js";
+import { fill } from "../lib/states.js";
 import { manyColours } from "../viewer/colours.js";
 import { cross, scale } from "../viewer/matrix.js";
 import { parsePoints } from "../viewer/points.js";
@@ -17,15 +17,13 @@ const LIFT = 0.012; // metres: a disc within the points would be half hidden by 
 
 /**
  * Cards with the cloud and the patches of an indexed frame.
- * @param {Object<string, any>} frame
- * @param {AbortSignal} signal
- * @returns {Promise<HTMLElement[]>} they fill themselves when the points have come
+ * @param {AbortSignal} signal @returns {Promise<HTMLElement[]>} they fill themselves when the points have come
  */
 export async function scene(frame, signal) {
   const path = at("maps", frame.map, "frames", frame.frame_id);
   const canvas = h("canvas", { class: "scene-canvas" });
-  const told = h("p", { class: "muted", role: "status" }, "Loading the points…");
-  const patchesPlace = h("div", { class: "patches" }, loading("Loading the patches"));
+  const told = h("div", { class: "scene-told muted", role: "status" });
+  const patchesPlace = h("div", { class: "patches" });
   /** @type {{colour: string, level: number, points: any, levels: any}} */
   const state = { colour: "height", level: 0, points: null, levels: null };
   const colours = viewSwitch(state.colour, (one) => { state.colour = one; draw(); }, COLOURS, "Colour of the points");
@@ -40,22 +38,15 @@ export async function scene(frame, signal) {
   let viewer = null;
 
   async function begin() {
-    try {
-      state.points = parsePoints(await bytes(`${path}/points`, { signal }));
-    } catch (error) {
-      if (error.name === "AbortError") return;
-      if (error.status === 401) throw error;
-      put(told, failed(error, () => { put(told, "Loading the points…"); begin(); }));
-      return;
-    }
+    state.points = parsePoints(await bytes(`${path}/points`, { signal }));
     const { count: shown, total } = state.points;
-    put(told, `${count(shown)}${total > shown ? ` of ${count(total)}` : ""} points. Drag to turn, Shift and drag to move, wheel to zoom, 0 shows all.`);
+    const words = `${count(shown)}${total > shown ? ` of ${count(total)}` : ""} points. Drag to turn, Shift and drag to move, wheel to zoom, 0 shows all.`;
     viewer = createViewer(canvas, {
       label: `Point cloud of frame ${frame.frame_id}, ${count(shown)} points`, up: frame.kind === "cloud" ? "z" : "-y",
       onlost: (lost) => canvas.toggleAttribute("data-lost", lost),
     });
     signal.addEventListener("abort", () => viewer.destroy(), { once: true });
-    if (signal.aborted) { viewer.destroy(); return; }
+    if (signal.aborted) viewer.destroy();
     viewer.cloud("points", { points: state.points, colour: "height" });
     if (frame.kind !== "cloud" || frame.viewpoint) {
       viewer.lines("sensor", { positions: frustum(frame.intrinsics, 0.25), tint: "query" });
@@ -63,18 +54,12 @@ export async function scene(frame, signal) {
     if (frame.kind === "cloud") viewer.look({ elevation: 0.8 }); // a scan is wide and flat
     viewer.fit(["points"]);
     draw();
+    return words;
   }
 
   async function describe() {
-    try {
-      const told = await get(`${path}/patches`, { signal });
-      state.levels = [...told.levels.map((one, i) => levelOf(one, `Level ${i + 1}`)), levelOf(told.validation, "Validation")];
-    } catch (error) {
-      if (error.name === "AbortError") return;
-      if (error.status === 401) throw error;
-      put(patchesPlace, failed(error, describe));
-      return;
-    }
+    const told = await get(`${path}/patches`, { signal });
+    state.levels = [...told.levels.map((one, i) => levelOf(one, `Level ${i + 1}`)), levelOf(told.validation, "Validation")];
     const names = state.levels.map((one, i) => [String(i), `${one.name} · ${count(one.size.length)}`]);
     const table = h("div", { class: "patches-table" });
     const pick = viewSwitch("0", (one) => {
@@ -85,8 +70,8 @@ export async function scene(frame, signal) {
       draw();
     }, names, "Level");
     put(table, tableOf(state.levels[0]));
-    put(patchesPlace, pick, table);
     draw();
+    return [pick, table];
   }
 
   function draw() {
@@ -101,8 +86,8 @@ export async function scene(frame, signal) {
     else if (viewer.has?.("patches")) viewer.remove("patches");
   }
 
-  begin();
-  describe();
+  fill(told, begin, "Loading the points");
+  fill(patchesPlace, describe, "Loading the patches");
   return cards;
 }
 

@@ -18,10 +18,7 @@ const PRESETS = {
   },
 };
 
-/**
- * What was typed the last time, in this tab: all fields as text ("" where nothing is said).
- * @returns {typeof EMPTY}
- */
+/** What was typed the last time, in this tab: all fields as text ("" where nothing is said). @returns {typeof EMPTY} */
 export function settings() {
   try {
     return { ...EMPTY, ...JSON.parse(sessionStorage.getItem(KEPT_AS) ?? "{}") };
@@ -90,8 +87,7 @@ function ofCloud(given, source) {
 
 /**
  * The form that uploads and queries send: parts `frame` and `meta`.
- * @param {File} file
- * @param {Object<string, any>} given as of `metaOf`
+ * @param {File} file @param {Object<string, any>} given as of `metaOf`
  * @param {{source?: import("./kinds.js").Source, pose?: number[][] | null,
  *   label?: {name?: string, sequence?: number}}} [more] see metaOf
  * @returns {Promise<FormData>}
@@ -103,7 +99,7 @@ export async function formOf(file, given, { source, pose = null, label } = {}) {
   return form;
 }
 
-/** Whether a depth image could be sent with these settings. @param {Object<string, any>} given */
+/** Whether a depth image could be sent with these settings. */
 export function hasCamera(given) {
   return ["fx", "fy", "cx", "cy"].every((name) => said(given[name]));
 }
@@ -123,75 +119,77 @@ function numberOf(value) {
   return Number.isFinite(number) ? number : value;
 }
 
+/** A text field of the settings. @param {string} name @param {string} label @param {Object<string, any>} [props] hint: beside the label */
+export function settingField(name, label, { hint = "", ...props } = {}) {
+  return h("label", { class: "field" }, h("span", {}, label, hint && h("small", { class: "muted" }, ` ${hint}`)),
+    h("input", { type: "text", name, autocomplete: "off", ...props }));
+}
+
 /**
- * Fields for the camera of depth images, and, folded, for how clouds are read. What is typed goes
- * into `given` and is remembered; `element.refill()` shows `given` after others changed it.
+ * Let fields write into settings as they change, and remember these; `refill()` shows them after others changed them.
+ * @template {HTMLElement} T
+ * @param {Object<string, any>} given settings() @param {T} element with fields of their names
+ * @param {{onchange?: () => void, onshow?: () => void}} [heard] onshow: also after a refill
+ * @returns {T & {refill: () => void}}
+ */
+export function settingsForm(given, element, { onchange = () => {}, onshow = () => {} } = {}) {
+  function refill() {
+    for (const one of /** @type {NodeListOf<HTMLInputElement>} */ (element.querySelectorAll("[name]"))) {
+      if (one.type === "checkbox") one.checked = Boolean(given[one.name]); else one.value = textOf(given[one.name]);
+    }
+    onshow();
+  }
+  element.addEventListener("input", (event) => {
+    const { name, type, checked, value } = /** @type {HTMLInputElement} */ (event.target);
+    if (!name) return;
+    given[name] = type === "checkbox" ? checked : value;
+    remember(/** @type {any} */ (given));
+    onshow();
+    onchange();
+  });
+  refill();
+  return Object.assign(element, { refill });
+}
+
+/**
+ * Fields for the camera of depth images, and, folded, for how clouds are read.
  * @param {typeof EMPTY} given settings()
  * @param {{onchange?: () => void}} [heard]
- * @returns {HTMLElement & {refill: () => void}}
  */
 export function cameraFields(given, { onchange = () => {} } = {}) {
-  const bound = [];
+  const number = (name, label, props) => settingField(name, label, { inputmode: "decimal", ...props });
   const preset = h("select", {
     onchange: () => {
       const { label, ...values } = PRESETS[preset.value];
       Object.assign(given, values);
-      changed();
-      refill();
+      remember(given);
+      form.refill();
+      onchange();
     },
   }, Object.entries(PRESETS).map(([value, { label }]) => h("option", { value }, label)));
-  const changed = () => { remember(given); onchange(); };
-
-  /** @param {string} name @param {string} label @param {Object<string, any>} [props] of the field; hint: beside the label */
-  function input(name, label, { type = "text", hint = "", ...props } = {}) {
-    const box = type === "checkbox";
-    const field = h("input", {
-      type, name, autocomplete: "off", inputmode: box ? null : "decimal", ...props,
-      oninput: () => {
-        given[name] = box ? field.checked : field.value;
-        showPreset();
-        changed();
-      },
-    });
-    bound.push(() => {
-      if (box) field.checked = Boolean(given[name]);
-      else field.value = textOf(given[name]);
-    });
-    return box
-      ? h("label", { class: "field source-check" }, field, h("span", null, label))
-      : h("label", { class: "field"}, h("span", null, label, hint && h("small", { class: "muted"}, ` ${hint}`)), field);
-  }
-
-  function showPreset() {
+  const onshow = () => {
     const fits = Object.entries(PRESETS).find(([key, { label, ...values }]) => key
       && Object.entries(values).every(([name, value]) => textOf(given[name]) === textOf(value)));
     preset.value = fits?.[0] ?? "";
-  }
-
-  function refill() {
-    for (const show of bound) show();
-    showPreset();
-  }
-
-  const element = h("div", { class: "source-fields" },
+  };
+  const form = settingsForm(given, h("div", { class: "source-fields" },
     h("fieldset", null,
       h("legend", null, "Camera settings"),
       h("label", { class: "field source-preset" }, h("span", null, "Preset"), preset),
       h("div", { class: "source-row" },
-        input("fx", "fx", { hint: "px" }), input("fy", "fy", { hint: "px" }),
-        input("cx", "cx", { hint: "px" }), input("cy", "cy", { hint: "px" }),
-        input("width", "Width", { hint: "px", placeholder: "from the image" }),
-        input("height", "Height", { hint: "px", placeholder: "from the image" }),
-        input("depth_scale", "Depth scale", { hint: "per metre", placeholder: "1000" }),
-        input("distortion", "Distortion", { placeholder: "k1,k2,p1,p2" })),
-      input("depth_along_ray", "Samples are ranges along the pixel’s ray", { type: "checkbox" })),
+        number("fx", "fx", { hint: "px" }), number("fy", "fy", { hint: "px" }),
+        number("cx", "cx", { hint: "px" }), number("cy", "cy", { hint: "px" }),
+        number("width", "Width", { hint: "px", placeholder: "from the image" }),
+        number("height", "Height", { hint: "px", placeholder: "from the image" }),
+        number("depth_scale", "Depth scale", { hint: "per metre", placeholder: "1000" }),
+        number("distortion", "Distortion", { placeholder: "k1,k2,p1,p2" })),
+      h("label", { class: "field source-check" }, h("input", { type: "checkbox", name: "depth_along_ray" }), h("span", null, "Samples are ranges along the pixel’s ray"))),
     h("details", null,
       h("summary", null, "Point clouds"),
       h("div", { class: "source-row" },
-        input("viewpoint", "Viewpoint", { hint: "x,y,z in metres, file or none", placeholder: "file" }),
-        input("units_per_metre", "Units per metre", { placeholder: "1" }))));
-  refill();
-  return Object.assign(element, { refill });
+        number("viewpoint", "Viewpoint", { hint: "x,y,z in metres, file or none", placeholder: "file" }),
+        number("units_per_metre", "Units per metre", { placeholder: "1" })))), { onchange, onshow });
+  return form;
 }
 
 function textOf(value) {

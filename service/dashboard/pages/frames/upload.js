@@ -1,5 +1,4 @@
 // Upload: files dropped or chosen, what is said of them, and what became of each.
-import { at, get } from "../lib/api.js";
 import { h, put, throttle } from "../lib/dom.js";
 import { bytes, count, things } from "../lib/format.js";
 import { link } from "../lib/router.js";
@@ -11,7 +10,7 @@ import { ACCEPT, titlesOf } from "./kinds.js";
 import { queueOf } from "./queue.js";
 import { recordingFields } from "./recording.js";
 import { groupOf, rowsOf } from "./rows.js";
-import { cameraFields, hasCamera, remember } from "./source.js";
+import { cameraFields, hasCamera, remember, settingField, settingsForm } from "./source.js";
 import { mapFields } from "./wholemap.js";
 
 const ALOUD_MS = 5000;
@@ -19,9 +18,8 @@ const ALOUD_MS = 5000;
 export const styles = ["plan/plan.css", "coverage/coverage.css", "frames/source.css", "frames/upload.css", "frames/frames.css"];
 
 /** The page: #/maps/NAME/upload */
-export async function render(root, { params, signal, title, actions }) {
-  const map = await get(at("maps", params.map), { signal });
-  title(`Upload to ${map.title ?? map.name}`);
+export async function render(root, { params, signal, actions, about }) {
+  const map = await about;
   if (!may("write", params.map)) {
     put(root, empty({ title: "Your key may not upload here", text: `“${me()?.name}” can only read this map. To upload, a key needs the scope “write” for it.` }));
     return;
@@ -181,10 +179,9 @@ function dropZone(take) {
 }
 
 function whoFields(given) {
-  const field = (name, label, placeholder) => h("label", { class: "field" }, h("span", {}, label),
-    h("input", { type: "text", name, autocomplete: "off", placeholder, value: given[name], onInput: (event) => { given[name] = event.target.value; remember(given); } }));
-  return h("fieldset", {}, h("legend", {}, "Source"),
+  const field = (name, label, placeholder) => settingField(name, label, { placeholder });
+  return settingsForm(given, h("fieldset", {}, h("legend", {}, "Source"),
     h("div", { class: "source-row" },
       field("robot", "Robot", "none"), field("session", "Session", "folder name"),
-      field("tags", "Tags", "door, north"), field("parent_frame", "Parent frame of poses", "same as the session")));
+      field("tags", "Tags", "door, north"), field("parent_frame", "Parent frame of poses", "same as the session"))));
 }

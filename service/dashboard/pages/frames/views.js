@@ -6,11 +6,8 @@ export const VIEWS = [["depth", "Depth"], ["normals", "Normals"], ["patches", "P
 
 /**
  * A switch between views; `show(view)` presses the button of one.
- * @param {string} view
- * @param {(view: string) => void} choose
- * @param {string[][]} [views] value and words of each
- * @param {string} [label]
- * @returns {HTMLElement & {show: (view: string) => void}}
+ * @param {string} view @param {(view: string) => void} choose @param {string[][]} [views] value and words of each
+ * @param {string} [label] @returns {HTMLElement & {show: (view: string) => void}}
  */
 export function viewSwitch(view, choose, views = VIEWS, label = "View") {
   const buttons = views.map(([value, text]) => h("button", {

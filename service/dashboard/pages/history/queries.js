@@ -19,9 +19,8 @@ const AT_ONCE = 50;
 const TOGETHER_MS = 500; // events of a burst are one look
 
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
-export async function render(root, { params, search, signal, go, title }) {
+export async function render(root, { params, search, signal, go }) {
   const { map } = params;
-  title(`Queries of ${map}`);
   const come = soon(root, "Loading the queries");
   /** @type {any} */
   const asked = Object.fromEntries(["status", "robot", "last", "since", "until", "kept"].map((name) => [name, search.get(name)]));

@@ -5,14 +5,10 @@ import { key } from "./session.js";
 export { address, ask, at, lives, Problem } from "./http.js";
 export { watch } from "./live.js";
 
-const KEPT_MOST = 200;
-const KEPT_BYTES = 64 * 2 ** 20;
-
 /**
  * JSON of the API.
  * @param {string} path under /v1, such as `at("maps", name, "frames")`
  * @param {{params?: Object<string, any> | URLSearchParams, signal?: AbortSignal, accept?: string}} [how]
- * @returns {Promise<any>}
  */
 export async function get(path, { params, signal, accept = "application/json" } = {}) {
   const answer = await ask(path, params, { signal, headers: { Accept: accept } });
@@ -38,8 +34,7 @@ export async function list(path, { params, signal, most = Infinity }) {
 
 /**
  * Change something.
- * @param {string} method
- * @param {string} path
+ * @param {string} method @param {string} path
  * @param {{json?: any, form?: FormData | Object<string, any>, body?: BodyInit, type?: string,
  *   headers?: Object<string, string>, params?: Object<string, any> | URLSearchParams,
  *   signal?: AbortSignal, onprogress?: (share: number) => void}} [what] one of json, form, body
@@ -57,44 +52,18 @@ export async function send(method, path, what = {}) {
   return { status: answer.status, data: await read(answer), headers: answer.headers };
 }
 
-const kept = new Map(); // address and key -> {tag, body}, the longest unused first
-let keptBytes = 0;
-
 /**
- * The bytes of a file; what has not changed since it was asked for is not sent again. They are
- * shared with who else asked: read them only.
- * @param {string} path
- * @param {{params?: Object<string, any>, signal?: AbortSignal, accept?: string}} [how]
- * @returns {Promise<ArrayBuffer>}
+ * The bytes of a file; the browser asks whether those that it has are still right.
+ * @param {string} path @param {{params?: Object<string, any>, signal?: AbortSignal, accept?: string}} [how]
  */
 export async function bytes(path, { params, signal, accept = "*/*" } = {}) {
-  const headers = { Accept: accept };
-  const name = `${key() ?? ""} ${accept} ${address(path, params)}`;
-  const known = kept.get(name);
-  if (known) headers["If-None-Match"] = known.tag;
-  const answer = await ask(path, params, { headers, signal }, known ? 304 : undefined);
-  const same = answer.status === 304;
-  const body = same ? known.body : await whole(answer.arrayBuffer());
-  const tag = same ? known.tag : answer.headers.get("ETag");
-  // by now another may have asked for it as well
-  keptBytes -= kept.get(name)?.body.byteLength ?? 0;
-  kept.delete(name);
-  if (tag && body.byteLength <= KEPT_BYTES / 4) {
-    kept.set(name, { tag, body });
-    keptBytes += body.byteLength;
-    for (const [oldest, one] of kept) {
-      if (kept.size <= KEPT_MOST && keptBytes <= KEPT_BYTES) break;
-      kept.delete(oldest);
-      keptBytes -= one.body.byteLength;
-    }
-  }
-  return body;
+  const answer = await ask(path, params, { headers: { Accept: accept }, signal, cache: "no-cache" });
+  return whole(answer.arrayBuffer());
 }
 
 /**
  * Let the browser keep a file.
- * @param {string} path
- * @param {{params?: Object<string, any>, name?: string}} [how] name: of the file
+ * @param {string} path @param {{params?: Object<string, any>, name?: string}} [how] name: of the file
  */
 export async function save(path, { params, name } = {}) {
   const link = document.createElement("a");

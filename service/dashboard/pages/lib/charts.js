@@ -10,7 +10,6 @@ const KEYS = { ArrowLeft: -1, ArrowRight: 1, PageUp: -10, PageDown: 10, Home: -I
 
 /**
  * A chart; it has nothing to show until `update` is called.
- *
  * @param {{
  *   title: string,
  *   kind?: "lines" | "bars",

@@ -17,21 +17,14 @@ export function h(tag, props, ...children) {
   return made(document.createElement(tag), props, children);
 }
 
-/**
- * The same in the namespace of SVG.
- * @param {string} tag
- * @param {?Object<string, any>} [props]
- * @param {...any} children
- * @returns {SVGElement}
- */
+/** The same in the namespace of SVG. @param {string} tag @param {?Object<string, any>} [props] @param {...any} children @returns {SVGElement} */
 export function svg(tag, props, ...children) {
   return made(document.createElementNS(SVG, tag), props, children);
 }
 
 /**
  * Replace what is in an element.
- * @param {Element} parent
- * @param {...any} children as of `h`
+ * @param {Element} parent @param {...any} children as of `h`
  * @returns {any} the parent
  */
 export function put(parent, ...children) {
@@ -41,13 +34,21 @@ export function put(parent, ...children) {
 
 /**
  * What a button does, once at a time: a second click while it is under way does nothing.
- * @param {() => Promise<any>} act
- * @returns {() => Promise<any>}
+ * @param {() => Promise<any>} act @returns {() => Promise<any>}
  */
 export function once(act) {
   /** @type {Promise<any> | null} */
   let turn = null;
   return () => (turn ??= act().finally(() => { turn = null; }));
+}
+
+/**
+ * Copy the text of a field; without the permission, or in a page that came without TLS, it is selected, to be copied by hand.
+ * @param {HTMLInputElement} field @returns {Promise<boolean>} whether it was copied
+ */
+export async function copyFrom(field) {
+  field.select();
+  return navigator.clipboard ? navigator.clipboard.writeText(field.value).then(() => true, () => false) : false;
 }
 
 /**
@@ -61,6 +62,31 @@ export function throttle(act, pause, signal) {
   let timer = null;
   signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
   return () => { timer ??= setTimeout(() => { timer = null; act(); }, pause); };
+}
+
+/**
+ * Act once for each of some elements when it comes into view, or nearly: what nobody looks at costs no request.
+ * @param {AbortSignal} signal of the page @param {number} [most] acts that are under way at once
+ * @returns {(element: Element, act: () => any) => void} to be called for each
+ */
+export function inView(signal, most = Infinity) {
+  const acts = new WeakMap(), queue = new Set(); // those that came into view first are first
+  let busy = 0;
+  const watcher = new IntersectionObserver((entries) => {
+    for (const { target, isIntersecting } of entries) if (isIntersecting) queue.add(target); else queue.delete(target);
+    next();
+  }, { rootMargin: "200px" });
+  signal.addEventListener("abort", () => watcher.disconnect(), { once: true });
+  function next() {
+    for (const element of queue) {
+      if (busy >= most || signal.aborted) return;
+      queue.delete(element);
+      watcher.unobserve(element);
+      busy += 1;
+      Promise.resolve(acts.get(element)?.()).finally(() => { busy -= 1; next(); });
+    }
+  }
+  return (element, act) => { acts.set(element, act); watcher.observe(element); };
 }
 
 function made(element, props, children) {

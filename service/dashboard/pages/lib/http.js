@@ -1,4 +1,5 @@
 // One request to the API: its address, the key, and what refusals become.
+import { searchOf } from "./router.js";
 import { key } from "./session.js";
 
 // of this module, not of the page: it is right behind whatever prefix a proxy adds
@@ -7,11 +8,7 @@ const BASE = new URL("v1/", ROOT);
 
 /** What the API refused, as its problem document says it; status 0 where nothing answered. */
 export class Problem extends Error {
-  /**
-   * @param {number} status
-   * @param {Object<string, any>} document
-   * @param {string | null} [retryAfter] the header of that name
-   */
+  /** @param {number} status @param {string | null} [retryAfter] the header of that name */
   constructor(status, document, retryAfter = null) {
     super(document.detail ?? document.title ?? `The service answered ${status}.`);
     this.status = status;
@@ -45,26 +42,21 @@ export async function lives(signal) {
 }
 
 /** Ask the API, with the key if there is one; Problem where it refuses or does not answer. */
-export async function ask(path, params, init = {}, alsoGood) {
+export async function ask(path, params, init = {}) {
   let answer;
   try {
-    answer = await fetch(address(path, params), { ...init, headers: keyed(init.headers), cache: "no-store" });
+    answer = await fetch(address(path, params), { cache: "no-store", ...init, headers: keyed(init.headers) });
   } catch (error) {
     if (error.name === "AbortError") throw error;
     throw unreachable();
   }
-  if (answer.ok || answer.status === alsoGood) return answer;
+  if (answer.ok) return answer;
   throw new Problem(answer.status, (await answer.json().catch(() => null)) ?? {}, answer.headers.get("Retry-After"));
 }
 
 /** The address of something of the API, for a link. @param {string} path @param {any} [params] */
 export function address(path, params) {
-  const url = new URL(path, BASE);
-  const entries = params instanceof URLSearchParams ? [...params] : Object.entries(params ?? {});
-  for (const [name, value] of entries) {
-    for (const one of [value].flat()) if (one !== null && one !== undefined && one !== "") url.searchParams.append(name, one);
-  }
-  return url.href;
+  return new URL(`${path}${searchOf(params)}`, BASE).href;
 }
 
 /** Headers, and the key if there is one. @param {Object<string, string>} [headers] */

@@ -11,7 +11,6 @@ const WRONG_KEY = "This key is unknown, revoked or expired. Check that you copie
  * A field for a key, and why it is there.
  * @param {Fault} problem of status 401 or 403
  * @param {() => void} taken what to do with a key that is good
- * @returns {HTMLElement}
  */
 export function keyPage(problem, taken) {
   const refused = problem.status !== 401;

@@ -4,6 +4,7 @@ import { ask, whole } from "./http.js";
 const FIRST_S = 1;
 const LONGEST_S = 15;
 const SILENT_S = 8; // a stream says every three seconds that it lives
+const HIDDEN = "hidden"; // why a stream was ended
 
 /**
  * Hear what happens until `signal` aborts. Where the stream breaks off it goes on at the last
@@ -18,58 +19,50 @@ export async function watch({ map, kinds, onevent, onstate = () => {}, signal })
   /** @type {any} */
   const state = { last: null };
   let wait = FIRST_S;
-  while (!signal.aborted) {
-    await shown(signal);
-    const turn = new AbortController();
-    const stop = () => turn.abort();
-    const rest = () => { if (document.hidden) turn.abort(); };
-    signal.addEventListener("abort", stop);
-    document.addEventListener("visibilitychange", rest);
-    let silent = false;
-    let lost = true;
+  const tell = (now) => { onstate(now); window.dispatchEvent(new CustomEvent("sceneprint:live", { detail: now })); };
+  for (;;) {
+    while (document.hidden && !signal.aborted) await either([document, "visibilitychange"], [signal, "abort"]);
+    if (signal.aborted) return;
+    const turn = new AbortController(), ends = AbortSignal.any([signal, turn.signal]);
+    document.addEventListener("visibilitychange", () => { if (document.hidden) turn.abort(HIDDEN); }, { signal: ends });
+    let isLive = false;
     /** @type {Timer} */
     let timer = null;
     const heard = () => {
       clearTimeout(timer);
-      timer = setTimeout(() => { silent = true; turn.abort(); }, 1000 * SILENT_S);
+      timer = setTimeout(() => turn.abort(), 1000 * SILENT_S);
+      if (isLive || state.last === null) return;
+      isLive = true;
+      tell("live");
     };
     try {
-      if (signal.aborted) return;
-      heard();
-      const headers = { Accept: "text/event-stream" };
-      if (state.last !== null) headers["Last-Event-ID"] = state.last;
-      const answer = await ask("events", { map, kind: kinds }, { headers, signal: turn.signal });
+      timer = setTimeout(() => turn.abort(), 1000 * SILENT_S);
+      const headers = { Accept: "text/event-stream", ...(state.last !== null && { "Last-Event-ID": state.last }) };
+      const answer = await ask("events", { map, kind: kinds }, { headers, signal: ends });
       wait = FIRST_S;
-      let begun = false;
-      await messages(answer.body, state, onevent, () => {
-        heard();
-        if (!begun && state.last !== null) { begun = true; tell("live", onstate); }
-      });
+      await messages(answer.body, state, onevent, heard);
     } catch (error) {
-      lost = silent || !turn.signal.aborted; // else it rests
-      if (error.name !== "AbortError" && !passes(error)) throw error;
+      if (!ends.aborted && !passes(error)) throw error;
     } finally {
       clearTimeout(timer);
-      signal.removeEventListener("abort", stop);
-      document.removeEventListener("visibilitychange", rest);
     }
     if (signal.aborted) return;
-    if (lost) {
-      tell("waiting", onstate);
-      await pause(wait, signal);
-      wait = Math.min(2 * wait, LONGEST_S);
-    }
+    if (turn.signal.reason === HIDDEN) continue;
+    turn.abort(); // the page may be hidden now
+    tell("waiting");
+    await pause(wait, signal);
+    wait = Math.min(2 * wait, LONGEST_S);
   }
 }
+
+/** Wait for the first of some events. @param {...[EventTarget, string]} events */
+const either = (...events) => new Promise((resolve) => {
+  for (const [target, type] of events) target.addEventListener(type, resolve, { once: true });
+});
 
 // no answer, too much to do, broken down; all else would be refused again
 function passes(error) {
   return error.status === 0 || error.status === 408 || error.status === 429 || error.status >= 500;
-}
-
-function tell(state, onstate) {
-  onstate(state);
-  window.dispatchEvent(new CustomEvent("sceneprint:live", { detail: state }));
 }
 
 async function messages(body, state, onevent, heard) {
@@ -96,21 +89,8 @@ async function messages(body, state, onevent, heard) {
   }
 }
 
-function shown(signal) {
-  if (!document.hidden || signal.aborted) return Promise.resolve(null);
-  return new Promise((resolve) => {
-    const look = () => {
-      if (document.hidden && !signal.aborted) return;
-      document.removeEventListener("visibilitychange", look);
-      resolve(null);
-    };
-    document.addEventListener("visibilitychange", look);
-    signal.addEventListener("abort", look, { once: true });
-  });
-}
-
 /** Wait, or until the page is left. @param {number} s @param {AbortSignal} signal */
-export function pause(s, signal) {
+function pause(s, signal) {
   return new Promise((resolve) => {
     const timer = setTimeout(resolve, 1000 * s);
     signal.addEventListener("abort", () => { clearTimeout(timer); resolve(null); }, { once: true });

@@ -5,8 +5,7 @@ import { plain } from "./prose.js";
 
 /**
  * A canvas that draws itself when the picture has come; where there is nothing to see it says why.
- * @param {string} path
- * @param {Object<string, any>} params
+ * @param {string} path @param {Object<string, any>} params
  * @param {{alt: string, width: number, height: number, signal?: AbortSignal}} how size: in CSS
  *   pixels, kept free until the picture is there
  * @returns {HTMLCanvasElement & {ready: Promise<boolean>}} its property `ready` is a promise: whether it was drawn

@@ -25,8 +25,7 @@ export function followJob(path, onchange, signal) {
 
 /**
  * Repeat requests until they return true, or `signal` aborts.
- * @param {() => Promise<boolean>} request
- * @param {AbortSignal} signal
+ * @param {() => Promise<boolean>} request @param {AbortSignal} signal
  */
 export async function repeat(request, signal) {
   for (;;) {
@@ -43,8 +42,7 @@ export async function repeat(request, signal) {
 
 /**
  * Begin a product when the form of a dialog is submitted; what is wrong is said in its `.field-error`.
- * @param {HTMLDialogElement} dialog
- * @param {string} path of the list of such products
+ * @param {HTMLDialogElement} dialog @param {string} path of the list of such products
  * @param {() => Object<string, any>} request what the form asks for
  * @param {(begun: Object<string, any>) => void} onbegun
  */

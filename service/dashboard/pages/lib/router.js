@@ -1,18 +1,18 @@
 // Addresses of the pages: everything behind `#`, so that they survive a reload and can be shared.
 
-/** Pages by the pattern of their address; `:name` is a segment. `section`: its place in the tabs
- * of a map; `crumbs`: what leads there. */
+/** Pages by the pattern of their address; `:name` is a segment. `section`: its place in the tabs of a
+ * map; `heading`: what stands before the title of the map in the heading, if it has that. */
 export const ROUTES = [
   { path: "", page: "maps/maps.js", area: "maps", title: "Maps" },
-  { path: "maps/:map", page: "frames/gallery.js", area: "maps", section: "frames", title: "Frames" },
+  { path: "maps/:map", page: "frames/gallery.js", area: "maps", section: "frames", title: "Frames", heading: "Frames of " },
   { path: "maps/:map/frames/:frame", page: "frames/frame.js", area: "maps", section: "frames", title: "Frame" },
-  { path: "maps/:map/sessions", page: "sessions/sessions.js", area: "maps", section: "sessions", title: "Sessions" },
-  { path: "maps/:map/difference", page: "difference/difference.js", area: "maps", section: "sessions", title: "Difference" },
-  { path: "maps/:map/upload", page: "frames/upload.js", area: "maps", section: "upload", title: "Upload" },
-  { path: "maps/:map/query", page: "query/ask.js", area: "maps", section: "query", title: "Query" },
-  { path: "maps/:map/queries", page: "history/queries.js", area: "maps", section: "queries", title: "Queries" },
-  { path: "maps/:map/coverage", page: "coverage/coverage.js", area: "maps", section: "coverage", title: "Coverage" },
-  { path: "maps/:map/place", page: "place/place.js", area: "maps", section: "place", title: "Place" },
+  { path: "maps/:map/sessions", page: "sessions/sessions.js", area: "maps", section: "sessions", title: "Sessions", heading: "Sessions of " },
+  { path: "maps/:map/difference", page: "difference/difference.js", area: "maps", section: "sessions", title: "Difference", heading: "Difference in " },
+  { path: "maps/:map/upload", page: "frames/upload.js", area: "maps", section: "upload", title: "Upload", heading: "Upload to " },
+  { path: "maps/:map/query", page: "query/ask.js", area: "maps", section: "query", title: "Query", heading: "Query " },
+  { path: "maps/:map/queries", page: "history/queries.js", area: "maps", section: "queries", title: "Queries", heading: "Queries of " },
+  { path: "maps/:map/coverage", page: "coverage/coverage.js", area: "maps", section: "coverage", title: "Coverage", heading: "Coverage of " },
+  { path: "maps/:map/place", page: "place/place.js", area: "maps", section: "place", title: "Place", heading: "" },
   { path: "queries/:query", page: "query/answer.js", area: "maps", title: "Answer" },
   { path: "queries/:query/matches/:frame", page: "overlay/overlay.js", area: "maps", title: "Overlay" },
   { path: "operations", page: "operations/operations.js", area: "operations", title: "Operations" },
@@ -45,31 +45,31 @@ export function parse(hash) {
 /**
  * An address: `link("maps", name, "frames", id, {k: 5})`; a last object is its search.
  * @param {...(string | Object<string, any> | URLSearchParams)} parts
- * @returns {string}
  */
 export function link(...parts) {
   const last = parts.at(-1);
   const search = typeof last === "object" ? last : null;
   if (search) parts.pop();
-  const path = `#/${parts.map((one) => encodeURIComponent(String(one))).join("/")}`;
-  if (search === null) return path;
+  return `#/${parts.map((one) => encodeURIComponent(String(one))).join("/")}${searchOf(search)}`;
+}
+
+/** The end of an address from `?` on, of what has a value; lists have one for each item. */
+export function searchOf(params) {
   const query = new URLSearchParams();
-  const entries = search instanceof URLSearchParams ? [...search] : Object.entries(search);
-  for (const [name, value] of entries) {
+  for (const [name, value] of params instanceof URLSearchParams ? params : Object.entries(params ?? {})) {
     for (const one of [value].flat()) if (one !== null && one !== undefined && one !== "") query.append(name, one);
   }
-  return query.size ? `${path}?${query}` : path;
+  return query.size ? `?${query}` : "";
 }
 
 /**
  * Go to a page. `replace`: Back leads past this one; `quiet`: the page that is shown has changed
- * itself already, and only its address follows.
- * @param {string} hash
- * @param {{replace?: boolean, quiet?: boolean}} [how]
+ * itself already, and only its address follows; `state`: what the history keeps with it.
+ * @param {string} hash @param {{replace?: boolean, quiet?: boolean, state?: any}} [how]
  */
-export function go(hash, { replace = false, quiet = false } = {}) {
+export function go(hash, { replace = false, quiet = false, state = null } = {}) {
   const same = hash === (location.hash || "#/");
-  if (replace || same) history.replaceState(null, "", hash); else history.pushState(null, "", hash);
+  if (replace || same) history.replaceState(state, "", hash); else history.pushState(state, "", hash);
   if (!quiet) window.dispatchEvent(new CustomEvent("sceneprint:go"));
 }
 

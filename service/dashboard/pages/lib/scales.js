@@ -18,45 +18,21 @@ export function steps(most, count = 3, least = 0) {
   return Array.from({ length: last + 1 }, (_, i) => Number((i * step).toPrecision(12)));
 }
 
-/**
- * A path through points; a null between them leaves a gap, and one alone is left to `dotPath`.
- * @param {(number | null)[]} values
- * @param {(i: number) => number} x
- * @param {(value: number) => number} y
- * @returns {string} of the attribute `d`
- */
-export function linePath(values, x, y) {
-  return runs(values).filter(([from, to]) => to - from > 1).map(([from, to]) => {
-    const points = values.slice(from, to).map((value, i) => `${fixed(x(from + i))} ${fixed(y(/** @type {number} */ (value)))}`);
-    return `M${points.join("L")}`;
-  }).join("");
-}
+/** Pixels of a place. @typedef {(value: number) => number} Pixel */
 
-/**
- * A path of no length at each value that has no neighbour: with round ends a dot.
- * @param {(number | null)[]} values
- * @param {(i: number) => number} x
- * @param {(value: number) => number} y
- * @returns {string}
- */
-export function dotPath(values, x, y) {
-  return runs(values).filter(([from, to]) => to - from === 1)
-    .map(([from]) => `M${fixed(x(from))} ${fixed(y(/** @type {number} */ (values[from])))}h0`).join("");
-}
+/** A path through points; a null between them leaves a gap, and one alone is left to `dotPath`.
+ * @param {(number | null)[]} values @param {Pixel} x of a number in the list @param {Pixel} y of a value @returns {string} of the attribute `d` */
+export const linePath = (values, x, y) => runs(values, (n) => n > 1).map(([from, to]) => `M${points(values, from, to, x, y)}`).join("");
 
-/**
- * The area between a line and the bottom, part by part as the line.
- * @param {(number | null)[]} values
- * @param {(i: number) => number} x
- * @param {(value: number) => number} y
- * @returns {string}
- */
-export function areaPath(values, x, y) {
-  return runs(values).filter(([from, to]) => to - from > 1).map(([from, to]) => {
-    const points = values.slice(from, to).map((value, i) => `${fixed(x(from + i))} ${fixed(y(/** @type {number} */ (value)))}`);
-    return `M${fixed(x(from))} ${fixed(y(0))}L${points.join("L")}L${fixed(x(to - 1))} ${fixed(y(0))}Z`;
-  }).join("");
-}
+/** A path of no length at each value that has no neighbour: with round ends a dot.
+ * @param {(number | null)[]} values @param {Pixel} x @param {Pixel} y */
+export const dotPath = (values, x, y) => runs(values, (n) => n === 1).map(([from, to]) => `M${points(values, from, to, x, y)}h0`).join("");
+
+/** The area between a line and the bottom, part by part as the line. @param {(number | null)[]} values @param {Pixel} x @param {Pixel} y */
+export const areaPath = (values, x, y) => runs(values, (n) => n > 1)
+  .map(([from, to]) => `M${fixed(x(from))} ${fixed(y(0))}L${points(values, from, to, x, y)}L${fixed(x(to - 1))} ${fixed(y(0))}Z`).join("");
+
+const points = (values, from, to, x, y) => values.slice(from, to).map((value, i) => `${fixed(x(from + i))} ${fixed(y(value))}`).join("L");
 
 /**
  * Where each value begins and ends when they stand one on the other; null counts as nothing.
@@ -95,8 +71,8 @@ export function clock(time) {
   return `${String(time.getHours()).padStart(2, "0")}:${String(time.getMinutes()).padStart(2, "0")}`;
 }
 
-/** From and to (excluded) of stretches without a null. */
-function runs(values) {
+/** From and to (excluded) of stretches without a null, of wanted lengths. */
+function runs(values, isWanted) {
   const found = [];
   /** @type {number | null} */
   let from = null;
@@ -104,9 +80,7 @@ function runs(values) {
     if (value !== null && from === null) from = i;
     if (value === null && from !== null) { found.push([from, i]); from = null; }
   });
-  return found;
+  return found.filter(([begin, end]) => isWanted(end - begin));
 }
 
-function fixed(x) {
-  return Math.round(x * 100) / 100;
-}
+const fixed = (x) => Math.round(x * 100) / 100;

@@ -8,7 +8,7 @@ let kept = null; // where storage is forbidden the key lasts until the page is l
 /** @type {any} */
 let known = { key: undefined, me: null };
 
-/** The key of this tab; null where none was given. @returns {string | null} */
+/** The key of this tab; null where none was given. */
 export function key() {
   try { return sessionStorage.getItem(KEY) ?? kept; } catch { return kept; }
 }
@@ -53,9 +53,7 @@ export function me() {
 
 /**
  * Whether the key may do that with a map; without one: with all maps.
- * @param {"read" | "write" | "admin"} scope
- * @param {string} [map]
- * @returns {boolean}
+ * @param {"read" | "write" | "admin"} scope @param {string} [map]
  */
 export function may(scope, map) {
   if (known.me === null) return true;

@@ -21,19 +21,20 @@ export function setTitle(text) {
 }
 
 /**
- * What leads to a page.
- * @param {any} route
- * @param {Object<string, string>} params `map` of an answer is known once that has come
+ * What leads to a page, and its heading if that names the map.
+ * @param {any} route @param {Object<string, string>} params `map` of an answer is known once that has come
+ * @param {string} [name] what the map is called: its title
  */
-export function drawCrumbs(route, { map, query, frame }) {
+export function drawCrumbs(route, { map, query, frame }, name = map) {
+  if (route?.heading !== undefined) setTitle(`${route.heading}${name}`);
   const crumbs = [];
   if (route?.area === "maps" && route.path !== "") crumbs.push(["Maps", "#/"]);
-  if (map && route.section !== "place") crumbs.push([map, link("maps", map, "place")]);
+  if (map && route.section !== "place") crumbs.push([name, link("maps", map, "place")]);
   if (query && map) crumbs.push(["Queries", link("maps", map, "queries")]);
   if (query && frame) crumbs.push(["Answer", link("queries", query)]);
   if (route?.path === "operations/jobs/:job") crumbs.push(["Operations", "#/operations"]);
   const items = crumbs.map(([text, href]) => h("li", {}, h("a", { href }, text)));
-  if (crumbs.length) items.push(h("li", { "aria-current": "page" }, map && route.section === "place" ? map : route.title));
+  if (crumbs.length) items.push(h("li", { "aria-current": "page" }, map && route.section === "place" ? name : route.title));
   put(document.getElementById("crumbs"), h("ol", {}, items));
 }
 

@@ -12,7 +12,7 @@ const SHAPES = {
 const AGAIN_S = 2;
 const TOAST_S = 6;
 
-/** A skeleton, told to screen readers. @param {string} [text] @returns {HTMLElement} */
+/** A skeleton, told to screen readers. @param {string} [text] */
 export function loading(text = "Loading") {
   const lines = [1, 2, 3].map(() => h("span", { class: "skeleton-line" }));
   return h("div", { class: "skeleton", role: "status" }, h("span", { class: "visually-hidden" }, `${text}…`), lines);
@@ -21,7 +21,6 @@ export function loading(text = "Loading") {
 /**
  * There is nothing yet, and how to begin.
  * @param {{title: string, text?: any, actions?: any}} what text, actions: as children of `h`
- * @returns {HTMLElement}
  */
 export function empty({ title, text, actions }) {
   return state("none", title, text, actions);
@@ -31,7 +30,6 @@ export function empty({ title, text, actions }) {
  * What the API refused, in its own words.
  * @param {Fault} problem a Problem, or a fault of ours
  * @param {() => void} [retry]
- * @returns {HTMLElement}
  */
 export function failed(problem, retry) {
   const known = problem.status !== undefined;
@@ -49,7 +47,6 @@ export function failed(problem, retry) {
  * The service is gone; asks until it is back.
  * @param {() => void} back what to do then
  * @param {AbortSignal} signal
- * @returns {HTMLElement}
  */
 export function gone(back, signal) {
   const timer = setInterval(async () => {
@@ -82,10 +79,25 @@ export function toast(text, { kind = "good", action } = {}) {
 }
 
 /**
+ * Fill a place with what is asked for; meanwhile there is a skeleton, and if it is refused the reason, with a button to try again.
+ * @param {Element} place @param {() => Promise<any>} ask children of `put`; undefined: nothing is to be put @param {string} text what is loaded
+ */
+export async function fill(place, ask, text) {
+  put(place, loading(text));
+  try {
+    const shown = await ask();
+    if (shown !== undefined) put(place, shown);
+  } catch (error) {
+    if (error.name === "AbortError") return;
+    if (error.status === 401) throw error;
+    put(place, failed(error, () => fill(place, ask, text)));
+  }
+}
+
+/**
  * Ask before something is done.
  * @param {{title: string, text: any, word?: string, action?: string}} what word: to be typed
  *   first, for what cannot be undone; action: what the button says
- * @returns {Promise<boolean>}
  */
 export function confirm({ title, text, word, action = "Continue" }) {
   return new Promise((resolve) => {
@@ -105,13 +117,12 @@ export function confirm({ title, text, word, action = "Continue" }) {
 /**
  * A dialog with a form, shown at once and removed when it closes; what its form does is the
  * caller's. Escape and Cancel close it.
- * @param {{title: string, children: any, buttons: any}} what
- * @returns {HTMLDialogElement}
+ * @param {{title: string, children: any, buttons: any, cancel?: string}} what cancel: words of the button that closes it
  */
-export function sheet({ title, children, buttons }) {
-  const cancel = h("button", { class: "button", type: "button", onClick: () => dialog.close() }, buttons ? "Cancel" : "Close");
+export function sheet({ title, children, buttons, cancel = buttons ? "Cancel" : "Close" }) {
+  const close = h("button", { class: "button", type: "button", onClick: () => dialog.close() }, cancel);
   const dialog = h("dialog", { class: "dialog", "aria-label": title },
-    h("form", { novalidate: true }, h("h2", {}, title), children, h("div", { class: "dialog-foot" }, cancel, buttons)));
+    h("form", { novalidate: true }, h("h2", {}, title), children, h("div", { class: "dialog-foot" }, close, buttons)));
   const before = /** @type {HTMLElement | null} */ (document.activeElement);
   dialog.addEventListener("close", () => {
     dialog.remove();

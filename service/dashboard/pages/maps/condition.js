@@ -4,21 +4,17 @@ import { link } from "../lib/router.js";
 
 const DAY_MS = 86_400_000; // a job that failed before is no news
 
-/**
- * Whether a failed job is news. If no frame of a recording can be used, the page of its upload says why.
- * @param {Object<string, any>} job
- */
+/** Whether a failed job is news. If no frame of a recording can be used, the page of its upload says why. */
 export function isNews(job) {
   return !job.frame_id && !job.followed_by && !job.progress?.recording?.problem && Date.now() - Date.parse(job.finished_at) < DAY_MS;
 }
 
-/** Frames of a map that wait for a worker, or are being signed. @param {Object<string, any>} map */
+/** Frames of a map that wait for a worker, or are being signed. */
 export function waiting(map) {
   return (map.frames.received ?? 0) + (map.frames.signing ?? 0) + (map.reencoding?.left ?? 0);
 }
 
 /**
- * @param {Object<string, any>[]} maps
  * @param {Object<string, any>[]} jobs that failed, other than those that sign frames
  * @returns {{kind: "good" | "bad" | "neutral", text: string, href: string | null}} href: of what failed
  */
@@ -40,7 +36,7 @@ export function conditionOf(maps, jobs) {
   return { kind: "good", text: "Everything is signed; no job failed.", href: null };
 }
 
-/** Frames of a map that have no signature for good. @param {Object<string, any>} map */
+/** Frames of a map that have no signature for good. */
 function lost(map) {
   return (map.frames.failed ?? 0) + (map.reencoding?.dead ?? 0);
 }

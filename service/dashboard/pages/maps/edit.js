@@ -43,11 +43,7 @@ export async function createMap(go, signal, { name: first = "", model: wanted = 
   });
 }
 
-/**
- * Ask for another title; an edit of another is not overwritten unseen.
- * @param {Object<string, any>} map
- * @param {() => Promise<void>} changed
- */
+/** Ask for another title; an edit of another is not overwritten unseen. @param {() => Promise<void>} changed */
 export async function retitleMap(map, changed) {
   let { etag } = map;
   const title = h("input", { id: "new-title", name: "title", autocomplete: "off", maxlength: 200, value: map.title ?? "" });

@@ -1,13 +1,12 @@
 // The fleet: whether all is well, and a card for each map, whose robots and counts move by events.
 import { at, get, watch } from "../lib/api.js";
-import { h, once, put } from "../lib/dom.js";
+import { h, inView, once, put } from "../lib/dom.js";
 import { things } from "../lib/format.js";
 import { may, me } from "../lib/session.js";
 import { coded } from "../lib/prose.js";
 import { empty } from "../lib/states.js";
 import { edit, mapCard } from "./card.js";
 import { conditionOf, isNews } from "./condition.js";
-import { inView } from "./turns.js";
 
 export const styles = ["maps/maps.css"];
 
@@ -16,14 +15,14 @@ const AGAIN_MS = 4000;
 const FAILURES = 50; // jobs that are looked through
 const MANY = 6; // from here on one list costs less than each map for itself
 const FILTER_FROM = 9;
+const AT_ONCE = 3; // cards that are filled
 const RENEW_MS = 60_000; // the last hour moves on without an event
 
 /** See lib/router.js. */
-export async function render(root, { signal, go, title, actions }) {
-  title("Maps");
+export async function render(root, { signal, go, actions }) {
   const cards = new Map();
   const dirty = new Set();
-  const view = inView(signal);
+  const viewed = inView(signal, AT_ONCE);
   const summary = h("p", { class: "muted number", id: "summary" });
   const health = h("p", { class: "fleet-health", role: "status" });
   /** @type {Object<string, any>[]} */
@@ -36,13 +35,13 @@ export async function render(root, { signal, go, title, actions }) {
 
   function draw(items) {
     const names = new Set(items.map((one) => one.name));
-    for (const [name, card] of cards) if (!names.has(name)) { view.leave(card.element); card.element.remove(); cards.delete(name); }
+    for (const [name, card] of cards) if (!names.has(name)) { card.element.remove(); cards.delete(name); }
     for (const one of items) {
       const known = cards.get(one.name);
       if (known) { known.update(one); continue; }
       const card = mapCard(one, { signal, changed: reload });
       cards.set(one.name, card);
-      view.join(card.element, card.fill);
+      viewed(card.element, card.fill);
     }
     items.forEach(({ name }, i) => { // those that stand right stay: moving takes the focus from what is in a card
       const { element } = cards.get(name);

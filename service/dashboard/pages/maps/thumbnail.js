@@ -12,8 +12,7 @@ const TRAIL = 30; // poses of the way of a robot
 const clamp = (share) => Math.min(Math.max(share, 0), 1);
 
 /**
- * @param {string} map
- * @param {AbortSignal} signal
+ * @param {string} map @param {AbortSignal} signal
  * @returns {{element: HTMLElement, load: (come?: Promise<any> | null) => Promise<void>, show: (records: Object<string, any>[]) => void, say: (text: any) => void}}
  *   load: fetch the plan where the last robot was, when `come`, the queries, are there; show: the robots of queries in the order of time; say: what stands in place of a plan
  */

@@ -35,7 +35,6 @@ export async function renderTab(root, { search, signal }) {
  * @param {{map?: string | null, kind?: string | string[] | null, limit: number, older?: boolean, signal: AbortSignal,
  *   onstate?: (state: "live" | "waiting") => void, onevent?: (event: Object<string, any>) => void}} what
  *   older: with a button for those before; limit: shown at first, and without `older` at most
- * @returns {Promise<HTMLElement>}
  */
 export async function events({ map, kind, limit, older = false, signal, onstate, onevent = () => {} }) {
   const list = h("ul", { class: "list events" });

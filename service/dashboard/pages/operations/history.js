@@ -35,14 +35,13 @@ const REQUESTS = {
   title: "Requests per minute", kind: "bars", format: count, least: 1, nothing: "No requests in the last hour",
   series: [
     { name: "answered", colour: "--accent" }, { name: "refused", colour: "--warn" },
-    { name: "busy", colour: "--rival" }, { name: "broken", colour: "--bad" },
+    { name: "busy", colour: "--rival" }, { name: "failed", colour: "--bad" },
   ],
 };
 
 /**
  * Charts of the last hour; of one map, those of its frames alone.
- * @param {boolean} whole
- * @returns {{element: HTMLElement, update: (stats: Object<string, any>) => void}}
+ * @param {boolean} whole @returns {{element: HTMLElement, update: (stats: Object<string, any>) => void}}
  */
 export function history(whole) {
   /** @type {[ReturnType<typeof chart>, (minute: Object<string, any>) => (number | null)[]]} */

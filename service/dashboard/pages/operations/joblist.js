@@ -28,12 +28,7 @@ export function span(s) {
   return s < 1 ? ms(1000 * s) : seconds(s);
 }
 
-/**
- * A job as a row of a list.
- * @param {Object<string, any>} job
- * @param {(job: Object<string, any>) => void} changed after a retry or a cancel, with the new job
- * @returns {HTMLElement}
- */
+/** A job as a row of a list. @param {(job: Object<string, any>) => void} changed after a retry or a cancel, with the new job */
 export function jobRow(job, changed) {
   const about = [
     job.map && h("a", { href: link("maps", job.map), dataset: { part: "map" } }, job.map),
@@ -56,7 +51,7 @@ export function jobRow(job, changed) {
     traceback(job));
 }
 
-/** The traceback, folded. @param {Object<string, any>} job @param {boolean} [open] */
+/** The traceback, folded. @param {boolean} [open] */
 export function traceback(job, open = false) {
   return job.traceback && h("details", { open }, h("summary", { dataset: { part: "traceback" } }, "Traceback of the last attempt"),
     h("pre", { class: "traceback", tabindex: "0", role: "region", "aria-label": "Traceback" }, job.traceback));
@@ -69,11 +64,7 @@ export function progress({ done, total }) {
     h("span", { class: "muted number" }, total === null ? count(done) : `${count(done)} of ${count(total)}`));
 }
 
-/**
- * Buttons of a job, by its state and what the key may.
- * @param {Object<string, any>} job
- * @param {(job: Object<string, any>) => void} changed
- */
+/** Buttons of a job, by its state and what the key may. @param {(job: Object<string, any>) => void} changed */
 export function actions(job, changed) {
   if (job.followed_by) return h("a", { href: link("operations", "jobs", job.followed_by), dataset: { part: "next" } }, "retried");
   const press = (what, told) => async (event) => {
@@ -95,9 +86,7 @@ export function actions(job, changed) {
 
 /**
  * Try again all dead jobs of a map or of all, after asking.
- * @param {string | null} map
- * @param {AbortSignal} signal
- * @param {(text: string) => void} tell how far it is
+ * @param {string | null} map @param {AbortSignal} signal @param {(text: string) => void} tell how far it is
  */
 export async function retryAll(map, signal, tell) {
   const text = h("p", {}, `All dead jobs${map ? ` of map ${map}` : ""} will be queued again with a fresh number of attempts. They may fail again for the same reason.`);

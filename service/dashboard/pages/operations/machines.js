@@ -9,7 +9,7 @@ const card = (id, title, ...children) => h("section", { class: "card", "aria-lab
 /** Names and values of a card. @param {[string, any][]} entries */
 const facts = (entries) => h("dl", { class: "facts" }, entries.map(([name, told]) => h("div", {}, h("dt", {}, name), h("dd", { class: "number" }, told))));
 
-/** Search indexes: version, tail, and the share of the nearest frames that a query finds. @param {Object<string, any>} stats */
+/** Search indexes: version, tail, and the share of the nearest frames that a query finds. */
 function indexes({ indexes: found }) {
   const row = (one) => h("tr", {},
     h("th", { scope: "row" }, h("a", { href: link("maps", one.map), dataset: { part: `map ${one.map}` } }, one.map)),
@@ -29,7 +29,7 @@ function recall({ recall: found }) {
   return h("span", { title: `Measured with ${count(found.sample)} frames; a query compares at least ${count(found.probes)} frames, those whose sketches are nearest` }, percent(found.share));
 }
 
-/** Processes that sign frames, and what each is at. @param {Object<string, any>} stats */
+/** Processes that sign frames, and what each is at. */
 function workers({ workers: found }) {
   return card("workers", "Workers",
     found.length === 0 && h("p", {}, h("span", { class: "badge", dataset: { kind: "bad" } }, "none"), " Frames wait until a worker runs: ", h("code", {}, "sceneprint work"), "."),
@@ -39,14 +39,14 @@ function workers({ workers: found }) {
       one.job_id !== null && h("a", { href: link("operations", "jobs", one.job_id), dataset: { part: `job ${one.name}` } }, "its job")))));
 }
 
-/** The room that the store takes, or one map of it. @param {Object<string, any>} stats */
+/** The room that the store takes, or one map of it. */
 function room({ bytes: found }) {
   const ofMap = found.free === null; // the disk is nobody's in particular
   const parts = [["Uploads and artifacts", found.blobs], [ofMap ? "Signatures" : "Database", found.database], ["Search index", found.index]];
   return card("room", "Disk space", facts((ofMap ? parts : [...parts, ["Free", found.free], ["Disk", found.disk]]).map(([name, size]) => [name, size === null ? "elsewhere" : bytes(size)])));
 }
 
-/** What one map has of what it may have, and for how long. @param {Object<string, any>} stats */
+/** What one map has of what it may have, and for how long. */
 function limits({ use }) {
   const days = use.retention_days;
   return card("limits", "Quota and retention", facts([

@@ -5,11 +5,8 @@ import { may } from "../lib/session.js";
 
 /**
  * A field with the maps of this key; "All maps" where it may read them all, or `all` says so.
- * @param {string | null} chosen
- * @param {AbortSignal} signal
- * @param {(map: string | null) => void} change
+ * @param {string | null} chosen @param {AbortSignal} signal @param {(map: string | null) => void} change
  * @param {boolean} [all]
- * @returns {Promise<HTMLElement>}
  */
 export async function mapField(chosen, signal, change, all = true) {
   const names = (await get("maps", { signal })).items.map((one) => one.name);

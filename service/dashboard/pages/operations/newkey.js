@@ -1,6 +1,6 @@
 // Making a key, and showing its secret the one time that it can be shown.
 import { get, send } from "../lib/api.js";
-import { h } from "../lib/dom.js";
+import { copyFrom, h } from "../lib/dom.js";
 import { saveFrom } from "../lib/form.js";
 import { sheet, toast } from "../lib/states.js";
 
@@ -8,8 +8,7 @@ const SCOPES = [["read", "read: view and query"], ["write", "write: also upload 
 
 /**
  * Ask for a name and grants, and make the key.
- * @param {AbortSignal} signal
- * @param {() => Promise<void>} made
+ * @param {AbortSignal} signal @param {() => Promise<void>} made
  * @param {boolean} isFirst it creates the others, so that it is offered all maps and everything
  */
 export async function newKey(signal, made, isFirst) {
@@ -52,22 +51,9 @@ function grantLine(map, scope) {
 /** The secret, until the dialog is closed: then it is nowhere. */
 function secret(key) {
   const field = h("input", { class: "mono", readonly: true, value: key.secret, "aria-label": "Secret", onFocus: () => field.select() });
-  const copy = h("button", { class: "button", type: "button", onClick: async () => {
-    field.select();
-    try {
-      await navigator.clipboard.writeText(key.secret);
-      toast("Copied");
-    } catch { // not in a page that came over plain http: it is selected, to be copied by hand
-      toast("Selected: press Ctrl+C to copy");
-    }
-  } }, "Copy");
-  const done = h("button", { class: "button primary", type: "button", onClick: () => dialog.close() }, "I have stored it");
-  const dialog = h("dialog", { class: "dialog", "aria-label": `Key ${key.name}` }, h("form", { method: "dialog" },
-    h("h2", {}, `Key ${key.name} was created`),
+  const copy = h("button", { class: "button", type: "button", onClick: async () => toast(await copyFrom(field) ? "Copied" : "Selected: press Ctrl+C to copy") }, "Copy");
+  const dialog = sheet({ title: `Key ${key.name} was created`, cancel: "I have stored it", buttons: null, children: [
     h("p", {}, h("strong", {}, "The secret is shown only once."), " The service stores only its hash. Send it as ", h("code", {}, "Authorization: Bearer SECRET"), "."),
-    h("div", { class: "joined" }, field, copy), h("div", { class: "dialog-foot" }, done)));
-  dialog.addEventListener("close", () => { field.value = ""; dialog.remove(); });
-  document.body.append(dialog);
-  dialog.showModal();
-  field.focus();
+    h("div", { class: "joined" }, field, copy)] });
+  dialog.addEventListener("close", () => { field.value = ""; });
 }

@@ -3,11 +3,8 @@
 /**
  * Ask at once and then every few seconds, as long as the page is seen: a hidden tab asks nothing,
  * and asks at once when it is seen again. Rejected if the first time is; later faults go to
- * `onfault`, and it is tried again. The banner says so where nothing answers, and a key that is
- * taken no more leads to the field for another.
- * @param {() => Promise<void>} ask
- * @param {number} s
- * @param {AbortSignal} signal
+ * `onfault`, and it is tried again. A key that is taken no more leads to the field for another.
+ * @param {() => Promise<void>} ask @param {number} s @param {AbortSignal} signal
  * @param {(error: Error) => void} [onfault]
  * @returns {Promise<() => void>} to be called where there is reason to ask now
  */
@@ -16,7 +13,6 @@ export async function poll(ask, s, signal, onfault = () => {}) {
   let timer = null;
   let asking = false;
   let again = false;
-  let lost = false;
   await ask();
 
   async function turn() {
@@ -26,12 +22,9 @@ export async function poll(ask, s, signal, onfault = () => {}) {
     asking = true;
     try {
       await ask();
-      if (lost) tell("live");
-      lost = false;
     } catch (error) {
       if (signal.aborted) return;
       if (error.status === 401) { Promise.reject(error); return; } // main's, as of any handler
-      if (error.status === 0) { lost = true; tell("waiting"); }
       if (error.name !== "AbortError") onfault(error);
     }
     asking = false;
@@ -47,10 +40,6 @@ export async function poll(ask, s, signal, onfault = () => {}) {
   }, { once: true });
   if (!signal.aborted) timer = setTimeout(turn, 1000 * s);
   return () => { turn(); };
-}
-
-function tell(state) {
-  window.dispatchEvent(new CustomEvent("sceneprint:live", { detail: state }));
 }
 
 /**

@@ -5,7 +5,7 @@ import { gauge } from "./machines.js";
 
 const OLD_S = 300; // a frame that waits longer than this needs attention
 
-/** Tiles for the whole service, or for one map where `whole` is false. @param {boolean} whole @param {Object<string, any>} stats */
+/** Tiles for the whole service, or for one map where `whole` is false. @param {boolean} whole */
 export function tiles(whole, stats) {
   const old = stats.oldest_waiting_s.sign ?? null;
   const shown = [
@@ -23,13 +23,15 @@ function ofService({ workers, total, bytes: { free, disk } }) {
   const full = disk > 0 ? 1 - free / disk : null, bar = full === null ? null : gauge(full);
   return [
     tile("Workers", "workers", count(workers.length), isIdle ? "none running" : `${count(busy)} busy`, isIdle ? "bad" : null),
-    tile("Requests, last hour", "requests", count(total.requests), [part(total.refused, "refused"), part(total.busy, "busy"), part(total.broken, "broken", "bad")]),
+    tile("Requests, last hour", "requests", count(total.requests), [part(total.refused, "refused", "Requests that ask for what is not there or not allowed"),
+      part(total.busy, "busy", "Requests that the service had no capacity for"), part(total.broken, "failed", "Requests that failed through an error of the service", "bad")]),
     tile("Disk", "disk", full === null ? "–" : `${percent(full)} full`, [`${bytes(free)} free of ${bytes(disk)}`, bar], bar?.dataset.kind),
   ];
 }
 
-function part(n, text, kind) {
-  return h("span", { class: "tile-part", dataset: { figure: text, kind: kind && n > 0 ? kind : null } }, `${count(n)} ${text}`);
+/** @param {number} n @param {string} text @param {string} title @param {string} [kind] */
+function part(n, text, title, kind) {
+  return h("span", { class: "tile-part", title, dataset: { figure: text, kind: kind && n > 0 ? kind : null } }, `${count(n)} ${text}`);
 }
 
 function others(frames) {

@@ -21,10 +21,8 @@ function mark(shape, colour) {
 
 /**
  * @param {Object<string, any>} shown see Scene
- * @param {Object<string, any>} details
  * @param {{query: Object<string, any>, match: Object<string, any>}} points
  * @param {Object<string, any> | undefined} tally of the pose that is shown; undefined until it has come
- * @returns {HTMLElement}
  */
 export function legend(shown, details, points, tally) {
   const rows = [], seen = (name) => !shown.hidden.has(name);

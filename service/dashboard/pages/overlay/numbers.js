@@ -35,7 +35,7 @@ export function verdictCard(answer, details) {
     vote && h("p", { class: "overlay-note" }, `The match speaks ${vote}${answer.status === "ambiguous" ? ": the answer is ambiguous" : " than the answer’s"}.`));
 }
 
-/** What the verdict was reached from. @param {Object<string, any>} details */
+/** What the verdict was reached from. */
 export function evidenceCard(details) {
   const v = details.validation, sampled = (details.query?.sampled ?? 0) + (details.match?.sampled ?? 0);
   const residual = v.residual ? `${metres(v.residual.translation_m)}, ${fine(v.residual.rotation_deg)}` : "–";
@@ -57,7 +57,7 @@ export function evidenceCard(details) {
     h("dt", {}, name), h("dd", { class: "number" }, value), h("dd", { class: "overlay-note" }, note)))));
 }
 
-/** Query to match. @param {Object<string, any>} details */
+/** Query to match. */
 export function transformCard(details) {
   const { transform } = details;
   if (!transform) return null;
@@ -85,7 +85,7 @@ function axes(optical, rows) {
       values.map((value) => h("td", { class: "number" }, value))))));
 }
 
-/** How far off it may be. @param {Object<string, any>} details */
+/** How far off it may be. */
 export function uncertaintyCard(details) {
   const { uncertainty, transform } = details;
   if (!uncertainty || !transform) {
@@ -105,7 +105,6 @@ export function uncertaintyCard(details) {
 
 /**
  * Another pose that explains the frames.
- * @param {Object<string, any>} details
  * @param {Object<string, Object<string, any>>} tallies of `tally`, by pose; the rival's may be missing yet
  */
 export function rivalCard(details, tallies) {
@@ -123,7 +122,7 @@ export function rivalCard(details, tallies) {
         h("td", { class: "number" }, share("aligned", key)), h("td", { class: "number" }, share("rival", key)))))));
 }
 
-/** Who was compared. @param {Object<string, any>} answer @param {Object<string, any>} details @param {Object<string, any> | null} frame */
+/** Who was compared. @param {Object<string, any> | null} frame */
 export function framesCard(answer, details, frame, query) {
   const asked = answer.frame;
   const row = (side, name, href, note) => h("li", { dataset: { side } },

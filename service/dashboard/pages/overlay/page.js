@@ -18,8 +18,7 @@ const POSES = { before: "Before", aligned: "Aligned", rival: "Rival" };
 const PARTS = { query: "Query", match: "Match", patches: "Patches", violations: "Violations", cameras: "Sensors", free: "Free directions" };
 
 /**
- * @param {HTMLElement} root
- * @param {Object<string, any>} context of the router
+ * @param {HTMLElement} root @param {Object<string, any>} context of the router
  * @param {Object<string, any>} told the answer, the match's details, points under its transform, both frames
  *   (null where they are not, or not kept), addresses, and how points under another are loaded
  */

@@ -27,8 +27,7 @@ export class Scene {
    * @param {Object<string, {query: import("../viewer/points.js").Points, match: any}>} sets points
    *   with residuals, by pose
    * @param {{query: Object<string, any> | null, match: Object<string, any> | null}} cameras intrinsics
-   * @param {Shown} shown
-   * @param {() => void} changed the share or the pose has
+   * @param {Shown} shown @param {() => void} changed the share or the pose has
    */
   constructor(viewer, details, sets, cameras, shown, changed) {
     this.viewer = viewer;
@@ -186,10 +185,7 @@ function violating(points) {
   return out.filter((_, i) => i % STRIDE === 0);
 }
 
-/**
- * What the points of both say, counted.
- * @param {Uint32Array[]} counts of `residualCounts`, of both clouds
- */
+/** What the points of both say, counted. @param {Uint32Array[]} counts of `residualCounts`, of both clouds */
 export function tally(counts) {
   const sum = (low, high) => counts.reduce(
     (total, one) => total + one.subarray(low, high + 1).reduce((a, b) => a + b, 0), 0);

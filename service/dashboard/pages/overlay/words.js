@@ -34,7 +34,6 @@ export function apart(a, b) {
  * A direction in which the transform is hardly held.
  * @param {Object<string, any>} free with translation, rotation and deviation
  * @param {boolean} optical
- * @returns {string}
  */
 export function freedom({ translation, rotation, deviation }, optical) {
   const parts = [];

@@ -11,7 +11,7 @@ import { EDGES } from "./scene.js";
 /** @param {Object<string, any>} edge of the API @returns {string} kind of EDGES */
 export const kindOf = (edge) => (edge.consistent === null ? "unchecked" : edge.consistent ? "consistent" : "inconsistent");
 
-/** Name of an association in a list. @param {Object<string, any>} one */
+/** Name of an association in a list. */
 export function titleOf(one) {
   const sessions = one.request.sessions.map((name, i) => (one.request.robots?.[i] ? `${name} (${one.request.robots[i]})` : name));
   const what = sessions.length === 1 ? `${sessions[0]}, loops` : sessions.join(" – ");
@@ -63,9 +63,7 @@ function progress(one) {
 
 /**
  * Ask which runs to associate, and begin it.
- * @param {string} map
- * @param {import("./data.js").Run[]} runs
- * @param {(begun: Object<string, any>) => void} onbegun
+ * @param {string} map @param {import("./data.js").Run[]} runs @param {(begun: Object<string, any>) => void} onbegun
  */
 export function begin(map, runs, onbegun) {
   const options = (first) => runs.map((one, i) => h("option", { value: i, selected: i === first }, one.robot === null || one.robot === one.session ? one.session : `${one.session} (${one.robot})`));
@@ -89,9 +87,7 @@ export function begin(map, runs, onbegun) {
 
 /**
  * Ask, and undo the join of an association.
- * @param {string} map
- * @param {string} id
- * @returns {Promise<boolean>} whether it was undone
+ * @param {string} map @param {string} id @returns {Promise<boolean>} whether it was undone
  */
 export async function undo(map, id) {
   const text = "Poses are again as they were sent, each in its own parent frame. The service does not join these frames again by itself.";

@@ -13,9 +13,10 @@ const COLOURS = 8;
 export const MOST_EDGES = 2000;
 
 /**
- * @typedef {{session: string, robot: string | null, parent: string, number: number, colour: number, frames: number,
+ * @typedef {{session: string, robot: string | null, parent: string, number: number, colour: number, frames: number, isVirtual: boolean,
  *   first: string | null, last: string | null}} Run
- *   number: its place in the list of sessions; colour: of those of paths.css; frames: of the session, with those that have no pose
+ *   number: its place in the list of sessions; colour: of those of paths.css; frames: of the session, with those that have no pose;
+ *   isVirtual: views rendered of a whole map, which no robot took on one way
  * @typedef {Run & {ids: string[], times: number[], poses: number[][], posed: number, leftOut: number,
  *   camera: Object<string, number> | null, isCloud: boolean, stamps: "captured" | "sequence" | "received" | null}} Path
  *   poses: T_parent_sensor, 16 column-major; times: seconds, or places in the session where stamps are `sequence`
@@ -43,7 +44,7 @@ export function runsOf(sessions) {
     } else {
       for (const parent of one.parent_frames) {
         runs.push({
-          session: one.session, robot: one.robot, parent, frames, number: runs.length, colour: 0,
+          session: one.session, robot: one.robot, parent, frames, number: runs.length, colour: 0, isVirtual: one.tags.includes("virtual"),
           first: one.first_captured_at, last: one.last_captured_at,
         });
       }
@@ -53,7 +54,7 @@ export function runsOf(sessions) {
   return { runs, without };
 }
 
-/** The frame that most frames have poses in; null without runs. @param {Run[]} runs @returns {string | null} */
+/** The frame that most frames have poses in; null without runs. @param {Run[]} runs */
 export function commonest(runs) {
   const counts = new Map();
   for (const one of runs) counts.set(one.parent, (counts.get(one.parent) ?? 0) + one.frames);
@@ -76,8 +77,7 @@ export async function sessionsOf(map, signal) {
 
 /**
  * The poses of a run, thinned to a share of what is drawn in all.
- * @param {string} map @param {Run} run
- * @param {number} share of so many runs
+ * @param {string} map @param {Run} run @param {number} share of so many runs
  * @returns {Promise<Path>}
  */
 export async function pathOf(map, run, share, signal) {

@@ -39,10 +39,7 @@ export const nameOf = (run) => run.session;
 
 const poses = ({ ids, posed }) => (ids.length < posed ? `${count(ids.length)} of ${count(posed)} poses` : things(posed, "pose"));
 
-/**
- * What of the map is not in the picture, in words.
- * @param {{name: string, frames: number, why: string}[]} without
- */
+/** What of the map is not in the picture, in words. @param {{name: string, frames: number, why: string}[]} without */
 export function leftOut(without) {
   if (!without.length) return null;
   return h("details", { class: "paths-left", open: without.length <= 4 },

@@ -4,21 +4,6 @@
 export const NEAR_PX = 28;
 
 /**
- * Where points are on a canvas.
- * @param {ArrayLike<number>} clip 16, column-major: world to clip coordinates
- * @param {number} width @param {number} height of the canvas, CSS pixels
- * @returns {(p: number[]) => [number, number, number] | null} x, y and depth; null behind the eye
- */
-export function projector(clip, width, height) {
-  return ([x, y, z]) => {
-    const at = (r) => clip[r] * x + clip[4 + r] * y + clip[8 + r] * z + clip[12 + r];
-    const w = at(3);
-    if (w <= 0) return null;
-    return [((at(0) / w + 1) / 2) * width, ((1 - at(1) / w) / 2) * height, w];
-  };
-}
-
-/**
  * The point whose projection is nearest; of two that are about as near, the one before the other.
  * @param {Iterable<number[]>} points of the world
  * @param {(p: number[]) => [number, number, number] | null} project

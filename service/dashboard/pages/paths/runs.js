@@ -9,6 +9,7 @@ import { plain } from "../lib/prose.js";
 import { go } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { toast } from "../lib/states.js";
+import { axesFor, uprightOf } from "../plan/axes.js";
 import { multiply, ofRows } from "../viewer/matrix.js";
 import { askedPanel } from "./asked.js";
 import { associationsPanel, begin, kindOf, undo } from "./associations.js";
@@ -16,29 +17,11 @@ import { chooser } from "./card.js";
 import { commonest, edgesOf, MOST_DRAWN, MOST_RUNS, pathOf } from "./data.js";
 import { bridges, reach } from "./joined.js";
 import { leftOut, legend } from "./legend.js";
-import { placeOf, upright } from "./shapes.js";
+import { placeOf } from "./shapes.js";
 import { edgesTable, runsTable } from "./tables.js";
 
 export class Runs {
   #paths = new Map(); // by run, as they were fetched
-  /** @type {ReturnType<typeof chooser>} */
-  card;
-  /** @type {HTMLSelectElement} */
-  parents;
-  /** @type {HTMLSelectElement} */
-  ups;
-  /** @type {HTMLInputElement} */
-  together;
-  /** @type {HTMLElement} */
-  said;
-  /** @type {HTMLElement} */
-  asks;
-  /** @type {HTMLElement} */
-  runsBox;
-  /** @type {HTMLElement} */
-  joinsBox;
-  /** @type {HTMLElement} */
-  words;
   /** @type {any[]} */
   #drawn = [];
   #hidden = new Set();
@@ -82,11 +65,6 @@ export class Runs {
     const over = this.associations.find((one) => one.state === "succeeded");
     this.association = wanted === null ? over ?? null : this.associations.find((one) => one.job_id === wanted) ?? null;
     this.up = ["z", "y", "-y"].includes(search.get("up") ?? "") ? search.get("up") : null;
-    this.#build();
-    for (const one of this.associations.filter(goesOn)) this.#follow(one.job_id);
-  }
-
-  #build() {
     this.card = chooser({
       map: this.map, signal: this.signal, onchoose: (one) => this.choose(one),
       onapproach: () => { const one = this.card.chosen; if (one) this.scene.approach(this.#drawn[one.path].world[one.place]); },
@@ -105,6 +83,7 @@ export class Runs {
         h("label", { class: "field" }, h("span", {}, "Up axis"), this.ups)),
       h("label", { class: "paths-check" }, this.together, h("span", {}, "Include frames joined to it by associations")),
       this.runsBox);
+    for (const one of this.associations.filter(goesOn)) this.#follow(one.job_id);
   }
 
   /** Draw another parent frame. @param {string} parent */
@@ -130,8 +109,8 @@ export class Runs {
     });
     this.#hidden = new Set();
     if (!early) {
-      const poses = this.#drawn.flatMap((one) => one.world.map((matrix) => ({ matrix, isCloud: one.isCloud })));
-      this.onframe(this.parent, this.#reached, this.up, () => ({ origin: poses.length ? placeOf(poses[0].matrix) : [0, 0, 0], up: upright(poses) }));
+      const above = uprightOf(this.#drawn.map((one) => ({ poses: one.world, isCloud: one.isCloud }))), [first] = this.#drawn;
+      this.onframe(this.parent, this.#reached, this.up, () => ({ origin: first ? placeOf(first.world[0]) : [0, 0, 0], up: { above, ahead: axesFor(above).y } }));
     }
     this.scene.show(this.#drawn);
     this.card.paths(this.#drawn);

@@ -7,12 +7,12 @@ import { letterOf } from "../query/alternatives.js";
 import { Orbit, VIEW } from "../viewer/camera.js";
 import { colourOf } from "../viewer/colours.js";
 import { around } from "../viewer/layers.js";
-import { dot } from "../viewer/matrix.js";
-import { links } from "../viewer/shapes.js";
+import { boxAbout, dot } from "../viewer/matrix.js";
+import { crosses, links } from "../viewer/shapes.js";
 import { createViewer, frustum } from "../viewer/viewer.js";
-import { nearest, projector } from "./pick.js";
+import { nearest } from "./pick.js";
 import {
-  boxAbout, copies, dashes, ellipsoid, grid, hollow, nice, placeOf, polyline, reachAlong, spaced,
+  copies, dashes, ellipsoid, grid, hollow, nice, placeOf, polyline, reachAlong, spaced,
 } from "./shapes.js";
 
 const FRUSTUMS = 160, CLOSEST = 16; // at first, and how many times as many when one is near
@@ -130,7 +130,8 @@ export class Scene {
     this.#size = Math.max(size, 0.5) * 0.035;
     this.#ground();
     paths.forEach((one, i) => {
-      this.#viewer.lines(`path ${i}`, { positions: polyline(one.world.map((m) => this.near(placeOf(m)))), tint: tintOf(one), width: 2 });
+      const places = one.world.map((m) => this.near(placeOf(m)));
+      this.#viewer.lines(`path ${i}`, { positions: one.isVirtual ? crosses(places, this.#size / 4) : polyline(places), tint: tintOf(one), width: 2 });
     });
     this.#ratio = 0;
     this.#thin(1);
@@ -174,7 +175,7 @@ export class Scene {
   hide(hidden) {
     this.#hidden = hidden;
     this.#drawn.forEach((_, i) => {
-      for (const kind of ["path", "frustums"]) this.#viewer.lines(`${kind} ${i}`, { visible: !hidden.has(i) });
+      for (const id of [`path ${i}`, `frustums ${i}`]) if (this.#viewer.has(id)) this.#viewer.lines(id, { visible: !hidden.has(i) });
     });
     this.#moved();
   }
@@ -266,11 +267,9 @@ export class Scene {
 
   /** Places less the origin to CSS pixels of the canvas, and metres ahead of the eye. */
   projector() {
-    const { clientWidth, clientHeight } = this.canvas, { orbit } = this.#viewer;
-    const flat = projector(this.#viewer.clip, clientWidth, clientHeight);
-    const eye = orbit.eye(), { ahead } = orbit.axes();
+    const { orbit, projector } = this.#viewer, eye = orbit.eye(), { ahead } = orbit.axes();
     return (p) => {
-      const seen = flat(p);
+      const seen = projector(p);
       return seen && /** @type {[number, number, number]} */ ([seen[0], seen[1], dot(ahead, p) - dot(ahead, eye)]);
     };
   }
@@ -281,6 +280,7 @@ export class Scene {
     this.#ratio = ratio;
     const total = this.#drawn.reduce((sum, one) => sum + one.world.length, 0);
     this.#drawn.forEach((one, i) => {
+      if (one.isVirtual) return; // thousands of views, all around: their places say enough
       const share = Math.max(Math.ceil((FRUSTUMS * ratio * one.world.length) / Math.max(total, 1)), 2);
       const size = this.#size / Math.sqrt(ratio), chosen = spaced(one.world.map(placeOf), 0.7 * size, share);
       const positions = copies(this.#sensor(one, size), chosen.map((k) => this.moveOrigin(one.world[k])));
@@ -331,8 +331,8 @@ export class Scene {
     const length = nice(60 / perMetre);
     this.#parts.bar.style.setProperty("width", `${length * perMetre}px`);
     put(this.#parts.scaleText, metres(length));
-    const seen = this.#labels.map(({ path, at }) => {
-      const place = this.#hidden.has(path) ? null : this.#viewer.project(at);
+    const project = this.#viewer.projector, seen = this.#labels.map(({ path, at }) => {
+      const place = this.#hidden.has(path) ? null : project(at);
       return place === null || place[0] < 0 || place[1] < 0 || place[0] > this.canvas.clientWidth || place[1] > height ? null : place;
     });
     const shown = this.#labels.flatMap((one, i) => (seen[i] ? [{ node: one.node, ...one.size, x: seen[i][0], y: seen[i][1] }] : []));

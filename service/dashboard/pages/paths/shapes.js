@@ -9,7 +9,7 @@ export const SIGMAS = Math.sqrt(7.8147);
 /** @param {number[]} m a pose, 16 column-major @returns {number[]} where it is */
 export const placeOf = (m) => [m[12], m[13], m[14]];
 
-/** A segment from each place to the next. @param {number[][]} places @returns {Float32Array} */
+/** A segment from each place to the next. @param {number[][]} places */
 export function polyline(places) {
   const out = new Float32Array(6 * Math.max(places.length - 1, 0));
   for (let i = 1; i < places.length; i += 1) {
@@ -92,19 +92,6 @@ export function nice(x) {
   return power * ([1, 2, 5, 10].find((step) => step * power >= x * (1 - 1e-9)) ?? 10);
 }
 
-/** The box about places; null about none. @param {number[][]} places */
-export function boxAbout(places) {
-  if (!places.length) return null;
-  const low = [...places[0]], high = [...places[0]];
-  for (const p of places) {
-    for (let k = 0; k < 3; k += 1) {
-      low[k] = Math.min(low[k], p[k]);
-      high[k] = Math.max(high[k], p[k]);
-    }
-  }
-  return { low, high };
-}
-
 /** From where to where a box reaches along a direction. @param {{low: number[], high: number[]}} box
  * @param {number[]} axis of unit length */
 export function reachAlong({ low, high }, axis) {
@@ -141,21 +128,6 @@ export function grid(box, { right, ahead, above }, height, origin) {
 }
 
 /**
- * What is up, as cameras are mostly held upright: the axis that theirs is nearest to on average.
- * @param {{matrix: number[], isCloud: boolean}[]} poses of the sensors in the frame of the picture
- * @returns {"z" | "y" | "-y"}
- */
-export function upright(poses) {
-  let y = 0, z = 0;
-  for (const { matrix, isCloud } of poses) {
-    y += isCloud ? matrix[9] : -matrix[5];
-    z += isCloud ? matrix[10] : -matrix[6];
-  }
-  if (z >= Math.abs(y)) return "z";
-  return y > 0 ? "y" : "-y";
-}
-
-/**
  * Axes of a normal error: eigenvalues and eigenvectors of a symmetric matrix, by Jacobi's rotations.
  * @param {number[][]} covariance 3 x 3
  * @returns {{deviation: number, axis: number[]}[]} the longest first
@@ -185,8 +157,7 @@ export function axesOf(covariance) {
 
 /**
  * The three great circles of an ellipsoid about the origin.
- * @param {{deviation: number, axis: number[]}[]} axes
- * @param {number} sigmas half an axis, in deviations
+ * @param {{deviation: number, axis: number[]}[]} axes @param {number} sigmas half an axis, in deviations
  */
 export function ellipsoid(axes, sigmas = SIGMAS, parts = 48) {
   const out = [];

@@ -14,7 +14,7 @@ export function runsTable(paths, parent) {
     h("td", { class: "mono" }, one.parent), h("td", {}, one.parent === parent ? "its own" : "joined"),
     h("td", { class: "number" }, count(one.posed)), h("td", { class: "number" }, count(one.ids.length)),
     h("td", { class: "number" }, count(one.leftOut - (one.posed - one.ids.length))),
-    h("td", { class: "number" }, wayOf(one.poses)),
+    h("td", { class: "number" }, one.isVirtual ? "–" : wayOf(one.poses)),
     h("td", {}, one.stamps === "captured" ? time(iso(one.times[0])) : "–")));
   return h("div", { class: "paths-scroll", tabindex: "0", role: "region", "aria-label": "Runs shown" }, h("table", { class: "table" },
     h("caption", { class: "visually-hidden" }, "Runs shown"),

@@ -30,8 +30,7 @@ const CHANGES = new Set(["events.missed", "frame.indexed", "frame.deleted", "fra
 /** Frames are told from so far below the plan to so far above it, metres. */
 const TALL = 1000;
 
-export async function render(root, { params: { map }, search, signal, go, title }) {
-  title(map);
+export async function render(root, { params: { map }, search, signal, go }) {
   const stage = h("div", { class: "paths-stage" });
   const scene = createScene(stage, { signal, onview: () => place?.looked() });
   const surface = new Surface({ map, signal, scene, onready: () => place?.measured() });
@@ -74,12 +73,6 @@ function nothing(map, without) {
 class Place {
   /** @type {Timer} */
   #timer = null;
-  /** @type {any} elements */
-  bar;
-  /** @type {any} */
-  notice;
-  /** @type {any[]} */
-  views = [];
 
   constructor(root, told) {
     const { map, search, signal, go, stage, scene, surface } = told;
@@ -110,11 +103,6 @@ class Place {
       stage, scene, surface, onframe: (one) => this.runs.choose(one), onspot: (spot) => this.#spot(spot),
       onbox: (corners) => this.#boxed(corners), onplan: () => this.#turn(true),
     });
-    this.#build(root, stage);
-    signal.addEventListener("abort", () => { clearTimeout(this.#timer); this.robots.stop(); }, { once: true });
-  }
-
-  #build(root, stage) {
     const button = (text, onClick, id) => h("button", { class: "button", type: "button", id, onClick }, text);
     this.views = [[true, "Plan"], [false, "3-D"]].map(([flat, text]) => h("button", {
       class: "button", type: "button", "aria-pressed": flat === this.flat, onClick: () => this.#turn(Boolean(flat)),
@@ -126,6 +114,7 @@ class Place {
     put(root, h("div", { class: "paths" },
       h("div", { class: "paths-main" }, this.bar, this.notice, stage, this.tools.said, this.robots.bar, this.spot.element, this.runs.card.element, this.runs.words),
       h("div", { class: "paths-side" }, this.runs.asks, this.shades.element, this.robots.section, this.runs.section, this.runs.joinsBox), this.runs.said));
+    signal.addEventListener("abort", () => { clearTimeout(this.#timer); this.robots.stop(); }, { once: true });
   }
 
   /** Draw it, and follow what happens. */

@@ -64,24 +64,6 @@ export class Robots {
   #near = null;
   /** @type {string | null | undefined} the period that the list of periods tells */
   #period;
-  /** @type {any} elements of the section */
-  list;
-  /** @type {any} */
-  none;
-  /** @type {any} elements of the time line */
-  slider;
-  /** @type {any} */
-  told;
-  /** @type {any} */
-  play;
-  /** @type {any} */
-  period;
-  /** @type {any} */
-  live;
-  /** @type {any} */
-  bar;
-  /** @type {any} */
-  dates;
 
   /**
    * @param {{map: string, signal: AbortSignal, search: URLSearchParams,
@@ -98,13 +80,9 @@ export class Robots {
     this.until = when("until");
     /** @type {string | null} the time that is shown; null: the latest */
     this.at = when("at");
-    this.#build();
     window.addEventListener("sceneprint:theme", () => this.draw(), { signal });
     signal.addEventListener("abort", () => clearTimeout(this.#player), { once: true });
     this.#later = throttle(() => this.#newest(), TOGETHER_MS, signal);
-  }
-
-  #build() {
     this.list = h("ul", { class: "place-robots" });
     this.none = h("p", { class: "muted" });
     this.slider = h("input", { type: "range", id: "place-time", min: 1, max: 1, value: 1, "aria-label": "Time", onInput: () => { this.stop(); this.#go(Number(this.slider.value)); }, onChange: () => this.onchange() });
@@ -160,7 +138,7 @@ export class Robots {
     const tokens = robotTokens(robotsOf(this.#records).map((one) => one.name)); // those of all times: none changes its colour
     for (const one of robots) one.token = tokens.get(one.name);
     put(this.list, robots.map((one) => this.#row(one)));
-    if (held) [...this.list.querySelectorAll("[aria-label]")].find((one) => one.getAttribute("aria-label") === held)?.focus();
+    if (held) /** @type {HTMLElement | null} */ (this.list.querySelector(`[aria-label="${CSS.escape(held)}"]`))?.focus();
     this.#marks(robots);
   }
 

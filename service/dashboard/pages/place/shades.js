@@ -9,10 +9,7 @@ const MOST_SESSIONS = 12;
 /** Steps from the lowest height to the highest. */
 const STEPS = 100;
 
-/**
- * @param {import("./surface.js").Surface} surface
- * @param {() => void} onchange the address follows
- */
+/** @param {import("./surface.js").Surface} surface @param {() => void} onchange the address follows */
 export function shades(surface, onchange) {
   const select = h("select", { id: "place-colour", onChange: () => { surface.paint({ colour: select.value }); draw(); onchange(); } },
     COLOURS.map(([value, text]) => h("option", { value, selected: value === surface.colour }, text)));

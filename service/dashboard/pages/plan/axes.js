@@ -44,8 +44,7 @@ export function nameOf(axis) {
 
 /**
  * The ellipse on the plan that holds 95 % of the errors of a place.
- * @param {Axes} axes
- * @param {number[]} covariance 36 numbers, row by row; of the place: the upper left 3 x 3
+ * @param {Axes} axes @param {number[]} covariance 36 numbers, row by row; of the place: the upper left 3 x 3
  * @returns {{long: number, short: number, angle: number}} half axes, metres; angle of the long one, rad
  */
 export function ellipseOf(axes, covariance) {

@@ -13,7 +13,7 @@ const LEAST_M = 4; // that places lie apart, for what is shown about them
 const SAME = 0.999; // cosine of two axes that are one
 
 /**
- * @typedef {{session: string, robot: string | null, ids: string[], poses: number[][], places: import("./plan.js").Place[]}} Run
+ * @typedef {import("../paths/data.js").Path & {places: import("./plan.js").Place[]}} Run
  * @typedef {{map: string, parent: string, axes: import("./axes.js").Axes, runs: Run[], left: number, surface: Object<string, any> | null}} Backdrop
  *   left: runs in this parent frame that are not among them; surface: of this parent frame, as the API tells it
  */
@@ -49,7 +49,7 @@ async function backdropOf(map, wanted, signal) {
   if (parent === null || (paths.length === 0 && fused === null)) return null;
   const axes = fused ? { x: fused.x_axis, y: fused.y_axis } : axesFor(told.up ? [told.up.x, told.up.y, told.up.z] : uprightOf(paths));
   return { map, parent, axes, left: own.length - paths.length, surface: fused,
-    runs: paths.map(({ session, robot, ids, poses }) => ({ session, robot, ids, poses, places: poses.map((m) => flat(axes, placeOf(m))) })) };
+    runs: paths.map((run) => ({ ...run, places: run.poses.map((m) => flat(axes, placeOf(m))) })) };
 }
 
 /** The surface of a map, as the API tells it. @param {string} map @param {AbortSignal} signal */
@@ -104,7 +104,7 @@ export function unseen(error) {
  */
 export function drawBackdrop(plan, { map, axes, runs, surface }, signal) {
   if (surface) laySurface(plan, axes, map, surface, signal).catch(unseen);
-  plan.mark("runs", ({ x, y }) => runs.map(({ places }) =>
+  plan.mark("runs", ({ x, y }) => runs.filter((one) => !one.isVirtual).map(({ places }) =>
     svg("path", { class: "plan-run", d: linePath(places.map((_, i) => i), (i) => x(places[i][0]), (i) => y(places[i][1])) })));
   plan.mark("frames", ({ x, y }) => svg("path", { class: "plan-frames", d: dots(runs.flatMap((one) => one.places), x, y) }));
 }

@@ -110,14 +110,6 @@ export class Plan {
     this.#later();
   }
 
-  /** Look at a place, not farther than so many metres to either side. @param {Place} at @param {number} reach */
-  approach(at, reach) {
-    this.#centre = [...at];
-    this.#scale = Math.min(Math.max(this.#scale, Math.min(...this.#size) / 2 / reach), CLOSEST);
-    this.#isFitted = false;
-    this.#later();
-  }
-
   /** @param {number} factor @param {[number, number]} [at] pixels that stay where they are */
   zoom(factor, at = [this.#size[0] / 2, this.#size[1] / 2]) {
     const [u, v] = this.place(at);

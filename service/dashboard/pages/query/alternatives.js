@@ -9,12 +9,7 @@ export const letterOf = (i) => String.fromCharCode(65 + i);
 
 const SAME = { metres: 0.25, degrees: 15 }; // votes so near each other are for one place
 
-/**
- * Which pose a match speaks for, where that is not the answer's.
- * @param {Object<string, any>} answer
- * @param {Object<string, any>} match one of it
- * @returns {string | null}
- */
+/** Which pose a match speaks for, where that is not the answer's. @param {Object<string, any>} match one of it */
 export function voteOf({ location, alternatives }, { pose_in_map: own, validation }) {
   if (!own || !["accepted", "ambiguous"].includes(validation.status)) return null;
   const isFor = (pose) => {
@@ -30,7 +25,6 @@ export function voteOf({ location, alternatives }, { pose_in_map: own, validatio
  * The list, for a wide card and a narrow one.
  * @param {Object<string, any>[]} alternatives of an answer
  * @param {(i: number) => any} [view] of the map near an alternative
- * @returns {HTMLElement}
  */
 export function alternativesList(alternatives, view = () => null) {
   const [first] = alternatives;

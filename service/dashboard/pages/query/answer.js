@@ -7,7 +7,6 @@ import { empty, soon } from "../lib/states.js";
 import { backdrops } from "../plan/backdrop.js";
 import { repeat } from "./asking.js";
 import { pickFrame } from "./picker.js";
-import { recall } from "./recent.js";
 import { again, showAnswer } from "./result.js";
 import { thumbs } from "./thumbs.js";
 import { mapOf } from "./words.js";
@@ -26,7 +25,7 @@ export async function render(root, { params, search, signal, go, title, actions,
   } catch (error) {
     come();
     if (error.status !== 404) throw error;
-    put(root, notKept(params.query));
+    put(root, notKept());
     return;
   }
   come();
@@ -58,12 +57,10 @@ function asked(question) {
       : "Default options.");
 }
 
-function notKept(id) {
-  const address = recall(id);
+function notKept() {
   return empty({
     title: "This answer has expired",
-    text: ["Answers expire after some weeks, or earlier if space runs out. The id may also be wrong, or your key may not see it.",
-      !address && " Send the frame again from the page of its map."],
-    actions: [address && h("a", { class: "button primary", href: address }, "Repeat the query"), h("a", { class: "button", href: "#/" }, "All maps")],
+    text: "Answers expire after some weeks, or earlier if space runs out. The id may also be wrong, or your key may not see it. Send the frame again from the page of its map.",
+    actions: h("a", { class: "button", href: "#/" }, "All maps"),
   });
 }

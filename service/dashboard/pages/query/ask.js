@@ -9,7 +9,6 @@ import { ask } from "./asking.js";
 import { controls } from "./controls.js";
 import { fieldsOf, fromOptions, fromSearch, toOptions, toSearch } from "./options.js";
 import { gallery } from "./picker.js";
-import { remember } from "./recent.js";
 import { showAnswer } from "./result.js";
 import { chooser } from "./source.js";
 import { thumbs } from "./thumbs.js";
@@ -21,16 +20,14 @@ export const styles = ["query/query.css", "query/alternatives.css", "plan/plan.c
 const PAUSE_MS = 250;
 
 /** @param {HTMLElement} root @param {Object<string, any>} context see main.js */
-export async function render(root, { params, search, signal, go, title }) {
-  title(`Query ${params.map}`);
+export async function render(root, { params, search, signal, go, about }) {
   const come = soon(root, "Loading the map");
   const [map, models, sessions, question] = await Promise.all([
-    get(at("maps", params.map), { signal }), get("models", { signal }),
+    about, get("models", { signal }),
     get(`${at("maps", params.map)}/sessions`, { params: { limit: 100 }, signal }).catch(() => ({ items: [] })),
     search.get("query") ? get(`${at("queries", search.get("query"))}/question`, { signal }).catch(kept) : null,
   ]);
   come();
-  if (map.title) title(`Query ${map.title}`);
   const page = new Page({ root, params, search, signal, go, map, question, fields: fieldsOf(models.items.find((one) => one.label === map.model) ?? null),
     sessions: sessions.items.map((one) => one.session).filter(Boolean) });
   page.show();
@@ -146,7 +143,7 @@ class Page {
     try {
       const options = { ...toOptions(this.said, this.rest), explain: true, explain_frame: this.why, record: false }; // no robot asks
       const answer = await this.answered(source, options, signal);
-      remember(answer.query_id, this.follow(answer));
+      this.follow(answer);
       this.panel.refuse([]);
       const shown = await showAnswer(this.result, answer, {
         signal: this.signal, turn: signal, pictures: this.pictures, backdrops: this.backdrops, seen: this.seen, onseen: () => this.follow(answer), before: this.answer, chosen: this.choice?.chosen ?? null,
@@ -191,13 +188,11 @@ class Page {
   /** The address that asks the same. A file is in no address: the answer to it is. */
   follow(answer) {
     const source = this.source;
-    if (!source) return "";
+    if (!source) return;
     const query = source.query ?? (source.file ? answer?.query_id : undefined);
     const maps = this.maps === "*" || this.maps.join() !== this.map ? { maps: this.maps === "*" ? "*" : this.maps.join() } : {};
     const own = query ? { query } : source.frame ? { frame: source.frame.frame_id } : {};
-    const address = link("maps", this.map, "query", { ...own, ...maps, ...toSearch(this.said), why: this.seen.why ? "open" : null, match: this.seen.match });
-    this.go(address, { replace: true, quiet: true });
-    return address;
+    this.go(link("maps", this.map, "query", { ...own, ...maps, ...toSearch(this.said), why: this.seen.why ? "open" : null, match: this.seen.match }), { replace: true, quiet: true });
   }
 
   say(text) { put(this.state, text); }

@@ -12,10 +12,8 @@ import { fill, plain } from "./options.js";
 /**
  * Ask once.
  * @param {Source} source `query` is set when a file has been asked: the next time it is not sent
- * @param {string[] | "*"} maps
- * @param {Object<string, any>} options of `toOptions`
- * @param {AbortSignal} signal
- * @returns {Promise<Object<string, any>>} the answer
+ * @param {string[] | "*"} maps @param {Object<string, any>} options of `toOptions`
+ * @param {AbortSignal} signal @returns {Promise<Object<string, any>>} the answer
  */
 export async function ask(source, maps, options, signal) {
   if (source.query) {
@@ -44,9 +42,7 @@ export async function ask(source, maps, options, signal) {
 
 /**
  * Repeat an earlier query.
- * @param {string} id
- * @param {string[] | "*"} maps
- * @param {Object<string, any>} options all of them; null for a default
+ * @param {string} id @param {string[] | "*"} maps @param {Object<string, any>} options all of them; null for a default
  * @param {AbortSignal} signal
  */
 export async function repeat(id, maps, options, signal) {

@@ -23,7 +23,6 @@ const STAGES = [["prepare", "Prepare"], ["retrieve", "Retrieve"], ["diversify", 
 
 /**
  * The counts of an answer as steps.
- * @param {Object<string, any>} answer
  * @returns {HTMLElement & {lose: (at: string | null | undefined) => void}} lose: mark where a frame
  *   was lost; null where it was not, undefined for no frame
  */

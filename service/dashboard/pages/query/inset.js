@@ -1,8 +1,8 @@
 // The query laid on one of its matches, beside the plan; the page of the overlay has all the rest.
-import { h, put } from "../lib/dom.js";
+import { h, inView, put } from "../lib/dom.js";
 import { frameLabel, metres, percent } from "../lib/format.js";
 import { link } from "../lib/router.js";
-import { failed, loading } from "../lib/states.js";
+import { fill } from "../lib/states.js";
 import { overlayParts, sensorsOf } from "../overlay/parts.js";
 import { keyOf, statusOf } from "./words.js";
 
@@ -41,15 +41,8 @@ export function overlayInset(answer, { pictures, choice, signal, wanted = null, 
     open.href = link("queries", answer.query_id, "matches", match.frame_id, { map: match.map });
     put(told, h("span", { class: "badge", dataset: { kind } }, text), " ", overlap !== null && `overlap ${percent(overlap)}`,
       residual && `, residual ${metres(residual.translation_m)}`);
-    put(stage, loading("Loading the overlay"));
     put(poses);
-    try {
-      await draw(stage, poses, answer, match, own.signal);
-    } catch (error) {
-      if (error.name === "AbortError" || own.signal.aborted) return;
-      if (error.status === 401) throw error;
-      put(stage, failed(error, () => { shown = null; show(key); }));
-    }
+    await fill(stage, () => draw(stage, poses, answer, match, own.signal), "Loading the overlay");
   }
 
   choice.hear((_, chosen) => { if (chosen !== null) show(chosen); });
@@ -58,13 +51,7 @@ export function overlayInset(answer, { pictures, choice, signal, wanted = null, 
     h("div", { class: "query-inset-foot" }, h("ul", { class: "plan-key", "aria-label": "Colours" },
       h("li", {}, h("span", { class: "query-swatch", dataset: { side: "query" } }), "Query"), h("li", {}, h("span", { class: "query-swatch", dataset: { side: "match" } }), "Match")), told));
   // when it is looked at: the service validates the match for it
-  const watcher = new IntersectionObserver((entries) => {
-    if (!entries.some((one) => one.isIntersecting)) return;
-    watcher.disconnect();
-    if (shown === null && !signal.aborted) show(laid.some((one) => keyOf(one) === wanted) ? wanted : keyOf(laid[0]));
-  });
-  watcher.observe(element);
-  signal.addEventListener("abort", () => watcher.disconnect(), { once: true });
+  inView(signal)(element, () => { if (shown === null) show(laid.some((one) => keyOf(one) === wanted) ? wanted : keyOf(laid[0])); });
   return element;
 }
 

@@ -1,17 +1,12 @@
 // Keep an answer until it is released, and the link that shares it.
 import { at, get, send } from "../lib/api.js";
-import { h, once, put } from "../lib/dom.js";
+import { copyFrom, h, once, put } from "../lib/dom.js";
 import { time } from "../lib/format.js";
 import { link } from "../lib/router.js";
 import { may } from "../lib/session.js";
 import { toast } from "../lib/states.js";
 
-/**
- * A button that keeps an answer; of one that is kept its link, and a button that releases it.
- * @param {Object<string, any>} answer
- * @param {AbortSignal} signal
- * @returns {HTMLElement}
- */
+/** A button that keeps an answer; of one that is kept its link, and a button that releases it. @param {AbortSignal} signal */
 export function keepPanel(answer, signal) {
   const query = at("queries", answer.query_id), path = `${query}/keep`;
   const mayKeep = answer.maps.length > 0 && answer.maps.every((map) => may("write", map));
@@ -47,17 +42,12 @@ export function keepPanel(answer, signal) {
   }
 
   async function copy() {
-    const address = new URL(link("queries", answer.query_id), location.href).href;
-    try {
-      await navigator.clipboard.writeText(address);
-      toast("The link was copied.");
-    } catch { // no permission, or a page without TLS: whoever asked can copy it by hand
-      const field = h("input", { class: "mono", readonly: true, value: address, "aria-label": "Link to this answer" });
-      place.querySelector("input")?.remove();
-      place.append(field);
-      field.focus();
-      field.select();
-    }
+    const field = h("input", { class: "mono", readonly: true, value: new URL(link("queries", answer.query_id), location.href).href, "aria-label": "Link to this answer" });
+    place.querySelector("input")?.remove();
+    if (await copyFrom(field)) { toast("The link was copied."); return; }
+    place.append(field);
+    field.focus();
+    field.select();
   }
 
   get(`${query}/question`, { signal }).then(draw, (error) => {

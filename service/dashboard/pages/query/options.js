@@ -22,9 +22,9 @@ export const FIELDS = [
   { name: "candidates", group: "search", label: "Candidates", kind: "range", min: 1, max: 200, step: 1, default: 10,
     hint: "Number of ranked frames to select and validate, about 20 ms each. Default: 10, or the number of matches if larger." },
   { name: "stages", group: "search", label: "Stages", kind: "choice", default: "retrieve,diversify,validate",
-    choices: [["retrieve,diversify,validate", "VDR: rank, diversify, validate"], ["retrieve,validate", "VR: rank, validate"],
-      ["retrieve,diversify", "DR: rank, diversify"], ["retrieve", "R: rank"]],
-    hint: "As named in the paper." },
+    choices: [["retrieve,diversify,validate", "Rank, diversify, validate"], ["retrieve,validate", "Rank, validate"],
+      ["retrieve,diversify", "Rank, diversify"], ["retrieve", "Rank"]],
+    hint: "VDR, VR, DR and R of the paper." },
   { name: "exact", group: "search", label: "Compare every frame", kind: "flag", default: false,
     hint: "Makes a difference only in very large maps and with PostgreSQL search, which skip some frames otherwise." },
   { name: "seed", group: "search", label: "Seed", kind: "number", min: 0, max: 4294967295, step: 1, default: 0,
@@ -98,7 +98,7 @@ export function fromSearch(search) {
   return said;
 }
 
-/** As an address has it: what is not default. @param {Object<string, any>} said */
+/** As an address has it: what is not default. */
 export function toSearch(said) {
   return Object.fromEntries(Object.entries(said).filter(([name, value]) => name in OWN && value !== null && value !== ""));
 }
@@ -122,7 +122,6 @@ export function fromOptions(options) {
 
 /**
  * Options as JSON, null for a default.
- * @param {Object<string, any>} said
  * @param {Object<string, any>} [rest] more of the filter
  * @returns {Object<string, any>}
  */
@@ -144,7 +143,7 @@ export function plain(options) {
   return Object.fromEntries(Object.entries(options).filter(([, value]) => value !== null && value !== undefined));
 }
 
-/** As a form has them, beside the file. @param {FormData} form @param {Object<string, any>} options */
+/** As a form has them, beside the file. @param {FormData} form */
 export function fill(form, options) {
   for (const [name, value] of Object.entries(plain(options))) {
     form.append(name, typeof value === "object" && !Array.isArray(value) ? JSON.stringify(value) : String(value));

@@ -8,9 +8,7 @@ const A_PAGE = 12;
 
 /**
  * Indexed frames, the newest first, a few at a time.
- * @param {string} map
- * @param {{pictures: any, signal: AbortSignal, onpick: (id: string) => void}} how
- * @returns {HTMLElement}
+ * @param {string} map @param {{pictures: any, signal: AbortSignal, onpick: (id: string) => void}} how
  */
 export function gallery(map, { pictures, signal, onpick }) {
   const grid = h("ol", { class: "query-picker-grid" });
@@ -56,8 +54,7 @@ export function gallery(map, { pictures, signal, onpick }) {
 
 /**
  * The same in a dialog.
- * @param {string} map
- * @param {{pictures: any, signal: AbortSignal, title?: string}} how
+ * @param {string} map @param {{pictures: any, signal: AbortSignal, title?: string}} how
  * @returns {Promise<string | null>} the id of a frame; null where none was picked
  */
 export function pickFrame(map, { pictures, signal, title = "Pick a frame" }) {

@@ -11,9 +11,7 @@ const WAITING = { queued: "Waiting for a workerâ€¦", running: "Fusing the viewsâ
 
 /**
  * A card that starts a reconstruction, and shows one that was started; the address says which.
- * @param {Object<string, any>} answer
- * @param {AbortSignal} signal
- * @returns {HTMLElement | null} null where there is nothing to fuse
+ * @param {AbortSignal} signal @returns {HTMLElement | null} null where there is nothing to fuse
  */
 export function reconstructionPanel(answer, signal) {
   const accepted = answer.matches.filter((one) => one.validation.status === "accepted");

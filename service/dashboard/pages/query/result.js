@@ -28,8 +28,7 @@ const shown = new WeakMap(); // element -> what ends the answer in it: a canvas 
 
 /**
  * Show an answer in an element: the verdict, then where that is and what it was matched with, then why.
- * @param {Element} root
- * @param {Object<string, any>} answer
+ * @param {Element} root @param {Object<string, any>} answer
  * @param {{signal: AbortSignal, turn?: AbortSignal, isOwnPage?: boolean, pictures: any, backdrops: any, ask: (frame: string) => Promise<any>,
  *   chosen?: string | null, before?: Object<string, any> | null, change?: (said: any) => void, pick?: () => Promise<string | null>,
  *   seen?: Seen, onseen?: (seen: Seen) => void}} how
@@ -89,7 +88,7 @@ async function fillReasons(root, answer, { signal, turn = signal, pictures, befo
     rows(answer, ranked, { pictures, choice: looked, before }),
     whyNot(answer, { ask, choice: looked, funnel: steps, change, pick }),
     h("div", { class: "query-below" }, steps, map));
-  heat(map, answer, { alike, ranked }, looked, signal, turn);
+  heat(map, answer, { alike, ranked }, looked, turn);
 }
 
 /** To where it is asked again with other options. */
@@ -158,7 +157,7 @@ function fromSimilarities(answer, alike) {
   return { ranking: frames, told: frames.every((one) => one.distance !== undefined) };
 }
 
-function heat(root, answer, { alike, ranked }, looked, signal, turn) {
+function heat(root, answer, { alike, ranked }, looked, turn) {
   if (answer.counts.ranked === 0) { root.hidden = true; return; }
   const ranks = new Map(ranked.ranking.map((one) => [keyOf(one), one.rank]));
   const isSelected = new Set(answer.matches.filter((one) => one.selected).map(keyOf));
@@ -193,7 +192,7 @@ function heat(root, answer, { alike, ranked }, looked, signal, turn) {
     const marked = new Set(keys.flatMap((key, i) => (isSelected.has(key) ? [i + 1] : [])));
     const rank = (i) => ranks.get(keys[i]) ?? i + 1; // frames deleted since are left out
     shown = heatmap({
-      values: similarity, signal, marked,
+      values: similarity, marked,
       names: ["the query", ...frames.map((one, i) => `${rank(i)}: frame ${frameLabel({ ...one, name: names[i] })}${marked.has(i + 1) ? ", selected" : ""}`)],
       ticks: ["Q", ...frames.map((_, i) => String(rank(i)))],
       label: gist(similarity), format: percent, size: Math.max(240, Math.min(560, body.clientWidth)),

@@ -16,7 +16,6 @@ let view = "depth"; // as it was chosen last, for the next answer
  * @param {{ranking: any[], told: boolean}} ranked the ranking; told: with distances and reasons
  * @param {{pictures: any, choice: any, before?: Object<string, any> | null}} shown before: the answer
  *   that this one replaces
- * @returns {HTMLElement}
  */
 export function rows(answer, ranked, { pictures, choice, before = null }) {
   const several = answer.maps.length > 1;
@@ -50,7 +49,7 @@ export function rows(answer, ranked, { pictures, choice, before = null }) {
       line("DR", isSelection ? "Diverse selection" : "Diversification was not requested", isSelection
         ? `${count(selected.length)} of ${count(answer.counts.ranked)} ranked` : "",
       isSelection ? selected : [], (one) => [
-        h("span", { class: "query-figure" }, h("span", { class: "muted" }, "gain "), number(one.diversity_gain)), bar(one.diversity_gain)],
+        h("span", { class: "query-figure" }, h("span", { class: "muted", title: "How much the frame added to the selection when it was selected: more for a near frame that resembles none of the others" }, "gain "), number(one.diversity_gain)), bar(one.diversity_gain)],
       (one) => `selected, with a gain of ${number(one.diversity_gain)}`),
       line("VDR", validated.length ? "Validated, best first" : isTried ? "Nothing was validated" : "Validation was not requested", validated.length
         ? `${count(answer.counts.accepted)} of ${count(answer.counts.validated)} accepted${skipped ? `, ${skipped} not tried` : ""}` : "",
@@ -66,7 +65,7 @@ export function rows(answer, ranked, { pictures, choice, before = null }) {
     const list = h("ol", { class: `query-tiles ${size}`, "aria-label": `${name}: ${title}` },
       frames.map((one) => tile(one, tell(one), name)));
     const element = h("section", { class: "query-row", "aria-label": name, dataset: { row: name } },
-      h("div", { class: "query-row-head" }, h("h3", {}, name), h("span", { class: "query-row-title" }, title), h("span", { class: "muted number query-row-title" }, tally), trace),
+      h("div", { class: "query-row-head" }, h("h3", {}, title), h("span", { class: "muted", title: "Name of this row in the paper" }, name), h("span", { class: "muted number query-row-title" }, tally), trace),
       list);
     return Object.assign(element, { trace, list, fates: new Map(frames.map((one) => [keyOf(one), fate(one)])), name });
   }

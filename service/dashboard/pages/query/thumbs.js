@@ -1,7 +1,7 @@
 // Previews of frames on tiles. One frame stands in several rows, and rows are drawn anew with every
 // answer: each picture is fetched and decoded once, and only when its tile comes into view.
 import { at } from "../lib/api.js";
-import { h } from "../lib/dom.js";
+import { h, inView } from "../lib/dom.js";
 import { bitmapOf, drawPicture } from "../lib/picture.js";
 
 const WIDTH = 192;
@@ -14,15 +14,7 @@ const MOST = 400;
  */
 export function thumbs(signal) {
   const known = new Map(); // path and view -> promise of a bitmap
-  const waiting = new WeakMap(); // canvas -> what draws it
-  const watcher = new IntersectionObserver((entries) => {
-    for (const { target, isIntersecting } of entries) {
-      if (!isIntersecting) continue;
-      watcher.unobserve(target);
-      waiting.get(target)?.();
-    }
-  }, { rootMargin: "200px" });
-  signal.addEventListener("abort", () => watcher.disconnect(), { once: true });
+  const viewed = inView(signal);
 
   function bitmap(path, view) {
     const name = `${view} ${path}`;
@@ -38,8 +30,7 @@ export function thumbs(signal) {
 
   function canvas(path, view, alt) {
     const element = h("canvas", { role: "img", "aria-label": alt, width: WIDTH, height: WIDTH * 3 / 4, class: "query-thumb" });
-    waiting.set(element, () => drawPicture(element, bitmap(path, view), alt));
-    watcher.observe(element);
+    viewed(element, () => drawPicture(element, bitmap(path, view), alt));
     return element;
   }
 

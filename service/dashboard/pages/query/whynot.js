@@ -25,7 +25,6 @@ const LOST = {
  * @param {{ask: (frame: string) => Promise<any>, choice: any, funnel: any, change?: (said: any) => void,
  *   pick?: () => Promise<string | null>}} how ask: again, with that frame explained; change: other options,
  *   where there are controls; pick: lets a frame of the map be picked
- * @returns {HTMLElement}
  */
 export function whyNot(answer, { ask, choice, funnel, change, pick }) {
   const typed = h("input", { type: "text", id: "why-frame", class: "mono", autocomplete: "off", spellcheck: "false", required: true, list: "why-known" });

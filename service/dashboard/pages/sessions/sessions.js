@@ -17,7 +17,7 @@ const AGAIN_MS = 5000;
 const COLUMNS = [["Session"], ["Robot"], ["Frames", 1], ["With pose", 1], ["Captured (UTC)"], ["Duration", 1], ["Tags"]];
 
 /** The page: #/maps/NAME/sessions; see lib/router.js. */
-export async function render(root, { params, signal, title, actions }) {
+export async function render(root, { params, signal, actions }) {
   const path = at("maps", params.map);
   const canWrite = may("write", params.map);
   const body = h("tbody", {});
@@ -104,8 +104,7 @@ export async function render(root, { params, signal, title, actions }) {
 
   const heard = () => { if (!signal.aborted) timer ??= setTimeout(again, SOON_MS); };
   signal.addEventListener("abort", () => clearTimeout(timer), { once: true });
-  const named = get(path, { signal }).then((map) => { title(map.title ?? params.map); });
-  await Promise.all([named, look()]);
+  await look();
   actions(canWrite && h("a", { class: "button primary", href: link("maps", params.map, "upload") }, "Upload frames"));
   let began = false;
   watch({

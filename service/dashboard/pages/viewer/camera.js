@@ -1,6 +1,6 @@
 // Where one looks from: an orbit about a target. Angles in radians, lengths in metres.
 
-import { add, cross, dot, multiply, parallel, perspective, scale, transformed, viewOf } from "./matrix.js";
+import { add, cornersOf, cross, dot, multiply, parallel, perspective, scale, transformed, viewOf } from "./matrix.js";
 
 /** Angle of view from top to bottom. */
 export const VIEW = (45 * Math.PI) / 180;
@@ -74,8 +74,7 @@ export class Orbit {
 
   /**
    * Keep looking the same way, from as near as shows all of some points.
-   * @param {number[][]} points
-   * @param {number} aspect width / height
+   * @param {number[][]} points @param {number} aspect width / height
    */
   fit(points, aspect) {
     const axes = this.axes(), [x, y, z] = [axes.right, axes.above, axes.ahead]
@@ -105,15 +104,13 @@ export class Orbit {
 
   /**
    * World to clip coordinates.
-   * @param {number} aspect
-   * @param {{low: number[], high: number[]}} box of all there is: it is never cut off behind
+   * @param {number} aspect @param {{low: number[], high: number[]}} box of all there is: it is never cut off behind
    */
-  projection(aspect, { low, high }) {
+  projection(aspect, box) {
     const { right, above, ahead } = this.axes(), eye = this.eye();
     const view = viewOf(eye, right, above, ahead);
     let farthest = this.distance, closest = this.distance;
-    for (let corner = 0; corner < 8; corner += 1) {
-      const p = low.map((x, k) => ((corner >> k) & 1 ? high[k] : x));
+    for (const p of cornersOf(box)) {
       const depth = -transformed(view, p)[2];
       [farthest, closest] = [Math.max(farthest, depth), Math.min(closest, depth)];
     }

@@ -3,7 +3,7 @@
 
 import { BESIDE } from "./colours.js";
 import { Layer, paletteTexture } from "./layers.js";
-import { transformed } from "./matrix.js";
+import { cornersOf as corners, transformed } from "./matrix.js";
 
 const MODES = { height: 0, session: 1, seen: 2, age: 3 };
 /** Bytes of a cell. */
@@ -37,8 +37,7 @@ export class CellsLayer extends Layer {
   }
 
   samples() {
-    const { low, high } = /** @type {any} */ (this.extent);
-    return Array.from({ length: 8 }, (_, i) => low.map((x, k) => ((i >> k) & 1 ? high[k] : x)));
+    return corners(this.extent);
   }
 
   free(gl) {
@@ -53,7 +52,7 @@ export class CellsLayer extends Layer {
 
   #buffers(gl, { name, data }) {
     const known = this.#held.get(name), every = this.every ?? 1, stride = every * STRIDE;
-    if (known?.every === every) return known;
+    if (known && known.every === every) return known;
     if (known) this.#drop(gl, name, known);
     const made = { array: gl.createVertexArray(), buffer: gl.createBuffer(), count: Math.ceil(Math.floor(data.byteLength / STRIDE) / every), every };
     gl.bindVertexArray(made.array);
@@ -105,7 +104,7 @@ export function isInView({ matrix, span }, clip, margin) {
 
 /** @param {{matrix: number[], span: number}} tile @returns {number[][]} in the picture's frame */
 export const cornersOf = ({ matrix, span }) =>
-  Array.from({ length: 8 }, (_, i) => transformed(matrix, [0, 1, 2].map((k) => ((i >> k) & 1 ? span : 0))).slice(0, 3));
+  corners({ low: [0, 0, 0], high: [span, span, span] }).map((p) => transformed(matrix, p).slice(0, 3));
 
 /** Where a cell is, metres from the corner of its tile. @param {{data: ArrayBuffer, span: number}} tile @param {number} i */
 export function placeIn({ data, span }, i) {
@@ -115,8 +114,7 @@ export function placeIn({ data, span }, i) {
 
 /**
  * The cell in front at a place of the canvas.
- * @param {Tile[]} tiles
- * @param {(p: number[]) => number[] | null} project see `projector` of paths/pick.js
+ * @param {Tile[]} tiles @param {(p: number[]) => number[] | null} project see `projector` of paths/pick.js
  * @param {{x: number, y: number, near: number, allowed: (p: number[]) => boolean}} where near: CSS
  *   pixels from there at most; allowed: by its place in the picture's frame
  * @returns {{tile: Tile, cell: number} | null}

@@ -31,8 +31,7 @@ export function colourOf(tint) {
 
 /**
  * Colours for so many patches that neighbours in the list differ: the golden angle apart.
- * @param {number} count
- * @returns {Uint8Array} red, green, blue of each
+ * @param {number} count @returns {Uint8Array} red, green, blue of each
  */
 export function manyColours(count) {
   const out = new Uint8Array(3 * count);

@@ -2,82 +2,32 @@
 // the context is lost.
 
 import { BESIDE, STEPS, VIOLATES, colourOf, manyColours } from "./colours.js";
-import { identity, transformed } from "./matrix.js";
+import { boxAbout, cornersOf, identity, transformed } from "./matrix.js";
 import { boxOf, someOf } from "./points.js";
 
 const MODES = { tint: 0, normal: 1, patch: 2, residual: 3, height: 4 };
 const unit = (bytes) => bytes.map((x) => x / 255);
 
 /** The box about a box that has been moved. */
-export function movedBox({ low, high }, matrix) {
-  const out = { low: [Infinity, Infinity, Infinity], high: [-Infinity, -Infinity, -Infinity] };
-  for (let corner = 0; corner < 8; corner += 1) {
-    const p = transformed(matrix, low.map((x, k) => ((corner >> k) & 1 ? high[k] : x)));
-    for (let k = 0; k < 3; k += 1) {
-      out.low[k] = Math.min(out.low[k], p[k]);
-      out.high[k] = Math.max(out.high[k], p[k]);
-    }
-  }
-  return out;
-}
+export const movedBox = (box, matrix) => boxAbout(cornersOf(box).map((p) => transformed(matrix, p)));
 
-export class Layer {
-  /** Bounds of what is drawn, null of nothing, and some of its points, before its matrix;
-   * undefined: to be computed. @type {any} */
-  own;
-  /** @type {number[][] | undefined} */
-  some;
-  // of a cloud, see Viewer.cloud
-  /** @type {any} see points.js */
-  points;
-  /** @type {Uint8Array | undefined} */
-  patchColours;
-  /** @type {keyof typeof MODES | undefined} */
-  colour;
-  /** @type {number | undefined} */
-  size;
-  /** @type {number | undefined} */
-  shade;
-  // of shapes, see Viewer.lines
-  /** @type {any} numbers */
-  positions;
-  /** @type {ArrayLike<number> | undefined} */
-  colours;
-  /** @type {number | undefined} */
-  width;
-  /** @type {number | undefined} */
-  alpha;
-  onTop = false;
-  // of cells, see cells.js
-  /** @type {import("./cells.js").Tile[] | undefined} */
-  tiles;
-  /** @type {number | undefined} every how many-th cell is drawn, up to 31 */
-  every;
-  /** @type {{low: number[], high: number[]} | undefined} all there is, whether it is drawn or not */
-  extent;
-  /** @type {Uint8Array | undefined} rgb of each session */
-  palette;
-  /** @type {number[] | undefined} that the colours of heights reach from and to */
-  heights;
-  /** @type {number[] | null | undefined} what is lower or higher is not drawn */
-  cut;
-  /** @type {number | undefined} greatest code of times seen that colours reach to */
-  most;
-  /** @type {number[] | undefined} codes of times that colours reach from and to */
-  ages;
-  // of both
-  /** @type {any} a token's name, or red, green, blue */
-  tint;
-  /** @type {string} */
-  kind;
-  /** @type {any} buffers of the context */
-  made = null;
-  /** @type {boolean | undefined} whether the buffers hold what is to be drawn */
-  fresh = false;
+/** Places of numbers, three each. */
+const placesOf = (numbers) => Array.from({ length: numbers.length / 3 }, (_, i) => numbers.slice(3 * i, 3 * i + 3));
+
+/** What a layer is set to has names of its own: see `cloud`, `lines`, `triangles` and `cells` of the viewer. */
+const Named = /** @type {new () => any} */ (Object);
+
+export class Layer extends Named {
+  /** @type {any} */
+  made;
+  /** @type {any} */
+  fresh;
 
   constructor(told) {
-    this.visible = true;
-    this.matrix = identity();
+    super();
+    // own, some: bounds, null of nothing, and some points, before the matrix, once computed; made: buffers
+    // of the context; fresh: whether they hold what is to be drawn
+    Object.assign(this, { own: undefined, some: undefined, made: null, fresh: false, onTop: false, visible: true, matrix: identity() });
     this.set(told);
   }
 
@@ -219,21 +169,11 @@ export class ShapeLayer extends Layer {
   bounds() {
     const p = this.positions;
     if (!p?.length) return null;
-    const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
-    for (let i = 0; i < p.length; i += 1) {
-      low[i % 3] = Math.min(low[i % 3], p[i]);
-      high[i % 3] = Math.max(high[i % 3], p[i]);
-    }
-    return { low, high };
+    return boxAbout(placesOf(p));
   }
 
   samples() {
-    const { positions: p, own: { low, high } } = this, out = [];
-    if (p.length > 3000) { // their box will do
-      for (let i = 0; i < 8; i += 1) out.push(low.map((x, k) => ((i >> k) & 1 ? high[k] : x)));
-    }
-    for (let i = 0; i < p.length && p.length <= 3000; i += 3) out.push([p[i], p[i + 1], p[i + 2]]);
-    return out;
+    return this.positions.length > 3000 ? cornersOf(this.own) : placesOf(this.positions); // of many their box will do
   }
 
   upload(gl) {
@@ -316,12 +256,5 @@ function fourTimes(values, size) {
 }
 
 /** The box about some boxes, null about none. @param {({low, high} | null)[]} boxes */
-export function around(boxes) {
-  const there = boxes.filter((one) => one !== null);
-  if (!there.length) return null;
-  return {
-    low: [0, 1, 2].map((k) => Math.min(...there.map((one) => one.low[k]))),
-    high: [0, 1, 2].map((k) => Math.max(...there.map((one) => one.high[k]))),
-  };
-}
+export const around = (boxes) => boxAbout(boxes.flatMap((one) => (one === null ? [] : [one.low, one.high])));
 

@@ -32,10 +32,25 @@ export const add = (a, b) => a.map((x, k) => x + b[k]);
 export const subtract = (a, b) => a.map((x, k) => x - b[k]);
 export const scale = (a, s) => a.map((x) => x * s);
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-export const length = (a) => Math.hypot(...a);
 export const cross = (a, b) => [
   a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
 ];
+
+/** The box about places; null about none. @param {ArrayLike<number>[]} places */
+export function boxAbout(places) {
+  if (!places.length) return null;
+  const low = [Infinity, Infinity, Infinity], high = low.map((x) => -x);
+  for (const p of places) {
+    for (let k = 0; k < 3; k += 1) {
+      low[k] = Math.min(low[k], p[k]);
+      high[k] = Math.max(high[k], p[k]);
+    }
+  }
+  return { low, high };
+}
+
+/** The eight corners of a box. @param {{low: number[], high: number[]}} box */
+export const cornersOf = ({ low, high }) => Array.from({ length: 8 }, (_, i) => low.map((x, k) => ((i >> k) & 1 ? high[k] : x)));
 
 /**
  * World to an eye that looks along -z with y up, as WebGL has it.

@@ -47,11 +47,7 @@ export function parsePoints(data) {
   };
 }
 
-/**
- * One point, for counting and for tests; drawing never asks.
- * @param {Points} points
- * @param {number} i
- */
+/** One point, for counting and for tests; drawing never asks. @param {Points} points @param {number} i */
 export function pointAt(points, i) {
   const at = points.offset + i * points.stride;
   const view = new DataView(points.data, at, points.stride);
@@ -64,11 +60,7 @@ export function pointAt(points, i) {
   };
 }
 
-/**
- * How many points have each residual.
- * @param {Points} points
- * @returns {Uint32Array} 256 counts
- */
+/** How many points have each residual. @param {Points} points @returns {Uint32Array} 256 counts */
 export function residualCounts(points) {
   const counts = new Uint32Array(256), bytes = new Uint8Array(points.data, points.offset);
   for (let at = 11; at < bytes.length; at += points.stride) counts[bytes[at]] += 1;
@@ -78,8 +70,7 @@ export function residualCounts(points) {
 /**
  * The box that holds all but the outermost points along each axis: a stray return far out must not
  * make the rest a dot.
- * @param {Points} points
- * @param {number} share left out on either side
+ * @param {Points} points @param {number} share left out on either side
  * @returns {{low: number[], high: number[]}} in the points' own coordinates
  */
 export function boxOf(points, share = 0.05) {
@@ -97,12 +88,7 @@ export function boxOf(points, share = 0.05) {
   return { low, high };
 }
 
-/**
- * Some points, spread over all of them.
- * @param {Points} points
- * @param {number} most
- * @returns {number[][]}
- */
+/** Some points, spread over all of them. @param {Points} points @param {number} most @returns {number[][]} */
 export function someOf(points, most = 400) {
   const step = Math.max(1, Math.ceil(points.count / most)), out = [];
   for (let i = 0; i < points.count; i += step) out.push(pointAt(points, i).position);

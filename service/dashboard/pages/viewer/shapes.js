@@ -35,10 +35,7 @@ function ring(radius, parts = 32) {
   return new Float32Array(out);
 }
 
-/**
- * Crosses along the three axes.
- * @param {number[][]} points @param {number} size metres from tip to tip
- */
+/** Crosses along the three axes. @param {number[][]} points @param {number} size metres from tip to tip */
 export function crosses(points, size) {
   const out = new Float32Array(18 * points.length), half = size / 2;
   points.forEach((p, i) => {

@@ -182,14 +182,18 @@ export class Viewer {
     this.canvas.setAttribute("aria-label", `${this.label}. ${this.orbit.flat ? PLAN_KEYS : KEYS}`);
   }
 
-  /** Where a point of the world is on the canvas: CSS pixels from its left and top, and metres
-   * before the eye; null behind it. */
-  project(point) {
-    const [x, y, , w] = transformed(this.#clip(), point);
-    if (w <= 0) return null;
-    const { clientWidth, clientHeight } = this.canvas;
-    return [((x / w + 1) / 2) * clientWidth, ((1 - y / w) / 2) * clientHeight, w];
+  /** Where points of the world are on the canvas: CSS pixels from its left and top, and metres
+   * before the eye; null behind it. @returns {(p: number[]) => [number, number, number] | null} */
+  get projector() {
+    const { clip, canvas: { clientWidth, clientHeight } } = this;
+    return (point) => {
+      const [x, y, , w] = transformed(clip, point);
+      return w <= 0 ? null : [((x / w + 1) / 2) * clientWidth, ((1 - y / w) / 2) * clientHeight, w];
+    };
   }
+
+  /** @param {number[]} point see `projector` */
+  project(point) { return this.projector(point); }
 
   /** Whether a graphics card draws, as far as the browser tells. */
   get isFast() {
@@ -205,7 +209,8 @@ export class Viewer {
 
   /** World to clip coordinates; 16, column-major. */
   get clip() {
-    return this.#clip();
+    const seen = [...this.#layers.values()].filter((one) => one.visible).map((one) => one.box);
+    return this.orbit.projection(this.#aspect(), around(seen) ?? NOTHING);
   }
 
   redraw() {
@@ -276,11 +281,6 @@ export class Viewer {
     return (this.canvas.clientWidth || 1) / (this.canvas.clientHeight || 1);
   }
 
-  #clip() {
-    const seen = [...this.#layers.values()].filter((one) => one.visible).map((one) => one.box);
-    return this.orbit.projection(this.#aspect(), around(seen) ?? NOTHING);
-  }
-
   #heights() {
     const above = this.orbit.above, heights = [];
     for (const one of this.#layers.values()) {
@@ -301,7 +301,7 @@ export class Viewer {
       canvas.width = width;
       canvas.height = height;
     }
-    const clip = this.#clip();
+    const { clip } = this;
     const view = {
       clip, density, heights: this.#heights(), pixelsAtOneMetre: height / 2 / Math.tan(VIEW / 2),
     };
