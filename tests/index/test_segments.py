@@ -109,7 +109,7 @@ def test_what_is_open_stays_open(walk, published, tmp_path):
     assert (len(first.segments[0]), len(third.segments[0])) == (100, 99)
 
 
-@settings(max_examples=25)
+@settings(max_examples=40)
 @given(data=st.data(), flat=st.sampled_from([0, 1 << 30]), seed=st.integers(0, 999))
 def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, flat, seed):
     """New, signed anew, deleted and indexed again, in any order, against a dict of all frames."""
