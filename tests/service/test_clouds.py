@@ -175,7 +175,7 @@ BAD = {
     "KITTI unsaid": (TEN.astype("<f4").tobytes(), {}, 422, "unreadable-frame", "format=kitti"),
     "a PNG said to be points": (b"\x89PNG\r\n\x1a\n", {"format": "ply"}, 422,
                                 "unreadable-cloud", ""),
-    "NaN": (npy(np.full((20, 3), np.nan)), {}, 422, "useless-frame", "20 of 20"),
+    "NaN": (npy(np.full((20, 3), np.nan)), {}, 422, "useless-frame", "0 of 20 points are valid"),
     "far": (npy(TEN * 1e6), {}, 422, "unreadable-cloud", "units_per_metre"),
     "viewpoint": (npy(TEN), {"viewpoint": "1,2"}, 422, "invalid-request", "`viewpoint`"),
     "a camera": (write_ply(TEN), {"fx": 1, "fy": 1, "cx": 0, "cy": 0, "width": 5, "height": 2},
