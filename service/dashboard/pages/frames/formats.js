@@ -8,7 +8,7 @@ export const FORMATS = [
   {"kind": "cloud", "name": "las", "title": "LAS, LAZ", "suffixes": [".las", ".laz"], "signature": "LASF"},
   {"kind": "cloud", "name": "npy", "title": "NPY", "suffixes": [".npy"], "signature": "\\x93NUMPY[\\s\\S]{4,6}(?=[^}]*'descr': *'[<>]f[248]')(?=[^}]*'shape': *\\(\\d+L?, *[34]L?,? *\\))"},
   {"kind": "cloud", "name": "kitti", "title": "KITTI .bin", "suffixes": [".bin"], "signature": ""},
-  {"kind": "cloud", "name": "pointcloud2", "title": "PointCloud2 in CDR", "suffixes": [".cdr"], "signature": "\\x00[\\x00\\x01]\\x00[\\x00-\\x03](?=[\\s\\S]*?(?:\\x02\\x00\\x00\\x00|\\x00\\x00\\x00\\x02)x\\x00)(?=[\\s\\S]*?(?:\\x02\\x00\\x00\\x00|\\x00\\x00\\x00\\x02)y\\x00)(?=[\\s\\S]*?(?:\\x02\\x00\\x00\\x00|\\x00\\x00\\x00\\x02)z\\x00)"},
+  {"kind": "cloud", "name": "pointcloud2", "title": "PointCloud2 in CDR", "suffixes": [".cdr"], "signature": "\\x00[\\x00\\x01]\\x00[\\x00-\\x03](?=[\\s\\S]*?(?:\\x02\\x00\\x00\\x00|\\x00\\x00\\x00\\x02)[xX]\\x00)(?=[\\s\\S]*?(?:\\x02\\x00\\x00\\x00|\\x00\\x00\\x00\\x02)[yY]\\x00)(?=[\\s\\S]*?(?:\\x02\\x00\\x00\\x00|\\x00\\x00\\x00\\x02)[zZ]\\x00)"},
   {"kind": "depth", "name": "png", "title": "PNG", "suffixes": [".png"], "signature": "\\x89PNG\\r\\n\\x1a\\n"},
   {"kind": "depth", "name": "npy", "title": "NPY", "suffixes": [".npy"], "signature": "\\x93NUMPY(?:[^}]*'shape': *\\((?=\\d+, *(\\d+)\\))(\\d+))?"},
   {"kind": "depth", "name": "pfm", "title": "PFM", "suffixes": [".pfm"], "signature": "Pf[\\n\\r ]+(?:(\\d+) +(\\d+))?"},
