@@ -106,5 +106,7 @@ def test_what_asks_for_no_wait_is_not_waited_for(served, small_shots, prefer):
 def test_a_list_of_maps_is_the_maps_one_by_one(served):
     """The list counts frames, poses and queries of all maps together."""
     listed = served.client.get("/v1/maps").json()["items"]
+    # the counts of a map whose frames are being signed may change between the requests
+    listed = [one for one in listed if one["frames"].keys() <= {"indexed"}]
     assert any(one["frames"].get("indexed") for one in listed)
     assert listed == [served.client.get(f"/v1/maps/{one['name']}").json() for one in listed]
