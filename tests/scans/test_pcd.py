@@ -54,7 +54,7 @@ LIES = {
     "more than there are": (
         b"12\nHEIGHT 1\nV",
         b"1\nHEIGHT 12\nDATA binary\nV",
-        "from the viewpoint",
+        "so the type, byte order",
     ),
     "doubles for floats": (b"SIZE 4 4 4 8 2", b"SIZE 8 4 4 8 2", "360 of 504 bytes follow"),
     "a negative count": (b"WIDTH 12", b"WIDTH -12", "WIDTH '-12'"),
