@@ -107,13 +107,14 @@ def test_it_holds_one_state_and_all_of_it(data, tmp_path, uploads, rows, answers
                 assert frame in states
                 if deleting.get(frame, end) >= end:
                     assert states[frame] != "deleted"
-        unfinished += sum(state in ("received", "signing") for state in states.values())
+        pending = sum(state in ("received", "signing") for state in states.values())
+        unfinished += pending
     assert answers(new, asked) == original
     assert unfinished
     assert deleting
     rows(new, "UPDATE jobs SET leased_until = 0 WHERE state = 'running'")  # as after a minute
     with Engine(settings(new)) as engine:  # what was being signed, and what waited, can be
-        for _ in range(2):
+        for _ in range(min(pending, 2)):
             work = engine.claim("w")
             assert work is not None
             assert engine.run(work) == "succeeded"
