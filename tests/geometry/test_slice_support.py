@@ -66,6 +66,9 @@ def test_correlations_are_split_by_hand():
     assert split_correlations(T, hypotheses, values, UP, P) == (4.0, 2.0)
     assert split_correlations(shifted(60), hypotheses, values, UP, P) == (0.0, 4.0)
     assert split_correlations(shifted(6), hypotheses, values, UP, P) == (0.0, 4.0)
+    # hypotheses that were not kept may correlate as much as the last one
+    only, lowest = hypotheses[[0, 4, 5]], np.array([3.0, 9.0, 2.0])
+    assert split_correlations(T, only, lowest, UP, P) == (3.0, 2.0)
 
 
 def test_the_correlation_of_a_hypothesis_is_that_of_the_search():

@@ -55,7 +55,7 @@ def refine_by_slices(
     if np.linalg.norm(T[:3, 3]) < p.slice_distance * p.cell:
         return T, False
     near, elsewhere = split_correlations(T, hypotheses, values, target.R[2], p)
-    if near < p.slice_share * elsewhere:
+    if near <= p.slice_share * elsewhere:
         return T, False
     refined = refine_by_points(source, target, T, p)
     if refined is None:
@@ -80,16 +80,17 @@ def split_correlations(
 
     Returns
     -------
-    near, elsewhere : correlations; 0 if there is no hypothesis
+    near : correlation; 0 if no hypothesis is near T
+    elsewhere : correlation; at least the lowest value, because hypotheses with lower values are not
+        listed
     """
     level = np.concatenate([T[None], hypotheses])
     level[:, :3, 3] -= (level[:, :3, 3] @ up)[:, None] * up
     metres, radians = 2 * p.cell * _SAME_CELLS, _SAME_YAWS * 2 * np.pi / p.n_yaws
     near = are_near(level[1:], level[0], metres, radians)
     apart = np.linalg.norm(level[1:, :3, 3], axis=1) >= 2 * p.cell * _CLOSE_CELLS
-    return (
-        float(values[near & apart].max(initial=0.0)), float(values[~near & apart].max(initial=0.0)),
-    )  # fmt: skip
+    elsewhere = values[~near & apart].max(initial=values.min())
+    return float(values[near & apart].max(initial=0.0)), float(elsewhere)
 
 
 def refine_by_points(
