@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 from urllib.parse import unquote, urlsplit
 
 import platformdirs
-from pydantic import Field, SecretStr, ValidationInfo, field_validator
+from pydantic import Field, SecretStr, ValidationInfo, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from sceneprint.errors import UnusableStore
@@ -340,6 +341,21 @@ class Settings(BaseSettings):
             if origin != "*" and not re.fullmatch(r"https?://[^/?#@\s*]+", origin):
                 raise ValueError(f"{origin!r:.80} is not an origin such as https://fleet.example")
         return value
+
+    @model_validator(mode="after")
+    def _names_are_known(self) -> Self:
+        """Refuse misspelt names of settings, which would be ignored."""
+        known = [name.upper() for name in type(self).model_fields]
+        for variable in os.environ:
+            prefix, _, name = variable.partition("_")
+            if prefix != "SCENEPRINT" or name.upper() in known:
+                continue
+            similar = get_close_matches(name, known, 1, cutoff=0.85)
+            if similar:
+                raise ValueError(
+                    f"{variable} is not a setting. Did you mean SCENEPRINT_{similar[0]}?"
+                )
+        return self
 
     @property
     def asks_for_keys(self) -> bool:

@@ -215,7 +215,7 @@ def add_data_option(command: argparse.ArgumentParser) -> None:
 def settings_of(options: argparse.Namespace) -> Settings:
     """Return the settings of the environment, overridden by the options.
 
-    Raise InvalidRequest if a value is not valid.
+    Raise InvalidRequest if a value is not valid, or a name is misspelt.
     """
     from pydantic import ValidationError
 
@@ -231,6 +231,8 @@ def settings_of(options: argparse.Namespace) -> Settings:
         return Settings(**fields)
     except ValidationError as error:
         first = error.errors()[0]
+        if not first["loc"]:  # of no single setting
+            raise InvalidRequest(str(first["ctx"]["error"])) from error
         name = str(first["loc"][0])
         # Do not print URLs, which may contain a password.
         secret = name.endswith("_url")

@@ -1,4 +1,4 @@
-"""Tests of URLs and body sizes in settings; errors never repeat a rejected URL."""
+"""Tests of URLs, body sizes and misspelt names in settings; errors never repeat a rejected URL."""
 
 import argparse
 import traceback
@@ -60,3 +60,26 @@ def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch):
         InvalidRequest, match=r"less than or equal to 536870912.*MAX_UPLOAD_BYTES\.$"
     ):
         settings_of(argparse.Namespace())
+
+
+def test_a_misspelt_setting_is_refused_and_variables_of_others_are_not(monkeypatch):
+    for other in (
+        "SCENEPRINT_DATABASE_URL_FILE",
+        "SCENEPRINT_KEY",
+        "SCENEPRINT_URL",
+        "SCENEPRINT_X",
+    ):
+        monkeypatch.setenv(other, "1")
+    settings_of(argparse.Namespace())
+    for name, meant in (
+        ("QUEUD_REQUESTS", "QUEUED_REQUESTS"), ("PRT", "PORT"), ("WORKER", "WORKERS"),
+    ):  # fmt: skip
+        with monkeypatch.context() as changed:
+            changed.setenv(f"SCENEPRINT_{name}", "1")
+            text = f"SCENEPRINT_{name} is not a setting. Did you mean SCENEPRINT_{meant}?"
+            with pytest.raises(InvalidRequest) as caught:
+                settings_of(argparse.Namespace())
+            assert str(caught.value) == text
+            with pytest.raises(ValidationError) as refused:
+                Settings()
+            assert text in str(refused.value)
