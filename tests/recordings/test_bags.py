@@ -263,6 +263,23 @@ def test_odometry_gives_poses_where_tf_does_not(tmp_path, ros, walk, depth):
         np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
 
 
+def test_odometry_with_more_messages_is_used_and_the_other_is_named(tmp_path, ros, walk, depth):
+    def fill(writer):
+        writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
+        writer.camera_info(0.0)
+        for i, (t, T) in enumerate(walk):
+            writer.odometry(t, T, "/filtered")
+            if i % 2:
+                writer.odometry(t, ros.transform(9, 9, 9), "/wheels")
+            writer.image(t, depth(i))
+
+    sequence = only(ros.write(tmp_path, fill))
+    ignored = "/wheels is ignored, because the poses of base_link are from /filtered"
+    assert ignored in sequence.note
+    for (_, T), frame in zip(walk, sequence.frames, strict=True):
+        np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
+
+
 def test_transforms_come_before_odometry_of_the_same_frames(tmp_path, ros, walk, depth):
     """Wheels slip: what a filter makes of their odometry is in tf."""
 

@@ -69,6 +69,8 @@ class BagPart:
     first : index of the first frame
     tree : transforms, and odometry for edges without transforms
     imus : measurements by coordinate frame of the IMU
+    odometry : poses by topic
+    ignored_odometry : sentences about topics of odometry that another topic replaces
     info_stamps_ns, infos : stamp of each calibrated CameraInfo, ns, and index in `BagScan.infos`
     """
 
@@ -76,6 +78,7 @@ class BagPart:
     tree: TransformTree = field(default_factory=TransformTree)
     imus: dict[str, Accelerations] = field(default_factory=dict)
     odometry: dict[str, list[_Odometry]] = field(default_factory=dict)
+    ignored_odometry: list[str] = field(default_factory=list)
     info_stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     infos: array[int] = field(default_factory=lambda: array("q"))
 
@@ -234,7 +237,7 @@ class _Scanner:
         if progress is not None:
             progress(total, total)
         for part in scan.parts:
-            _add_odometry(part.tree, part.odometry)
+            _add_odometry(part)
             _add_fixed(part.tree, scan.fixed)
         return scan
 
@@ -338,15 +341,18 @@ def _add_fixed(tree: TransformTree, fixed: dict[tuple[str, str], list[list[float
             tree.pass_over(parent, child, reason)
 
 
-def _add_odometry(tree: TransformTree, odometry: dict[str, list[_Odometry]]) -> None:
+def _add_odometry(part: BagPart) -> None:
     """Add odometry for edges without transforms, from the topic with the most messages."""
-    edges: dict[tuple[str, str], list[_Odometry]] = {}
-    for topic in sorted(odometry, key=lambda name: len(odometry[name])):
-        for pose in odometry[topic][:1]:
-            edges[pose.parent, pose.child] = odometry[topic]
-    for (parent, child), samples in edges.items():
-        if tree.has_edge(parent, child):
+    topics: dict[tuple[str, str], list[str]] = {}
+    for topic in sorted(part.odometry, key=lambda name: len(part.odometry[name])):
+        for pose in part.odometry[topic][:1]:
+            topics.setdefault((pose.parent, pose.child), []).append(topic)
+    for (parent, child), (*ignored, used) in topics.items():
+        if part.tree.has_edge(parent, child):
             continue
-        for pose in samples:
+        part.ignored_odometry += [
+            f"{topic} is ignored, because the poses of {child} are from {used}" for topic in ignored
+        ]
+        for pose in part.odometry[used]:
             if (pose.parent, pose.child) == (parent, child):
-                tree.add(parent, child, pose.stamp_ns, pose.sample, fixed=False)
+                part.tree.add(parent, child, pose.stamp_ns, pose.sample, fixed=False)

@@ -351,6 +351,7 @@ def _compute_motion(
         for topic, samples in part.odometry.items()
         if not samples
     ]
+    motion.remarks += part.ignored_odometry
     if world is not None:
         poses = tree.lookup(world, sensor, stamps)
         ends = poses
