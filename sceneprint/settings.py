@@ -345,12 +345,12 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
         """Refuse misspelt names of settings, which would be ignored."""
-        known = [name.upper() for name in type(self).model_fields]
+        settings = [name.upper() for name in type(self).model_fields]
         for variable in os.environ:
             prefix, _, name = variable.partition("_")
-            if prefix != "SCENEPRINT" or name.upper() in known:
+            if prefix != "SCENEPRINT" or name.upper() in settings:
                 continue
-            similar = get_close_matches(name, known, 1, cutoff=0.85)
+            similar = get_close_matches(name, settings, 1, cutoff=0.85)
             if similar:
                 raise ValueError(
                     f"{variable} is not a setting. Did you mean SCENEPRINT_{similar[0]}?"

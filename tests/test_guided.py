@@ -124,15 +124,15 @@ def test_guided_matches_can_be_searched_for_after_all(walk):
     geometries, poses = walk
     rows = [1, 2, 3]
     matches = asked_of(walk, rows, dict(enumerate(poses)))
-    known = unguided_validations(matches)
-    assert sorted(known) == [1, 2]
+    earlier = unguided_validations(matches)
+    assert sorted(earlier) == [1, 2]
     ranking = Ranking(np.array(rows, np.intp), np.zeros(3, np.int64), np.zeros(3))
     again = associate(
-        geometries[0], ranking, range(3), geometries.__getitem__, 3, validations=known,
+        geometries[0], ranking, range(3), geometries.__getitem__, 3, validations=earlier,
     )  # fmt: skip
     by_row = {match.index: match.validation for match in again}
-    assert by_row[1] is known[1]
-    assert by_row[2] is known[2]
+    assert by_row[1] is earlier[1]
+    assert by_row[2] is earlier[2]
     assert by_row[3].search == "correspondences"
     assert unguided_validations(again) is None
     alone = associate(geometries[0], ranking, range(3), geometries.__getitem__, 3)

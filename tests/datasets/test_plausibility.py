@@ -41,6 +41,11 @@ DEPTH = {
     "of 2 % noise without holes": (
         2000.0 * (1.0 + 0.02 * RANDOM.standard_normal((480, 640)))
     ).astype(np.uint16),
+    "of waves and 2.8 % noise without holes": (
+        2000.0
+        * (1.0 + 0.025 * np.sin(2 * np.pi * np.arange(640) / 64))
+        * (1.0 + 0.028 * RANDOM.standard_normal((480, 640)))
+    ).astype(np.uint16),
     "of 80 x 60": room(width=80, height=60),
     "of 8 bits": (room(0.0) // 16).astype(np.uint16) << 8,
     "sparse": np.where(RANDOM.random((240, 320)) < 0.1, room(), 0).astype(np.uint16),

@@ -151,6 +151,13 @@ def test_a_transform_is_supported_if_points_correlate_much_better_than_elsewhere
     assert refine(1.41 * exact, exact)[1]
     refined, supported = refine(0.69, 1.0)  # much less than elsewhere
     assert (refined is first, supported) == (True, False)
+    # the hypothesis is near the transform, but not near what that is refined to
+    near = np.stack([shifted(5, -0.5), shifted(-20)])
+    refined, supported = refine_by_slices(
+        source, target, shifted(8.4, 0.2, 0.0, 2.5), near, np.array([2 * exact, exact]), P
+    )
+    np.testing.assert_allclose(refined, true, atol=1e-3)
+    assert not supported
     apart = replace(P, slice_distance=19.0)  # 9.5 m
     refined, supported = refine(1.0, 0.1, p=apart)
     assert (refined is first, supported) == (True, False)

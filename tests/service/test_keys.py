@@ -98,32 +98,57 @@ def test_who_uses_a_key_waits_for_no_note_of_it(tmp_path):
         assert used() == {"busy": True, "idle": False}
 
 
+async def authenticated(app, secret):
+    """Authenticate a request to an endpoint that needs no shared thread."""
+    body = RequestBody(Request({"type": "http"}).receive, 0)
+    request = Request(
+        {
+            "type": "http", "app": app, "method": "GET", "path": "/v1/keys/me",
+            "query_string": b"", "headers": [], "route": SimpleNamespace(endpoint=authenticated),
+            "state": {"forwarded": None, "at_end": [], "body": body},
+        }
+    )  # fmt: skip
+    shown = HTTPAuthorizationCredentials(scheme="Bearer", credentials=secret)
+    return await authenticate(request, app.state.service, shown)
+
+
 def test_a_key_is_looked_up_while_every_shared_thread_is_taken(tmp_path):
     """Slow requests of some keep nobody from being told who they are."""
     app = create_app(Settings(data_dir=tmp_path, host="0.0.0.0", workers=0))
 
     async def ask():
         async with app.router.lifespan_context(app):
-            here = app.state.service
-            secret = create_key(here.context.store, "robot").secret
+            secret = create_key(app.state.service.context.store, "robot").secret
             shared = to_thread.current_default_thread_limiter()
             slow = [object() for _ in range(int(shared.total_tokens))]
             for one in slow:
                 shared.acquire_on_behalf_of_nowait(one)
-            body = RequestBody(Request({"type": "http"}).receive, 0)
-            request = Request(
-                {
-                    "type": "http", "app": app, "method": "GET", "path": "/v1/keys/me",
-                    "query_string": b"", "headers": [], "route": SimpleNamespace(endpoint=ask),
-                    "state": {"forwarded": None, "at_end": [], "body": body},
-                }
-            )  # fmt: skip
-            shown = HTTPAuthorizationCredentials(scheme="Bearer", credentials=secret)
             try:
                 with fail_after(30):
-                    return (await authenticate(request, here, shown)).name
+                    return (await authenticated(app, secret)).name
             finally:
                 for one in slow:
                     shared.release_on_behalf_of(one)
 
     assert asyncio.run(ask()) == "robot"
+
+
+def test_lists_of_a_tenant_make_way_for_one_that_lists_nothing(tmp_path):
+    app = create_app(Settings(data_dir=tmp_path, host="0.0.0.0", workers=0))
+
+    async def ask():
+        async with app.router.lifespan_context(app):
+            here = app.state.service
+            secret = create_key(here.context.store, "robot").secret
+            order, admitted = here.reads.order, []
+            for lists in (("first", "second"), ("third", "fourth")):
+                for waiter in lists:
+                    order.enter("another", waiter)
+                admitted.append(order.admit())
+                for _ in admitted[-1]:
+                    order.release("another")
+                await authenticated(app, secret)
+            return admitted
+
+    # alone both of its lists run at once, and beside the robot one after the other
+    assert asyncio.run(ask()) == [["first", "second"], ["third"]]

@@ -2,6 +2,7 @@
 
 from datetime import datetime
 
+import numpy as np
 import pytest
 
 
@@ -103,10 +104,19 @@ def test_what_asks_for_no_wait_is_not_waited_for(served, small_shots, prefer):
     assert (sent.status_code, sent.headers.get("preference-applied")) == (202, None)
 
 
-def test_a_list_of_maps_is_the_maps_one_by_one(served):
+def test_a_list_of_maps_is_the_maps_one_by_one(served, small_shots):
     """The list counts frames, poses and queries of all maps together."""
-    listed = served.client.get("/v1/maps").json()["items"]
-    # the counts of a map whose frames are being signed may change between the requests
-    listed = [one for one in listed if one["frames"].keys() <= {"indexed"}]
-    assert any(one["frames"].get("indexed") for one in listed)
-    assert listed == [served.client.get(f"/v1/maps/{one['name']}").json() for one in listed]
+    pose = {"parent_frame": "odom", "matrix": np.eye(4).tolist()}
+    for name, number in (("counted", 90), ("queried", 91)):
+        served.client.post("/v1/maps", json={"name": name, "model": "depth"})
+        form = small_shots[number].form(pose=pose)
+        sent = served.client.post(f"/v1/maps/{name}/frames", **form, headers={"Prefer": "wait=200"})
+        assert sent.json()["state"] == "indexed", sent.text
+    asked = served.client.post("/v1/maps/queried/queries", **small_shots[91].form())
+    assert asked.status_code == 200
+    listed = {one["name"]: one for one in served.client.get("/v1/maps").json()["items"]}
+    for name, queries in (("counted", {}), ("queried", {asked.json()["status"]: 1})):
+        one = listed[name]
+        assert one == served.client.get(f"/v1/maps/{name}").json()
+        assert (one["frames"], one["posed_frames"], one["parent_frames"], one["recent_queries"]) \
+            == ({"indexed": 1}, 1, 1, queries)  # fmt: skip

@@ -74,12 +74,12 @@ class SampleRange(ApiRecord):
 
     def __str__(self) -> str:
         what = "range" if self.valid is None else "depth"
-        text = f"{what} {self.near:.2g} to {self.far:.2g} m (5th to 95th percentile), "
-        text += (
+        amount = (
             f"{self.count} points"
             if self.valid is None
-            else (f"{_percent(self.valid)} of pixels valid")
+            else f"{_percent(self.valid)} of pixels valid"
         )
+        text = f"{what} {self.near:.2g} to {self.far:.2g} m (5th to 95th percentile), {amount}"
         if not self.is_doubtful:
             return text
         if self.valid is None:

@@ -60,6 +60,7 @@ def refine_by_slices(
     refined = refine_by_points(source, target, T, p)
     if refined is None:
         return T, False
+    near, elsewhere = split_correlations(refined, hypotheses, values, target.R[2], p)
     near = max(near, slice_correlation(source, target, refined, p))
     return refined, near >= p.slice_margin * elsewhere
 
