@@ -6,13 +6,13 @@ import hashlib
 import shutil
 import sqlite3
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle.backup import take_backup
+from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.settings import Settings
 from sceneprint_client.api import FrameMeta, GivenPose, JobState, NewMap, Query
 from tests.whole_engine import Engine
@@ -28,14 +28,6 @@ def settings_of(folder):
 @pytest.fixture(scope="session")
 def settings():
     return settings_of
-
-
-@dataclass(frozen=True)
-class Upload:
-    """A frame as a robot sends it."""
-
-    data: bytes
-    meta: FrameMeta
 
 
 @pytest.fixture(scope="session")
@@ -114,9 +106,9 @@ def rows():
 def answers():
     """A function that returns the answers of the map `hall`, without parts that always differ."""
 
-    def of(folder, asked):
+    def of(settings, asked):
         free = {"query_id": "", "milliseconds": {}}
-        with Engine(settings_of(folder)) as engine:
+        with Engine(settings) as engine:
             return [
                 engine.queries.upload(["hall"], one.data, one.meta, Query(exact=True)).model_copy(
                     update=free

@@ -149,8 +149,7 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
     blob = lines_of(copy, "rows/frames")[0].index("blob")
     lies("rows/frames", lambda lines: lines[1].pop(), "a different number of columns")
     lies("rows/frames", lambda lines: lines[0].reverse(), "its columns differ")
-    lies("rows/frames", lambda lines: lines.insert(1, {}), "a different number of columns")
-    for value in (5, ["x"], True):
+    for value in (5, ["x"]):
         lies(
             "rows/frames", lambda lines, value=value: lines[1].__setitem__(blob, value),
             r"A row of table frames .*\(column blob holds a ",
@@ -159,14 +158,12 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
     lies("rows/frames", lambda lines: lines[1].__setitem__(blob, None), "NOT NULL constraint")
     of = lines_of(copy, "rows/frames")[0].index("map_number")
     lies("rows/frames", lambda lines: lines[1].__setitem__(of, 9), "a missing row of maps")
-    lies("rows/secrets", lambda lines: lines[1].__setitem__(1, "?"), "A row of table secrets")
     for name in ("../evil", "0" * 64):
         lies(
             "rows/frames", lambda lines, name=name: lines[1].__setitem__(blob, name),
             "the blobs that its rows refer to",
         )  # fmt: skip
     lies("blobs", lambda lines: lines.pop(), "its blobs")
-    lies("blobs", lambda lines: lines[1].__setitem__(2, "gone"), "invalid entry in the list")
     lies("blobs", lambda lines: lines[1].__setitem__(0, "../../evil"), "invalid entry in the list")
     lies("blobs", lambda lines: lines.insert(1, ["0" * 64, 5, None]), "is missing")
     part = next(one for one in manifest_of(copy)[1]["parts"] if one["kind"] == "rows/frames")

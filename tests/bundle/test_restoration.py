@@ -5,11 +5,8 @@ import json
 import os
 import pty
 import shutil
-import signal
 import sqlite3
-import subprocess
 import sys
-import time
 from contextlib import closing
 from pathlib import Path
 
@@ -17,17 +14,14 @@ import psycopg
 import pytest
 from pydantic import SecretStr
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_folder, restore_to_server, verify_bundle
 from sceneprint.engine.admin.operations import list_keys
 from sceneprint.errors import BundleError, UnusableStore
-from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint.store.blobs.object_store import BucketOwner
 from sceneprint.store.tables import metadata
-from sceneprint_client.api import Query
 from tests.bundle.test_backup import names_in
 from tests.whole_engine import Engine
 
@@ -38,14 +32,6 @@ own_servers = pytest.mark.sqlite_only("these have servers of their own")
 
 def fleet_of(folder, url, **other):
     return Settings(data_dir=folder, database_url=SecretStr(url), index_dir=None, **other)
-
-
-def answers_of(settings, asked):
-    """What the map `hall` answers, but for what no two answers share."""
-    free = {"query_id": "", "milliseconds": {}}
-    with Engine(settings) as engine:
-        found = [engine.queries.upload(["hall"], x.data, x.meta, Query(exact=True)) for x in asked]
-        return [one.model_copy(update=free) for one in found]
 
 
 def ask(url, asked):
@@ -84,12 +70,11 @@ def test_what_is_restored_is_what_was_there(
     del original[f"blobs/{orphan[:2]}/{orphan}"]
     assert content(new) == original
     asked = uploads[:8]
-    wanted = answers(data, asked)
+    wanted = answers(settings(data), asked)
     assert {one.status for one in wanted} >= {"found"}
-    assert answers(new, asked) == wanted
+    assert answers(settings(new), asked) == wanted
     with Engine(settings(new)) as engine:  # the frame that waited is signed, and found
         work = engine.claim("w")
-        assert work is not None
         assert engine.run(work) == "succeeded"
         assert engine.get_map("hall").frames == {"deleted": 1, "indexed": 5}
         assert [key.name for key in list_keys(engine.store).items] == ["robot"]
@@ -119,21 +104,6 @@ def test_keys_of_a_bundle_are_listed_and_kept_or_revoked(
     with closing(sqlite3.connect(new / "sceneprint.db")) as database:
         revoked = database.execute("SELECT count(*) FROM events WHERE kind = 'key.revoked'")
         assert revoked.fetchone() == (0 if kept else 1,)
-
-
-@file_only
-def test_queries_that_only_held_an_answer_are_not_restored(
-    data, tmp_path, answers, uploads, settings
-):
-    answers(data, uploads[:2])
-    changed(data, "UPDATE queries SET listed = number > (SELECT min(number) FROM queries)")
-    place, new = str(tmp_path / "bundles"), tmp_path / "new"
-    take_backup(settings(data), place)
-    restore_to_folder(place, new)
-    with closing(sqlite3.connect(data / "sceneprint.db")) as database:
-        listed = database.execute("SELECT id FROM queries WHERE listed ORDER BY id").fetchall()
-    with closing(sqlite3.connect(new / "sceneprint.db")) as database:
-        assert database.execute("SELECT id FROM queries ORDER BY id").fetchall() == listed != []
 
 
 @file_only
@@ -226,63 +196,20 @@ def test_two_at_once(place, tmp_path):
     assert names_in(tmp_path / "new") == ["blobs", "sceneprint.db"]
 
 
-#: Restores to a mount with `lost+found`, and to one that is too small.
-MOUNTED = """
-import os, subprocess, sys
-from pathlib import Path
-from sceneprint.bundle.backup import take_backup
-from sceneprint.bundle.restoration import restore_to_folder
-from sceneprint.errors import BundleError, StoreFull
-from sceneprint.settings import Settings
-
-place, folder = sys.argv[1], Path(sys.argv[2])
-volume, small = folder / "volume", folder / "small"
-for mount, size in ((volume, "64m"), (small, "100k")):
-    mount.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", mount], check=True)
-(volume / "lost+found").mkdir()
-restore_to_folder(place, volume)
-print(sorted(os.listdir(volume)))
-for attempt in (
-    lambda: restore_to_folder(place, small),
-    lambda: take_backup(Settings(data_dir=volume, database_url=None), str(small / "place")),
-):
-    try:
-        attempt()
-    except (BundleError, StoreFull) as error:
-        print(error)
-"""
-
-
-@file_only
-def test_a_mount_is_filled_and_never_moved(place, tmp_path):
-    if subprocess.run(["unshare", "-rm", "true"], capture_output=True).returncode != 0:
-        pytest.skip("this machine lets nobody mount anything")
-    done = subprocess.run(
-        ["unshare", "-rm", sys.executable, "-c", MOUNTED, place, str(tmp_path)],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    first, second, third = done.stdout.splitlines()
-    assert first == "['blobs', 'lost+found', 'sceneprint.db']"
-    assert "small: the bundle needs" in second
-    assert "The store is full" in third
-
-
 # servers
 
 
 @own_servers
-def test_there_and_back(place, data, uploads, postgres_url, tmp_path, content, settings):
+def test_there_and_back(place, data, uploads, postgres_url, tmp_path, content, answers, settings):
     fleet = fleet_of(tmp_path / "fleet", postgres_url)
     first = restore_to_server(place, fleet)
     assert first.manifest.frames["indexed"] == SIGNED
     asked = uploads[SIGNED - 1 : SIGNED + 2]
-    before = answers_of(settings(data), asked)
+    before = answers(settings(data), asked)
     assert all(one.matches for one in before)
     back = take_backup(fleet, str(tmp_path / "back"))
     assert back.manifest.parts == first.manifest.parts  # of PostgreSQL they are the same bytes
-    assert answers_of(fleet, asked) == before
+    assert answers(fleet, asked) == before
     restore_to_folder(str(tmp_path / "back"), tmp_path / "home")
     restore_to_folder(place, tmp_path / "straight")
     found = content(tmp_path / "home")
@@ -336,35 +263,6 @@ def test_what_postgresql_cannot_hold_is_not_restored(data, postgres, tmp_path, s
     with pytest.raises(BundleError, match=r"a row of table frames .*character varying"):
         restore_to_server(str(tmp_path / "place"), fleet_of(tmp_path / "fleet", url))
     assert rows_in(url) == 0
-
-
-RESTORE = "import sys; from sceneprint.cli import main; sys.exit(main(sys.argv[1:]))"
-
-
-@own_servers
-@pytest.mark.thorough
-def test_killed_half_way_it_can_be_restored_again(place, postgres_url, tmp_path):
-    fleet = fleet_of(tmp_path / "fleet", postgres_url)
-    with closing(psycopg.connect(postgres_url.replace("+psycopg", ""))) as holder:
-        with Engine(fleet):  # which makes the schema
-            pass
-        holder.execute("LOCK TABLE signatures IN SHARE MODE")  # what is written waits for it
-        process = subprocess.Popen(
-            [sys.executable, "-c", RESTORE, "restore", place, "--data", fleet.data_dir],
-            env=os.environ | {"SCENEPRINT_DATABASE_URL": postgres_url},
-        )
-        waits = "SELECT count(*) FROM pg_locks WHERE NOT granted AND locktype = 'relation'"
-        until = time.monotonic() + PATIENCE_S
-        while holder.execute(waits).fetchone() == (0,) and time.monotonic() < until:
-            assert process.poll() is None
-            time.sleep(0.05)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    assert rows_in(postgres_url) == 0
-    restored = restore_to_server(place, fleet)
-    assert rows_in(postgres_url) > 0
-    assert [one for one in fsck(fleet) if one.left] == []
-    assert restored.manifest.blobs == len([*(fleet.data_dir / "blobs").glob("*/*")])
 
 
 @own_servers

@@ -32,13 +32,7 @@ PATIENCE_S = 300.0
 
 @dataclass
 class Trials:
-    """The trials of one operation with one fault.
-
-    Parameters
-    ----------
-    calls : number of calls at which the fault was tried
-    violations : broken invariants, with the call that failed
-    """
+    """Number of calls at which a fault was tried, and broken invariants."""
 
     calls: int = 0
     violations: list[str] = field(default_factory=list)
@@ -79,7 +73,7 @@ class Child:
 
 def _prepare(operation, store, _say):
     with Engine(store.settings) as engine:
-        operation.prepare(engine, store)
+        operation[0](engine, store)
 
 
 def _say_contents(store, say):
@@ -100,14 +94,7 @@ def _say(pipe, line):
 
 
 class Enumeration:
-    """Prepared stores of each operation, copied for every trial.
-
-    Parameters
-    ----------
-    work : empty folder
-    uploads : frames to send
-    server : server of the databases; None for SQLite
-    """
+    """Prepared stores of each operation, copied for every trial."""
 
     def __init__(self, work, uploads, server=None):
         self._work, self._uploads, self._server = work, uploads, server
@@ -165,7 +152,7 @@ class Enumeration:
                 injector = Injector(store.folder, fault, at)
                 injector.arm()
                 try:
-                    OPERATIONS[operation].act(engine, store, say)
+                    OPERATIONS[operation][1](engine, store, say)
                 except (SceneprintError, OSError) as error:
                     say(f"error {type(error).__name__}")
                 if not injector.failed:

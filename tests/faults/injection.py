@@ -7,7 +7,6 @@ removed: inject in a process that ends afterwards.
 
 import errno
 import os
-import shutil
 import signal
 import sqlite3
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 
 from sqlalchemy.engine.default import DefaultDialect
 
-from tests.faults.disk import Disk
+from tests.faults.disk import CutDisk
 
 #: Faults by name: the error of a call on files, and SQLite's message; None for the others.
 #: `power cut` kills the process, and undoes what was not synced. `interrupts` sends signals from
@@ -30,8 +29,6 @@ FAULTS = {
 }
 #: Interval of the signals, seconds.
 _EVERY_S = 2e-4
-#: Beginning of the names of files that SQLite writes and syncs itself.
-_DATABASE = "sceneprint.db"
 #: Audit events of calls that change a folder, and how many of their first arguments are paths.
 _EVENTS = {
     "open": 1, "os.rename": 2, "os.link": 2, "os.remove": 1, "os.mkdir": 1, "os.rmdir": 1,
@@ -43,14 +40,7 @@ _STATEMENTS = ("BEGIN IMMEDIATE", "INSERT", "UPDATE", "DELETE", "CREATE", "COMMI
 
 
 class Injector:
-    """Counts the calls on a folder and its database, and lets one of them fail.
-
-    Parameters
-    ----------
-    root : folder whose files count
-    fault : one of FAULTS
-    at : number of the call that fails, from 1
-    """
+    """Counts the calls on a folder and its database, and lets the one with number `at` fail."""
 
     def __init__(self, root, fault, at):
         self._root, self._error, self._at = str(root), FAULTS[fault], at
@@ -140,32 +130,3 @@ class Injector:
         if isinstance(connection, sqlite3.Connection):
             raise sqlite3.OperationalError(message)
         connection.close()  # the call itself fails then, as if the server had gone
-
-
-class CutDisk(Disk):
-    """A disk that loses power once, and keeps no record of earlier states."""
-
-    def _keep(self, what):
-        """Keep nothing."""
-
-    def look(self):
-        """Record the changes before a call."""
-        self._look()
-
-    def cut(self):
-        """Undo all that was not synced, and kill this process. SQLite syncs its files itself."""
-        tree = self.sure()
-        for path in sorted(self.root.rglob("*"), reverse=True):
-            if str(path.relative_to(self.root)) in tree or path.name.startswith(f"{_DATABASE}-"):
-                continue
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-        for name, content in tree.items():  # folders before their content
-            path = self.root / name
-            if content is None:
-                path.mkdir(exist_ok=True)
-            elif not path.name.startswith(_DATABASE) or not path.exists():
-                path.write_bytes(content)
-        os.kill(os.getpid(), signal.SIGKILL)

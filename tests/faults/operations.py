@@ -6,7 +6,7 @@ import io
 import json
 import tarfile
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,19 +40,10 @@ _LEFTOVERS = {"unreferenced-file"}
 #: First words of lines by which an operation acknowledges; an id or a name follows.
 ACKNOWLEDGED = ("added", "deleted", "bundle", "restored")
 
-Say = Callable[[str], None]
-
 
 @dataclass(frozen=True)
 class Store:
-    """A store under test.
-
-    Parameters
-    ----------
-    folder : data folder
-    url : URL of a PostgreSQL database; None for SQLite in the folder
-    uploads : frames to send, the first STORED of which the map holds
-    """
+    """A store under test: its data folder, the URL of PostgreSQL if any, and frames to send."""
 
     folder: Path
     url: str | None
@@ -71,20 +62,6 @@ class Store:
         """The store that a restore of this one fills."""
         url = None if self.url is None else f"{self.url}{RESTORED}"
         return Store(self.folder / "restored", url, self.uploads)
-
-
-@dataclass(frozen=True)
-class Operation:
-    """An operation on a store.
-
-    Parameters
-    ----------
-    prepare : brings the store to the state before it
-    act : does it, and says what it acknowledges, see ACKNOWLEDGED
-    """
-
-    prepare: Callable[[Engine, Store], None]
-    act: Callable[[Engine, Store, Say], None]
 
 
 def fill(store):
@@ -126,7 +103,6 @@ def _wait_for_signature(engine, store):
 
 def _sign(engine, store, say):
     work = engine.claim("w")
-    assert work is not None
     engine.run(work)
 
 
@@ -195,15 +171,17 @@ def _archive(uploads):
     return packed.getvalue()
 
 
+#: What brings a store to the state before an operation, and what does it and says what it
+#: acknowledges, see ACKNOWLEDGED.
 OPERATIONS = {
-    "upload": Operation(_nothing, _upload),
-    "signature": Operation(_wait_for_signature, _sign),
-    "publication": Operation(_nothing, _publish),
-    "deletion": Operation(_nothing, _delete),
-    "purge": Operation(_delete_first, _purge),
-    "import": Operation(_nothing, _import),
-    "backup": Operation(_nothing, _back_up),
-    "restore": Operation(_back_up_once, _restore),
+    "upload": (_nothing, _upload),
+    "signature": (_wait_for_signature, _sign),
+    "publication": (_nothing, _publish),
+    "deletion": (_nothing, _delete),
+    "purge": (_delete_first, _purge),
+    "import": (_nothing, _import),
+    "backup": (_nothing, _back_up),
+    "restore": (_back_up_once, _restore),
 }
 
 
@@ -225,20 +203,14 @@ def contents(store):
 
 
 def violations(store, operation, acknowledged, before):
-    """Start again after a fault, finish what was begun, and yield each broken invariant.
-
-    Parameters
-    ----------
-    acknowledged : what the operation said before the fault
-    before : upload and signature of each frame that the store held
-    """
+    """Start again after a fault, finish what was begun, and yield each broken invariant."""
     said = dict(line.split(" ", 1) for line in acknowledged)
     with Engine(store.settings) as engine:
         work_off(engine)
         engine.publish_due()
         engine.purging.now()
         if operation in ("upload", "import"):  # a robot that got no answer sends it again
-            OPERATIONS[operation].act(engine, store, lambda _: None)
+            OPERATIONS[operation][1](engine, store, lambda _: None)
             work_off(engine)
             engine.publish_due()
         yield from _wrong_frames(engine, operation, said, before)

@@ -13,23 +13,6 @@ from tests.faults.operations import OPERATIONS
 pytestmark = pytest.mark.sqlite_only("makes stores of its own, on either database")
 
 ROOT = Path(__file__).resolve().parents[2]
-#: Names the call that fails in each of eight attempts to write a file.
-CALLS = """
-import sys
-from pathlib import Path
-from sceneprint.atomic_files import write_durable
-from tests.faults.injection import Injector
-
-for at in range(1, 9):
-    injector = Injector(Path(sys.argv[1]), "full disk", at)
-    injector.arm()
-    try:
-        write_durable(Path(sys.argv[1]) / str(at), b"data")
-    except OSError:
-        pass
-    injector.disarm()
-    print(injector.failed or "none")
-"""
 
 
 def run(*arguments):
@@ -47,19 +30,12 @@ def counts(*options):
     return json.loads(report)
 
 
-def test_calls_fail_one_after_another(tmp_path):
-    # the file and its writer are opened and the file is synced; then its name, and its folder
-    calls = ["open", "open", "os.fsync", "os.rename", "os.fsync"]
-    assert run("-c", CALLS, str(tmp_path)).split("\n")[:8] == [*calls, "none", "none", "none"]
-
-
-def test_kills_at_some_calls():
-    operations = ("upload", "signature", "deletion")
-    found = counts(
-        *operations, "--store", "sqlite", "--fault", "kill", "--first", "3", "--step", "9"
-    )
+def test_kills_and_power_cuts_at_some_calls():
+    operations, faults = ("upload", "signature", "publication", "deletion"), ("kill", "power cut")
+    chosen = [part for fault in faults for part in ("--fault", fault)]
+    found = counts(*operations, "--store", "sqlite", *chosen, "--first", "3", "--step", "9")
     assert found.keys() == set(operations)
-    assert min(tried["kill"] for tried in found.values()) > 0
+    assert min(tried[fault] for tried in found.values() for fault in faults) > 0
 
 
 @pytest.mark.thorough

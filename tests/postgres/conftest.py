@@ -5,10 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import pytest
+from sqlalchemy import text
 
 from benchmarks.postgres import Server
 from sceneprint.store import open_store
+from sceneprint.store.maps import add_map, store_model
 from sceneprint_client.api import FrameMeta
+
+MODEL = "ab" * 32
 
 
 class Small(NamedTuple):
@@ -34,6 +38,29 @@ def server_store(postgres_url, tmp_path):
     opened = open_store(postgres_url, tmp_path / "blobs")
     yield opened
     opened.database.close()
+
+
+@pytest.fixture
+def rows(server_store):
+    """Three empty maps: a, b and c."""
+    with server_store.database.write() as connection:
+        store_model(connection, MODEL, "toy", b"a model")
+        return [add_map(connection, name, None, MODEL) for name in ("a", "b", "c")]
+
+
+@pytest.fixture(scope="session")
+def waiting():
+    """A function that counts the advisory locks that somebody waits for."""
+    asked = text(
+        "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted "
+        "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+    )
+
+    def count(store):
+        with store.database.read() as connection:
+            return int(connection.execute(asked).scalar_one())
+
+    return count
 
 
 @pytest.fixture

@@ -26,7 +26,6 @@ def engine(pair, tmp_path):
 def index(engine, frame):
     added, _ = engine.add_frame("hall", *frame)
     work = engine.claim("w")
-    assert work is not None
     assert engine.run(work) == JobState.SUCCEEDED
     return added.frame_id
 

@@ -1,7 +1,7 @@
 """Tests of claims of jobs without a lock, in competition with other changes."""
 
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 
 import pytest
@@ -61,31 +61,18 @@ def uncommitted(store):
 
 
 def beside(store, until, what):
-    """Begin something that has to wait for a lock; what waits for its end, and returns it."""
-    found = []
-
-    def run():
-        try:
-            found.append(what())
-        except Exception as error:
-            found.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
+    """Begin something that has to wait for a lock; its future."""
+    pool = ThreadPoolExecutor(1)
+    begun = pool.submit(what)
+    pool.shutdown(wait=False)
 
     def waits():
-        assert found == [], found
+        assert not begun.done(), begun.result()
         with store.database.read() as connection:
             return bool(connection.execute(BLOCKED).scalar_one() == 1)
 
     until(waits)
-
-    def end():
-        thread.join(PATIENCE_S)
-        (one,) = found
-        return one
-
-    return end
+    return begun
 
 
 def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(store):
@@ -126,7 +113,7 @@ def test_a_claim_beside_a_cancellation(store, until, first):
             held = queue.claim(connection, "w", 60.0)
             done = beside(store, until, cancel)
             commit()
-        assert done() is None
+        assert done.result(PATIENCE_S) is None
         assert held is not None
         with pytest.raises(LostLease), store.database.write() as connection:
             queue.finish(connection, held, JobState.SUCCEEDED)
@@ -169,8 +156,8 @@ def test_an_end_that_comes_late_and_a_claim_take_effect_once(store, until, what)
         held = queue.claim(connection, "next", 60.0)
         done = beside(store, until, ends)
         commit()
-    assert isinstance(done(), LostLease)
-    assert held is not None
+    with pytest.raises(LostLease):
+        done.result(PATIENCE_S)
     assert now_is(store, late).worker == "next"
     assert now_is(store, late) == held
 
@@ -189,25 +176,8 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(stor
         held = queue.claim(connection, "next", 60.0)
         done = beside(store, until, tell)
         commit()
-    assert done() is None
-    assert held is not None
+    assert done.result(PATIENCE_S) is None
     assert now_is(store, dead) == held  # which is not queued again under its worker
-
-
-def test_a_renewal_beside_the_burial_of_its_job(store, until):
-    held = claimed(store, "w", -1.0)
-    turned(store, held, attempts=queue.MAXIMUM_ATTEMPTS)
-
-    def bury():
-        with store.database.write() as connection:
-            return queue.dead_letter(connection)
-
-    with uncommitted(store) as (connection, commit):
-        queue.renew(connection, held, 60.0)
-        done = beside(store, until, bury)
-        commit()
-    assert done() == []
-    assert now_is(store, held).state == JobState.RUNNING
 
 
 def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store):

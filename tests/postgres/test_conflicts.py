@@ -5,24 +5,19 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import pytest
+from sqlalchemy import text
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.errors import StoreLocked
-from sceneprint.store import open_database
+from sceneprint.store import open_database, open_store
+from sceneprint.store.deletion import doom, doomed_blobs
 from sceneprint.store.events import record_event
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, store_model
-from sceneprint.store.postgres import connection as postgres
+from sceneprint.store.postgres.connection import take_turn
 
 MODEL = "ab" * 32
-
-
-@pytest.fixture
-def rows(server_store):
-    with server_store.database.write() as connection:
-        store_model(connection, MODEL, "toy", b"a model")
-        return [add_map(connection, name, None, MODEL) for name in ("a", "b")]
 
 
 def test_a_deadlock_of_two_costs_none_of_those_written_with_them(server_store, rows):
@@ -56,7 +51,7 @@ def test_a_deadlock_of_two_costs_none_of_those_written_with_them(server_store, r
         (keep(first, meet=True), keep(second), innocent),
         (keep(second, meet=True), keep(first), innocent),
     ]
-    groups = [Grouping(database, row.number) for row in rows]
+    groups = [Grouping(database, row.number) for row in rows[:2]]
     with ThreadPoolExecutor(6) as pool:
         found = []
         with database.write():  # until this is over nobody else writes
@@ -92,34 +87,42 @@ def test_who_waited_for_its_turn_sees_what_was_committed_meanwhile(postgres, lev
             assert said == "repeatable read"
 
 
-def test_a_new_schema_is_looked_at_by_each_who_sent_the_one_of_before(
-    server_store, rows, monkeypatch
-):
-    database = server_store.database
-    database.guard_schema()
-
-    def sign(row):
-        with database.write(map_number=row.number, single=True) as connection:
-            return bool(connection.exec_driver_sql("SELECT 1").scalar_one())
-
-    assert sign(rows[0])
-    with database.write() as connection:
-        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
-    both, look = threading.Barrier(2), postgres.KnownSchema.read
-
-    def look_together(self, connection):
-        both.wait(PATIENCE_S)  # both have sent the schema of before
-        look(self, connection)
-
-    monkeypatch.setattr(postgres.KnownSchema, "read", look_together)
-    with ThreadPoolExecutor(2) as pool:
-        assert list(pool.map(sign, rows)) == [True, True]
+@pytest.mark.parametrize(
+    ("wait_s", "after"), [(0.1, ("10s", "0")), (10.0, ("10s", "0")), (60.0, ("0", "0"))]
+)
+def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(server_store, wait_s, after):
+    limits = "SELECT current_setting('lock_timeout'), current_setting('statement_timeout')"
+    engine = server_store.database._writers
+    with engine.begin() as connection:
+        assert tuple(take_turn(connection, wait_s, "SELECT 7, 'x'")) == (7, "x")
+        assert tuple(connection.exec_driver_sql(limits).one()) == after
+    with engine.begin() as connection:
+        assert tuple(connection.exec_driver_sql(limits).one()) == ("10s", "1min")
 
 
-def test_a_prepared_statement_that_is_gone_is_told(server_store):
-    """As behind a pooler that gives one connection to several clients."""
-    with (
-        pytest.raises(StoreLocked, match="A prepared statement no longer exists"),
-        server_store.database.read() as connection,
-    ):
-        connection.exec_driver_sql("EXECUTE nothing")
+_WAITING = text("SELECT count(*) FROM pg_locks WHERE locktype = 'transactionid' AND NOT granted")
+
+
+def waiting(store):
+    """Return whether a transaction waits for the end of another."""
+    with store.database.read() as connection:
+        return bool(connection.execute(_WAITING).scalar_one())
+
+
+def test_writers_of_two_maps_may_doom_the_same_blobs(server_store, postgres_url, tmp_path, until):
+    blobs = [f"{number:064x}" for number in range(3)]
+
+    def doom_elsewhere():
+        with (
+            closing(open_store(postgres_url, tmp_path / "blobs")) as other,
+            other.database.write(map_number=8) as connection,
+        ):
+            doom(connection, blobs)
+
+    with ThreadPoolExecutor(1) as pool, server_store.database.write(map_number=7) as connection:
+        doom(connection, blobs[:2])
+        writer = pool.submit(doom_elsewhere)
+        until(lambda: waiting(server_store))
+    writer.result()
+    with server_store.database.read() as connection:
+        assert doomed_blobs(connection, 9) == blobs

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
-import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,8 +16,6 @@ import pytest
 
 from benchmarks.postgres import Server
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.settings import Settings
-from service.app import create_app
 
 
 @dataclass
@@ -135,31 +131,3 @@ def test_nothing_acknowledged_is_lost_and_all_goes_on_by_itself(fleet, small, un
     assert len(fleet.log("worker ready")) == 1  # it waited, and was not replaced
     assert fleet.log("worker died") == []
     assert fleet.process.poll() is None
-
-
-async def _states_told(app):
-    """Frames by state, as the application tells them once it has begun."""
-    async with app.router.lifespan_context(app):
-        return dict(app.state.service.statistics.collect().frames)
-
-
-def test_a_database_that_goes_while_a_service_starts_is_waited_for(tmp_path, caplog, until):
-    """Gone between the first look of the process at its store, and that of the application."""
-    server = Server(tmp_path / "primary")
-    server.start()
-    server.create("fleet")
-    server.stop()
-    url = f"postgresql+psycopg://postgres@127.0.0.1:{server.port}/fleet"
-    settings = Settings(database_url=url, data_dir=tmp_path / "data")
-
-    def return_once_waited_for():
-        until(lambda: "waiting for the database" in caplog.messages)
-        server.start()
-
-    returns = threading.Thread(target=return_once_waited_for)
-    returns.start()
-    try:
-        assert asyncio.run(_states_told(create_app(settings, warm=False))) == {}
-    finally:
-        returns.join()
-        server.kill()

@@ -1,44 +1,28 @@
 """Tests of new frames of several maps in one statement, from many threads."""
 
-import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 
 import pytest
 from sqlalchemy import select, text, update
 from sqlalchemy.exc import IntegrityError
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest import write_groups
 from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.errors import StoreLocked
-from sceneprint.process import of_request, work_of
+from sceneprint.process import of_request
 from sceneprint.store import open_database
-from sceneprint.store.database import MAP_WRITERS
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import add_map, store_model
+from sceneprint.store.maps import add_map
 from sceneprint.store.new_frames import NewFrame, receive_frames
 from sceneprint.store.postgres.connection import MapsInUse, take_turn
-from sceneprint.store.tables import frame_tags, frames, idempotency, jobs, maps, pending_events
-
-MODEL = "ab" * 32
-VALUES = {
-    "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1}, "depth_scale": 1000.0,
-    "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": [],
-    "pose_parent": None, "pose": None, "name": None, "sequence": None,
-}  # fmt: skip
-
-
-@pytest.fixture
-def rows(server_store):
-    with server_store.database.write() as connection:
-        store_model(connection, MODEL, "toy", b"a model")
-        return [add_map(connection, name, None, MODEL) for name in ("a", "b", "c")]
+from sceneprint.store.tables import frames, idempotency, jobs, maps, pending_events
+from tests.store.frame_rows import frame_values
 
 
 def new(row, content, **given):
-    known = {name: given.pop(name) for name in list(given) if name in VALUES}
-    return NewFrame(row, {**VALUES, **known, "content_id": f"{content:064x}"}, **given)
+    own = {name: given.pop(name) for name in ("priority", "result") if name in given}
+    return NewFrame(row, frame_values(f"{content:064x}", **given), **own)
 
 
 def receive(database, *given, wait_s=10.0):
@@ -78,29 +62,6 @@ def test_frames_of_several_maps_are_taken_in_their_order(server_store, rows):
         assert [(one.map, one.frame_id, one.job_id) for one in told] == [
             (one.row.name, one.frame_id, one.job_id) for one in given
         ]
-
-
-def test_each_has_its_own_columns_tags_and_priority(server_store, rows):
-    pose = [[1.0, 0.0, 0.0, 2.5], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.5], [0, 0, 0, 1.0]]
-    plain = new(rows[0], 1)
-    full = new(
-        rows[1], 2, robot="cart \U0001f916 \"'\\", captured_at=0.1, tags=["wet", "dark", "wet"],
-        pose=pose, pose_parent="odom", sequence=2**40, priority=-3,
-    )  # fmt: skip
-    assert receive(server_store.database, plain, full) == [True, True]
-    with server_store.database.read() as connection:
-        one, other = connection.execute(select(frames).order_by(frames.c.number)).mappings()
-        kept = {name: other[name] for name in (*VALUES, "pose_x", "pose_y", "pose_z")}
-        tags = connection.execute(select(frame_tags.c.frame_number, frame_tags.c.tag)).all()
-        priorities = connection.execute(select(jobs.c.priority).order_by(jobs.c.number)).scalars()
-        assert list(priorities) == [0, -3]
-        nulls = text("SELECT number FROM frames WHERE pose IS NULL")
-        assert connection.execute(nulls).scalars().all() == [one["number"]]
-    assert {name: one[name] for name in VALUES} == VALUES
-    assert kept["robot"] == full.values["robot"]
-    assert (kept["captured_at"], kept["sequence"], kept["pose"]) == (0.1, 2**40, pose)
-    assert (kept["pose_x"], kept["pose_y"], kept["pose_z"]) == (2.5, -1.0, 0.5)
-    assert sorted(map(tuple, tags)) == [(other["number"], "dark"), (other["number"], "wet")]
 
 
 def test_a_cloud_has_no_intrinsics(server_store, rows):
@@ -193,54 +154,32 @@ def test_a_map_that_is_in_use_is_waited_for_shortly(server_store, rows):
     assert receive(database, new(b, 1), wait_s=0.05) == [True]
 
 
-def test_maps_are_locked_in_one_order(server_store, rows, until):
+def test_maps_are_locked_in_one_order(server_store, rows, until, waiting):
     """Who waits for a map has none that comes after it: nobody waits for one who waits for him."""
     database = server_store.database
     with database.write() as connection:
-        rows += [add_map(connection, f"map-{i}", None, MODEL) for i in range(5)]
+        rows += [add_map(connection, f"map-{i}", None, rows[0].model_id) for i in range(5)]
     first, last = rows[0], rows[7]  # a set of their numbers has the greater one first
     assert list({last.number, first.number}) == [8, 1]
-    waiting = text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted")
     others = text("SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND objid = 8")
-    writer = threading.Thread(target=receive, args=(database, new(last, 1), new(first, 1)))
-    with in_use(database, first) as other:
-        writer.start()
-        until(lambda: other.execute(waiting).scalar_one() == 1)
+    with ThreadPoolExecutor(1) as pool, in_use(database, first) as other:
+        writer = pool.submit(receive, database, new(last, 1), new(first, 1))
+        until(lambda: waiting(server_store) == 1)
         assert other.execute(others).scalar_one() == 0
-    writer.join(PATIENCE_S)
+    writer.result()
     assert {name: n for name, n, _ in counted(database) if n} == {"a": 1, last.name: 1}
-
-
-def test_a_turn_that_does_not_come_is_no_map_in_use(server_store, rows, monkeypatch):
-    database = server_store.database
-    monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
-    with database._writers.begin() as other:
-        take_turn(other, 10.0)
-        with pytest.raises(StoreLocked):
-            receive(database, new(rows[0], 1), wait_s=10.0)
-    assert database._held
 
 
 def together(group, given, until):
     """What came of frames that all waited for one statement."""
-    found = [None] * len(given)
-
-    def run(i):
-        try:
-            found[i] = group.receive(given[i])
-        except Exception as error:
-            found[i] = error
-
-    threads = [threading.Thread(target=run, args=(i,)) for i in range(len(given))]
     group._led = True  # somebody writes
-    for one in threads:
-        one.start()
-    until(lambda: len(group._waiting) == len(given))
-    leader = group._waiting[0]
-    leader.leads = True
-    leader.ready.set()
-    for one in threads:
-        one.join()
+    with ThreadPoolExecutor(len(given)) as pool:
+        begun = [pool.submit(group.receive, one) for one in given]
+        until(lambda: len(group._waiting) == len(given))
+        leader = group._waiting[0]
+        leader.leads = True
+        leader.ready.set()
+        found = [one.exception() or one.result() for one in begun]
     assert (group._waiting, group._led) == ([], False)
     return found
 
@@ -285,33 +224,6 @@ def test_a_store_that_cannot_be_used_is_told_to_all(server_store, rows, until, m
         take_turn(other, 10.0)
         found = together(NewFrames(server_store.database), given, until)
     assert [type(one) for one in found] == [StoreLocked, StoreLocked]
-
-
-def test_others_do_not_wait_for_the_maps_of_who_leads(server_store, rows, until):
-    """A tenant whose own maps are all in use comes first in the group of all."""
-    database, group = server_store.database, NewFrames(server_store.database)
-    with database.write() as connection:
-        busy = [add_map(connection, f"busy-{i}", None, MODEL) for i in range(MAP_WRITERS)]
-
-    def write(row):
-        with work_of("its tenant"), database.write(map_number=row.number):
-            pass
-
-    def lead():
-        with work_of("its tenant"):
-            return group.receive(new(rows[0], 1))
-
-    with ThreadPoolExecutor(len(busy) + 1) as pool, ExitStack() as others:
-        for row in busy:
-            others.enter_context(in_use(database, row))
-        writers = [pool.submit(write, row) for row in busy]
-        until(lambda: database._map_turns._order._held.get("its tenant", 0) > 0)
-        assert pool.submit(lead).result(PATIENCE_S)
-        assert group.receive(new(rows[1], 1))
-        assert not any(one.done() for one in writers)
-        others.close()
-        for one in writers:
-            one.result(PATIENCE_S)
 
 
 def test_a_statement_that_was_prepared_in_vain_is_prepared_again(server_store, rows):

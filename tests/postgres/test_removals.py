@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import socket
-import subprocess
-import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, suppress
 
 import pytest
@@ -29,37 +28,11 @@ from sceneprint.store.tables import doomed, signatures
 from sceneprint_client.api import JobState, NewMap
 from tests.whole_engine import Engine
 
-OTHER = hashlib.sha256(b"of another frame").hexdigest()
-WAITING = text(
-    "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted "
-    "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
-)
 SESSIONS = (
     f"SELECT count(pg_terminate_backend(pid)) FROM pg_locks WHERE granted AND classid = {LOCKS} "
     "AND locktype = 'advisory' "
     "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
 )
-#: Seconds that a removal whose remover is gone is taken to go on.
-LONGEST = "sceneprint.store.postgres.session_locks.LONGEST_S"
-#: Removes blobs; dies before it settles them where it is told so.
-REMOVER = """
-import os, signal, sys
-from sceneprint.engine.upkeep import garbage_collection
-from sceneprint.store import open_store
-
-url, bucket, dies, *blobs = sys.argv[1:]
-store = open_store(url, bucket)
-if dies == "after":
-    clear = garbage_collection.clear_doomed
-
-    def clear_all_but_what_is_gone(connection, some, at=None, before=None):
-        if at is not None:
-            os.kill(os.getpid(), signal.SIGKILL)
-        clear(connection, some, at, before)
-
-    garbage_collection.clear_doomed = clear_all_but_what_is_gone
-garbage_collection.collect_blobs(store, blobs)
-"""
 
 
 class HeldDeletes:
@@ -124,28 +97,12 @@ class HeldDeletes:
                 one.shutdown(socket.SHUT_RDWR)
 
 
-class Background(threading.Thread):
-    """A call in a thread, of which is known what came of it."""
-
-    def __init__(self, do):
-        super().__init__(daemon=True)
-        self._do, self._found, self._error = do, None, None
-        self.start()
-
-    def run(self):
-        """Call it."""
-        try:
-            self._found = self._do()
-        except BaseException as error:
-            self._error = error
-
-    def result(self):
-        """What it returned."""
-        self.join(PATIENCE_S)
-        assert not self.is_alive()
-        if self._error is not None:
-            raise self._error
-        return self._found
+def background(do):
+    """Call it in a thread of its own; its future."""
+    with_one = ThreadPoolExecutor(1)
+    future = with_one.submit(do)
+    with_one.shutdown(wait=False)
+    return future
 
 
 @pytest.fixture
@@ -179,22 +136,16 @@ def remover(engine, postgres_url, bucket, held, monkeypatch):
 @pytest.fixture
 def removal(remover, held):
     """Begin to remove blobs, and come back when the request to delete them is held."""
-    begun = list[Background]()
+    begun = []
 
     def begin(*blobs):
-        begun.append(Background(lambda: collect_blobs(remover, blobs)))
+        begun.append(background(lambda: collect_blobs(remover, blobs)))
         assert held.arrived.wait(PATIENCE_S)
         return begun[-1]
 
     yield begin
     held.release()
-    for one in begun:
-        one.join(PATIENCE_S)
-
-
-def waiting(engine):
-    with engine.store.database.read() as connection:
-        return int(connection.execute(WAITING).scalar_one())
+    wait(begun, PATIENCE_S)
 
 
 def doomed_in(engine):
@@ -231,7 +182,7 @@ def test_an_upload_does_not_wait_for_a_removal(engine, small, held, removal):
         add(engine, small)
     assert engine.get_map("hall").frames == {"received": 2}
     assert doomed_in(engine) == [digest]
-    assert removing.is_alive()
+    assert not removing.done()
     held.release()
     removing.result()
     assert not engine.store.blobs.holds(digest)
@@ -241,29 +192,27 @@ def test_an_upload_does_not_wait_for_a_removal(engine, small, held, removal):
 
 @pytest.mark.parametrize(("add", "turn_s"), [(alone, 0.001), (in_a_group, 60.0)])
 def test_the_same_content_is_there_after_its_removal(
-    engine, small, held, removal, until, add, turn_s, monkeypatch
+    engine, small, held, removal, until, waiting, add, turn_s, monkeypatch
 ):
     """Who has committed its frame has no turn, and waits for longer."""
     monkeypatch.setattr("sceneprint.store.blobs.object_store.TURN_S", turn_s)
     digest = engine.store.blobs.put(small[0].png)
     removing = removal(digest)
-    adding = Background(lambda: add(engine, small))
-    until(lambda: waiting(engine) == 1 or not adding.is_alive())
+    adding = background(lambda: add(engine, small))
+    until(lambda: waiting(engine.store) == 1 or adding.done())
     held.release()
     removing.result()
     adding.result()
     assert engine.store.blobs.get(digest) == small[0].png
     work = engine.claim("w")
-    assert work is not None
     assert engine.run(work) == JobState.SUCCEEDED
 
 
-def test_an_artifact_is_there_after_its_removal(engine, small, held, removal, until):
+def test_an_artifact_is_there_after_its_removal(engine, small, held, removal, until, waiting):
     engine.create_map(NewMap(name="yard"))
     for name in ("hall", "yard"):
         engine.add_frame(name, *small[0])
     work = engine.claim("w")
-    assert work is not None
     assert engine.run(work) == JobState.SUCCEEDED
     with engine.store.database.write() as connection:
         artifact = connection.execute(select(signatures.c.geometry)).scalar_one()
@@ -273,9 +222,8 @@ def test_an_artifact_is_there_after_its_removal(engine, small, held, removal, un
     # the upload is the other map's, too, and stays noted until no earlier removal can take it
     assert doomed_in(engine) == sorted(blobs)
     work = engine.claim("w")
-    assert work is not None
-    signing = Background(lambda: engine.run(work))
-    until(lambda: waiting(engine) == 1 or not signing.is_alive())
+    signing = background(lambda: engine.run(work))
+    until(lambda: waiting(engine.store) == 1 or signing.done())
     held.release()
     removing.result()
     assert signing.result() == JobState.SUCCEEDED
@@ -312,74 +260,6 @@ def test_an_upload_that_waited_in_vain_has_its_blob_when_it_is_sent_again(
     assert not engine.store.blobs.holds(digest)
     outcome, again = engine.uploads.add("hall", Upload(*small[0]), once)
     assert (outcome.new, again) == (True, True)
-    assert engine.store.blobs.get(digest) == small[0].png
-
-
-def test_a_second_upload_waits_for_a_removal_too(engine, small, held, removal, until, monkeypatch):
-    """The first one may die before it has put its blob once more."""
-    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
-    digest = engine.store.blobs.put(small[0].png)
-    removing = removal(digest)
-    with monkeypatch.context() as patch:
-        patch.setattr("sceneprint.store.blobs.object_store.REMOVAL_S", 0.1)
-        with pytest.raises(StoreLocked):
-            alone(engine, small)
-    second = Background(lambda: alone(engine, small))
-    until(lambda: waiting(engine) == 1 or not second.is_alive())
-    held.release()
-    removing.result()
-    _, is_new = second.result()
-    assert not is_new
-    assert engine.store.blobs.get(digest) == small[0].png
-
-
-def test_what_is_on_its_way_out_stays_doomed_for_all(
-    engine, small, held, removal, until, monkeypatch
-):
-    """Also where another removal finds that something refers to it by now."""
-    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
-    digest = engine.store.blobs.put(small[0].png)
-    removing = removal(digest)
-    adding = Background(lambda: alone(engine, small))  # it is committed, and waits
-    until(lambda: waiting(engine) == 1 or not adding.is_alive())
-    collect_blobs(engine.store, [digest])
-    assert doomed_in(engine) == [digest]
-    held.release()
-    removing.result()
-    adding.result()
-    assert engine.store.blobs.get(digest) == small[0].png
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("dies", ["before", "after"])
-def test_what_a_killed_remover_leaves(
-    engine, small, held, postgres_url, bucket, dies, remover, until, monkeypatch
-):
-    digest = engine.store.blobs.put(small[0].png)
-    engine.store.blobs.put(b"of another frame")
-    if dies == "after":
-        held.release()
-    with subprocess.Popen(
-        [sys.executable, "-c", REMOVER, postgres_url, bucket, dies, digest, OTHER]
-    ) as process:
-        if dies == "before":
-            assert held.arrived.wait(PATIENCE_S)
-            process.kill()
-    assert process.returncode == -9
-    assert doomed_in(engine) == sorted([digest, OTHER])
-    held.drop()  # what it had asked for is not carried out
-    if dies == "before":
-        with pytest.raises(StoreLocked, match="lost its connection, and may still remove the blob"):
-            alone(engine, small)  # nobody can tell whether it is dead, or cut off
-        grow_old(engine)
-    alone(engine, small)  # who is dead is not waited for
-    assert engine.store.blobs.get(digest) == small[0].png
-    assert (OTHER in engine.store.blobs.digests()) == (dies == "before")
-    grow_old(engine)
-    monkeypatch.setattr(LONGEST, 0.0)
-    assert collect_doomed_blobs(engine.store) == 2
-    assert doomed_in(engine) == []
-    assert list(engine.store.blobs.digests()) == [digest]
     assert engine.store.blobs.get(digest) == small[0].png
 
 
@@ -427,7 +307,7 @@ def test_blobs_stay_doomed_where_the_object_store_is_away(engine, held, removal,
     assert digest in engine.store.blobs.digests()
     collect_blobs(engine.store, [digest])  # what was asked for may still come
     assert digest in engine.store.blobs.digests()
-    monkeypatch.setattr(LONGEST, 0.0)
+    monkeypatch.setattr("sceneprint.store.postgres.session_locks.LONGEST_S", 0.0)
     assert collect_doomed_blobs(engine.store) == 1
     assert not engine.store.blobs.holds(digest)
     assert doomed_in(engine) == []
@@ -479,19 +359,19 @@ def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
 
     def stall(self, *digests):
         arrived.set()
-        passes.wait()
+        passes.wait(PATIENCE_S)
         remove(self, *digests)
 
     with Engine(given) as engine, closing(open_store(postgres_url, given.blobs)) as remover:
         engine.create_map(NewMap(name="hall"))
         digest = engine.store.blobs.put(small[0].png)
         monkeypatch.setattr(FolderBlobs, "remove", stall)
-        removing = Background(lambda: collect_blobs(remover, [digest]))
+        removing = background(lambda: collect_blobs(remover, [digest]))
         assert arrived.wait(PATIENCE_S)
         end_sessions(engine, "objid = 1 AND mode = 'ExclusiveLock'")
-        adding = Background(lambda: alone(engine, small))
-        until(lambda: not adding.is_alive() or engine.get_map("hall").frames == {"received": 1})
-        assert adding.is_alive()
+        adding = background(lambda: alone(engine, small))
+        until(lambda: adding.done() or engine.get_map("hall").frames == {"received": 1})
+        assert not adding.done()
         passes.set()
         with pytest.raises(UnusableStore):
             removing.result()
@@ -499,26 +379,15 @@ def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
         assert engine.store.blobs.get(digest) == small[0].png
 
 
-def test_what_is_doomed_again_meanwhile_is_not_settled(engine, held, removal):
-    """It may have been put again, and its frame deleted, by who died before it removed it."""
-    first, second = (engine.store.blobs.put(one) for one in (b"of another frame", b"of a third"))
-    removing = removal(first, second)
-    with engine.store.database.write() as connection:
-        doom(connection, [first])
-    held.release()
-    removing.result()
-    assert doomed_in(engine) == [first]
-
-
-def test_one_removal_waits_for_another(engine, held, removal, until, monkeypatch):
+def test_one_removal_waits_for_another(engine, held, removal, until, waiting, monkeypatch):
     blobs = [engine.store.blobs.put(one) for one in (b"a", b"b", b"c")]
     removing = removal(blobs[0])
     with monkeypatch.context() as patch:
         patch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
         collect_blobs(engine.store, [blobs[1]])  # not for long
     assert doomed_in(engine) == sorted(blobs[:2])
-    also = Background(lambda: collect_blobs(engine.store, [blobs[2]]))
-    until(lambda: waiting(engine) == 1 or not also.is_alive())
+    also = background(lambda: collect_blobs(engine.store, [blobs[2]]))
+    until(lambda: waiting(engine.store) == 1 or also.done())
     held.release()
     removing.result()
     also.result()

@@ -21,6 +21,7 @@ from sceneprint.store.tables import (
     surface_frames,
 )
 from sceneprint_client.api import JobState
+from tests.store.frame_rows import frame_values
 
 MODEL, OTHER = "ab" * 32, "cd" * 32
 MADE = StoredSignature(MODEL, b"signature", "e" * 64, [3, 2], [5, 4])
@@ -31,13 +32,12 @@ CHANCE = {
     "started_at", "token", "turn",
 }  # fmt: skip
 POSE = [[1.0, 0.0, 0.0, 2.5], [0.0, 1.0, 0.0, -1.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.0, 0.0, 1.0]]
-VALUES = {
-    "content_id": "c" * 64, "blob": "b" * 64, "bytes": 70, "novelty": None,
-    "intrinsics": {"width": 4, "height": 3, "fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 1.5},
-    "depth_scale": 1000.0, "depth_along_ray": False, "robot": "cart", "session": "monday",
-    "captured_at": 12.5, "tags": ["wet", "dark", "wet"], "pose_parent": "odom", "pose": POSE,
-    "base_frame": None, "base": None, "up": [0.0, -1.0, 0.0], "sequence": 7, "cloud": None,
-}  # fmt: skip
+VALUES = frame_values(
+    "c" * 64, bytes=70, novelty=None, robot="cart \U0001f916 \"'\\", session="monday",
+    intrinsics={"width": 4, "height": 3, "fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 1.5},
+    captured_at=12.5, tags=["wet", "dark", "wet"], pose_parent="odom", pose=POSE, base_frame=None,
+    base=None, up=[0.0, -1.0, 0.0], sequence=2**40, cloud=None,
+)  # fmt: skip
 
 
 @pytest.fixture

@@ -2,76 +2,31 @@
 
 from __future__ import annotations
 
-import socket
-import threading
-from contextlib import contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 
 import pytest
 from sqlalchemy import event, func, insert, literal_column, select, text, update
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.engine.jobs import signature_job
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
-from sceneprint.errors import IdempotencyConflict, LostLease, NewerSchema, StoreLocked
+from sceneprint.errors import IdempotencyConflict, LostLease, NewerSchema
 from sceneprint.settings import Settings
-from sceneprint.store import open_database, queue
+from sceneprint.store import open_database
 from sceneprint.store.keys import IdempotentRequest
-from sceneprint.store.maps import add_map, find_map, frame_of, store_model
-from sceneprint.store.new_frames import NewFrame, receive_frames
+from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.signatures import StoredSignature, index_claimed_frame
-from sceneprint.store.tables import frames, idempotency, jobs, maps, pending_events, signatures
+from sceneprint.store.tables import idempotency, maps, pending_events, signatures
 from sceneprint_client.api import JobState, NewMap
 from tests.whole_engine import Engine
 
 MODEL = "ab" * 32
-#: What is known of a frame beside its content.
-KNOWN = {
-    "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1}, "depth_scale": 1000.0,
-    "depth_along_ray": False, "robot": None, "session": None, "captured_at": None, "tags": ["a"],
-    "pose_parent": None, "pose": None, "name": None, "sequence": None,
-}  # fmt: skip
 LOCKS_HELD = text(
     "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND granted "
     "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
 )
-WAITING = text(str(LOCKS_HELD).replace("AND granted", "AND NOT granted"))
-
-
-class TripCounter:
-    """A server's port that counts round trips: how often one asks after the other has answered."""
-
-    def __init__(self, port):
-        self._to, self._asks, self.trips = port, False, 0
-        self._lock = threading.Lock()
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._listener.getsockname()[1]
-        self._open: list[socket.socket] = []
-        threading.Thread(target=self._accept, daemon=True).start()
-
-    def _accept(self):
-        with suppress(OSError):
-            while True:
-                near, _ = self._listener.accept()
-                far = socket.create_connection(("127.0.0.1", self._to))
-                self._open += [near, far]
-                for pair in ((near, far, True), (far, near, False)):
-                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
-
-    def _pump(self, source, to, asks):
-        with suppress(OSError):
-            while data := source.recv(1 << 16):
-                with self._lock:
-                    self.trips += asks and not self._asks
-                    self._asks = asks
-                to.sendall(data)
-            to.shutdown(socket.SHUT_WR)
-
-    def close(self):
-        for one in (self._listener, *self._open):
-            one.close()
 
 
 @pytest.fixture
@@ -79,36 +34,6 @@ def row(server_store):
     with server_store.database.write() as connection:
         store_model(connection, MODEL, "toy", b"a model")
         return add_map(connection, "hall", None, MODEL)
-
-
-@pytest.fixture
-def counted(server_store, row):
-    """The same database by way of one who counts."""
-    url = server_store.database._engine.url
-    assert url.port is not None
-    counter = TripCounter(url.port)
-    database = open_database(url.set(port=counter.port).render_as_string(hide_password=False))
-    yield database, counter
-    database.close()
-    counter.close()
-
-
-def upload(database, row, number):
-    with database.write(map_number=row.number, single=True) as connection:
-        values = {**KNOWN, "content_id": f"{number:064x}"}
-        assert receive_frames(connection, [NewFrame(row, values)])
-
-
-def claimed(database):
-    with database.write(turn=False) as connection:
-        job = queue.claim(connection, "worker", 60.0)
-        return job, frame_of(connection, job.frame)
-
-
-def sign(database, job, frame):
-    made = StoredSignature(MODEL, bytes(400), "00" * 32, [1], [1])
-    with database.write(map_number=frame.map_number, single=True) as connection:
-        assert index_claimed_frame(connection, job, frame, "hall", made)
 
 
 def edit(database, row, note, *, single=True):
@@ -121,9 +46,9 @@ def named(store):
         return str(connection.execute(select(maps.c.name)).scalar_one())
 
 
-def locks(store, which=LOCKS_HELD):
+def locks(store):
     with store.database.read() as connection:
-        return int(connection.execute(which).scalar_one())
+        return int(connection.execute(LOCKS_HELD).scalar_one())
 
 
 @contextmanager
@@ -132,26 +57,6 @@ def held(store, row):
     with store.database._writers.begin() as other:
         postgres.take_turn(other, 10.0, None, None if row is None else row.number)
         yield other
-
-
-def test_an_upload_and_a_signature_take_one_round_trip_each(counted, row):
-    database, counter = counted
-    for number in range(8):  # what is asked often is prepared, which has its own messages
-        upload(database, row, number)
-        sign(database, *claimed(database))
-    begun = counter.trips
-    upload(database, row, 90)
-    assert counter.trips - begun == 1
-    work = claimed(database)
-    begun = counter.trips
-    sign(database, *work)
-    assert counter.trips - begun == 1
-    begun = counter.trips
-    edit(database, row, "later", single=False)
-    assert counter.trips - begun == 3  # the turn takes its own
-    with database.read() as connection:
-        counts = select(frames.c.state, func.count()).group_by(frames.c.state)
-        assert [tuple(one) for one in connection.execute(counts)] == [("indexed", 9)]
 
 
 def test_it_is_committed_with_its_answer_and_keeps_no_turn(server_store, row):
@@ -175,40 +80,30 @@ def test_nothing_cuts_its_commit_off(server_store, row):
         assert connection.exec_driver_sql("SHOW statement_timeout").scalar_one() == "1min"
 
 
-def test_it_sees_what_was_committed_while_its_turn_was_waited_for(server_store, row, until):
-    found = list[str]()
-
+def test_it_sees_what_was_committed_while_its_turn_was_waited_for(
+    server_store, row, until, waiting
+):
     def late():
         with server_store.database.write(map_number=row.number, single=True) as connection:
-            found.append(connection.execute(select(maps.c.name)).scalar_one())
+            return connection.execute(select(maps.c.name)).scalar_one()
 
-    writer = threading.Thread(target=late)
-    with held(server_store, row) as other:
-        writer.start()
-        until(lambda: locks(server_store, WAITING) == 1)
+    with ThreadPoolExecutor(1) as pool, held(server_store, row) as other:
+        writer = pool.submit(late)
+        until(lambda: waiting(server_store) == 1)
         other.execute(update(maps).values(name="renamed"))
-    writer.join(PATIENCE_S)
-    assert found == ["renamed"]
+    assert writer.result() == "renamed"
 
 
-def test_who_waited_for_a_migration_writes_nothing(server_store, row, until):
-    raised = list[Exception]()
-
-    def late():
-        try:
-            edit(server_store.database, row, "late")
-        except NewerSchema as error:
-            raised.append(error)
-
-    writer = threading.Thread(target=late)
-    with held(server_store, None) as other:
-        writer.start()
-        until(lambda: locks(server_store, WAITING) == 1)
+@pytest.mark.parametrize("single", [True, False])
+def test_who_waited_for_a_migration_writes_nothing(server_store, row, until, waiting, single):
+    with ThreadPoolExecutor(1) as pool, held(server_store, None) as other:
+        writer = pool.submit(edit, server_store.database, row, "late", single=single)
+        until(lambda: waiting(server_store) == 1)
         other.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
         other.exec_driver_sql("UPDATE schema_range SET least_revision = '9999'")
         other.exec_driver_sql("ALTER TABLE maps RENAME COLUMN name TO gone")  # it would fail, too
-    writer.join(PATIENCE_S)
-    assert [str(one).partition("schema ")[2][:4] for one in raised] == ["9999"]
+    with pytest.raises(NewerSchema, match="schema 9999"):
+        writer.result()
 
 
 def test_a_schema_that_went_on_and_may_be_written_to_is_noted(server_store, row):
@@ -224,26 +119,6 @@ def test_a_schema_that_went_on_and_may_be_written_to_is_noted(server_store, row)
     with pytest.raises(NewerSchema, match="Nothing was stored"):
         edit(database, row, "too late")
     assert named(server_store) == "later"
-
-
-def test_a_turn_that_does_not_come_in_time_is_said(server_store, row, monkeypatch):
-    monkeypatch.setattr("sceneprint.store.database.BUSY_S", 0.1)
-    with held(server_store, row), pytest.raises(StoreLocked):
-        edit(server_store.database, row, "late")
-    assert named(server_store) == "hall"
-    assert server_store.database._held  # who comes after that waits for less
-    edit(server_store.database, row, "later")
-    assert named(server_store) == "later"
-    assert not server_store.database._held
-
-
-def test_a_warning_of_before_is_not_one_of_its_commit(server_store, row):
-    """One of its commit says that it is not on the standby."""
-    with server_store.database.read() as connection:
-        warned = connection.execute(text("SELECT pg_cancel_backend(2147483647)")).scalar()
-    assert warned is False
-    edit(server_store.database, row, "after")
-    assert named(server_store) == "after"
 
 
 def test_what_fails_leaves_nothing(server_store, row):
@@ -298,8 +173,9 @@ def engine(postgres_url, tmp_path):
         yield opened
 
 
-def removed_before(engine, monkeypatch, then):
-    """Have a deletion remove an upload just before its commit, and something done after that."""
+def test_an_upload_that_a_deletion_removed_before_its_commit_is_put_again(
+    engine, small, monkeypatch
+):
     once = NewFrames.receive
 
     def run(group, frame):
@@ -307,16 +183,9 @@ def removed_before(engine, monkeypatch, then):
         collect_blobs(engine.store, list(engine.store.blobs.digests()))
         found = once(group, frame)
         assert list(engine.store.blobs.digests()) == []
-        then()
         return found
 
     monkeypatch.setattr(NewFrames, "receive", run)
-
-
-def test_an_upload_that_a_deletion_removed_before_its_commit_is_put_again(
-    engine, small, monkeypatch
-):
-    removed_before(engine, monkeypatch, lambda: None)
     added, new = engine.add_frame("hall", *small[0])
     assert new
     work = engine.claim("w")
@@ -325,74 +194,11 @@ def test_an_upload_that_a_deletion_removed_before_its_commit_is_put_again(
     assert engine.get_map("hall").frames == {"indexed": 1}
 
 
-def test_a_worker_that_missed_an_upload_tries_again(engine, small, monkeypatch):
-    """It had come between the commit and the upload's being put again."""
-    missed = list[str]()
-
-    def work_in_between():
-        work = engine.claim("w")
-        assert engine.run(work) == JobState.QUEUED
-        missed.append(work.job.id)
-
-    removed_before(engine, monkeypatch, work_in_between)
-    added, new = engine.add_frame("hall", *small[0])
-    assert (new, missed) == (True, [added.job_id])
-    with engine.store.database.write() as connection:
-        connection.execute(update(jobs).values(run_after=0.0))
-    work = engine.claim("w")
-    assert work is not None
-    assert engine.run(work) == JobState.SUCCEEDED
-    assert engine.get_map("hall").frames == {"indexed": 1}
-
-
-def test_an_upload_to_a_map_in_use_waits_for_it_and_others_go_on(engine, small, until, monkeypatch):
-    """Those for the same map wait behind it, and nobody with them."""
-    engine.create_map(NewMap(name="other"))
-    tried, receive = list[str](), NewFrames.receive
-
-    def noted(group, frame):
-        tried.append(frame.row.name)
-        return receive(group, frame)
-
-    monkeypatch.setattr(NewFrames, "receive", noted)
-    with engine.store.database.read() as connection:
-        row = find_map(connection, "hall")
-    done = list[bool]()
-
-    def late(number):
-        done.append(engine.add_frame("hall", *small[number])[1])
-
-    first, second = (threading.Thread(target=late, args=(i,)) for i in (0, 1))
-    with held(engine.store, row):
-        first.start()
-        until(lambda: row.number in engine.uploads._writes)  # it was not waited for any longer
-        second.start()
-        until(lambda: len(engine.uploads._writes[row.number]._waiting) == 2)
-        assert engine.add_frame("other", *small[2])[1]
-        assert done == []
-    first.join(PATIENCE_S)
-    second.join(PATIENCE_S)
-    assert (done, tried) == ([True, True], ["hall", "other"])
-    assert engine.get_map("hall").frames == {"received": 2}
-
-
-def test_a_frame_has_the_id_that_it_is_put_under(engine, small):
-    mine, other, no = (
-        Upload(*small[i], frame_id=frame_id) for i, frame_id in enumerate(("mine", "other", None))
-    )
-    assert engine.uploads.add("hall", mine)[0].accepted.frame_id == "mine"
-    outcomes, _ = engine.uploads.add_all("hall", [other, no])
-    own, given = (one.accepted.frame_id for one in outcomes)
-    assert (own, len(given)) == ("other", 32)
-    assert engine.get_map("hall").frames == {"received": 3}
-
-
 def test_an_artifact_that_a_deletion_removed_before_its_commit_is_put_again(
     engine, small, monkeypatch
 ):
     engine.add_frame("hall", *small[0])
     work = engine.claim("w")
-    assert work is not None
     (upload,) = engine.store.blobs.digests()
     index = signature_job.index_claimed_frame
 

@@ -13,6 +13,7 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.store import open_database, open_store, queue
 from sceneprint.store.maps import add_frame, add_map, store_model
 from sceneprint.store.tables import jobs
+from tests.store.frame_rows import frame_values
 
 MODEL = "ab" * 32
 
@@ -120,16 +121,11 @@ def received(store, hall):
     """A function that inserts a frame with default fields."""
 
     def add(content, row=hall, frame_id=None, within=None, **given):
-        values = {
-            "content_id": content, "blob": "00" * 32, "bytes": 3, "intrinsics": {"width": 1},
-            "depth_scale": 1000.0, "depth_along_ray": False, "robot": None, "session": None,
-            "captured_at": None, "tags": [], "pose_parent": None, "pose": None, "name": None,
-            "sequence": None,
-        }  # fmt: skip
+        values = frame_values(content, **given)
         if within is not None:
-            return add_frame(within, row.number, values | given, frame_id)
+            return add_frame(within, row.number, values, frame_id)
         with store.database.write() as connection:
-            return add_frame(connection, row.number, values | given, frame_id)
+            return add_frame(connection, row.number, values, frame_id)
 
     return add
 

@@ -1,19 +1,16 @@
-"""Tests of rows of frames, signatures and keys, and of notifications."""
-
-import hashlib
+"""Tests of rows of frames and signatures, and of notifications."""
 
 import pytest
 from sqlalchemy import select, update
 from sqlalchemy.exc import IntegrityError
 
-from sceneprint.errors import Conflict, UnknownFrame, UnknownKey, UnknownMap
+from sceneprint.errors import UnknownFrame, UnknownMap
 from sceneprint.store import frame_queries, queue
 from sceneprint.store import frames as stored
-from sceneprint.store import keys as stored_keys
 from sceneprint.store import maps as stored_maps
 from sceneprint.store import signatures as signed
 from sceneprint.store.deletion import remove_map
-from sceneprint.store.tables import events, keys, signatures
+from sceneprint.store.tables import events, signatures
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.listing import FrameListing
 
@@ -198,35 +195,3 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(store, hall, r
     with store.database.write() as connection:  # numbers are not given out twice
         again = stored_maps.add_map(connection, "hall", None, hall.model_id)
     assert again.number > other.number
-
-
-def test_a_key_is_shown_once_and_kept_as_a_hash(store):
-    with store.database.write() as connection:
-        assert stored_keys.list_keys(connection) == []
-        secret = stored_keys.create_key(connection, "fleet", {"*": "admin"})
-        other = stored_keys.create_key(connection, "dashboard", {"hall": "read"}, 5.0)
-    assert secret.startswith("sp_")
-    assert len(secret) == 46
-    with pytest.raises(Conflict, match="A key named 'fleet'"), store.database.write() as connection:
-        stored_keys.create_key(connection, "fleet", {"*": "admin"})
-    with store.database.read() as connection:
-        assert [key.name for key in stored_keys.list_keys(connection)] == ["dashboard", "fleet"]
-        found = [stored_keys.find_key(connection, s) for s in (secret, other, secret[:-1], "")]
-        assert [one and (one.name, one.grants, one.expires_at) for one in found] == [
-            ("fleet", {"*": "admin"}, None), ("dashboard", {"hall": "read"}, 5.0), None, None,
-        ]  # fmt: skip
-        rows = connection.execute(select(keys).order_by(keys.c.name.desc())).all()
-        assert [row.digest for row in rows] == [
-            hashlib.sha256(s.encode()).hexdigest() for s in (secret, other)
-        ]
-        told = connection.execute(select(events)).all()
-    assert [(each.kind, each.data) for each in told] == [
-        ("key.created", {"name": "fleet"}), ("key.created", {"name": "dashboard"}),
-    ]  # fmt: skip
-    assert secret not in repr(rows) + repr(told)
-    with store.database.write() as connection:
-        stored_keys.revoke_key(connection, "fleet")
-        assert stored_keys.find_key(connection, secret) is None
-        assert stored_keys.find_key(connection, other) is not None
-    with pytest.raises(UnknownKey, match="no key named 'fleet'"), store.database.write() as c:
-        stored_keys.revoke_key(c, "fleet")

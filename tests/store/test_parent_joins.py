@@ -16,6 +16,7 @@ from sceneprint.store.parent_joins import (
 )
 from sceneprint.store.tables import frame_row, frames, surface_frames
 from sceneprint_client.api import FrameState
+from tests.store.frame_rows import frame_values
 
 MODEL = "ab" * 32
 CB, BA = "c" * 32, "b" * 32  # associations
@@ -39,13 +40,8 @@ def at(store):
         store_model(connection, MODEL, "toy", b"")
         row = add_map(connection, "hall", None, MODEL)
         for name in ("A", "B", "C", None):
-            values = {
-                "content_id": f"{name}" * 8, "blob": "e" * 64, "bytes": 1, "novelty": None,
-                "intrinsics": None, "depth_scale": 1.0, "depth_along_ray": False, "robot": None,
-                "session": name, "captured_at": None, "tags": [], "base_frame": None, "base": None,
-                "up": None, "sequence": None, "cloud": None, "pose_parent": name,
-                "pose": None if name is None else SENT,
-            }  # fmt: skip
+            pose = {} if name is None else {"pose_parent": name, "pose": SENT}
+            values = frame_values(f"{name}" * 8, session=name, novelty=None, cloud=None, **pose)
             add_frame(connection, row.number, values)
         yield connection, row.number
 

@@ -13,11 +13,7 @@ from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import open_blobs, open_database, open_store
 from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.blobs.object_client import open_objects
-from sceneprint.store.blobs.object_store import ObjectBlobs
-from sceneprint.store.postgres.session_locks import BLOBS
 
-#: Seconds that a removal whose remover is gone is taken to go on.
-LONGEST = "sceneprint.store.postgres.session_locks.LONGEST_S"
 HOLDS = """
 import sys, time
 from sceneprint.store import open_store
@@ -25,22 +21,6 @@ with open_store(sys.argv[1], sys.argv[2]).blobs.block_removals():
     print("held", flush=True)
     time.sleep(600)
 """
-
-
-def objects_of(store):
-    assert isinstance(store.blobs, ObjectBlobs)
-    return store.blobs
-
-
-def lose_lock(store, until):
-    """Close the connection that removes, and wait until the server has released its lock."""
-    objects_of(store)._locks.close()
-    locks = text(
-        "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND objid = :blobs "
-        "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
-    )
-    with store.database.read() as connection:
-        until(lambda: connection.execute(locks, {"blobs": BLOBS}).scalar_one() == 0)
 
 
 def test_a_new_database_gets_its_folder_beside_blobs_elsewhere(tmp_path):
@@ -157,45 +137,6 @@ def test_what_was_put_is_held_without_asking_until_something_is_removed(postgres
     assert mine.blobs.holds(digest)
     mine.blobs.remove(digest)
     assert not mine.blobs.holds(digest)
-    mine.close()
-    theirs.close()
-
-
-def test_a_remover_that_dies_is_not_forgotten(postgres_url, bucket, monkeypatch, until):
-    mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
-    removing = theirs.blobs.removing()
-    assert removing.__enter__()
-    digest = mine.blobs.put(b"depth")
-    lose_lock(theirs, until)  # as its process would, before it counted to the end
-    objects_of(theirs).objects.delete(f"blobs/{digest[:2]}/{digest}")
-    assert not mine.blobs.holds(digest)
-    with mine.blobs.removing() as allowed:  # its lock is free, and its requests may still come
-        assert not allowed
-    assert objects_of(mine)._locks.removals() is None
-    monkeypatch.setattr(LONGEST, 0.0)
-    with mine.blobs.removing() as allowed:
-        assert allowed
-    digest = mine.blobs.put(b"depth")
-    objects_of(mine).objects.delete(f"blobs/{digest[:2]}/{digest}")
-    assert mine.blobs.holds(digest)  # counted evenly again, and so not asked
-    removing.__exit__(None, None, None)
-    mine.close()
-    theirs.close()
-
-
-def test_who_lost_its_lock_does_not_end_the_removal_of_another(
-    postgres_url, bucket, monkeypatch, until
-):
-    monkeypatch.setattr(LONGEST, 0.0)
-    mine, theirs = (open_store(postgres_url, bucket) for _ in range(2))
-    removing = mine.blobs.removing()
-    assert removing.__enter__()
-    lose_lock(mine, until)  # as the loss of its connection would
-    with theirs.blobs.removing() as allowed:
-        assert allowed
-        removing.__exit__(None, None, None)
-        assert objects_of(theirs)._locks.removals() is None
-    assert objects_of(theirs)._locks.removals() is not None
     mine.close()
     theirs.close()
 

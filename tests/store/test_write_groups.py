@@ -1,14 +1,13 @@
 """Tests of writers that are committed together, and fail separately."""
 
-import threading
 import time
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from sqlalchemy import event, func, select
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.engine.ingest.write_groups import MOST_TOGETHER, Grouping, _Group, _Waiting
+from sceneprint.engine.ingest.write_groups import MOST_TOGETHER, Grouping
 from sceneprint.errors import FrameConflict, LostLease, StoreFull
 from sceneprint.process import of_request, request_id
 from sceneprint.store.events import record_event
@@ -27,23 +26,15 @@ def together(database, works, *, one_by_one=False):
     """
     group, commits = Grouping(database), [0]
     event.listen(database._engine, "commit", lambda _: commits.__setitem__(0, commits[0] + 1))
-    found = [None] * len(works)
-
-    def run(i):
-        try:
-            found[i] = group.run(works[i])
-        except BaseException as error:
-            found[i] = error
-
-    threads = [threading.Thread(target=run, args=(i,)) for i in range(len(works))]
-    with database.write():  # until this is over nobody else writes
-        for i, one in enumerate(threads):
-            one.start()
-            if one_by_one:
-                until_waiting(group, i + 1)
-        until_waiting(group, len(works))
-    for one in threads:
-        one.join()
+    with ThreadPoolExecutor(len(works)) as pool:
+        with database.write():  # until this is over nobody else writes
+            begun = []
+            for work in works:
+                begun.append(pool.submit(group.run, work))
+                if one_by_one:
+                    until_waiting(group, len(begun))
+            until_waiting(group, len(works))
+        found = [one.exception() or one.result() for one in begun]
     return found, commits[0] - 1
 
 
@@ -82,13 +73,9 @@ def test_each_is_of_its_own_request_whoever_writes_it(database):
         with of_request(f"request {i}"):
             seen[i] = group.run(lambda _: request_id())
 
-    threads = [threading.Thread(target=run, args=(i,)) for i in range(4)]
-    with database.write():
-        for one in threads:
-            one.start()
-        until_waiting(group, len(threads))
-    for one in threads:
-        one.join()
+    with ThreadPoolExecutor(4) as pool, database.write():
+        begun = [pool.submit(run, i) for i in range(4)]
+        until_waiting(group, len(begun))
     assert seen == {i: f"request {i}" for i in range(4)}
 
 
@@ -149,59 +136,3 @@ def test_ctrl_c_in_a_second_try_forgets_nobody(database):
     )
     assert [type(found[0]), *found[1:]] == [KeyboardInterrupt, 1, None, 3]
     assert (errors, count(database, "a")) == ([], 3)
-
-
-def test_ctrl_c_of_one_that_waits_is_its_own(database, monkeypatch):
-    """Also where it was to lead next."""
-    group, found = Grouping(database), list[Any]()
-    interrupted = _Waiting(noting("a", 2))
-
-    def wait():
-        interrupted.leads = True  # passed on before it notices
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(interrupted.ready, "wait", wait)
-    monkeypatch.setattr("sceneprint.engine.ingest.write_groups._Waiting", lambda _: interrupted)
-    group._led = True  # somebody writes
-    with pytest.raises(KeyboardInterrupt):
-        group.run(noting("a", 2))
-    monkeypatch.undo()
-    found.append(group.run(noting("a", 3)))
-    assert (found, count(database, "a"), group._led, group._waiting) == ([3], 1, False, [])
-
-
-def test_ctrl_c_of_who_leads_and_of_one_that_it_took_ends_both_alone(monkeypatch):
-    entered, taken_by_now, leave = (threading.Event() for _ in range(3))
-
-    class Interrupted(_Group[str]):
-        def _write_together(self, batch):
-            entered.set()
-            assert taken_by_now.wait(PATIENCE_S)
-            self._take(batch)
-            leave.set()
-            waiter.join(PATIENCE_S)
-            raise KeyboardInterrupt
-
-    class Leaving(_Waiting[str]):
-        def __init__(self, work):
-            super().__init__(work)
-            monkeypatch.setattr(self.ready, "wait", self.leave)
-
-        def leave(self):
-            assert leave.wait(PATIENCE_S)
-            raise KeyboardInterrupt
-
-    def run(name):
-        with pytest.raises(KeyboardInterrupt):
-            group._await(name)
-
-    group = Interrupted()
-    leader, waiter = (threading.Thread(target=run, args=(name,)) for name in ("leader", "waiter"))
-    leader.start()
-    assert entered.wait(PATIENCE_S)
-    monkeypatch.setattr("sceneprint.engine.ingest.write_groups._Waiting", Leaving)
-    waiter.start()
-    until_waiting(group, 2)
-    taken_by_now.set()
-    leader.join(PATIENCE_S)
-    assert (group._led, group._waiting) == (False, [])

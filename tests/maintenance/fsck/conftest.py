@@ -6,11 +6,11 @@ import shutil
 import sqlite3
 import zlib
 from contextlib import closing
-from dataclasses import dataclass
 
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
+from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.models import open_table, write_model
@@ -23,22 +23,14 @@ from tests.whole_engine import Engine
 HALL = 12
 
 
-@dataclass(frozen=True)
-class Upload:
-    """A frame as a robot sends it."""
-
-    data: bytes
-    meta: FrameMeta
-
-
 class House:
     """A data folder with its cache folder, and actions on them."""
 
-    def __init__(self, place):
+    def __init__(self, place, url=None, cache=None):
         self.place, self.data = place, place / "data"
         self.settings = Settings(
-            data_dir=self.data, cache_dir=place / "cache", database_url=None, index_dir=None,
-            unindexed_frames=HALL // 2 - 1,
+            data_dir=self.data, cache_dir=cache or place / "cache", database_url=url,
+            index_dir=None, unindexed_frames=HALL // 2 - 1,
         )  # fmt: skip
 
     @property
@@ -47,6 +39,9 @@ class House:
 
     def look(self, **how):
         return list(fsck(self.settings, **how))
+
+    def kinds(self, **how):
+        return [one.kind for one in self.look(**how)]
 
     def files(self):
         """Return the checksum of every file, and the names of folders."""
@@ -170,6 +165,12 @@ def copied(master):
         return House(place)
 
     return copy
+
+
+@pytest.fixture(scope="session")
+def house_at():
+    """A function that returns the data folder of a place, perhaps with a database elsewhere."""
+    return House
 
 
 @pytest.fixture

@@ -1,21 +1,12 @@
 """Tests of `sceneprint fsck`: output, exit codes, and use beside a service."""
 
-import io
 import json
 import os
 import shutil
-import subprocess
-import sys
-import threading
 
-import numpy as np
 import pytest
-from PIL import Image
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint_client import Client
-from sceneprint_lab.cli.demo import serving
 from tests.whole_engine import Engine
 
 
@@ -96,54 +87,3 @@ def test_what_is_not_there_is_not_made(house, tmp_path, capsys):
         assert (said.out, said.err.count("\n")) == ("", 1)
     Engine(house.settings).close()  # nor does a service that starts
     assert not any(path.exists() for path in (typo, out, house.data / "blobs"))
-
-
-def variant(upload, n):
-    """The upload, n millimetres farther away: another content, and another blob."""
-    out, samples = io.BytesIO(), np.array(Image.open(io.BytesIO(upload.data)))
-    Image.fromarray(np.where(samples > 0, samples + n, 0).astype(np.uint16)).save(out, "PNG")
-    return out.getvalue()
-
-
-@pytest.mark.thorough
-def test_beside_a_service_nothing_is_lost(house, uploads):
-    """Robots upload and delete while fsck repairs without grace: worse than an operator does."""
-    record = house.place / "found.json"
-    command = [
-        sys.executable, "-m", "sceneprint", "fsck", "--repair", "--grace", "0",
-        "--data", str(house.data), "--json", str(record),
-    ]  # fmt: skip
-    ended, found = [], []
-
-    def check():
-        while len(ended) < 2:
-            done = subprocess.run(command, capture_output=True, text=True)
-            ended.append((done.returncode, done.stderr))
-            found.extend(json.loads(record.read_text())["findings"])
-
-    kept, deleted = {}, 0
-    with serving(house.data, 1) as url, Client(url) as client:
-        client.create_map("busy", model="depth")
-        thread = threading.Thread(target=check)
-        thread.start()
-        n = 0
-        while thread.is_alive():
-            n += 1
-            for i, each in enumerate(uploads):
-                data = variant(each, n)
-                added, _ = client.add("busy", data, each.meta)
-                kept[added.frame_id] = (added.job_id, data)
-                if n > 1 or i % 3 == 2:  # enough to sign, and still enough to do
-                    client.delete_frame("busy", added.frame_id)
-                    del kept[added.frame_id]
-                    deleted += 1
-        thread.join()
-        assert ended == [(0, "")] * 2
-        # what may be found is a blob before its commit, or after its frame was deleted
-        assert {one["kind"] for one in found} <= {"unreferenced-file"}
-        client.wait([job for job, _ in kept.values()], timeout_s=PATIENCE_S)
-        assert client.map("busy").frames == {"deleted": deleted, "indexed": len(kept)}
-    for frame, (_, data) in kept.items():
-        ((blob,),) = house.sql("SELECT blob FROM frames WHERE id = ?", frame)
-        assert house.blob(blob).read_bytes() == data
-    assert house.look() == []

@@ -2,7 +2,6 @@
 
 import zlib
 
-import numpy as np
 import pytest
 
 FIRST = "(SELECT MIN(number) FROM frames WHERE state = 'indexed')"
@@ -40,34 +39,11 @@ FAULTS = {
         f"SELECT COUNT(*) FROM signatures WHERE frame_number = {WAITING}",
         [(0,)],
     ),
-    "a signature of another model": (
-        (
-            "INSERT INTO models SELECT 'other', name, content, created_at FROM models",
-            "INSERT INTO signatures SELECT frame_number, 'other', vector, checksum, geometry,"
-            f" n_patches, n_pairs FROM signatures WHERE frame_number = {FIRST}",
-        ),
-        "stray-signature",
-        f"SELECT COUNT(*) FROM signatures WHERE frame_number = {FIRST}",
-        [(1,)],
-    ),
     "a tag too many": (
         f"INSERT INTO frame_tags VALUES ({FIRST}, 'other')",
         "stale-value",
         f"SELECT tag FROM frame_tags WHERE frame_number = {FIRST} ORDER BY tag",
         [("all",), ("view-0",)],
-    ),
-    "a tag that is not there": (
-        f"DELETE FROM frame_tags WHERE frame_number = {FIRST} AND tag = 'all'",
-        "stale-value",
-        f"SELECT tag FROM frame_tags WHERE frame_number = {FIRST} ORDER BY tag",
-        [("all",), ("view-0",)],
-    ),
-    "another position": (
-        f"UPDATE frames SET pose_y = pose_y + 1 WHERE number = {FIRST}",
-        "stale-value",
-        # another sample of the same view
-        "SELECT pose_y = (SELECT pose_y FROM frames WHERE number = 2) FROM frames WHERE number = 1",
-        [(1,)],
     ),
     "a revision beyond the map's": (
         "UPDATE maps SET revision = 11 WHERE name = 'hall'",
@@ -116,15 +92,6 @@ def test_what_a_map_is_counted_to_hold(house):
     assert f"usage is {before[0][0] + 1} frames with {before[0][1]} bytes" in found.means
     assert [one.left for one in house.look(repair=True)] == [False]
     assert (house.sql(asked), house.look()) == (before, [])
-
-
-def test_what_is_repaired_is_signed(house, truth, uploads):
-    house.sql(f"DELETE FROM signatures WHERE frame_number = {FIRST}")
-    house.sql(f"UPDATE jobs SET state = 'cancelled' WHERE frame_number = {WAITING}")
-    assert [one.left for one in house.look(repair=True)] == [False, False]
-    assert house.work() == ["succeeded", "succeeded"]
-    assert house.look() == []
-    assert house.answers(uploads[:12]) == truth
 
 
 def test_one_map_is_looked_at_alone(house):
@@ -180,43 +147,3 @@ def test_a_damaged_signature_is_made_again(house, truth, uploads):
     assert [one for one in house.sql(asked) if one[0] <= 13] == [o for o in sound if o[0] <= 13]
     assert house.look() == []
     assert house.answers(uploads[:12]) == truth
-
-
-@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-@pytest.mark.parametrize("times", [4, pytest.param(12, marks=pytest.mark.thorough)])
-@pytest.mark.parametrize("kind", ["keys", "faiss", "json", "upload", "artifact", "signature"])
-def test_a_flipped_bit_is_named_and_nothing_else_is(house, kind, times):
-    rng = np.random.default_rng(7)
-    stored = house.sql(
-        "SELECT f.id, f.blob, s.geometry, s.vector FROM frames f JOIN signatures s"
-        " ON s.frame_number = f.number JOIN maps m ON m.number = f.map_number"
-        " WHERE m.name = 'hall' ORDER BY f.number"
-    )
-    database = house.data / "sceneprint.db"
-    data = database.read_bytes()
-    # each lies there alone, and on one page: some are split, or like another's
-    whole = [(one[3], one[0]) for one in stored if data.count(one[3]) == 1]
-    places = {
-        "upload": [(house.blob(one[1]), one[0]) for one in stored],
-        "artifact": [(house.blob(one[2]), one[0]) for one in stored],
-    }
-    before = house.files()
-    for _ in range(times):
-        if kind == "signature":
-            vector, what = whole[rng.integers(len(whole))]
-            path, at = database, data.index(vector) + int(rng.integers(len(vector)))
-        else:
-            some = places.get(kind) or [(one, str(one.parent)) for one in house.index_files(kind)]
-            path, what = some[rng.integers(len(some))]
-            at = int(rng.integers(path.stat().st_size))
-        bit = int(rng.integers(8))
-        house.damage(path, at=at, bit=bit)
-        flipped = house.files()
-        (found,) = house.look()
-        wanted = kind if kind in (*places, "signature") else "index"
-        assert (found.kind, found.frame_id or str(found.path)) == (f"damaged-{wanted}", what)
-        assert (found.severity, found.done, found.left) == ("damage", None, True)
-        assert house.files() == flipped  # to look changes nothing
-        house.damage(path, at=at, bit=bit)
-    assert house.files() == before
-    assert house.look() == []

@@ -1,10 +1,13 @@
-"""Tests of the valid secrets of a key, and of the time of its last use."""
+"""Tests of keys: their secrets, and the time of their last use."""
+
+import hashlib
 
 import pytest
 from sqlalchemy import select
 
-from sceneprint.errors import UnknownKey
+from sceneprint.errors import Conflict, UnknownKey
 from sceneprint.store import keys
+from sceneprint.store.tables import events
 from sceneprint.store.tables import keys as table
 
 
@@ -62,3 +65,35 @@ def test_a_use_is_written_once_an_hour(store, clock):
         use()
         uses.write(store.database)
         assert used() == [expected]
+
+
+def test_a_key_is_shown_once_and_kept_as_a_hash(store):
+    with store.database.write() as connection:
+        assert keys.list_keys(connection) == []
+        secret = keys.create_key(connection, "fleet", {"*": "admin"})
+        other = keys.create_key(connection, "dashboard", {"hall": "read"}, 5.0)
+    assert secret.startswith("sp_")
+    assert len(secret) == 46
+    with pytest.raises(Conflict, match="A key named 'fleet'"), store.database.write() as connection:
+        keys.create_key(connection, "fleet", {"*": "admin"})
+    with store.database.read() as connection:
+        assert [key.name for key in keys.list_keys(connection)] == ["dashboard", "fleet"]
+        found = [keys.find_key(connection, s) for s in (secret, other, secret[:-1], "")]
+        assert [one and (one.name, one.grants, one.expires_at) for one in found] == [
+            ("fleet", {"*": "admin"}, None), ("dashboard", {"hall": "read"}, 5.0), None, None,
+        ]  # fmt: skip
+        rows = connection.execute(select(table).order_by(table.c.name.desc())).all()
+        assert [row.digest for row in rows] == [
+            hashlib.sha256(s.encode()).hexdigest() for s in (secret, other)
+        ]
+        told = connection.execute(select(events)).all()
+    assert [(each.kind, each.data) for each in told] == [
+        ("key.created", {"name": "fleet"}), ("key.created", {"name": "dashboard"}),
+    ]  # fmt: skip
+    assert secret not in repr(rows) + repr(told)
+    with store.database.write() as connection:
+        keys.revoke_key(connection, "fleet")
+        assert keys.find_key(connection, secret) is None
+        assert keys.find_key(connection, other) is not None
+    with pytest.raises(UnknownKey, match="no key named 'fleet'"), store.database.write() as c:
+        keys.revoke_key(c, "fleet")
