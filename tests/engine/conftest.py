@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import shutil
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from sqlalchemy import select, update
 
 from sceneprint.engine.jobs.tasks import LongJob
@@ -17,10 +19,13 @@ from sceneprint.formats.dataset import decode_frame, write_depth_png
 from sceneprint.geometry.signature.fisher_vector import Whitening
 from sceneprint.pipeline import open_signer, prepare
 from sceneprint.settings import Settings
+from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.events import number_events
+from sceneprint.store.maps import MapUsage, counted_usage, find_map
 from sceneprint.store.tables import events, jobs
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
+from sceneprint_client.api.frames import ImportOptions
 from tests.whole_engine import Engine
 
 
@@ -44,6 +49,52 @@ class Between:
     def __call__(self):
         self._do()
         return False
+
+
+def packed_again(data, level=0):
+    """Return the same pixels as another PNG."""
+    out = io.BytesIO()
+    Image.open(io.BytesIO(data)).save(out, "PNG", compress_level=level)
+    assert out.getvalue() != data
+    return out.getvalue()
+
+
+def flip(path, position):
+    """Change one bit of a file."""
+    data = bytearray(path.read_bytes())
+    data[position] ^= 1 << position % 8
+    path.write_bytes(data)
+
+
+def used(engine):
+    """Return what `hall` is counted to hold, which a count over its rows confirms."""
+    with engine.store.database.read() as connection:
+        row = find_map(connection, "hall")
+        assert counted_usage(connection, row.number) == MapUsage(row.used_frames, row.used_bytes)
+    return MapUsage(row.used_frames, row.used_bytes)
+
+
+def bytes_on_disk(engine):
+    """Return the size of all files below the folder of blobs, unfinished ones too."""
+    paths = engine.settings.blob_dir.rglob("*")
+    # the mark says whose the blobs are
+    return sum(one.stat().st_size for one in paths if one.is_file() and one.name != MARK)
+
+
+def begin_import(engine, data, options=None, map_name="hall"):
+    """Send a file to be imported; returns the job."""
+    options = options or ImportOptions()
+    with engine.imports.receive(map_name, options) as receiver:
+        receiver.write(data)
+        file = receiver.end()
+    return engine.imports.begin(map_name, file, options)[0]
+
+
+def claim_long(engine):
+    """Claim a long job; frames that wait to be signed are left waiting."""
+    while not isinstance(work := engine.claim("test"), LongJob):
+        assert work is not None
+    return work
 
 
 @pytest.fixture(scope="session")
@@ -206,31 +257,3 @@ def due_now():
             connection.execute(update(jobs).where(running).values(leased_until=1.0))
 
     return turn
-
-
-@pytest.fixture(scope="session")
-def each_slice_lost_once(due_now):
-    """A function that runs a product's job in steps, with a worker that dies after each one.
-
-    It returns the number of slices.
-    """
-
-    def work(engine, products, job_id):
-        slices = 0
-        while not products.get("hall", job_id).state.over:
-            lost = engine.claim("dies")
-            assert isinstance(lost, LongJob)
-            first = products.run_slice(lost, lambda: True)
-            due_now(engine)
-            again = engine.claim("lives")
-            assert isinstance(again, LongJob)
-            assert engine.jobs._tasks.run(lost, 60.0, 60.0) is None  # another worker has the lease
-            second = products.run_slice(again, lambda: True)
-            assert asdict(first) == asdict(second)
-            engine.jobs._tasks._store_result(again, second)
-            slices += 1
-            progress = products.get("hall", job_id).progress
-            assert progress.done == min(slices, progress.total or 0)
-        return slices
-
-    return work

@@ -3,14 +3,14 @@
 import time
 
 import pytest
-from sqlalchemy import event, insert, select, update
+from sqlalchemy import insert, select, update
 
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep.purge import Retention
 from sceneprint.errors import UnknownFrame, UnknownJob
 from sceneprint.index.index_manifest import manifests, read_manifest
-from sceneprint.store.deletion import DAY_S, maps_with_ended
+from sceneprint.store.deletion import DAY_S
 from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, jobs, maps, surface_frames
 from sceneprint_client.api import FrameState, Query
@@ -76,16 +76,6 @@ def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(full
     assert after(full, 1000) == 0  # the living stay
 
 
-def test_a_frame_that_can_be_restored_keeps_its_row(full, ids):
-    name = ids(full)[0]
-    full.delete_frame("hall", name)
-    assert after(full, 2 * DAYS) == 0
-    assert (name, "deleted") in rows(full)
-    full.tombstones.restore_one("hall", name)
-    with full.store.database.read() as connection:
-        assert connection.execute(select(frames.c.ended_at)).scalars().all() == [None] * 12
-
-
 @pytest.mark.parametrize("needed", ["job", "surface"])
 def test_a_row_that_is_needed_stays(full, ids, needed):
     full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
@@ -138,27 +128,6 @@ def test_a_reader_that_missed_deletions_begins_anew(data, make_engine, uploads, 
         assert engine.view("hall")[2].size == 10
 
 
-def test_an_index_is_published_before_it_would_be_too_old(data, make_engine, uploads, ids):
-    """Of ten thousand frames, one deletion would else be no reason for a year."""
-    engine = make_engine(data, unindexed_frames=5, deleted_rows_days=DAYS)
-    assert engine.publish_due() == 1
-    engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
-    names = ids(engine)
-    engine.delete_frame("hall", names[4])
-    assert engine.publish_due() == 0
-    with engine.store.database.write() as connection:
-        aged = frames.c.state == "deleted"
-        old = time.time() - DAY_S * DAYS / 2 - 60
-        connection.execute(update(frames).where(aged).values(ended_at=old))
-    late = make_engine(data, unindexed_frames=5, deleted_rows_days=DAYS)
-    assert late.publish_due() == 1
-    assert late.publish_due() == 0
-    assert after(late, DAYS) == 1
-    version = make_engine(data, unindexed_frames=5).view("hall")[2].version
-    assert version.revision == pruned(late)
-    assert found(late, uploads) == sorted(set(names) - {names[4]})
-
-
 def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(data, make_engine, ids):
     """On a node that was off meanwhile: its index is built anew, as nobody knows what went."""
     engine = make_engine(data, unindexed_frames=11)
@@ -176,18 +145,3 @@ def test_purging_leaves_no_byte_of_a_frame_whose_row_is_gone(data, make_engine, 
     assert (number, read_manifest(path).frames) == (2, 6)
     assert before.isdisjoint(path.name for path in folder.glob("*.faiss"))
     assert engine.purging.now().indexes == 0
-
-
-def test_rows_that_are_due_are_found_by_an_index(full, ids):
-    asked = []
-    database = full.store.database
-    with database.read() as connection:
-        event.listen(connection, "before_cursor_execute", lambda *given: asked.append(given[2]))
-        assert maps_with_ended(connection, 1.0) == []
-        if not database.is_sqlite:
-            return
-        statement = next(one for one in asked if one.startswith("SELECT"))
-        plan = connection.exec_driver_sql(f"EXPLAIN QUERY PLAN {statement}", (1.0, 1.0)).all()
-    told = [one[3] for one in plan]
-    assert sum("ix_frames_ended" in one for one in told) >= 2, told
-    assert not any("SCAN frames" in one for one in told), told

@@ -59,47 +59,33 @@ def fill(engine, count, seed, name="hall"):
             vector = rng.integers(0, 3, model.signature_bytes, np.uint8)
             signature = StoredSignature(model.id, vector.tobytes(), "11" * 32, [1], [1])
             index_frame(connection, frame, signature)
-            made.append(
-                Known(
-                    frame.id,
-                    vector,
-                    values["robot"],
-                    values["session"],
-                    at,
-                    values["tags"],
-                    parent,
-                    place,
-                )
-            )
+            robot, session, tags = (values[name] for name in ("robot", "session", "tags"))
+            made.append(Known(frame.id, vector, robot, session, at, tags, parent, place))
     return made
 
 
 def passes(one, wanted, own):
     """By the sentences of `Filter`, condition by condition."""
-    if wanted.robot is not None and one.robot not in wanted.robot:
-        return False
-    if wanted.session is not None and one.session not in wanted.session:
-        return False
-    if wanted.captured_after and (one.at is None or one.at < wanted.captured_after):
-        return False
-    if wanted.captured_before and (one.at is None or one.at > wanted.captured_before):
-        return False
-    if not set(wanted.tags) <= set(one.tags):
-        return False
+    inside = is_far = True
     if wanted.not_within_s is not None and one.session == own.session:
         other_robot = None not in (one.robot, own.robot) and one.robot != own.robot
         near = one.at is None or abs((one.at - own.at).total_seconds()) <= wanted.not_within_s
-        if near and not other_robot:
-            return False
+        is_far = other_robot or not near
     if wanted.region is not None:
         low, high = wanted.region.min, wanted.region.max
-        inside = all(
-            getattr(low, axis) <= x <= getattr(high, axis)
-            for axis, x in zip("xyz", one.place, strict=True)
+        sides = zip("xyz", one.place, strict=True)
+        inside = one.parent == wanted.region.parent_frame and all(
+            getattr(low, axis) <= x <= getattr(high, axis) for axis, x in sides
         )
-        if one.parent != wanted.region.parent_frame or not inside:
-            return False
-    return one.id not in wanted.exclude_frames
+    after, before = wanted.captured_after, wanted.captured_before
+    return (
+        (wanted.robot is None or one.robot in wanted.robot)
+        and (wanted.session is None or one.session in wanted.session)
+        and (after is None or (one.at is not None and one.at >= after))
+        and (before is None or (one.at is not None and one.at <= before))
+        and set(wanted.tags) <= set(one.tags)
+        and (is_far and inside and one.id not in wanted.exclude_frames)
+    )
 
 
 def ranked(frames, own, wanted):
@@ -174,52 +160,14 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine, published):
         sizes.append(hold(answer, frames, own, wanted))
     assert min(sizes) == 0
     assert sum(size > 20 for size in sizes) > 10
-    everything = Filter()
-    assert hold(ask(engine, frames[0], everything), frames, frames[0], everything) > 100
-
-
-def test_each_condition_alone(make_engine):
-    engine = make_engine()
-    engine.create_map(NewMap(name="hall", model="depth"))
-    frames = fill(engine, 100, 5)
-    times = [one.at for one in frames]
-    whole = [one for one in frames if None not in (one.session, one.robot, one.at)]
-    own = next(one for one in whole if times.count(one.at) > 1)
-    nameless = next(one for one in frames if one.session and one.at and one.robot is None)
-    later = own.at + timedelta(hours=2)
-    box = {"min": {"x": -1, "y": -1, "z": -1}, "max": {"x": 1, "y": 1, "z": 1}}
-    cases = [
-        ({"robot": own.robot}, own),
-        ({"robot": ["r1", "r2", "r3"]}, own),
-        ({"session": "s2"}, own),
-        ({"captured_after": own.at}, own),
-        ({"captured_before": own.at}, own),
-        ({"captured_after": own.at, "captured_before": own.at}, own),
-        # another zone's clock, the same moment
-        ({"captured_before": own.at.astimezone(timezone(timedelta(hours=5)))}, own),
-        ({"tags": ["é"]}, own),
-        ({"tags": ["c", "door", "c"]}, own),
-        ({"not_within_s": 10}, own),
-        ({"not_within_s": 10}, nameless),
-        ({"not_within_s": 1e300}, own),
-        ({"region": {"parent_frame": "p1", **box}}, own),
-        ({"region": {"parent_frame": "p2", **box}}, own),
-        ({"exclude_frames": [one.id for one in frames[:90]] + ["nobody"]}, own),
-    ]
-    for given, asker in cases:
+    own = askers[0]
+    for given in (
+        {}, {"captured_after": own.at, "captured_before": own.at},  # bounds are inside
+        {"captured_before": own.at.astimezone(timezone(timedelta(hours=5)))},  # the same moment
+        {"not_within_s": 1e300}, {"exclude_frames": [one.id for one in frames[:90]] + ["nobody"]},
+    ):  # fmt: skip
         wanted = Filter.model_validate(given)
-        passed = hold(ask(engine, asker, wanted), frames, asker, wanted)
-        assert 0 < passed < 99, given
-    nothing = [
-        {"robot": "nobody"},
-        {"tags": ["door", "window"]},
-        {"captured_after": later},
-        {"region": {"parent_frame": "p3", **box}},
-        {"exclude_frames": [one.id for one in frames]},
-    ]
-    for given in nothing:
-        wanted = Filter.model_validate(given)
-        assert hold(ask(engine, own, wanted), frames, own, wanted) == 0
+        assert hold(ask(engine, own, wanted), frames, own, wanted) > 0
 
 
 def test_what_does_not_pass_is_neither_matched_nor_located_by(full, uploads, ids):
@@ -266,35 +214,3 @@ def test_who_asks_to_keep_away_from_itself_says_where_it_is(full, uploads, ids, 
     assert caught.value.fields == (("captured_at", needed),)
     whole = named.model_copy(update={"captured_at": START})
     assert full.queries.upload(["hall"], uploads[0].data, whole, query).counts.passed == 12
-
-
-def test_frames_between_view_and_filter_do_no_harm(make_engine, monkeypatch):
-    """One is deleted, and one indexed, after the view was made and before the filter is asked."""
-    from sceneprint.engine.search import retrieval
-
-    engine = make_engine()
-    engine.create_map(NewMap(name="hall", model="depth"))
-    frames = fill(engine, 20, 6)
-    passing, gone = retrieval.passing_frames, frames[3]
-
-    def late(*given):
-        monkeypatch.setattr(retrieval, "passing_frames", passing)
-        engine.delete_frame("hall", gone.id)
-        fill(engine, 5, 7)
-        return passing(*given)
-
-    monkeypatch.setattr(retrieval, "passing_frames", late)
-    answer = ask(engine, frames[0], Filter())
-    left = [one for one in frames if one is not gone]
-    assert [m.frame_id for m in answer.matches] == [i for i, _ in ranked(left, frames[0], Filter())]
-    assert (answer.counts.map, answer.counts.passed) == (19, 18)
-
-    def early(*given):
-        numbers = passing(*given)
-        engine.delete_frame("hall", frames[4].id)
-        return numbers
-
-    monkeypatch.setattr(retrieval, "passing_frames", early)
-    answer = ask(engine, frames[0], Filter())
-    assert frames[4].id not in {m.frame_id for m in answer.matches}  # though it was compared
-    assert len(answer.matches) == 22

@@ -3,15 +3,14 @@
 import time
 
 import pytest
-from sqlalchemy import select, text, update
+from sqlalchemy import select, update
 
 from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.upkeep import purge
 from sceneprint.engine.upkeep.purge import Retention
-from sceneprint.errors import InvalidRequest, StoreLocked
-from sceneprint.store.deletion import DAY_S, old_frames
+from sceneprint.errors import InvalidRequest
+from sceneprint.store.deletion import DAY_S
 from sceneprint.store.events import EventFilter, list_events, number_events
-from sceneprint.store.maps import find_map
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap
 
@@ -74,15 +73,6 @@ def test_time_goes_on_and_keeping_all_stops_it(aged, ids):
     assert ids(aged) == names[1:]
 
 
-def test_a_turn_is_short_and_goes_on_with_the_next(aged, ids, monkeypatch):
-    monkeypatch.setattr(purge, "AT_ONCE", 3)
-    monkeypatch.setattr(purge, "TURN_S", 0.0)
-    edit_map(aged.store, "hall", {"retention_days": 0.01})
-    worker = Retention(aged.store, ROWS_DAYS)
-    assert [worker.run() for _ in range(6)] == [3, 3, 3, 3, 0, 0]
-    assert ids(aged) == []
-
-
 def test_what_it_would_do_is_told_and_not_done(aged, ids):
     before, etag = ids(aged), aged.get_map("hall").etag
     told = edit_map(aged.store, "hall", {"retention_days": 3}, dry_run=True)
@@ -92,32 +82,6 @@ def test_what_it_would_do_is_told_and_not_done(aged, ids):
     assert ids(aged) == before
     with pytest.raises(InvalidRequest):
         edit_map(aged.store, "hall", {"retention_days": -3}, dry_run=True)
-
-
-def test_a_store_without_a_turn_is_asked_again_later(aged, ids, monkeypatch):
-    def locked(*_):
-        raise StoreLocked("somebody writes")
-
-    edit_map(aged.store, "hall", {"retention_days": 3})
-    with monkeypatch.context() as patch:
-        patch.setattr(purge, "delete_frames", locked)
-        assert Retention(aged.store, ROWS_DAYS).run() == 0
-    assert len(ids(aged)) == 12
-    assert Retention(aged.store, ROWS_DAYS).run() == 9
-
-
-@pytest.mark.sqlite_only("it asks SQLite for its plan")
-def test_the_oldest_are_found_without_reading_those_that_are_gone(aged):
-    with aged.store.database.read() as connection:
-        number = find_map(connection, "hall").number
-        statement = str(
-            select(frames.c.number)
-            .where(text("map_number = 1 AND received_at < 5 AND state != 'deleted'"))
-            .order_by(frames.c.received_at)
-        )
-        plan = connection.execute(text(f"EXPLAIN QUERY PLAN {statement}")).all()
-        assert "ix_frames_aging (map_number=? AND received_at<?)" in str(plan)
-        assert len(old_frames(connection, number, time.time(), 100)) == 12
 
 
 def test_a_host_whose_clock_is_wrong_deletes_nothing(make_engine, postgres_url, uploads, tmp_path):

@@ -9,11 +9,11 @@ import pytest
 from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import AppendBuffer
 from sceneprint.errors import UnusableStore
-from sceneprint.index.index_manifest import scrub
 from sceneprint.index.index_version import newest
 from sceneprint.models import read_model
 from sceneprint.store.signatures import SignatureChange
 from sceneprint_client.api import Query
+from tests.engine.conftest import flip
 
 ALL = Query(stages=("retrieve",), k=50)
 #: Bytes of a signature.
@@ -34,12 +34,6 @@ def until_healed(engine):
     return published
 
 
-def flip(path, position):
-    data = bytearray(path.read_bytes())
-    data[position] ^= 1 << position % 8
-    path.write_bytes(data)
-
-
 @pytest.mark.parametrize("kind", ["faiss", "keys", "json"])
 def test_a_flipped_byte_of_an_index_is_found_and_healed(data, make_engine, uploads, kind):
     builder = make_engine(data, unindexed_frames=1, index_check_interval_s=1)
@@ -58,29 +52,6 @@ def test_a_flipped_byte_of_an_index_is_found_and_healed(data, make_engine, uploa
     assert (sound.number, len(sound)) == (2, 12)
     for engine in (served, make_engine(data)):
         assert ask(engine, uploads) == (wanted, 2)
-
-
-def test_who_scrubs_leaves_a_mark_and_nobody_else_does_for_a_while(data, make_engine):
-    engine = make_engine(
-        data, unindexed_frames=1, index_check_interval_s=3600
-    )  # which holds it open
-    assert engine.publish_due() == 1
-    (path,) = data.glob("index/hall-*/*.faiss")
-    flip(path, path.stat().st_size - 5 * LENGTH)
-    assert until_healed(engine) == 0
-    (data / "index" / ".scrubbed").unlink()
-    assert until_healed(make_engine(data, unindexed_frames=1, index_check_interval_s=3600)) == 1
-
-
-def test_rebuilding_makes_the_same_index_from_nothing(data, make_engine, uploads):
-    engine = make_engine(data, unindexed_frames=1)
-    wanted, _ = ask(engine, uploads)
-    assert engine.publish_due() == 1
-    names = {path.name for path in data.glob("index/hall-*/*.faiss")}
-    version = engine.rebuild_index("hall")
-    assert version == 2
-    assert {path.name for path in data.glob("index/hall-*/*.faiss")} == names
-    assert ask(engine, uploads) == (wanted, 2)
 
 
 def test_a_frame_signed_anew_is_found_once_with_its_new_signature():
@@ -113,37 +84,6 @@ def test_a_tail_in_a_file_is_as_one_in_memory(tmp_path, monkeypatch, in_memory):
     np.testing.assert_array_equal(late.tail().signatures, rows[200:])
     np.testing.assert_array_equal(late.tail().keys, np.arange(200, 300))
     assert list(tmp_path.glob("index/*")) == []  # nothing to be left behind
-
-
-def test_a_damaged_index_is_read_once_and_not_with_every_query(data, make_engine, uploads, caplog):
-    assert make_engine(data, unindexed_frames=1).publish_due() == 1
-    (path,) = data.glob("index/hall-*/*.faiss")
-    flip(path, path.stat().st_size - 5 * LENGTH)
-    engine = make_engine(data)
-    for _ in range(5):
-        assert ask(engine, uploads)[1] == 0
-    said = [r for r in caplog.records if r.message.startswith("Damaged index skipped")]
-    assert len(said) == 1
-    flip(path, path.stat().st_size - 5 * LENGTH)  # as it was: out of reach for a moment
-    _, reader = engine.readers._open["hall"]
-    reader._unsound = reader._unsound[0], 0.0  # when it is time to try again
-    assert ask(engine, uploads)[1] == 1
-
-
-def test_what_is_out_of_reach_for_a_moment_is_not_removed(data, make_engine, monkeypatch):
-    assert make_engine(data, unindexed_frames=1).publish_due() == 1
-    (folder,) = data.glob("index/hall-*")
-    before = sorted(path.name for path in folder.iterdir())
-    real = Path.open
-
-    def no_descriptor(path, *given, **more):
-        if path.suffix == ".faiss":
-            raise OSError(24, "Too many open files")
-        return real(path, *given, **more)
-
-    monkeypatch.setattr(Path, "open", no_descriptor)
-    assert [one for one in scrub(folder) if one is not None] == []
-    assert sorted(path.name for path in folder.iterdir()) == before
 
 
 def test_a_tail_that_finds_no_room_is_as_it_was(tmp_path, monkeypatch):

@@ -17,7 +17,7 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.bundle import rows
 from sceneprint.engine.maps import map_copy
 from sceneprint.engine.maps.map_copy import pull_map
-from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, NotFound, UnknownMap
+from sceneprint.errors import Conflict, DamagedBlob, InvalidRequest, UnknownMap
 from sceneprint.store import open_store
 from sceneprint_client import Client
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose
@@ -229,34 +229,6 @@ def test_a_copy_is_one_state_of_a_map_that_changes(robot, walk, monkeypatch):
     assert answered[-1][1] == {}  # the copy's own parts are those of the service
 
 
-def test_a_frame_that_goes_before_its_artifact_is_passed_over(robot, walk, monkeypatch):
-    service = robot.service
-    service.create_map(MAP, model="depth")
-    ids = upload(service, walk[:2])
-    read = service.copied_artifact
-
-    def gone(*given):
-        if service.frame(MAP, ids[0]).state == "indexed":
-            service.delete_frame(MAP, ids[0])
-        return read(*given)
-
-    monkeypatch.setattr(service, "copied_artifact", gone)
-    found = robot.pull()
-    assert (found.frames, found.written, found.revision) == (1, 1, 3)
-
-
-def test_artifacts_that_are_away_end_the_pull(robot, walk, monkeypatch):
-    robot.service.create_map(MAP, model="depth")
-    upload(robot.service, walk[:1])
-
-    def away(*_):
-        raise NotFound("no such artifact")
-
-    monkeypatch.setattr(robot.service, "copied_artifact", away)
-    with pytest.raises(Conflict, match="lost artifacts"):
-        robot.pull()
-
-
 def test_other_bytes_than_were_named_are_refused(robot, walk, monkeypatch):
     robot.service.create_map(MAP, model="depth")
     upload(robot.service, walk[:1])
@@ -287,14 +259,3 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
     for folder in (other, other / "sceneprint.db"):
         with pytest.raises(InvalidRequest, match="but no pulled maps"):
             map_copy.claim_folder(folder)
-
-
-def test_edits_of_the_map_follow(robot):
-    robot.service.create_map(MAP, model="depth")
-    robot.pull()
-    robot.service.edit_map(MAP, {"title": "The hall", "up": [0.0, 0.0, 1.0]})
-    robot.pull()
-    with Client.embedded(robot.folder) as client:
-        told = client.map(MAP)
-        assert (told.title, told.up) == ("The hall", robot.service.map(MAP).up)
-        assert told.up is not None

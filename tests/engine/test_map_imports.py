@@ -20,6 +20,7 @@ from sceneprint.types import ReferenceSurface
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.frames import ImportOptions, MapImportResult
 from sceneprint_lab.synth.rooms import make_room
+from tests.engine.conftest import begin_import, claim_long
 from tests.whole_engine import Engine
 
 #: A camera of few pixels, so that views are rendered and signed quickly.
@@ -33,20 +34,7 @@ def options_of(**more):
 
 
 def begun(engine, data, **more):
-    options = options_of(**more)
-    with engine.imports.receive("hall", options) as receiver:
-        for start in range(0, len(data), 100_000):
-            receiver.write(data[start : start + 100_000])
-        file = receiver.end()
-    return engine.imports.begin("hall", file, options)[0]
-
-
-def claimed(engine):
-    while True:  # views that wait to be signed are left waiting
-        work = engine.claim("test")
-        if isinstance(work, LongJob):
-            return work
-        assert work is not None
+    return begin_import(engine, data, options_of(**more))
 
 
 def slice_of(engine, task, is_over):
@@ -70,7 +58,7 @@ def chosen_folder(once, room_mesh):
             engine.create_map(NewMap(name="hall", model="depth"))
             begun(engine, room_mesh, tags=["given"], robot="r1")
             for _ in ("read", "choose"):
-                assert engine.run(claimed(engine)) == JobState.QUEUED
+                assert engine.run(claim_long(engine)) == JobState.QUEUED
 
     return once("chosen", make)
 
@@ -125,7 +113,7 @@ def test_a_room_becomes_a_map_in_which_it_is_found(chosen, due_now):
 
 def test_a_slice_that_was_lost_adds_nothing_twice(chosen, monkeypatch):
     monkeypatch.setattr(map_import, "_AT_ONCE", 3)
-    task = claimed(chosen)
+    task = claim_long(chosen)
     lost = slice_of(chosen, task, lambda: True)
     assert [one["status"] for one in lost.items] == [202, 202, 202]
     again = slice_of(chosen, task, lambda: False)  # there is time for all now
@@ -139,19 +127,9 @@ def test_a_slice_that_was_lost_adds_nothing_twice(chosen, monkeypatch):
     assert [one.name for one in chosen.list_frames("hall", limit=1000).items] == names
 
 
-def test_the_same_view_in_two_sessions_is_two_frames(chosen, monkeypatch):
-    monkeypatch.setattr(map_import, "_AT_ONCE", 2)
-    task = claimed(chosen)
-    data = {**task.job.data, "session": "annex"}
-    other = replace(task, job=replace(task.job, data=data))
-    added = [slice_of(chosen, one, lambda: True).items for one in (task, other)]
-    assert [one["status"] for items in added for one in items] == [202] * 4
-    assert len({one["frame_id"] for items in added for one in items}) == 4
-
-
 def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(chosen, monkeypatch):
     monkeypatch.setattr("sceneprint.engine.ingest.archive_import.TIDY_S", 0.0)
-    task = claimed(chosen)
+    task = claim_long(chosen)
     edit_map(chosen.store, "hall", {"quota_frames": 1})
     before = replace(task, job=replace(task.job, progress={**task.progress, "phase": "choose"}))
     with pytest.raises(QuotaExceeded, match=r"has \d+ views, .* 1 frames"):
@@ -174,7 +152,7 @@ def test_a_surface_needs_room_beyond_that_of_its_file(empty):
     data += f"property float z\nend_header\n{rows}"
     job = begun(empty, data.encode())
     edit_map(empty.store, "hall", {"quota_bytes": len(data) + 10})
-    assert empty.run(claimed(empty)) == JobState.FAILED
+    assert empty.run(claim_long(empty)) == JobState.FAILED
     assert "its quota is" in str(empty.get_job(job.job_id).error)
     assert used_bytes(empty) == len(data)
 
@@ -199,7 +177,7 @@ def test_files_in_one_parent_frame_need_one_offset(empty):
     def slices(place, name, count, **more):
         job = begun(empty, room_at(place), name=name, parent_frame="district", **more)
         for _ in range(count):
-            task = claimed(empty)
+            task = claim_long(empty)
             assert task.job.id == job.job_id
             state = empty.run(task)
         if state == JobState.QUEUED:
@@ -241,7 +219,7 @@ def test_files_that_are_no_map_are_refused(empty, room_mesh):
             begun(empty, data, name="room")
     assert list(empty.store.blobs.digests()) == []
     job = begun(empty, room_mesh[: len(room_mesh) // 2])
-    assert empty.run(claimed(empty)) == JobState.FAILED
+    assert empty.run(claim_long(empty)) == JobState.FAILED
     assert "room.ply" in str(empty.get_job(job.job_id).error)
     empty.create_map(NewMap(name="yard", model="lidar"))
     with (

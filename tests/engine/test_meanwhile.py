@@ -1,11 +1,7 @@
 """Tests of answers while frames are added, deleted and damaged."""
 
-import threading
-import time
-
 import pytest
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.search import local_index, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
@@ -73,52 +69,6 @@ def test_matches_that_are_deleted_while_they_are_validated_are_not_found(
     answer = empty.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query())
     assert (answer.status, answer.matches, answer.location) == ("not_found", [], None)
     assert (answer.counts.validated, answer.counts.accepted) == (0, 0)
-
-
-def test_queries_beside_deletions_and_publishing_see_one_state(
-    full, make_engine, uploads, ids, monkeypatch
-):
-    """Frames go one by one, from the last: every answer has the first n, rightly ranked."""
-    monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-    engine, builder = make_engine(unindexed_frames=1), make_engine(unindexed_frames=1)
-    names = ids(full)
-    whole = [(m.frame_id, m.distance) for m in full.query_frame("hall", names[0], R).matches]
-    over, raised, sizes = threading.Event(), [], [[] for _ in range(4)]
-
-    def work(seen):
-        try:
-            while not over.is_set():
-                answer = engine.query_frame("hall", names[0], R)
-                live = set(names[1 : answer.counts.map + 1])
-                told = [(m.frame_id, m.distance) for m in answer.matches]
-                wanted = [pair for pair in whole if pair[0] in live]
-                # what went after the view was taken is left out, and nothing else
-                assert [pair for pair in wanted if pair in told] == told
-                seen.append(answer.counts.map)
-        except BaseException as error:
-            raised.append(error)
-
-    threads = [threading.Thread(target=work, args=(seen,)) for seen in sizes]
-    for thread in threads:
-        thread.start()
-    try:  # the threads end, whatever fails: they would keep the process alive
-        for i, name in enumerate(reversed(names[4:])):
-            builder.delete_frame("hall", name)
-            if i == 3:
-                assert builder.publish_due() == 1
-        deadline = time.monotonic() + PATIENCE_S
-        while not all(seen and seen[-1] == 3 for seen in sizes) and not raised:
-            last = [seen[-1:] for seen in sizes]
-            assert time.monotonic() < deadline, f"readers see {last} frames, not 3 each"
-            over.wait(0.01)
-    finally:
-        over.set()
-        for thread in threads:
-            thread.join()
-    assert raised == []
-    for seen in sizes:
-        assert seen == sorted(seen, reverse=True)
-    assert engine.query_frame("hall", names[0], R).index_version == 1
 
 
 def test_what_is_deleted_while_an_index_is_published_stays_deleted(

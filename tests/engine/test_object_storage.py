@@ -1,18 +1,12 @@
 """Tests of engines that share only PostgreSQL and an object store."""
 
-import io
-import json
-import tarfile
-
 import pytest
 
-from benchmarks.s3 import ObjectServer
 from sceneprint.engine.admin import statistics as measuring
 from sceneprint.engine.context import require_writable
 from sceneprint.errors import UnusableStore
 from sceneprint.store.blobs.object_client import open_objects
 from sceneprint_client.api import NewMap, Query
-from sceneprint_client.api.frames import ImportOptions
 
 
 @pytest.fixture
@@ -56,56 +50,6 @@ def test_what_one_node_takes_another_works_on(nodes, uploads, work_off, bucket):
     assert len(keys(objects, "blobs/")) == 2
     one.delete_map("hall")
     assert keys(objects, "blobs/") == []
-
-
-def test_objects_are_removed_by_one_request_and_those_that_are_needed_stay(
-    make_engine, postgres_url, uploads, tmp_path, work_off, monkeypatch
-):
-    """Writers wait meanwhile, and a store of objects may be far away."""
-    with ObjectServer(log=tmp_path / "requests") as server:
-        for name, value in server.env.items():
-            monkeypatch.setenv(name, value)
-        bucket = server.bucket("counted")
-        engine = make_engine(tmp_path / "node", database_url=postgres_url, blob_url=bucket)
-        for name in ("hall", "shop"):
-            engine.create_map(NewMap(name=name, model="depth"))
-        for each in uploads[:5]:
-            engine.add_frame("hall", each.data, each.meta)
-        engine.add_frame("shop", uploads[0].data, uploads[0].meta)
-        assert work_off(engine) == ["succeeded"] * 6
-        objects = open_objects(bucket)
-        assert len(keys(objects, "blobs/")) == 10
-        before = server.requests()
-        engine.delete_map("hall")
-        asked = server.requests() - before
-        assert (asked["POST"], asked["DELETE"]) == (1, 0)
-        assert len(keys(objects, "blobs/")) == 2
-        told = engine.queries.upload(["shop"], uploads[0].data, uploads[0].meta, Query(k=1))
-        assert told.status == "found"
-
-
-def test_an_archive_is_read_where_it_lies(nodes, uploads, work_off, bucket):
-    one, other = nodes
-    one.create_map(NewMap(name="hall", model="depth"))
-    made = io.BytesIO()
-    camera = uploads[0].meta.intrinsics.model_dump(exclude={"distortion"})
-    with tarfile.open(fileobj=made, mode="w:gz") as archive:
-        members = {"run/intrinsics.json": json.dumps(camera).encode()}
-        members |= {f"run/{i}.png": one.data for i, one in enumerate(uploads[:3])}
-        for name, data in members.items():
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            archive.addfile(info, io.BytesIO(data))
-    with one.imports.receive("hall", ImportOptions()) as receiver:
-        receiver.write(made.getvalue())
-        file = receiver.end()
-    job = one.imports.begin("hall", file, ImportOptions())[0]
-    assert work_off(other) == ["succeeded"] * 4
-    told = one.get_job(job.job_id)
-    assert told.result["received"] == 3
-    names = {key.rpartition("/")[2] for key in keys(open_objects(f"{bucket}/fleet"), "blobs/")}
-    assert len(names) == 6  # uploads and artifacts; the archive went with its job
-    assert file.blob not in names
 
 
 def test_what_ends_with_a_process_is_for_one_process_alone(make_engine, uploads, work_off):

@@ -5,12 +5,10 @@ import io
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from sceneprint.engine.maps.map_frames import (
     BYTES,
     NPY,
-    find_indexed,
     list_sessions,
     trajectory,
     trajectory_file,
@@ -19,10 +17,8 @@ from sceneprint.engine.maps.map_frames import (
 from sceneprint.engine.maps.map_lifecycle import edit_frame
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownMap
 from sceneprint.formats.dataset import read_trajectory
-from sceneprint.pictures import depth_view, normals_view, picture
 from sceneprint.signing import describe
-from sceneprint.store.maps import find_frame, find_map
-from sceneprint_client.api import FrameMeta, NewMap
+from sceneprint_client.api import FrameMeta
 from sceneprint_client.api.listing import Run
 from sceneprint_client.poses import rotation_of
 
@@ -37,37 +33,17 @@ def rows(ply):
 
 
 def test_a_cloud_is_the_surface_of_the_artifact(full, ids, uploads, prepared):
-    for i in (0, 7):
-        name, surface = ids(full)[i], prepared[i][1].surface
-        told, found = rows(full.outputs.cloud("hall", name).make())
-        assert told["frame"] == f"{name}.optical"
-        assert np.array_equal(found[:, :3], surface.points[surface.valid])
-        assert np.array_equal(found[:, 3:], surface.normals[surface.valid])
-        told, found = rows(full.outputs.cloud("hall", name, "parent").make())
-        T = uploads[i].pose
-        assert told["frame"] == uploads[i].room
-        at = surface.points[surface.valid].astype(float) @ T[:3, :3].T + T[:3, 3]
-        np.testing.assert_allclose(found[:, :3], at, atol=1e-5)
-        turned = surface.normals[surface.valid].astype(float) @ T[:3, :3].T
-        np.testing.assert_allclose(found[:, 3:], turned, atol=1e-6)
-
-
-def test_a_preview_is_that_of_the_artifact(full, ids, uploads, prepared, signer):
-    name, surface = ids(full)[0], prepared[0][1].surface
-    views = {"depth": depth_view, "normals": normals_view}
-    for view, make in views.items():
-        data = full.outputs.preview("hall", name, view, 160).make()
-        colours, _ = make(surface)
-        with Image.open(io.BytesIO(data)) as image:
-            assert np.array_equal(np.asarray(image), colours)
-            assert image.text["frame"] == f"{name}.optical"
-        assert len(data) < 3 * len(picture(colours, 160, {}))
-    data = full.outputs.preview("hall", name, "patches", 640).make()
-    with Image.open(io.BytesIO(data)) as image:
-        assert image.size[0] == 640
-        own = len(describe(uploads[0].frame, signer.model.parameters).levels[0].means)
-        assert image.text["patches"] == str(own)
-        assert len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) in (own, own + 1)
+    name, surface, T = ids(full)[7], prepared[7][1].surface, uploads[7].pose
+    told, found = rows(full.outputs.cloud("hall", name).make())
+    assert told["frame"] == f"{name}.optical"
+    assert np.array_equal(found[:, :3], surface.points[surface.valid])
+    assert np.array_equal(found[:, 3:], surface.normals[surface.valid])
+    told, found = rows(full.outputs.cloud("hall", name, "parent").make())
+    assert told["frame"] == uploads[7].room
+    at = surface.points[surface.valid].astype(float) @ T[:3, :3].T + T[:3, 3]
+    np.testing.assert_allclose(found[:, :3], at, atol=1e-5)
+    turned = surface.normals[surface.valid].astype(float) @ T[:3, :3].T
+    np.testing.assert_allclose(found[:, 3:], turned, atol=1e-6)
 
 
 def test_patches_are_those_that_were_signed(full, ids, uploads, prepared, signer):
@@ -111,30 +87,10 @@ def test_an_upload_is_had_back_as_it_came(full, ids, uploads):
 def every_output(engine, name):
     o = engine.outputs
     return {
-        "optical": lambda: o.cloud("hall", name), "parent": lambda: o.cloud("hall", name, "parent"),
-        "depth": lambda: o.preview("hall", name),
-        "small": lambda: o.preview("hall", name, "depth", 64),
-        "normals": lambda: o.preview("hall", name, "normals"),
-        "patches": lambda: o.preview("hall", name, "patches"),
+        "cloud": lambda: o.cloud("hall", name), "picture": lambda: o.preview("hall", name),
         "lists": lambda: o.patches("hall", name), "signature": lambda: o.signature("hall", name),
-        "bytes": lambda: o.vector("hall", name, BYTES), "npy": lambda: o.vector("hall", name, NPY),
-        "upload": lambda: o.upload("hall", name),
+        "bytes": lambda: o.vector("hall", name, BYTES), "upload": lambda: o.upload("hall", name),
     }  # fmt: skip
-
-
-def test_a_tag_stands_for_one_content(full, ids):
-    first, second, *_ = ids(full)
-    tags = {name: find().tag for name, find in every_output(full, first).items()}
-    assert tags == {name: find().tag for name, find in every_output(full, first).items()}
-    others = [find().tag for find in every_output(full, second).values()]
-    assert len({*tags.values(), *others}) == 2 * len(tags)
-    edit_frame(full.store, "hall", first, {"tags": ["seen"]})
-    assert tags == {name: find().tag for name, find in every_output(full, first).items()}
-    edit_frame(full.store, "hall", first, {"pose": {"parent_frame": "elsewhere"}})
-    now = {name: find().tag for name, find in every_output(full, first).items()}
-    assert {name for name, tag in tags.items() if tag != now[name]} == {"parent"}
-    told, _ = rows(full.outputs.cloud("hall", first, "parent").make())
-    assert told["frame"] == "elsewhere"
 
 
 def test_what_is_not_there_is_said(empty, uploads, work_off):
@@ -152,40 +108,10 @@ def test_what_is_not_there_is_said(empty, uploads, work_off):
             empty.outputs.cloud("hall", posed.frame_id, within)
         assert told.value.fields[0][0] == "frame"
     empty.delete_frame("hall", waiting.frame_id)
-    for find in every_output(empty, waiting.frame_id).values():
-        with pytest.raises(UnknownFrame, match="was deleted"):
-            find()
-    for find in every_output(empty, "nobody").values():
-        with pytest.raises(UnknownFrame, match="no frame 'nobody'"):
-            find()
-    with pytest.raises(UnknownMap):
-        empty.outputs.upload("nowhere", posed.frame_id)
-
-
-def test_a_redundant_frame_has_no_upload(full, uploads, work_off):
-    depth = uploads[0].frame.depth.copy()
-    depth[200:208, 300:308] = 0  # another content of the same place
-    buffer = io.BytesIO()
-    np.save(buffer, depth)
-    added, _ = full.add_frame("hall", buffer.getvalue(), uploads[0].meta, if_novel=1.0)
-    work_off(full)
-    assert full.get_frame("hall", added.frame_id).state == "redundant"
-    for find in every_output(full, added.frame_id).values():
-        with pytest.raises(NotIndexed, match="is redundant"):
-            find()
-
-
-def test_a_lost_artifact_is_made_again(full, ids, work_off):
-    name = ids(full)[4]
-    before = full.outputs.cloud("hall", name).make()
-    with full.store.database.read() as connection:
-        frame = find_frame(connection, find_map(connection, "hall"), name)
-    found = find_indexed(full.store, "hall", name)
-    full.store.blobs.path(found.artifact).unlink()
-    assert full.outputs.cloud("hall", name).make() == before
-    assert frame.state == "indexed"
-    assert work_off(full) == ["succeeded"]
-    assert full.outputs.cloud("hall", name).make() == before
+    for name, why in ((waiting.frame_id, "was deleted"), ("nobody", "no frame 'nobody'")):
+        for find in every_output(empty, name).values():
+            with pytest.raises(UnknownFrame, match=why):
+                find()
 
 
 def test_a_trajectory_is_read_back(full, ids, uploads, tmp_path):
@@ -214,29 +140,14 @@ def test_a_trajectory_is_read_back(full, ids, uploads, tmp_path):
     assert trajectory(full.store, "hall", Run(session="s", parent_frame="p")).frame_ids == names[:1]
 
 
-def test_a_session_too_long_is_asked_for_in_parts(full, ids, monkeypatch):
-    from sceneprint.engine.maps import map_frames
-
-    for i, name in enumerate(ids(full)[:3]):
-        at = f"2026-11-16T09:30:0{i}Z"
-        edit_frame(full.store, "hall", name, {"session": "s", "captured_at": at})
-    monkeypatch.setattr(map_frames, "MOST_POSES", 2)
-    with pytest.raises(InvalidRequest, match="has 3 frames, but a trajectory has at most 2"):
-        trajectory(full.store, "hall", Run(session="s"))
-    part = Run.model_validate({"session": "s", "captured_after": "2026-11-16T09:30:01Z"})
-    assert trajectory(full.store, "hall", part).frame_ids == ids(full)[1:3]
-
-
 def test_pages_of_sessions(empty, uploads):
     for i, one in enumerate(uploads[:5]):
         meta = one.meta.model_copy(update={"session": f"s{i}" if i else None})
         empty.add_frame("hall", one.data, meta)
-    found, cursor = [], None
-    for _ in range(3):
-        page = list_sessions(empty.store, "hall", cursor, 2)
-        found += page.items
-        cursor = page.next_cursor
-    assert cursor is None
+    page = list_sessions(empty.store, "hall", None, 2)
+    rest = list_sessions(empty.store, "hall", page.next_cursor, 9)
+    found = [*page.items, *rest.items]
+    assert (len(page.items), rest.next_cursor) == (2, None)
     assert [one.session for one in found] == [None, "s1", "s2", "s3", "s4"]
     assert [one.parent_frames for one in found] == [["room-000"]] * 5
     assert [one.frames for one in found] == [{"received": 1}] * 5
@@ -246,5 +157,3 @@ def test_pages_of_sessions(empty, uploads):
             list_sessions(empty.store, "hall", bad, 2)
     with pytest.raises(UnknownMap):
         list_sessions(empty.store, "nowhere", None, 2)
-    empty.create_map(NewMap(name="new", model="depth"))
-    assert list_sessions(empty.store, "new", None, 2).items == []

@@ -14,12 +14,7 @@ from sceneprint.engine.search.verification import Validated, numbers_of
 from sceneprint.errors import InvalidPose, InvalidRequest
 from sceneprint.geometry.rigid import inverse
 from sceneprint.geometry.validation.validation import PairValidation, ValidationParameters
-from sceneprint.localization import (
-    AlternativePose,
-    PoseEstimate,
-    localize,
-    views_of_rows,
-)
+from sceneprint.localization import AlternativePose, PoseEstimate, localize, views_of_rows
 from sceneprint.models import read_model
 from sceneprint.pipeline import PairMatch, associate, diversify, retrieve
 from sceneprint.places import QueryFrame, model_parameters
@@ -187,16 +182,6 @@ def test_candidates_near_a_prior_are_tried_first(full, uploads, ids):
     here = prior_at(uploads[0])
     here["pose"]["parent_frame"] = uploads[8].room
     assert set(tried(here)) == {"skipped"}
-
-
-def test_a_prior_is_read_and_changes_no_answer_that_is_sure(full, uploads):
-    alone = localized(full, uploads[8])
-    for prior in (prior_at(uploads[8], 0.2), prior_at(uploads[8], 3.0)):
-        there = localized(full, uploads[8], prior=prior)
-        assert (there.status, there.verified_by, there.pose) == ("found", "matches", alone.pose)
-    covariance = np.eye(6) * 0.04
-    given = Prior.model_validate(prior_at(uploads[8], covariance=listed(covariance)))
-    assert localized(full, uploads[8], prior=given).pose == alone.pose
 
 
 @pytest.mark.parametrize(

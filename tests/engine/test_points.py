@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownQuery
+from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame
 from sceneprint.formats.export import points_of
 from sceneprint.geometry.rigid import transform_points
-from sceneprint.geometry.validation.inspection import STEP_COLOURS, patches_at
+from sceneprint.geometry.validation.inspection import patches_at
 from sceneprint_client.api import Query
 from sceneprint_client.surface_encoding import HEADER, POINT
 
@@ -46,63 +46,13 @@ def test_the_points_of_a_frame(full, prepared, ids):
     assert there == pytest.approx(transform_points(pose, points.astype(float)), abs=1e-4)
 
 
-@pytest.mark.parametrize("by", ["aligned", "none"])
-def test_residuals_are_those_of_the_overlay(full, asked, by):
-    best = asked.matches[0]
-    ply = full.inspection.overlay(asked.query_id, best.frame_id, colour="residual", by=by)
-    body = ply.split(b"end_header\n", 1)[1]
-    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    colours = np.frombuffer(body, [*kinds, ("rgb", "u1", 3)])["rgb"]
-    told = []
-    for side in ("query", "match"):
-        head, rows, _ = rows_of(
-            full.points.match(asked.query_id, best.frame_id, "hall", side, by).make()
-        )
-        assert head[2] == 7
-        assert head[12] == pytest.approx(0.05)
-        told.append(rows["residual"])
-    steps = np.searchsorted((50, 100, 250, 253), np.concatenate(told))
-    assert (colours == STEP_COLOURS[steps]).all()
-    assert len(set(steps.tolist())) > 2
-    if by == "aligned":  # looked up on every 25th point, evidence finds about as much
-        inside = float((np.concatenate(told) <= 250).mean())
-        assert inside == pytest.approx(best.validation.overlap, abs=0.05)
-
-
-def test_points_of_a_query_are_those_of_its_side(full, asked):
-    best = asked.matches[0].frame_id
-    head, rows, at = rows_of(full.points.query(asked.query_id).make())
-    _, compared, there = rows_of(full.points.match(asked.query_id, best).make())
-    assert (at == there).all()
-    assert (rows["patch"] == compared["patch"]).all()
-    assert (rows["residual"] == 255).all()
-    assert head[12] == 0
-
-
 def test_what_cannot_be_drawn(full, asked, ids):
     best = asked.matches[0].frame_id
     with pytest.raises(InvalidRequest, match="no rival"):
         full.points.match(asked.query_id, best, by="rival").make()
-    with pytest.raises(UnknownQuery):
-        full.points.query("0" * 32)
-    with pytest.raises(UnknownFrame, match="no match"):
-        full.points.match(asked.query_id, "nobody")
     bare = full.query_frame("hall", ids(full)[3], Query(k=1, stages=("retrieve",)))
     with pytest.raises(NotIndexed):
         full.points.query(bare.query_id)
     full.delete_frame("hall", best)
     with pytest.raises(UnknownFrame, match="was deleted"):
         full.points.match(asked.query_id, best)
-
-
-def test_one_match_is_validated_once(full, asked, monkeypatch):
-    best, made = asked.matches[0].frame_id, []
-    from sceneprint.engine.results import result_views
-
-    whole = result_views.validate
-    monkeypatch.setattr(result_views, "validate", lambda *a, **b: made.append(1) or whole(*a, **b))
-    told = full.inspection.match(asked.query_id, best)
-    for side in ("query", "match"):
-        full.points.match(asked.query_id, best, side=side).make()
-    assert full.inspection.match(asked.query_id, best) == told
-    assert len(made) == 1

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sqlalchemy import event, func, select, update
+from sqlalchemy import func, select, update
 
 from sceneprint.engine.maps.map_lifecycle import get_maps
 from sceneprint.engine.results import query_log
@@ -22,18 +22,11 @@ from sceneprint.engine.results.query_entry import (
 from sceneprint.engine.results.query_log import QueryLog
 from sceneprint.errors import FrameError, InvalidRequest, QuotaExceeded, StoreLocked, UnknownQuery
 from sceneprint.settings import Settings
-from sceneprint.store.answer_files import AnswerObjects, open_answers
-from sceneprint.store.blobs.object_client import open_objects
+from sceneprint.store.answer_files import open_answers
 from sceneprint.store.deletion import DAY_S
 from sceneprint.store.events import EventFilter, list_events
 from sceneprint.store.frame_queries import QueryOrigin
-from sceneprint.store.query_rows import (
-    NewQuery,
-    WantedQueries,
-    count_statuses,
-    drop_answers,
-    keep_answer,
-)
+from sceneprint.store.query_rows import NewQuery, WantedQueries, count_statuses
 from sceneprint.store.tables import queries
 from sceneprint_client.api import (
     Alternative,
@@ -117,9 +110,6 @@ def count(engine, *conditions):
         return connection.execute(asked).scalar_one()
 
 
-# Rows.
-
-
 def test_answers_and_failures_become_rows(full, uploads):
     one, query = uploads[3], Query(k=3)
     answer = full.queries.upload(["hall"], one.data, one.meta, query)
@@ -164,14 +154,13 @@ def test_pages_and_filters(engine):
         # two at one moment: a page may end between them
         engine.query_log.note(row(i, at=start + i // 2, map=home, robot=who, status=status))
     engine.query_log.note(row(7, listed=False), stored())
-    assert numbers(engine) == [6, 5, 4, 3, 2, 1, 0]
-    assert numbers(engine, ["hall"]) == [6, 5, 4, 2, 1, 0]
-    assert numbers(engine, ["attic", "cellar"]) == [3]
-    assert numbers(engine, []) == []
-    assert numbers(engine, robot="spot") == [3, 1]
-    assert numbers(engine, ["hall"], statuses=("found",)) == [5, 1]
-    assert numbers(engine, statuses=("found", "failed"), robot="spot") == [3, 1]
-    assert numbers(engine, since=start + 1, until=start + 3) == [5, 4, 3, 2]
+    for names, wanted, expected in (
+        (None, {}, [6, 5, 4, 3, 2, 1, 0]), (["hall"], {}, [6, 5, 4, 2, 1, 0]),
+        (["attic", "cellar"], {}, [3]), ([], {}, []), (None, {"robot": "spot"}, [3, 1]),
+        (["hall"], {"statuses": ("found",)}, [5, 1]),
+        (None, {"since": start + 1, "until": start + 3}, [5, 4, 3, 2]),
+    ):  # fmt: skip
+        assert numbers(engine, names, **wanted) == expected
     for forged in ("0", "a" * 64, engine.store.seals.seal("query", 3)):
         with pytest.raises(InvalidRequest, match="cursor"):
             engine.query_log.page(EVERY, None, forged, 2)
@@ -179,34 +168,6 @@ def test_pages_and_filters(engine):
         found = list_events(connection, EventFilter(kinds=("query.",)))
     assert [int(one.data["query_id"], 16) for one in found] == list(range(7))
     assert [one.map for one in found] == ["hall"] * 3 + ["attic"] + ["hall"] * 3
-
-
-def test_pages_are_read_by_index(engine):
-    if not engine.store.database.is_sqlite:
-        pytest.skip("reads SQLite's description of its plans")
-    engine.query_log.note(row(1))
-    assert engine.query_log.flush(60)
-    plans = []
-
-    def explain(connection, cursor, statement, parameters, context, many):
-        if "FROM queries" in statement and not statement.startswith("EXPLAIN"):
-            raw = connection.connection.driver_connection
-            found = raw.execute(f"EXPLAIN QUERY PLAN {statement}", parameters).fetchall()
-            plans.append("; ".join(step[-1] for step in found))
-
-    event.listen(engine.store.database._engine, "before_cursor_execute", explain)
-    for names, wanted, index in (
-        (None, {}, "ix_queries_at"), (["hall"], {}, "ix_queries_map_number_at"),
-        (["hall"], {"statuses": ("failed",)}, "ix_queries_map_number_status"),
-        (None, {"robot": "r"}, "ix_queries_robot"),
-        (["hall"], {"since": 1.0, "until": 2.0}, "ix_queries_map_number_at"),
-        (["hall"], {"robot": "r", "statuses": ("found",)}, "ix_queries_robot"),
-        (["hall"], {"kept": True}, "ix_queries_kept"),
-    ):  # fmt: skip
-        plans.clear()
-        numbers(engine, names, **wanted)
-        assert all(index in one and "TEMP B-TREE" not in one for one in plans), plans
-        assert plans
 
 
 def test_recent_queries_are_counted_by_map_and_status(engine):
@@ -241,26 +202,6 @@ def test_a_revoked_key_is_no_longer_named(engine):
     engine.revoke_key("arm")
     (after,) = engine.query_log.page(EVERY, None, None, 9).items
     assert (before.key, after.key) == ("arm", None)
-
-
-# The writer.
-
-
-def test_a_burst_is_few_commits_and_waits_for_nobody(engine, monkeypatch):
-    monkeypatch.setattr(query_log, "AT_ONCE", 200)
-    engine.query_log.note(row(1000))  # the first after a pause is written at once
-    assert engine.query_log.flush(60)
-    monkeypatch.setattr(query_log, "GATHER_S", 60.0)  # and the next ones are gathered
-    commits = []
-    event.listen(engine.store.database._engine, "commit", commits.append)
-    with engine.store.database.write():  # another writer holds the lock meanwhile
-        for i in range(199):
-            engine.query_log.note(row(i))
-        assert not commits
-    commits.clear()
-    assert engine.query_log.flush(60)
-    assert count(engine) == 200
-    assert 1 <= len(commits) <= 3
 
 
 def test_what_cannot_be_written_now_is_written_later(engine, monkeypatch, caplog):
@@ -299,22 +240,6 @@ def test_what_is_lost_is_logged_and_counted(engine, monkeypatch, caplog):
     assert (engine.query_log.lost, count(engine)) == (13, 3)
 
 
-def test_an_unexpected_error_costs_its_rows_alone(engine, monkeypatch, caplog):
-    write = query_log.add_queries
-
-    def breaks(connection, rows):
-        if rows[0].id.endswith("1"):
-            raise ZeroDivisionError
-        write(connection, rows)
-
-    monkeypatch.setattr(query_log, "add_queries", breaks)
-    for i in (1, 2):
-        engine.query_log.note(row(i))
-        assert engine.query_log.flush(60)
-    assert (numbers(engine), engine.query_log.lost) == ([2], 1)
-    assert "queries cannot be logged" in [one.message for one in caplog.records]
-
-
 def test_waiting_answers_take_bounded_memory(engine, monkeypatch):
     monkeypatch.setattr(query_log, "MOST_WAITING_BYTES", 2500)
     with engine.store.database.write():
@@ -324,16 +249,13 @@ def test_waiting_answers_take_bounded_memory(engine, monkeypatch):
     assert (count(engine), count(engine, queries.c.bytes > 0)) == (4, 2)
 
 
-# Answers.
-
-
 def test_an_answer_comes_back_as_it_was():
     asked = Query(k=2, seed=9, validation={"evidence": 0.35}, filter={"robot": "r1"})
     base = ("base_link", np.arange(16.0).reshape(4, 4))
     origin = QueryOrigin("r1", "run", 12.5)
     for one in (
-        stored(query=asked), replace(stored(), geometry=None), replace(stored(), geometry=b""),
-        replace(stored(), origin=origin, base=base, up=np.array([0.0, 0.0, 1.0])),
+        stored(query=asked), replace(stored(query=asked), geometry=None),
+        replace(stored(query=asked), origin=origin, base=base, up=np.array([0.0, 0.0, 1.0])),
     ):  # fmt: skip
         again = decode_answer(encode_answer(one))
         assert again.answer.model_dump_json() == one.answer.model_dump_json()
@@ -341,12 +263,11 @@ def test_an_answer_comes_back_as_it_was():
         assert (again.model_id, again.geometry, again.at) == (one.model_id, one.geometry, one.at)
         assert (again.ranked, again.vector.tobytes()) == ((7, 3), one.vector.tobytes())
         assert again.origin == one.origin
+        # only what was set: the model has its own defaults
+        assert again.query.validation.model_fields_set == {"evidence"}
     assert again.base[0] == "base_link"
     assert (again.base[1] == base[1]).all()
     assert again.up.tolist() == [0.0, 0.0, 1.0]
-    # only what was set: the model has its own defaults
-    again = decode_answer(encode_answer(stored(query=asked)))
-    assert again.query.validation.model_fields_set == {"evidence"}
     several = stored(query=SeveralQuery(maps=["hall", "attic"], k=4))
     assert decode_answer(encode_answer(several)).query == Query(k=4)
 
@@ -361,15 +282,19 @@ def test_an_answer_is_found_by_every_process(engine, make_engine):
 
 
 def test_damaged_bytes_are_no_answer(engine):
+    """Answers are not synced to disk: after a power cut a row may be without its file."""
     name = log_answer(engine)
     path = engine.settings.query_dir / name
-    for data in (b"", b"x", b"\xff" * 400, path.read_bytes()[:300]):
-        path.write_bytes(data)
+    for data in (b"", b"\xff" * 400, path.read_bytes()[:300], None):
+        if data is None:
+            path.unlink()
+        else:
+            path.write_bytes(data)
         with pytest.raises(UnknownQuery):
             engine.query_log.find(name)
-    path.unlink()
     with pytest.raises(UnknownQuery):
-        engine.query_log.find(name)
+        engine.query_log.keep(name, None)
+    assert numbers(engine, kept=True) == []
 
 
 def test_nothing_is_stored_where_there_is_no_room_or_time(engine):
@@ -394,28 +319,15 @@ def test_the_oldest_answers_go_where_room_is_needed(engine):
     log.remove_surplus()
     with engine.store.database.read() as connection:
         held = connection.execute(select(func.sum(queries.c.bytes))).scalar_one()
+        of_answers = select(queries.c.id).where(queries.c.bytes > 0)
+        there = set(connection.execute(of_answers).scalars())
     assert 20_000 < held <= 30_000
-    there = set()
-    for name in names:
-        try:
-            there.add(log.find(name).answer.query_id)
-        except UnknownQuery:
-            continue
     assert there == set(names[-len(there) :])
     assert files_of(engine) == there - {kept}  # which is in the database
     # a listed query stays without its answer, and of the others nothing
     assert count(engine, queries.c.listed) == 20
     assert count(engine, ~queries.c.listed) == len(there & set(names[1::2]))
     log.close()
-
-
-def test_room_is_made_while_answers_are_written(engine):
-    log = log_of(engine, query_log_bytes=30_000)
-    for _ in range(60):
-        log_answer(engine, 1000, log)
-    log.close()
-    sizes = [path.stat().st_size for path in engine.settings.query_dir.iterdir()]
-    assert 20_000 < sum(sizes) <= 30_000 * (1 + 2 / 16)
 
 
 def test_files_without_a_row_are_swept(engine):
@@ -438,23 +350,10 @@ def test_a_folder_that_cannot_be_written_costs_no_query_its_row(engine, caplog):
     assert [one.message for one in caplog.records] == ["answers cannot be stored"]
 
 
-def test_answers_of_a_fleet_are_objects():
-    files = AnswerObjects(open_objects("memory:///"))
-    for name in "abc":
-        files.put(name, name.encode())
-    assert files.get("b") == b"b"
-    files.delete(["a", "b", "missing"])
-    assert [name for name, _ in files.list()] == ["c"]
-    with pytest.raises(FileNotFoundError):
-        files.get("b")
-
-
 def test_old_and_surplus_queries_are_removed_in_blocks(engine, monkeypatch):
     monkeypatch.setattr(query_log, "BLOCK", 3)
-    for i in range(10):
-        engine.query_log.note(row(i))
-    for i in range(10, 14):
-        engine.query_log.note(row(i, map="attic"))
+    for i in range(14):
+        engine.query_log.note(row(i, map="attic" if i >= 10 else "hall"))
     assert engine.query_log.flush(60)
     with engine.store.database.write() as connection:
         aged = update(queries).where(queries.c.id.in_(f"{i:032x}" for i in range(4)))
@@ -464,15 +363,11 @@ def test_old_and_surplus_queries_are_removed_in_blocks(engine, monkeypatch):
     monkeypatch.setattr(query_log, "MOST_QUERIES", 2)
     assert engine.query_log.remove_surplus() == 6
     assert numbers(engine) == [13, 12, 9, 8]
-    assert engine.query_log.remove_surplus() == 0
     monkeypatch.setattr(query_log, "TIDY_S", 0.0)
     with engine.store.database.write() as connection:
         connection.execute(update(queries).values(at=1.0))
     engine.publish_due()  # workers do so
     assert count(engine) == 0
-
-
-# Kept answers.
 
 
 def test_a_kept_answer_stays_until_it_is_released(engine, make_engine):
@@ -492,30 +387,12 @@ def test_a_kept_answer_stays_until_it_is_released(engine, make_engine):
     assert files_of(engine) == set()
     second.query_log.release(kept)
     assert second.query_log.record(kept).kept_at is None
-    assert second.query_log.find(kept).answer.query_id == kept
     second.query_log.remove_surplus()
-    for missing in (
-        lambda: engine.query_log.find(kept), lambda: engine.query_log.release(kept),
-        lambda: engine.query_log.keep(kept, None), lambda: engine.query_log.find(other),
-    ):  # fmt: skip
+    for missing in (kept, other):
         with pytest.raises(UnknownQuery):
-            missing()
-
-
-def test_a_lost_answer_is_not_kept(engine):
-    """Answers are not synced to disk: after a power cut a row may be without its file."""
-    lost = log_answer(engine)
-    open_answers(engine.store.blobs, engine.settings.query_dir).delete([lost])
-    for look in (engine.query_log.find, lambda one: engine.query_log.keep(one, None)):
-        with pytest.raises(UnknownQuery):
-            look(lost)
-    assert numbers(engine, kept=True) == []
-    removed = log_answer(engine)
-    found = engine.query_log.find_row(removed)
-    with engine.store.database.write() as connection:
-        assert drop_answers(connection, [found.number]) == [removed]
-        assert not keep_answer(connection, found.number, b"late", time.time())
-    assert numbers(engine, kept=True) == []
+            engine.query_log.find(missing)
+    with pytest.raises(UnknownQuery):
+        engine.query_log.release(kept)
 
 
 def test_so_many_answers_are_kept(engine, monkeypatch):
@@ -554,17 +431,11 @@ def test_an_answer_goes_with_a_purged_frame_that_it_shows(full, uploads):
     assert full.query_log.purge() == 0  # its deletion can be undone
     full.tombstones.restore_one("hall", shown)
     assert full.query_log.purge() == 0
+    own = full.query_frame("hall", shown, Query(k=1)).query_id
     full.delete_frame("hall", shown)
+    with pytest.raises(UnknownQuery):  # at once, without the frame that was its query
+        full.query_log.find(own)
     full.tombstones.purge(everything=True)
-    assert full.query_log.purge() == 1
+    assert full.query_log.purge() == 2
     with pytest.raises(UnknownQuery):
         full.query_log.find(answer.query_id)
-
-
-def test_an_answer_is_not_shown_without_the_frame_that_was_its_query(full, uploads):
-    frame = full.list_frames("hall").items[0].frame_id
-    name = full.query_frame("hall", frame, Query(k=1)).query_id
-    assert full.query_log.find(name).answer.frame.frame_id == frame
-    full.delete_frame("hall", frame)
-    with pytest.raises(UnknownQuery):
-        full.query_log.find(name)

@@ -1,6 +1,5 @@
 """Tests of the effect and the explanation of each option of a query."""
 
-import json
 import math
 import time
 from dataclasses import replace
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine.search import local_index, retrieval
+from sceneprint.engine.search import retrieval
 from sceneprint.engine.search.retrieval import FIRST_S, Deadline
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.errors import UnknownFrame
@@ -22,7 +21,6 @@ from sceneprint.geometry.retrieval.ranking import (
 )
 from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint.pipeline import retrieve, validate
-from sceneprint.store.maps import find_frame, find_map
 from sceneprint.store.tables import frames
 from sceneprint_client.api import Query
 from sceneprint_client.api.query import ValidationOptions
@@ -37,19 +35,6 @@ def ask(engine, frame_id, **how):
 def told(answer, *without):
     """Its bytes, but for who it is and how long it took."""
     return answer.model_dump_json(exclude={"query_id", "milliseconds", *without})
-
-
-def test_an_answer_without_options_has_none_of_their_fields(full, ids):
-    answer = ask(full, ids(full)[3])
-    new = ("per_map", "deadline_reached", "explanations", "explained_frame")
-    assert [getattr(answer, name) for name in new] == [None] * 4
-    assert answer.maps == ["hall"]
-    assert (answer.frame.map, answer.frame.frame_id) == ("hall", ids(full)[3])
-    same = ask(
-        full, ids(full)[3], candidates=10, diversity={"sigma": 1.0, "omega": 4.0},
-        validation={"mode": "full", "residual_deg": 5.0},
-    )  # fmt: skip
-    assert told(same) == told(answer)
 
 
 def test_so_many_candidates_are_selected_and_tried(full, ids):
@@ -147,35 +132,6 @@ def test_a_deadline_stops_validation_and_says_so(full, ids, monkeypatch):
         assert one.validation == full_told[one.frame_id].validation
 
 
-def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(full, ids, monkeypatch):
-    names, strict = ids(full), {"evidence": 1.0}
-    ranked = ask(full, names[0], k=50, stages=["retrieve"]).matches
-    how = {"candidates": 3, "stages": VR, "deadline_ms": 600_000}
-    allows, asked = Deadline.allows, list[bool]()
-
-    def so_often(self):
-        asked.append(allows(self))
-        self.reached = len(asked) > most
-        return not self.reached
-
-    monkeypatch.setattr(Deadline, "allows", so_often)
-    most = 3
-    answer = ask(full, names[0], **how, validation=strict, explain_frame=ranked[-1].frame_id)
-    assert len(asked) == 4
-    assert answer.explained_frame.validation.reason == "the deadline passed before it was validated"
-    assert answer.explained_frame.lost_at == "selection"
-    assert (answer.counts.validated, answer.counts.accepted) == (3, 0)
-    assert (answer.status, answer.deadline_reached) == ("not_found", False)  # all were tried
-    most = 5
-    asked.clear()
-    how["candidates"] = 6
-    answer = ask(full, names[0], **how, explain_frame=ranked[5].frame_id)
-    assert (len(asked), answer.status, answer.deadline_reached) == (6, "found", False)
-    assert (answer.explained_frame.lost_at, answer.matches[5].validation.reason) == (
-        "turn", "enough matches were accepted before it",
-    )  # fmt: skip
-
-
 def test_no_candidate_is_begun_that_would_likely_end_too_late(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
@@ -197,42 +153,35 @@ def test_no_candidate_is_begun_that_would_likely_end_too_late(monkeypatch):
 def test_every_frame_of_the_ranking_is_explained(full, prepared, ids):
     names = ids(full)
     vectors = {name: one.vector for name, (one, _) in zip(names, prepared, strict=True)}
+
+    def apart(a, b):
+        return distances(vectors[a], vectors[b][None], "l2")[0]
+
     ranked = [one.frame_id for one in ask(full, names[0], k=50, stages=["retrieve"]).matches]
     outcomes = set()
     for candidates in (5, 11):  # some of the ranking, and all of it
         how = {"k": 2, "candidates": candidates}
         plain, answer = ask(full, names[0], **how), ask(full, names[0], **how, explain=True)
         assert told(answer, "explanations") == told(plain, "explanations")
-        assert set(answer.milliseconds) - set(plain.milliseconds) == {"explain"}
         found = answer.explanations
-        assert [one.rank for one in found] == [*range(1, 12)]
-        assert [one.frame_id for one in found] == ranked
+        assert [(one.rank, one.frame_id) for one in found] == list(enumerate(ranked, 1))
         matches = {one.frame_id: one for one in answer.matches}
-        accepted = [one.frame_id for one in found if one.outcome == "accepted"]
-        assert len(accepted) == answer.counts.accepted
-        chosen = {*matches, *accepted}  # accepted ones beyond `k` are not listed
+        # accepted ones beyond `k` are not listed
+        chosen = {*matches, *(one.frame_id for one in found if one.outcome == "accepted")}
         assert len(chosen) == candidates
         for one in found:
             outcomes.add(one.outcome)
-            d = distances(vectors[names[0]], vectors[one.frame_id][None], "l2")[0]
-            assert one.distance == d
+            assert one.distance == apart(names[0], one.frame_id)
             if one.frame_id not in chosen:
                 assert (one.stage, one.outcome) == ("retrieve", "not_selected")
-                nearest = min(
-                    (
-                        distances(vectors[one.frame_id], vectors[name][None], "l2")[0],
-                        ranked.index(name), name,
-                    )
-                    for name in chosen
-                )  # fmt: skip
-                said = f"most similar to the selected frame {nearest[2]} (distance {nearest[0]})"
+                near = min((apart(one.frame_id, name), ranked.index(name), name) for name in chosen)
+                said = f"most similar to the selected frame {near[2]} (distance {near[0]})"
                 assert one.reason.startswith(said)
             elif one.frame_id in matches:
                 match = matches[one.frame_id]
                 assert (one.rank, one.similarity) == (match.rank, match.similarity)
                 if match.validation.status == "skipped":
                     assert (one.stage, one.outcome) == ("diversify", "skipped")
-                    assert one.reason == "enough matches were accepted before it"
                 else:
                     assert (one.stage, one.outcome) == ("validate", match.validation.status)
                     assert one.reason.startswith(f"{one.outcome}: {match.validation.reason}")
@@ -297,34 +246,6 @@ def test_a_frame_is_explained_where_it_was_lost(full, prepared, ids, signer, mon
     assert (bare.validation, bare.transform, bare.lost_at) == (None, None, "ranking")
 
 
-def test_what_an_approximate_index_missed_is_said(full, ids, monkeypatch):
-    names = ids(full)
-    near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
-    real, lost = local_index.search, near[1]
-    with full.store.database.read() as connection:
-        number = find_frame(connection, find_map(connection, "hall"), lost).number
-
-    def search(*given, dead, exact, **more):
-        if exact:
-            return real(*given, dead=dead, exact=True, **more)
-        return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
-
-    monkeypatch.setattr(local_index, "search", search)
-    monkeypatch.setattr(retrieval, "ranking_size", lambda n: min(n, 3))
-    for rank, name in enumerate(near, 1):
-        answer = ask(full, names[0], explain_frame=name, stages=["retrieve"], k=3)
-        assert (answer.exact, answer.counts.compared) == (False, 10)
-        one = answer.explained_frame
-        assert (one.rank, one.shortlisted) == (rank, name != lost)
-        if name == lost:
-            assert (one.lost_at, one.ranked) == ("shortlist", False)
-            assert one.reason.startswith("the approximate index missed it, although its rank is 2")
-        elif rank <= 4:  # one place is free
-            assert (one.lost_at, one.ranked) == (None, True)
-        else:
-            assert (one.lost_at, one.ranked) == ("ranking", False)
-
-
 def test_a_frame_that_is_not_searched_is_explained(full, ids):
     names = ids(full)
     itself = ask(full, names[0], explain_frame=names[0]).explained_frame
@@ -338,15 +259,3 @@ def test_a_frame_that_is_not_searched_is_explained(full, ids):
     assert (bad.lost_at, bad.state) == ("state", "rejected")
     with pytest.raises(UnknownFrame, match="'nobody' in map 'hall'"):
         ask(full, names[0], explain_frame="nobody")
-
-
-def test_options_as_text_are_those_of_json():
-    given = {
-        "candidates": 7, "diversity": {"sigma": 2.0}, "validation": {"mode": "paper"},
-        "deadline_ms": 50, "explain": True, "explain_frame": "f", "keep": False,
-    }  # fmt: skip
-    text = {name: one if isinstance(one, str) else json.dumps(one) for name, one in given.items()}
-    query = Query.model_validate(text)
-    assert query == Query.model_validate(given)
-    assert (query.diversity.sigma, query.diversity.omega) == (2.0, 4.0)
-    assert math.radians(query.validation.residual_deg) == math.radians(5.0)

@@ -1,11 +1,9 @@
 """Tests of queries while maps grow, are indexed, shrink and are recreated."""
 
 import shutil
-import threading
 
 import pytest
 
-from sceneprint.engine.search import local_index
 from sceneprint_client.api import JobState, NewMap, Query
 
 ALL = Query(stages=("retrieve",), k=50)
@@ -79,19 +77,6 @@ def test_an_index_is_due_beyond_so_many_frames(data, make_engine):
     assert make_engine(data, unindexed_frames=11).publish_due() == 1
 
 
-@pytest.mark.parametrize(("pause_s", "version"), [(1e9, 0), (0.0, 1)])
-def test_a_newer_index_is_looked_for_from_time_to_time(
-    data, make_engine, uploads, monkeypatch, pause_s, version
-):
-    monkeypatch.setattr(local_index, "_LOOK_S", pause_s)
-    reader = make_engine(data)
-    assert len(found(ask(reader, uploads))) == 12
-    assert make_engine(data, unindexed_frames=1).publish_due() == 1
-    answer = ask(reader, uploads)
-    assert len(found(answer)) == 12
-    assert answer.index_version == version
-
-
 def test_readers_follow_a_map_through_versions(data, make_engine, uploads, more, ids, tmp_path):
     first, builder = make_engine(data, unindexed_frames=3), make_engine(data, unindexed_frames=3)
     ask(first, uploads)
@@ -137,26 +122,3 @@ def test_a_map_made_anew_has_none_of_the_old_frames(data, make_engine, uploads, 
         answer = ask(engine, uploads, 7)
         assert found(answer) == [(added.frame_id, 0)]
         assert answer.index_version == 0
-
-
-def test_a_crowd_at_a_cold_engine_is_served(data, make_engine, ids):
-    """More threads than the pool has connections, all in need of the model at once."""
-    engine = make_engine(data)
-    name, start, answers, raised = ids(engine)[0], threading.Barrier(40), [], []
-
-    def work():
-        try:
-            start.wait()
-            answers.append(found(engine.query_frame("hall", name, ALL)))
-        except BaseException as error:
-            raised.append(error)
-
-    threads = [threading.Thread(target=work) for _ in range(40)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert raised == []
-    assert len(answers) == 40
-    assert all(answer == answers[0] for answer in answers)
-    assert len(answers[0]) == 11

@@ -4,24 +4,18 @@ import os
 import signal
 import sys
 from contextlib import closing
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from sceneprint.decoders.recording_decoder import RecordingDecoder, RecordingIndex
-from sceneprint.engine.ingest import recording_import
-from sceneprint.engine.ingest.archive_import import add_block
-from sceneprint.engine.jobs.lifecycle import cancel
 from sceneprint.engine.jobs.tasks import LongJob
-from sceneprint.errors import Busy, InvalidRequest, UnreadableArchive
+from sceneprint.errors import UnreadableArchive
 from sceneprint.formats.recording.selection import RecordingOptions, recording_sequences
-from sceneprint.store.maps import find_map
-from sceneprint.store.queue import files_of
 from sceneprint_client.api import JobState, NewMap
 from sceneprint_client.api.frames import ImportOptions
 from sceneprint_client.frame_files import meta_of
+from tests.engine.conftest import begin_import, claim_long
 
 ROOM = 2.5  #: metres from the camera to the wall
 FRAMES = 6
@@ -49,10 +43,7 @@ def write_drive(ros, folder, container="mcap", **more):
 
 def begun(engine, path, **more):
     options = ImportOptions.model_validate({"as": "recording", "name": path.name, **more})
-    with engine.imports.receive("hall", options) as receiver:
-        receiver.write(path.read_bytes())
-        file = receiver.end()
-    return engine.imports.begin("hall", file, options)[0]
+    return begin_import(engine, path.read_bytes(), options)
 
 
 def run_import(engine):
@@ -66,12 +57,8 @@ def run_import(engine):
 
 def second_slice(engine):
     """Read the recording in the first slice, and return the job for the next one."""
-    work = engine.claim("test")
-    assert isinstance(work, LongJob)
-    engine.run(work)
-    work = engine.claim("test")
-    assert isinstance(work, LongJob)
-    return work
+    engine.run(claim_long(engine))
+    return claim_long(engine)
 
 
 @pytest.fixture
@@ -113,8 +100,7 @@ def test_frames_are_those_of_an_upload(engine, ros, tmp_path, container):
 
 def test_the_outline_is_there_before_the_frames(engine, ros, tmp_path):
     job = begun(engine, write_drive(ros, tmp_path))
-    work = engine.claim("test")
-    assert isinstance(work, LongJob)
+    work = claim_long(engine)
     assert engine.run(work) == JobState.QUEUED
     progress = engine.get_job(job.job_id).progress
     assert (progress.done, progress.total, progress.phase) == (0, FRAMES, "add")
@@ -127,41 +113,6 @@ def test_the_outline_is_there_before_the_frames(engine, ros, tmp_path):
     }
     assert progress.recording.problem is None
     assert "mounting: at 0.210 -0.050 0.930 m in base_link" in progress.recording.findings
-
-
-def test_topics_are_shown_if_none_can_be_chosen(engine, ros, tmp_path):
-    def fill(writer):
-        for name in ("/a", "/b"):
-            writer.image(0, wall(0), topic=f"{name}/image_raw")
-            writer.camera_info(0, f"{name}/camera_info")
-
-    path = ros.write(tmp_path, fill, "mcap")
-    job = begun(engine, path)
-    assert run_import(engine) == [JobState.QUEUED, JobState.FAILED]
-    failed = engine.get_job(job.job_id)
-    assert failed.error == failed.progress.recording.problem
-    assert str(failed.error).endswith(" messages). Select one with `topic`.")
-    used = [one.name for one in failed.progress.recording.topics if one.use == "16UC1"]
-    assert used == ["/a/image_raw", "/b/image_raw"]
-    begun(engine, path, topic="/b/image_raw")
-    assert run_import(engine)[-1] == JobState.SUCCEEDED
-    [frame] = engine.list_frames("hall").items
-    assert frame.name.startswith("b/image_raw/")
-
-
-@pytest.mark.parametrize(
-    ("more", "ends"), [
-        ({"topic": "/none"}, "Select one of /a/image_raw (Image, 1 messages)."),
-        ({}, "topics of CameraInfo are none. Select one with `camera_info`."),
-    ],
-)  # fmt: skip
-def test_a_problem_advises_nothing_that_only_commands_can_do(engine, ros, tmp_path, more, ends):
-    def fill(writer):
-        writer.image(0, wall(0), topic="/a/image_raw")
-
-    job = begun(engine, ros.write(tmp_path, fill, "mcap"), **more)
-    run_import(engine)
-    assert str(engine.get_job(job.job_id).error).endswith(ends)
 
 
 def test_an_import_fails_at_once_without_rosbags(engine, ros, tmp_path, monkeypatch):
@@ -187,33 +138,6 @@ def test_only_the_frame_whose_process_fails_is_refused(ros, tmp_path, sent):
         assert decoder.frame(index.topic, index.frames[1]["place"]) == second != first
 
 
-def test_a_slice_is_repeated_if_no_process_can_read_a_frame(engine, ros, tmp_path):
-    def read():
-        raise Busy("No process can be started.")
-
-    begun(engine, write_drive(ros, tmp_path))
-    work = engine.claim("test")
-    assert isinstance(work, LongJob)
-    with pytest.raises(Busy):
-        add_block(engine.uploads, work, [("a", read)])
-
-
-@pytest.mark.parametrize(("seconds", "looks"), [(1, 1), (8, FRAMES - 1)])
-def test_blocks_of_slow_frames_are_smaller(engine, ros, tmp_path, monkeypatch, seconds, looks):
-    begun(engine, write_drive(ros, tmp_path))
-    work = second_slice(engine)
-    clock = SimpleNamespace(monotonic=iter(range(0, 1000, seconds)).__next__)
-    monkeypatch.setattr(recording_import, "time", clock)
-    counted = list[bool]()
-
-    def is_over():
-        counted.append(False)
-        return False
-
-    assert engine.jobs.handlers["import-bag"](work, is_over).over
-    assert len(counted) == looks
-
-
 def test_a_slice_that_is_run_again_adds_no_frame_twice(engine, ros, tmp_path):
     begun(engine, write_drive(ros, tmp_path))
     work = second_slice(engine)
@@ -225,23 +149,6 @@ def test_a_slice_that_is_run_again_adds_no_frame_twice(engine, ros, tmp_path):
     assert (done["received"], done["there"]) == (FRAMES - 1, 1)
 
 
-def test_files_and_their_bytes_go_with_a_cancelled_import(engine, ros, tmp_path):
-    path = write_drive(ros, tmp_path)
-    job = begun(engine, path)
-    work = engine.claim("test")
-    assert isinstance(work, LongJob)
-    engine.run(work)
-
-    def stored():
-        with engine.store.database.read() as connection:
-            names = list(files_of(connection, work.job.number))
-            return names, find_map(connection, "hall").used_bytes
-
-    assert stored() == (["archive", "index"], path.stat().st_size)
-    cancel(engine.store, job.job_id)
-    assert stored() == ([], 0)
-
-
 def test_damage_is_the_fault_of_the_file(engine, ros, tmp_path):
     path = write_drive(ros, tmp_path)
     cut = tmp_path / "cut.mcap"
@@ -249,19 +156,7 @@ def test_damage_is_the_fault_of_the_file(engine, ros, tmp_path):
     job = begun(engine, cut)
     assert run_import(engine) == [JobState.FAILED]
     assert "mcap recover" in str(engine.get_job(job.job_id).error)
+    notes = tmp_path / "notes.txt"
+    notes.write_bytes(b"no recording" * 1000)
     with pytest.raises(UnreadableArchive, match=r"notes\.txt"):
-        begun(engine, _written(tmp_path / "notes.txt", b"no recording" * 1000))
-
-
-def _written(path, data):
-    path.write_bytes(data)
-    return path
-
-
-@pytest.mark.parametrize(
-    "more", [{"as": "frames", "topic": "/a"}, {"as": "map", "keyframe_m": 1.0},
-             {"as": "recording", "heights": [1.0]}],
-)  # fmt: skip
-def test_options_of_other_imports_are_refused(more):
-    with pytest.raises((ValidationError, InvalidRequest)):
-        ImportOptions.model_validate(more)
+        begun(engine, notes)

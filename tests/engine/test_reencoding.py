@@ -9,10 +9,10 @@ import pytest
 from sqlalchemy import select
 
 from sceneprint.engine.maps import map_lifecycle
-from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, UnreadableModel
+from sceneprint.errors import Conflict, UnknownMap, UnreadableModel
 from sceneprint.models import save_model
 from sceneprint.settings import Settings
-from sceneprint.store.tables import frames, jobs, signatures
+from sceneprint.store.tables import jobs, signatures
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from tests.whole_engine import Engine
 
@@ -77,51 +77,6 @@ def queued(engine):
             jobs.c.state == JobState.QUEUED
         )
         return [tuple(row) for row in connection.execute(asked)]
-
-
-def test_a_map_of_psi_is_compared_whole_by_l1_until_it_is_moved(
-    make_engine, paper_folder, uploads, work_off, tmp_path
-):
-    shutil.copytree(paper_folder, tmp_path / "old")
-    engine = make_engine(tmp_path / "old", unindexed_frames=1)
-
-    def ranked(metric):
-        """What a naive scan of the rows says of the fifth frame."""
-        names = {engine.get_frame("hall", name).frame_id for name in ids(engine)}
-        with engine.store.database.read() as connection:
-            asked = select(frames.c.id, signatures.c.vector).join(
-                frames, frames.c.number == signatures.c.frame_number
-            )
-            rows = {name: np.frombuffer(v, np.uint8) for name, v in connection.execute(asked)}
-        assert set(rows) == names
-        own = rows[ids(engine)[4]].astype(int)
-        far = {name: np.abs(row - own) for name, row in rows.items()}
-        found = {
-            name: int(d.sum()) if metric == "l1" else int((d * d).sum()) for name, d in far.items()
-        }
-        return sorted(((name, d) for name, d in found.items()), key=lambda one: one[1])
-
-    def answered():
-        answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
-        return answer, [(match.frame_id, match.distance) for match in answer.matches]
-
-    assert engine.publish_due() == 0
-    with pytest.raises(InvalidRequest, match="has no index"):
-        engine.rebuild_index("hall")
-    before, found = answered()
-    assert found == ranked("l1")
-    assert (before.exact, before.index_version) == (True, 0)
-    engine.reencode("hall", "depth")
-    during, again = answered()
-    assert (during.model, again) == (before.model, found)
-    work_off(engine)
-    engine.publish_due()
-    after, moved = answered()
-    assert after.model.startswith("depth-")
-    assert moved == ranked("l2")
-    assert moved[0][1] == 0  # the frame itself
-    assert engine.view("hall")[2].version is not None
-    assert engine.publish_due() == 0
 
 
 def test_after_the_switch_the_map_is_as_if_made_with_that_model(

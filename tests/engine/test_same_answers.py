@@ -10,7 +10,6 @@ from sceneprint.geometry.rigid import pose_difference
 from sceneprint_client.api import Query
 from sceneprint_lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
 from sceneprint_lab.evaluation.sites import signed
-from sceneprint_lab.synth import synthesise_lookalike
 
 
 @pytest.fixture
@@ -67,15 +66,6 @@ def see_same(served, evaluated, truth):
         assert pose.evidence.model_dump() == pytest.approx(vars(place.evidence), abs=6e-4)
 
 
-@pytest.mark.thorough
-def test_equal_offices_are_answered_alike(both, make_upload):
-    site = synthesise_lookalike("offices", 3, 0, queries=6)
-    in_map, queries = ([make_upload(frame, "room") for frame in some]
-                       for some in (site.map, site.queries))  # fmt: skip
-    answers = both(in_map, queries)
-    assert {served.status for served, _ in answers} == {"found", "ambiguous"}
-
-
 def test_guided_matches_that_are_searched_for_change_both_answers(both, make_upload, room_views):
     """Two frames whose poses are 3 m off vote elsewhere, after others have guided the rest."""
     path = room_views(21, 0, 48, along_path=True, step=3).frames
@@ -91,25 +81,3 @@ def test_guided_matches_that_are_searched_for_change_both_answers(both, make_upl
     assert first.support > 2  # that many had guided the others, which vote now as well
     assert pose_difference(np.array(first.pose.matrix), np.array(path[4].pose))[0] < 0.02
     assert first.evidence.rival_weight >= 0.8  # the two frames that are off vote elsewhere
-
-
-def test_frames_elsewhere_are_compared_for_both_answers(both, make_upload, uploads):
-    """An equal room 30 m away fills the selection, so that it alone would be believed."""
-    rng = np.random.default_rng(5)
-
-    def again(one, metres, noise=0.0):
-        depth, pose = one.frame.depth, np.array(one.pose)
-        noisy = depth + (depth > 0) * rng.normal(0.0, noise, depth.shape)
-        pose[0, 3] += metres
-        frame = replace(one.frame, depth=noisy.astype(np.float32), pose=pose)
-        return make_upload(frame, "room")
-
-    twins = [again(one, 30.0, 1e-3) for one in uploads[6:]]
-    other, own = (
-        [again(one, -30.0) for one in uploads[:6]],
-        [again(one, 0.0) for one in uploads[6:]],
-    )
-    query = own.pop(2)
-    [(served, _)] = both([*other, *own, *twins], [query], candidates=3)
-    assert served.status == "ambiguous"
-    assert any(one.selected is False for one in served.matches)

@@ -27,58 +27,35 @@ REFUSED = [
     (Query, {"K": 5}, "K"),
     (Query, {"k": 0}, "k"),
     (Query, {"k": 51}, "k"),
-    (Query, {"k": 2.5}, "k"),
-    (Query, {"seed": -1}, "seed"),
     (Query, {"seed": 2**32}, "seed"),
-    (Query, {"stages": []}, "stages"),
     (Query, {"stages": ["validate"]}, "stages"),
-    (Query, {"stages": ["diversify", "retrieve"]}, "stages"),
-    (Query, {"stages": ["retrieve", "validate", "diversify"]}, "stages"),
     (Query, {"stages": ["retrieve", "retrieve"]}, "stages"),
     (Query, {"stages": ["retrieve", "rank"]}, "stages.1"),
-    (NewMap, {"name": ""}, "name"),
     (NewMap, {"name": "Hall"}, "name"),
-    (NewMap, {"name": "-hall"}, "name"),
-    (NewMap, {"name": "hall\n"}, "name"),
     (NewMap, {"name": "../hall"}, "name"),
-    (NewMap, {"name": "h" * 64}, "name"),
     (NewMap, {"name": "hall", "model": "large"}, "model"),
     (NewMap, {"name": "hall", "frames": 3}, "frames"),
     (FrameMeta, {"viewpoint": {"x": 0, "y": 0}}, "viewpoint.GivenVector.z"),
     (FrameMeta, {"units_per_metre": 0}, "units_per_metre"),
-    (FrameMeta, {"format": "obj"}, "format"),
     (FrameMeta, meta(colour="red"), "colour"),
-    (FrameMeta, meta(intrinsics=CAMERA | {"skew": 0}), "intrinsics.skew"),
     (FrameMeta, meta(intrinsics=CAMERA | {"fx": math.nan}), "intrinsics.fx"),
-    (FrameMeta, meta(intrinsics=CAMERA | {"cy": -math.inf}), "intrinsics.cy"),
     (FrameMeta, meta(intrinsics=CAMERA | {"width": 0}), "intrinsics.width"),
     (FrameMeta, meta(intrinsics=CAMERA | {"distortion": [math.nan]}), "intrinsics.distortion.0"),
     (FrameMeta, meta(intrinsics=CAMERA | {"distortion": [0] * 9}), "intrinsics.distortion"),
     (FrameMeta, meta(depth_scale=0), "depth_scale"),
-    (FrameMeta, meta(depth_scale=math.inf), "depth_scale"),
-    (FrameMeta, meta(robot=""), "robot"),
-    (FrameMeta, meta(robot="r\n"), "robot"),
     (FrameMeta, meta(robot="r\0"), "robot"),
-    (NewMap, {"name": "hall", "title": "t\0"}, "title"),
     (FrameMeta, meta(session="s" * 129), "session"),
     (FrameMeta, meta(tags=["a"] * 33), "tags"),
     (FrameMeta, meta(tags=["a", ""]), "tags.1"),
     (FrameMeta, meta(captured_at="2026-01-01T00:00:00"), "captured_at"),
     (FrameMeta, meta(captured_at="9999-12-31T23:59:59-12:00"), "captured_at"),
-    (FrameMeta, meta(captured_at="9999-12-31T23:59:59.999999Z"), "captured_at"),
-    (FrameMeta, meta(captured_at="0001-01-01T00:00:00+12:00"), "captured_at"),
     (FrameMeta, meta(pose={"matrix": EYE}), ""),  # in which frame?
     (GivenPose, {}, ""),
     (GivenPose, {"translation": ORIGIN}, ""),
-    (GivenPose, {"rotation": LEVEL}, ""),
     (GivenPose, {"translation": ORIGIN, "rotation": LEVEL, "matrix": EYE}, ""),
-    (GivenPose, {"translation": ORIGIN, "matrix": EYE}, ""),
-    (GivenPose, {"rotation": LEVEL, "matrix": EYE}, ""),
     (GivenPose, {"matrix": EYE[:3]}, "matrix"),
-    (GivenPose, {"matrix": [[*row, 0.0] for row in EYE]}, "matrix.0"),
     (GivenPose, {"matrix": [[math.nan, 0, 0, 0], *EYE[1:]]}, "matrix.0.0"),
     (GivenPose, {"translation": ORIGIN | {"x": math.inf}, "rotation": LEVEL}, "translation.x"),
-    (GivenPose, {"translation": ORIGIN | {"w": 1}, "rotation": LEVEL}, "translation.w"),
     (GivenPose, {"translation": ORIGIN, "rotation": ORIGIN}, "rotation.w"),
 ]
 
@@ -92,23 +69,7 @@ def test_what_would_mean_nothing_is_refused_at_its_place(kind, given, place):
         kind.model_validate_json(json.dumps(given))
 
 
-@pytest.mark.parametrize(
-    ("stages", "k", "seed"),
-    [(["retrieve"], 1, 0), (["retrieve", "validate"], 50, 2**32 - 1),
-     (["retrieve", "diversify"], 5, 1), (["retrieve", "diversify", "validate"], 5, 0)],
-)  # fmt: skip
-def test_a_query_at_its_limits_is_taken(stages, k, seed):
-    query = Query.model_validate({"stages": stages, "k": k, "seed": seed})
-    assert (list(query.stages), query.k, query.seed) == (stages, k, seed)
-    assert Query() == Query(k=5, stages=("retrieve", "diversify", "validate"), seed=0, exact=False)
-
-
-def test_a_pose_may_be_in_the_frame_of_its_session():
-    given = FrameMeta.model_validate(meta(pose={"matrix": EYE}, session="night"))
-    assert given.pose.parent_frame is None
-
-
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_both_ways_of_a_pose_are_one(seed):
     rotation, t = Rotation.random(random_state=seed), [1.5, -2.25, 1e3]
     T = np.eye(4)

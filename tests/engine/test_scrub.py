@@ -1,19 +1,16 @@
 """Tests of the scrub, which reads all stored bytes in slices and has damage repaired."""
 
-import signal
 import time
-from contextlib import closing
 
 import pytest
 from sqlalchemy import select, update
 
 from sceneprint.maintenance.scrub import Scrub
-from sceneprint.process import StopSignal
 from sceneprint.settings import Settings
 from sceneprint.store.scrub_rows import PASS_S, SLICE_S, ScrubRow, read_scrub
 from sceneprint.store.tables import frames, scrubs, signatures
 from sceneprint_client.api import JobState
-from worker.loop import Trace, Worker
+from tests.engine.conftest import flip
 
 
 @pytest.fixture(autouse=True)
@@ -49,12 +46,6 @@ def _blobs(engine):
     return [place(r[0]) for r in rows], [place(r[1]) for r in rows], [r[2] for r in rows]
 
 
-def _flip(path):
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(data)
-
-
 def test_all_bytes_are_read_once_a_day(full):
     uploads, artifacts, _ = _blobs(full)
     before = time.time()
@@ -71,29 +62,12 @@ def test_all_bytes_are_read_once_a_day(full):
     assert (told.blobs, told.bytes, told.damaged) == (row.blobs, row.bytes, 0)
 
 
-@pytest.mark.parametrize("reason", ["time", "ring"])
-def test_a_slice_ends_after_a_few_frames_where_its_time_is_over_or_a_frame_waits(
-    full, monkeypatch, reason
-):
-    uploads, _, _ = _blobs(full)
-    monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
-    if reason == "time":
-        monkeypatch.setattr("sceneprint.maintenance.scrub.TURN_S", 0.0)
-    seen = []
-    for _ in range(4):
-        row = _scrub(full).run(lambda: reason == "time", now=True)
-        seen.append(row.blobs)
-        _due(full)
-    assert seen == [10, 20, 2 * len(uploads), 2 * len(uploads)]
-    assert len(uploads) == 12
-
-
 def test_damage_is_told_and_what_can_be_made_again_is(full, work_off):
     uploads, artifacts, ids = _blobs(full)
     sound = artifacts[1].read_bytes()
-    _flip(artifacts[1])
+    flip(artifacts[1], 500)
     artifacts[2].unlink()
-    _flip(uploads[3])
+    flip(uploads[3], 500)
     with full.store.database.write() as connection:
         vector = select(signatures.c.vector).limit(1)
         size = len(connection.execute(vector).scalar_one())
@@ -152,34 +126,7 @@ def test_none_is_read_where_it_is_switched_off(full):
 
 
 @pytest.mark.parametrize(
-    ("next_at", "due"), [(99.0, True), (100.0, True), (160.0, False), (100.0 + PASS_S, False),
-                         (101.0 + PASS_S, True)],
-)  # fmt: skip
+    ("next_at", "due"), [(100.0, True), (160.0, False), (101.0 + PASS_S, True)]
+)
 def test_a_clock_that_was_set_back_does_not_stop_it(next_at, due):
     assert ScrubRow(1, 0, next_at, 0.0, None, 0, 0, 0).is_due(100.0) is due
-
-
-@pytest.fixture
-def stop():
-    """One whose handlers are gone afterwards."""
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.getsignal(one) for one in numbers]
-    yield StopSignal()
-    signal.set_wakeup_fd(-1)
-    for number, handler in zip(numbers, before, strict=True):
-        signal.signal(number, handler)
-
-
-def test_a_worker_scrubs_only_until_it_is_rung_for(full, stop, monkeypatch):
-    monkeypatch.setattr("sceneprint.maintenance.scrub.AT_ONCE", 5)
-    with full.bell.listen() as listener, closing(Trace()) as trace:
-        worker = Worker(full.context, listener, trace, stop)
-        listener.wait(0.0)  # what rang before
-        for blobs, rings in ((10, True), (24, False)):
-            worker._upkeep_at = worker._scrub._next = 0.0
-            if rings:
-                full.bell.ring()
-            worker.turn()
-            row = _row(full)
-            assert row.blobs == blobs
-            _due(full)

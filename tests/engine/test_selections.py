@@ -1,16 +1,23 @@
-"""Tests of deletions and edits of selected frames, and of undo."""
+"""Tests of deletions and edits of selected frames and of sessions, in blocks, and of undo."""
 
 import pytest
 from pydantic import ValidationError
 
 from sceneprint.engine.maps import selections as module
-from sceneprint.engine.maps.selections import delete_selection, edit_selection
-from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
+from sceneprint.engine.maps.map_frames import list_sessions
+from sceneprint.engine.maps.selections import (
+    delete_selection,
+    delete_session,
+    edit_selection,
+    edit_session,
+)
+from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap, UnknownSession
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.api.listing import FrameListing, FramesEdit, FrameSelection
+from sceneprint_client.api.listing import FrameListing, FramesEdit, FrameSelection, SessionEdit
 
 #: Session, robot and tags of each of twelve uploads.
 TAKEN = [("a", "r1", ["x"])] * 5 + [("b", "r2", ["x", "y"])] * 4 + [(None, None, [])] * 3
+OF_SESSIONS = [("a", "r1")] * 5 + [("a", "r2")] * 3 + [("a/..", "r1")] * 2 + [(None, "r1")] * 2
 
 
 @pytest.fixture(autouse=True)
@@ -122,12 +129,6 @@ def test_an_edit_goes_on_after_the_last_frame(empty, ids):
         edit(empty, filter={"session": "a"}, session="c", after="none")
 
 
-def test_one_call_edits_so_many(empty, ids, monkeypatch):
-    monkeypatch.setattr(module, "MOST_SELECTED", 4)
-    told = edit(empty, filter={"name": "0"}, robot="r3")
-    assert (told.frames, told.remaining, told.last_frame_id) == (4, 6, ids[3])
-
-
 def test_too_many_tags_are_refused(empty, ids):
     with pytest.raises(InvalidRequest, match="33 tags, but a frame can have at most 32"):
         edit(empty, frame_ids=ids[:1], add_tags=[f"t{i}" for i in range(32)])
@@ -153,3 +154,64 @@ def test_an_edit_changes_something():
             ValidationError, match="specify session, robot, add_tags or remove_tags"
         ):
             FramesEdit.model_validate({"frame_ids": ["a"]} | given)
+
+
+@pytest.fixture
+def of_sessions(empty, uploads):
+    """Twelve frames of four pairs of a session and a robot."""
+    made = []
+    for upload, (session, robot) in zip(uploads, OF_SESSIONS, strict=True):
+        known = upload.meta.model_dump() | {"session": session, "robot": robot, "tags": ["old"]}
+        made.append(empty.add_frame("hall", upload.data, FrameMeta.model_validate(known))[0])
+    return [one.frame_id for one in made]
+
+
+def frames(engine):
+    return {one.frame_id: one for one in engine.list_frames("hall", None, 100).items}
+
+
+def test_a_session_is_deleted_with_its_frames_and_blobs(empty, of_sessions):
+    before = frames(empty)
+    change = delete_session(empty.store, "hall", "a", empty.tombstones, "r1")
+    assert (change.session, change.robot, change.frames, change.remaining) == ("a", "r1", 5, 0)
+    assert frames(empty) == {one: before[one] for one in of_sessions[5:]}
+    assert empty.tombstones.purge(everything=True) == 5
+    assert len(list(empty.store.blobs.digests())) == 7
+    assert empty.get_map("hall").used_frames == 7
+    assert delete_session(empty.store, "hall", "a", empty.tombstones).frames == 3
+    assert delete_session(empty.store, "hall", "a/..", empty.tombstones).frames == 2
+    assert list(frames(empty)) == of_sessions[10:]
+    for name, robot in (("a", None), ("", None), ("a", "r1")):
+        with pytest.raises(UnknownSession, match="has no frame of session"):
+            delete_session(empty.store, "hall", name, empty.tombstones, robot)
+    with pytest.raises(UnknownMap):
+        delete_session(empty.store, "hall-2", "a", empty.tombstones)
+
+
+def test_a_session_is_renamed_and_joins_another(empty, of_sessions):
+    before = frames(empty)
+    edit = SessionEdit(session="a", robot="r2")
+    assert edit_session(empty.store, "hall", "a/..", edit).frames == 2
+    after = frames(empty)
+    for place, one in enumerate(of_sessions):
+        wanted = {"session": "a", "robot": "r2"} if place in (8, 9) else {}
+        free = {"etag": "", "revision": 0}
+        now = after[one].model_copy(update=free)
+        assert now == before[one].model_copy(update={**wanted, **free})
+    assert delete_session(empty.store, "hall", "a", empty.tombstones, "r2").frames == 3 + 2
+
+
+def test_tags_are_added_once_and_removed(empty, of_sessions):
+    edit = SessionEdit(add_tags=["new", "old", "new"], remove_tags=["other"])
+    change = edit_session(empty.store, "hall", "a", edit, "r1")
+    assert (change.frames, change.session, change.robot) == (5, "a", "r1")
+    tags = [one.tags for one in frames(empty).values()]
+    assert tags == [["old", "new"]] * 5 + [["old"]] * 7
+    listed = list_sessions(empty.store, "hall", None, 10).items
+    assert [(one.session, one.robot, one.tags) for one in listed] == [
+        (None, "r1", ["old"]), ("a", "r1", ["new", "old"]), ("a", "r2", ["old"]),
+        ("a/..", "r1", ["old"]),
+    ]  # fmt: skip
+    edit_session(empty.store, "hall", "a", SessionEdit(remove_tags=["old"]))
+    found = empty.list_frames("hall", None, 100, wanted=FrameListing(tag=["old"])).items
+    assert [one.frame_id for one in found] == of_sessions[8:]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprint.engine.products.session_differences import POINTS
-from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
+from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.rigid import inverse, transform_points
 from sceneprint_client.api import JobState
 from sceneprint_client.api.sessions import GONE, NEW, NewDifference
@@ -70,31 +70,6 @@ def test_what_came_is_new_and_what_went_is_gone(compared, work_off):
     assert (back.result.gone, back.result.new) == (result.new, result.gone)
     gone = points_of(engine, back)
     np.testing.assert_array_equal(gone.points[gone.patches == GONE], new)
-
-
-def test_a_slice_that_was_lost_is_done_again_with_the_same_result(
-    compared, work_off, each_slice_lost_once
-):
-    engine, _ = compared
-    whole = difference(engine, work_off, "a", "b")
-    begun = engine.differences.begin("hall", NewDifference(before="a", after="b"))
-    with pytest.raises(NotIndexed, match="is queued"):
-        engine.differences.file("hall", begun.job_id, POINTS)
-    slices = each_slice_lost_once(engine, engine.differences, begun.job_id)
-    assert slices == 12  # each frame is fused, and judges
-    told = engine.differences.get("hall", begun.job_id)
-    assert told.result == whole.result
-    files = [engine.differences.file("hall", one.job_id, POINTS) for one in (whole, told)]
-    assert files[0].blob == files[1].blob
-    # the frames of a comparison are shown by it: with one of them it goes
-    assert engine.differences.forget() == 0
-    page = engine.list_frames("hall").items
-    engine.delete_frame("hall", next(one.frame_id for one in page if one.session == "b"))
-    engine.purging.now()
-    for one in (whole, told):
-        with pytest.raises(UnknownJob):
-            engine.differences.get("hall", one.job_id)
-    assert not engine.store.blobs.holds(files[0].blob)
 
 
 def test_sessions_that_cannot_be_compared_are_refused(compared):

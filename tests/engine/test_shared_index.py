@@ -3,7 +3,6 @@
 import os
 import shutil
 import time
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,12 +10,11 @@ import pytest
 from pydantic import ValidationError
 from sqlalchemy import select
 
-from sceneprint.atomic_files import folder_turn
 from sceneprint.engine.search import index_place, local_index
 from sceneprint.engine.search.index_place import IN_USE_S
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep import index_upkeep
-from sceneprint.errors import BusyIndex, DamagedIndex, UnusableStore
+from sceneprint.errors import DamagedIndex, UnusableStore
 from sceneprint.index.index_manifest import manifests
 from sceneprint.index.index_version import clear, newest, publish
 from sceneprint.settings import Settings
@@ -135,17 +133,6 @@ def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, upl
     assert ask(built, uploads).counts.map == 8
 
 
-def test_a_host_goes_on_from_what_another_built(built, host, fill):
-    """The one that builds next fetches what it has not, and reads the rest from the database."""
-    other = host("two")
-    fill(built, range(4, 8))
-    assert numbers(other) == []
-    assert other.publish_due() == 1
-    assert numbers(other) == [2, 1]
-    head = shared(built).head(row_of(built))
-    assert (head.number, head.frames) == (2, 8)
-
-
 @pytest.fixture
 def append(place):
     """Publish and share signatures that no frame has, as the next version of map "hall"."""
@@ -203,83 +190,6 @@ def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
     assert set(keys(objects)) == {
         f"{made.number:010d}.json", *(name for name, _ in made.manifest.files)
     }  # fmt: skip
-
-
-def test_files_of_a_version_stay_while_somebody_may_fetch_it(
-    built, append, place, host, monkeypatch
-):
-    """Also old ones, that the next version has merged."""
-    built.create_map(NewMap(name="other", model="depth"))
-    row, objects, other = row_of(built), open_objects(place), host("two")
-    shared(built).withdraw(row)
-    clear(folder_of(built))
-    first = append(built, 100)
-    second = append(built, 20)
-    shared(built).prune(row)
-    head = shared(built).head(row)
-    third = append(built, 31)
-    assert [len(each.segments) for each in (first, second, third)] == [1, 2, 1]
-    files = [{name for name, _ in each.manifest.files} for each in (first, second, third)]
-    # a builder that has lost its turn may still name a part that it has put
-    fresh = f"{64 * '0'}.keys"
-    objects.put(f"index/{folder_of(built).name}/{fresh}", b"new")
-    # all is an hour old but this and the newest, which have just come
-    listed, new = objects.list, (f"{third.number:010d}.json", fresh)
-
-    def aged(prefix):
-        return [
-            one if one.key.endswith(new) else replace(one, changed_at=one.changed_at - 3600)
-            for one in listed(prefix)
-        ]
-
-    monkeypatch.setattr(shared(built)._store, "list", aged)
-    shared(built).prune(row)
-    left = set(keys(objects))
-    assert left >= files[1] | files[2] | {f"{n.number:010d}.json" for n in (second, third)}
-    assert fresh in left
-    assert f"{first.number:010d}.json" not in left
-    for name, size in head.files:  # who began before goes on
-        shared(other)._get(objects, folder_of(built), name, size)
-    shared(built).prune(row, clean=True)
-    assert set(keys(objects)) == files[2] | {f"{third.number:010d}.json"}
-
-
-def test_a_service_drops_segments_of_which_frames_have_been_gone_for_long(host, append):
-    """The version is another each time, and the segment the same."""
-    one, service = host("one"), host("two", purge_deadline_s=1)
-    one.create_map(NewMap(name="hall", model="depth"))
-    append(one, 100)
-    left = []
-    for drop in ({5}, {6}):
-        append(one, 0, frozenset(drop))
-        service.memory_purging._purged = time.monotonic() - 1
-        shared(service).sync(row_of(one))
-        service.memory_purging.run()
-        left.append(numbers(service))
-    assert left == [[2], []]
-    append(one, 0, clean=True)
-    shared(service).sync(row_of(one))
-    service.memory_purging._purged = time.monotonic() - 1
-    service.memory_purging.run()
-    assert numbers(service) == [4]
-
-
-def test_while_one_host_builds_no_other_does(host, fill):
-    engine = host("one")
-    if engine.store.database.is_sqlite:
-        pytest.skip("the builders of one machine have the lock of a folder")
-    engine.create_map(NewMap(name="hall", model="depth"))
-    fill(engine, range(4))
-    with index_turn(engine.store.database, row_of(engine).number) as mine:
-        assert mine is not None
-        with index_turn(engine.store.database, row_of(engine).number) as again:
-            assert again is None
-        with index_turn(engine.store.database, row_of(engine).number + 1) as others:
-            assert others is not None
-        assert engine.publish_due() == 0
-        with pytest.raises(BusyIndex):
-            engine.rebuild_index("hall")
-    assert engine.publish_due() == 1
 
 
 def test_who_lost_the_turn_publishes_nothing(built):
@@ -377,16 +287,6 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, id
     assert keys(objects)[:2] == [".swept", "0000000002.json"]
     assert [ask(engine, uploads).counts.map for engine in (built, other, service)] == [3, 3, 3]
     assert ask(other, uploads).index_version == 2
-    # parts that no version lists, as a killed removal or download leaves them
-    (folder,) = (tmp_path / "three" / "index").iterdir()
-    left = folder / ("0" * 64 + ".keys")
-    for manifest in (None, *folder.glob("*.json")):
-        if manifest is not None:
-            manifest.unlink()
-        left.write_bytes(secret)
-        service.memory_purging._purged = time.monotonic() - 1
-        service.memory_purging.run()
-        assert not left.exists()
 
 
 def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, host, uploads, ids):
@@ -403,32 +303,14 @@ def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, 
     assert ask(service, uploads).counts.map == 3
 
 
-def test_a_number_of_an_index_that_was_emptied_is_not_used_again(built, ids, fill, place):
-    for name in ids(built):
-        built.delete_frame("hall", name)
-    built.purging.now()
-    objects = open_objects(place)
-    assert keys(objects) == [".swept", "0000000001.json"]
-    assert numbers(built) == []
-    fill(built, range(4, 8))
-    assert built.publish_due() == 1
-    assert numbers(built) == [2]
-
-
-def test_nothing_is_shared_of_maps_that_are_gone(built, fill, place, host, uploads):
+def test_nothing_is_shared_of_maps_that_are_gone(built, place, host, uploads):
     service = host("two", purge_deadline_s=1)
-    built.create_map(NewMap(name="other", model="depth"))
-    fill(built, range(4, 8), "other")
-    assert built.publish_due() == 1
     ask(service, uploads)
     shared(service).finish()
     folder, objects = folder_of(service), open_objects(place)
-    name = folder_of(built).name
     built.delete_map("hall")
     built.purging.now()
-    left = {one.key.split("/")[1] for one in objects.list("index/")}
-    assert left == {".swept", folder_of(built, "other").name}
-    assert name not in left
+    assert {one.key.split("/")[1] for one in objects.list("index/")} == {".swept"}
     service.memory_purging._purged = time.monotonic() - 1
     service.memory_purging.run()
     assert not folder.exists()
@@ -507,14 +389,6 @@ def test_another_database_is_refused(built, make_engine, place, tmp_path):
     stranger.create_map(NewMap(name="hall", model="depth"))
     with pytest.raises(UnusableStore, match="another database"):
         shared(stranger).head(row_of(stranger))
-
-
-def test_a_folder_where_somebody_builds_is_left_alone(built, host):
-    other = host("two")
-    with folder_turn(folder_of(other)) as mine:
-        assert mine
-        assert shared(other).sync(row_of(other)) is None
-    assert shared(other).sync(row_of(other)) is not None
 
 
 def test_memory_is_shared_with_nobody():

@@ -3,12 +3,10 @@
 import pytest
 from sqlalchemy import select, update
 
-from sceneprint.engine.jobs import tasks
 from sceneprint.engine.jobs.lifecycle import list_jobs
 from sceneprint.engine.jobs.tasks import LongJob, SliceResult
 from sceneprint.engine.upkeep.garbage_collection import collect_blobs
-from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob, UnknownMap
-from sceneprint.process import work_of
+from sceneprint.errors import CannotRetry, InvalidRequest, UnknownJob
 from sceneprint.store.events import number_events
 from sceneprint.store.queue import JobFile, files_of, find_job, items_of, remove_job
 from sceneprint.store.tables import events, jobs
@@ -103,32 +101,6 @@ def test_what_cannot_be_done_fails_at_once_and_goes_on_when_retried(engine, work
         engine.retry_job(job.job_id)
 
 
-def test_what_breaks_down_is_tried_again_until_it_is_dead(engine, work_off):
-    def handle(_task, _):
-        raise RuntimeError("no luck")
-
-    engine.handle("count", handle)
-    job, _ = engine.begin_task("count", None, {})
-    states = []
-    for _ in range(3):
-        with engine.store.database.write() as connection:
-            connection.execute(update(jobs).values(run_after=1.0))
-        states += work_off(engine)
-    assert states == [JobState.QUEUED, JobState.QUEUED, JobState.DEAD]
-    dead = engine.get_job(job.job_id)
-    assert (dead.map, dead.error) == (None, "RuntimeError: no luck")
-    assert dead.traceback is not None
-    assert "no luck" in dead.traceback
-
-
-def test_a_kind_that_nobody_does_says_so(engine, work_off):
-    job, _ = engine.begin_task("dance", "hall", {})
-    assert work_off(engine) == [JobState.FAILED]
-    assert "kind 'dance'" in str(engine.get_job(job.job_id).error)
-    with pytest.raises(UnknownMap):
-        engine.begin_task("dance", "nowhere", {})
-
-
 def test_a_map_takes_its_long_jobs_and_their_files_along(engine, work_off):
     engine.handle("count", count_to(engine, 2))
     job, _ = engine.begin_task("count", "hall", {})
@@ -207,32 +179,3 @@ def test_a_file_that_a_deletion_swept_is_made_again(engine, work_off):
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     assert engine.get_job(job.job_id).attempts == 1
     assert engine.store.blobs.get(swept[0]) == b"part 0"
-
-
-def test_a_file_that_another_takes_the_place_of_is_removed(engine, work_off):
-    engine.handle("count", count_to(engine, 3))
-    engine.begin_task("count", "hall", {})
-    work_off(engine)
-    [blob] = engine.store.blobs.digests()
-    assert engine.store.blobs.get(blob) == b"part 2"
-
-
-def test_a_slice_ends_when_another_tenant_waits(engine, monkeypatch):
-    monkeypatch.setattr(tasks, "SLICE_S", 1e6)
-
-    def handle(_, is_over):
-        with work_of("other"):
-            engine.begin_task("count", "hall", {})
-        while not is_over():
-            pass
-        return SliceResult(over=False, progress={"done": 1, "total": 2})
-
-    engine.handle("endless", handle)
-    engine.handle("count", count_to(engine, 1))
-    with work_of("own"):
-        engine.begin_task("endless", "hall", {})
-    held = engine.claim("w")
-    assert held is not None
-    assert engine.run(held) == JobState.QUEUED
-    following = engine.claim("w")
-    assert (following.job.kind, following.job.tenant) == ("count", "other")

@@ -1,14 +1,11 @@
 """Tests of deleted frames: hidden, restored in time, and finally removed."""
 
-import os
-from pathlib import Path
-
 import pytest
 from sqlalchemy import update
 
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.maps import selections, tombstones
-from sceneprint.engine.maps.map_lifecycle import begin_reencoding, edit_map
+from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.maps.selections import delete_selection, delete_session
 from sceneprint.errors import (
     Conflict,
@@ -18,12 +15,12 @@ from sceneprint.errors import (
     UnknownFrame,
     UnknownMap,
 )
-from sceneprint.store.blobs.folder import MARK
 from sceneprint.store.frames import set_state
-from sceneprint.store.maps import MapUsage, counted_usage, find_frame, find_map
+from sceneprint.store.maps import MapUsage, find_frame, find_map
 from sceneprint.store.tables import frames as frames_table
-from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
+from sceneprint_client.api import FrameMeta, FrameState, Query
 from sceneprint_client.api.listing import FrameListing, FrameSelection
+from tests.engine.conftest import bytes_on_disk, used
 
 #: What a restored frame has anew.
 FRESH = {"revision", "job_id", "indexed_at", "state"}
@@ -49,23 +46,6 @@ def end_undo(engine):
     """Let the time of all deletions be over."""
     with engine.store.database.write() as connection:
         connection.execute(update(frames_table).values(ended_at=frames_table.c.ended_at - 601))
-
-
-def used(engine):
-    """Return what `hall` is counted to hold, which a count over its rows confirms."""
-    with engine.store.database.read() as connection:
-        row = find_map(connection, "hall")
-        assert counted_usage(connection, row.number) == MapUsage(row.used_frames, row.used_bytes)
-    return MapUsage(row.used_frames, row.used_bytes)
-
-
-def bytes_on_disk(engine):
-    return sum(
-        os.lstat(Path(folder, name)).st_size
-        for folder, _, names in os.walk(engine.settings.blob_dir)
-        for name in names
-        if name != MARK  # it says whose the blobs are
-    )
 
 
 def nearest(engine, upload):
@@ -117,20 +97,6 @@ def test_a_restored_frame_is_as_it_was_and_found_at_once(full, uploads, told):
     for name in (first, "none"):
         with pytest.raises(UnknownFrame, match="was not deleted, or can no longer be restored"):
             full.tombstones.restore_one("hall", name)
-
-
-def test_a_frame_of_a_map_that_has_another_model_now_is_signed_again(full, work_off, small_model):
-    first = next(iter(frames(full)))
-    full.delete_frame("hall", first)
-    begin_reencoding(full.store, full.bell, "hall", small_model)
-    full.publish_due()
-    work_off(full)
-    full.publish_due()
-    assert full.get_map("hall").model_id == small_model.id
-    full.tombstones.restore_one("hall", first)
-    assert full.get_frame("hall", first).state == FrameState.RECEIVED
-    assert work_off(full) == [JobState.SUCCEEDED]
-    assert full.get_frame("hall", first).state == FrameState.INDEXED
 
 
 def test_a_session_is_restored_with_names_tags_and_states(empty, uploads, monkeypatch):
@@ -193,21 +159,10 @@ def test_a_quota_of_frames_holds(full):
     edit_map(full.store, "hall", {"quota_frames": len(names) - 1})
     with pytest.raises(QuotaExceeded, match="no room for the 3 frames"):
         restore(full, deletion)
-    assert len(frames(full)) == len(names) - 3
     for name in names[:2]:
         full.tombstones.restore_one("hall", name)
     with pytest.raises(QuotaExceeded):
         full.tombstones.restore_one("hall", names[2])
-
-
-def test_bytes_of_deleted_frames_count_until_they_are_purged(full):
-    names, use = list(frames(full)), used(full)
-    size = sum(len(full.outputs.upload("hall", one).make()) for one in names[:2])
-    delete(full, names[:2])
-    assert used(full) == MapUsage(use.frames - 2, use.bytes)
-    end_undo(full)
-    assert full.tombstones.purge() == 2
-    assert used(full) == MapUsage(use.frames - 2, use.bytes - size)
 
 
 def test_an_upload_beyond_the_quota_purges_the_oldest_deletions(empty, uploads):
@@ -247,9 +202,10 @@ def restorable(engine, names):
 
 
 def test_after_its_time_a_deletion_is_for_good(full):
-    names = list(frames(full))
+    names, use, on_disk = list(frames(full)), used(full), bytes_on_disk(full)
     deletion = delete(full, names[:2]).deletion
-    blobs = len(list(full.store.blobs.digests()))
+    size = sum(full.get_frame("hall", one).bytes for one in names[2:])
+    assert used(full) == MapUsage(use.frames - 2, use.bytes)
     assert full.tombstones.purge() == 0
     end_undo(full)
     with pytest.raises(UnknownDeletion, match="has expired"):
@@ -258,17 +214,10 @@ def test_after_its_time_a_deletion_is_for_good(full):
         full.tombstones.restore_one("hall", names[0])
     assert full.tombstones.list_all("hall", None, 9).items == []
     assert full.tombstones.purge() == 2
-    assert len(list(full.store.blobs.digests())) == blobs - 4  # uploads and artifacts
+    assert used(full) == MapUsage(use.frames - 2, size)  # bytes count until they are gone
+    assert len(list(full.store.blobs.digests())) == 2 * len(names) - 4  # uploads and artifacts
+    assert bytes_on_disk(full) < on_disk
     assert full.tombstones.purge() == 0
-
-
-def test_without_time_to_undo_a_deletion_is_for_good(full, make_engine):
-    names, blobs = list(frames(full)), len(list(full.store.blobs.digests()))
-    never = make_engine(undo_window_s=0)
-    done = delete(never, names[:1])
-    assert (done.frames, done.deletion) == (1, None)
-    assert len(list(full.store.blobs.digests())) == blobs - 2
-    assert used(full).frames == len(names) - 1
 
 
 def test_deletions_are_listed_a_page_at_a_time(full):
@@ -302,16 +251,3 @@ def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
     assert (now.state, now.reason) == (FrameState.REJECTED, "as a test says")
     assert empty.get_frame("hall", made[1].frame_id).state == FrameState.DELETED
     assert used(empty) == use
-
-
-def test_maps_do_not_share_their_deletions(full, uploads):
-    full.create_map(NewMap(name="attic", model="depth"))
-    other = full.add_frame("attic", uploads[0].data, uploads[0].meta)[0].frame_id
-    first = next(iter(frames(full)))
-    deletion = delete(full, [first]).deletion
-    full.delete_frame("attic", other)
-    with pytest.raises(UnknownDeletion):
-        full.tombstones.restore("attic", deletion.deletion_id)
-    with pytest.raises(UnknownFrame):
-        full.tombstones.restore_one("attic", first)
-    assert restore(full, deletion).frames == 1

@@ -1,13 +1,11 @@
 """Tests of up vectors of frames and maps: storage, estimation, use, and wrong vectors."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sceneprint.engine.maps.map_lifecycle import edit_frame, edit_map
-from sceneprint.engine.results.query_entry import decode_answer, encode_answer
 from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.errors import FrameConflict, InvalidRequest, MapExists
@@ -40,8 +38,6 @@ def test_a_frame_keeps_its_up(empty, uploads):
     added, _ = empty.add_frame("hall", one.data, with_up(one.meta, near))
     told = empty.get_frame("hall", added.frame_id)
     assert (told.up.x, told.up.y, told.up.z) == (0.0, -1.0, 0.0)
-    [listed] = empty.list_frames("hall").items
-    assert listed.up == told.up
     again, new = empty.add_frame("hall", one.data, with_up(one.meta, [0, -1, 0]))
     assert (again.frame_id, new) == (added.frame_id, False)
     for other in (None, [0, 0, 1]):
@@ -49,21 +45,16 @@ def test_a_frame_keeps_its_up(empty, uploads):
             empty.add_frame("hall", one.data, with_up(one.meta, other))
     moved = edit_frame(empty.store, "hall", added.frame_id, {"up": [1, 0, 0]})
     assert moved.up.x == 1.0
-    assert moved.etag != told.etag
     bare = edit_frame(empty.store, "hall", added.frame_id, {"up": None})
     assert bare.up is None
-    assert bare.etag not in (told.etag, moved.etag)
-    empty.delete_frame("hall", added.frame_id)
-    assert row_of(empty, added.frame_id).up is None
+    assert len({told.etag, moved.etag, bare.etag}) == 3
 
 
 @pytest.mark.parametrize(
     ("up", "why"),
     [
         ([0, 0, 9.81], "the length is 9.81, not 1"),
-        ([0, 0, 0], "the length is 0, not 1"),
         ([0, -1], "must be {x, y, z} or a list of three numbers"),
-        ("up", "must be {x, y, z} or a list of three numbers"),
         ({"x": 0, "y": 1}, "Field required"),
         ([math.nan, 0, 1], "finite number"),
     ],
@@ -79,7 +70,6 @@ def test_a_map_has_an_up_that_can_be_changed(empty):
     new = NewMap.model_validate({"name": "level", "up": {"x": 0, "y": 0, "z": 1}})
     made, _ = empty.create_map(new)
     assert made.up.z == 1.0
-    assert empty.create_map(new)[1] is False
     with pytest.raises(MapExists, match="another name"):
         empty.create_map(NewMap.model_validate({"name": "level", "up": [0, 1, 0]}))
     told = edit_map(empty.store, "level", {"up": [0, -1, 0]}, [str(made.etag)])
@@ -91,14 +81,19 @@ def test_a_map_has_an_up_that_can_be_changed(empty):
         edit_map(empty.store, "level", {"up": [0, 0, 2]})
 
 
-def test_a_map_tells_its_frames_their_up(full, ids, uploads):
-    names = ids(full)
-    numbers = [row_of(full, name).number for name in names]
+def ups(engine, names):
+    """Numbers of frames, and a function that returns their known ups."""
+    numbers = [row_of(engine, name).number for name in names]
 
     def known():
-        with full.store.database.read() as connection:
+        with engine.store.database.read() as connection:
             return known_ups(connection, numbers)
 
+    return numbers, known
+
+
+def test_a_map_tells_its_frames_their_up(full, ids, uploads):
+    names, numbers, known = ids(full), *ups(full, ids(full))
     assert known() == {}
     edit_map(full.store, "hall", {"up": Z})
     found = known()
@@ -114,13 +109,7 @@ def test_a_map_tells_its_frames_their_up(full, ids, uploads):
 
 
 def test_the_up_of_a_parent_frame_is_learnt_from_three_frames(full, ids, uploads):
-    names = ids(full)
-    numbers = [row_of(full, name).number for name in names]
-
-    def known():
-        with full.store.database.read() as connection:
-            return known_ups(connection, numbers)
-
+    names, numbers, known = ids(full), *ups(full, ids(full))
     for i in (0, 1):
         edit_frame(full.store, "hall", names[i], {"up": up_of(uploads[i])})
     assert sorted(known()) == numbers[:2]
@@ -175,18 +164,6 @@ def test_a_wrong_up_is_told_and_gives_no_pose(level, uploads):
     # looked at again, it is what it was
     again = level.inspection.match(told.query_id, told.matches[0].frame_id)
     assert again.validation == first
-
-
-def test_what_was_found_with_up_is_looked_at_again_with_it(level, uploads):
-    one = uploads[2]
-    told = level.queries.upload(["hall"], one.data, with_up(one.meta, up_of(one)), Query(k=3))
-    best = told.matches[0]
-    again = level.inspection.match(told.query_id, best.frame_id)
-    assert again.validation == best.validation
-    stored = level.query_log.find(told.query_id)
-    assert stored.up is not None
-    np.testing.assert_allclose(stored.up, up_of(one), atol=1e-12)
-    assert decode_answer(encode_answer(replace(stored, up=None))).up is None
 
 
 def test_a_stored_frame_asks_with_the_up_that_is_known_of_it(level, ids):

@@ -7,11 +7,8 @@ import pytest
 from sqlalchemy import update
 
 from sceneprint.engine import signers
-from sceneprint.engine.search import retrieval
 from sceneprint.errors import InvalidRequest, UnreadableModel
-from sceneprint.index import index_manifest, index_version
 from sceneprint.index.index_manifest import manifests, read_manifest
-from sceneprint.index.part_files import verify
 from sceneprint.store.tables import models
 from sceneprint_client.api import JobState, NewMap, Query
 
@@ -89,24 +86,6 @@ def test_indexes_of_deleted_maps_are_removed_and_nothing_else(
     assert [one.name for one in engine.settings.indexes.glob("[!.]*")] == ["notes"]
 
 
-def test_what_was_not_asked_for_long_is_not_held(make_engine, uploads, work_off, monkeypatch):
-    engine = make_engine()
-    for name in ("hall", "other"):
-        engine.create_map(NewMap(name=name, model="depth"))
-        engine.add_frame(name, uploads[0].data, uploads[0].meta)
-    work_off(engine)
-
-    def held():
-        for name in ("hall", "other", "hall"):
-            answer = engine.queries.upload([name], uploads[0].data, uploads[0].meta, ALL)
-            assert answer.matches[0].distance == 0
-        return list(engine.readers._open)
-
-    assert held() == ["other", "hall"]
-    monkeypatch.setattr(retrieval, "HELD_BYTES", 2 * 64 * 448 - 1)  # 64 rows are set aside at once
-    assert held() == ["hall"]
-
-
 def test_a_model_that_cannot_be_read_costs_its_maps_alone(make_engine, uploads, work_off, caplog):
     engine = make_engine()
     for name, model in (("hall", "depth"), ("old", "paper")):
@@ -122,46 +101,6 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(make_engine, uploads, 
     assert fresh.queries.upload(["hall"], uploads[0].data, uploads[0].meta, ALL).counts.map == 1
     with pytest.raises(UnreadableModel):
         fresh.queries.upload(["old"], uploads[0].data, uploads[0].meta, ALL)
-
-
-def test_an_index_is_published_by_what_it_lacks_however_large(data, make_engine, uploads, work_off):
-    """Twelve frames, and deletions one after the other: each second one is published."""
-    engine = make_engine(data, unindexed_frames=1)
-    assert engine.publish_due() == 1
-    names = [one.frame_id for one in engine.list_frames("hall").items]
-    due = []
-    for name in names[:4]:
-        engine.delete_frame("hall", name)
-        other = make_engine(data, unindexed_frames=1)  # who knows nothing of the index
-        due.append((engine.publish_due(), other.publish_due()))
-    assert due == [(0, 0), (1, 0), (0, 0), (1, 0)]
-    answer = engine.queries.upload(["hall"], uploads[11].data, uploads[11].meta, ALL)
-    assert (answer.counts.map, answer.index_version) == (8, 3)
-
-
-def test_a_worker_reads_a_file_of_an_index_once(make_engine, uploads, work_off, monkeypatch):
-    """To read a large index for each of many small publications would cost more than to write."""
-    engine, read = make_engine(unindexed_frames=1), list[str]()
-    engine.create_map(NewMap(name="hall", model="depth"))
-
-    def noted(folder, name, size):
-        read.append(name)
-        return verify(folder, name, size)
-
-    fill(engine, uploads, work_off, range(6))
-    assert engine.publish_due() == 1
-    assert engine.publish_due() == 0  # and all has been scrubbed
-    monkeypatch.setattr(index_version, "verify", noted)
-    monkeypatch.setattr(index_manifest, "verify", noted)
-    fill(engine, uploads, work_off, range(6, 8))
-    assert engine.publish_due() == 1
-    assert read == []
-    other = make_engine(unindexed_frames=1)
-    fill(other, uploads, work_off, range(8, 11))
-    assert other.publish_due() == 1
-    assert sorted(name.rpartition(".")[2] for name in read) == ["faiss", "faiss", "keys", "keys"]
-    (number, _), *_ = manifests(next(engine.settings.indexes.glob("hall*")))
-    assert number == 3
 
 
 def test_purging_removes_what_a_publication_had_only_marked(make_engine, uploads, work_off):
@@ -206,27 +145,19 @@ def test_purging_writes_an_index_again_whose_keys_are_damaged(make_engine, uploa
     assert number == 2
 
 
-def test_maps_of_whole_fisher_vectors_have_no_index(make_engine, uploads, work_off, tmp_path):
+def test_maps_of_whole_fisher_vectors_are_compared_by_l1_without_an_index(
+    make_engine, uploads, work_off
+):
     engine = make_engine(unindexed_frames=1)
     engine.create_map(NewMap(name="hall", model="paper"))
-    names = fill(engine, uploads, work_off, range(3))
+    names = fill(engine, uploads, work_off, range(4))
     assert engine.publish_due() == 0
     assert list(engine.settings.indexes.glob("hall*/*.json")) == []
     with pytest.raises(InvalidRequest, match="has no index, because"):
         engine.rebuild_index("hall")
     answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, ALL)
-    assert (answer.matches[0].frame_id, answer.index_version) == (names[1], 0)
-
-
-def test_a_model_of_another_version_keeps_its_index(make_engine, uploads, work_off):
-    """Who made it looks after it."""
-    engine = make_engine(unindexed_frames=1)
-    engine.create_map(NewMap(name="hall", model="depth"))
-    fill(engine, uploads, work_off, range(3))
-    assert engine.publish_due() == 1
-    (folder,) = engine.settings.indexes.glob("hall*")
-    with engine.store.database.write() as connection:
-        connection.execute(update(models).values(content=b"of another version"))
-    other = make_engine(unindexed_frames=1)
-    assert other.publish_due() == 0
-    assert len(list(folder.glob("*.json"))) == 1
+    assert (answer.exact, answer.index_version) == (True, 0)
+    rows = np.stack([list(engine.outputs.vector("hall", one).make()) for one in names])
+    apart = np.abs(rows - rows[1]).sum(axis=1)
+    found = [(match.frame_id, match.distance) for match in answer.matches]
+    assert found == [(names[i], apart[i]) for i in np.argsort(apart, kind="stable")]

@@ -7,27 +7,17 @@ import pytest
 from PIL import Image
 from sqlalchemy import event, update
 
-from sceneprint.engine.ingest.write_groups import Grouping
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.errors import (
     FrameConflict,
     InvalidIntrinsics,
-    UnknownFrame,
-    UnknownMap,
     UselessFrame,
 )
 from sceneprint.store.tables import jobs
 from sceneprint_client.api import FrameMeta, FrameState, JobState, NewMap, Query
+from tests.engine.conftest import packed_again
 
 ASK = Query(stages=("retrieve",), k=50)
-
-
-def packed(data, level):
-    """The same pixels as another PNG."""
-    out = io.BytesIO()
-    Image.open(io.BytesIO(data)).save(out, "PNG", compress_level=level)
-    assert out.getvalue() != data
-    return out.getvalue()
 
 
 def blobs(engine):
@@ -44,10 +34,10 @@ def test_the_same_upload_is_the_frame_that_is_there(empty, uploads, work_off, to
     assert (new, first.state, first.reason) == (True, FrameState.RECEIVED, None)
     assert empty.get_frame("hall", first.frame_id).state == FrameState.RECEIVED
     assert empty.add_frame("hall", data, meta) == (first, False)
-    assert empty.add_frame("hall", packed(data, 0), meta) == (first, False)
+    assert empty.add_frame("hall", packed_again(data, 0), meta) == (first, False)
     assert len(blobs(empty)) == 1  # other bytes of the same frame are not kept
     assert work_off(empty) == [JobState.SUCCEEDED]
-    again, new = empty.add_frame("hall", packed(data, 9), meta)
+    again, new = empty.add_frame("hall", packed_again(data, 9), meta)
     assert (again.frame_id, again.job_id, new) == (first.frame_id, first.job_id, False)
     assert again.state == FrameState.INDEXED
     assert told(empty) == ["map.created", "frame.received", "frame.indexed"]
@@ -97,37 +87,6 @@ def test_a_signature_whose_artifact_is_swept_before_its_commit_is_made_again(
     assert len(blobs(empty)) == 2
 
 
-def test_while_others_wait_a_new_frame_takes_one_statement_or_one_for_each_table(empty, uploads):
-    """On PostgreSQL each is a round trip, and nobody else writes meanwhile."""
-    database, said = empty.store.database, list[str]()
-
-    def note(connection, _cursor, statement, *_):
-        if {"sceneprint_write", "sceneprint_single"} & connection.get_execution_options().keys():
-            said.append(statement)
-
-    event.listen(database._engine, "before_cursor_execute", note)
-    tagged = with_(uploads[0].meta, tags=["a", "b"], robot="R2", session="night")
-    added, new = empty.add_frame("hall", uploads[0].data, tagged)
-    written = ["UPDATE maps", "INSERT INTO frames", "INSERT INTO frame_tags", "INSERT INTO jobs",
-               "INSERT INTO events"]  # fmt: skip
-    if database.is_sqlite:
-        begun, *said = [one for one in said if not one.startswith("PRAGMA busy_timeout")]
-        assert begun == "BEGIN IMMEDIATE"
-        check, *said = said  # whether a later version migrated meanwhile
-        assert check.count("SELECT version_num") == 1
-        assert [one.partition(" (")[0].partition(" SET")[0] for one in said] == written
-    else:  # with which its turn comes
-        assert len(said) == 1
-        told = "INSERT INTO pending_events"
-        assert all(said[0].count(one) == 1 for one in [*written[:-1], told])
-    event.remove(database._engine, "before_cursor_execute", note)
-    assert new
-    found = empty.get_frame("hall", added.frame_id)
-    assert (found.tags, found.robot, found.session) == (["a", "b"], "R2", "night")
-    assert empty.get_job(added.job_id).frame_id == added.frame_id
-    assert empty.get_map("hall").frames == {"received": 1}
-
-
 def test_other_metadata_of_the_same_content_is_a_conflict_that_names_it(empty, uploads):
     data, meta = uploads[0].data, uploads[0].meta
     added, _ = empty.add_frame("hall", data, meta)
@@ -144,7 +103,7 @@ def test_other_metadata_of_the_same_content_is_a_conflict_that_names_it(empty, u
         ({"robot": "R2", "tags": ["a", "b"]}, "robot, tags"),
     ):
         with pytest.raises(FrameConflict) as caught:
-            empty.add_frame("hall", packed(data, 1), with_(meta, **more))
+            empty.add_frame("hall", packed_again(data, 1), with_(meta, **more))
         said = f"Frame {added.frame_id} has the same content, but a different {fields}. A map"
         assert str(caught.value).startswith(said)
     assert len(blobs(empty)) == 1
@@ -183,32 +142,6 @@ def test_what_cannot_be_a_frame_is_refused_and_not_kept(empty, uploads):
     assert empty.statistics.state_counts() == ({}, {})
 
 
-def test_a_deleted_frame_is_found_no_more_and_may_come_again(full, uploads, ids, work_off, told):
-    data, meta, gone = uploads[3].data, uploads[3].meta, ids(full)[3]
-    assert full.queries.upload(["hall"], data, meta, ASK).matches[0].frame_id == gone
-    before = set(blobs(full))
-    full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
-    full.delete_frame("hall", gone)
-    assert len(before - set(blobs(full))) == 2  # upload and artifact
-    answer = full.queries.upload(["hall"], data, meta, ASK)
-    assert len(answer.matches) == answer.counts.map == answer.counts.compared == 11
-    assert gone not in [m.frame_id for m in answer.matches]
-    assert full.get_frame("hall", gone).state == FrameState.DELETED
-    assert full.get_frame("hall", gone).content_id is None
-    assert gone not in ids(full)
-    with pytest.raises(UnknownFrame, match="already deleted"):
-        full.delete_frame("hall", gone)
-    again, new = full.add_frame("hall", data, meta)
-    assert new
-    assert again.frame_id != gone
-    assert work_off(full) == [JobState.SUCCEEDED]
-    assert set(blobs(full)) == before
-    answer = full.queries.upload(["hall"], data, meta, ASK)
-    assert (answer.matches[0].frame_id, answer.matches[0].distance) == (again.frame_id, 0)
-    assert answer.counts.map == 12
-    assert told(full)[-3:] == ["frame.deleted", "frame.received", "frame.indexed"]
-
-
 @pytest.mark.parametrize("how", ["frame", "map"])
 def test_blobs_stay_while_another_map_refers_to_them(empty, uploads, work_off, how):
     empty.create_map(NewMap(name="other", model="depth"))
@@ -225,30 +158,6 @@ def test_blobs_stay_while_another_map_refers_to_them(empty, uploads, work_off, h
         else:
             empty.delete_frame(name, added[name].frame_id)
         assert blobs(empty) == left
-
-
-def test_an_upload_into_a_map_that_is_deleted_meanwhile_leaves_no_blob(empty, uploads, monkeypatch):
-    """Deleted and made anew before the commit, and deleted again before the next try."""
-    put, run = empty.store.blobs.put, Grouping.run
-
-    def made_anew(data):
-        digest = put(data)
-        empty.delete_map("hall")
-        empty.create_map(NewMap(name="hall"))
-        return digest
-
-    def deleted_after(grouping, do):
-        found = run(grouping, do)
-        assert found is None
-        monkeypatch.undo()
-        empty.delete_map("hall")
-        return found
-
-    monkeypatch.setattr(empty.store.blobs, "put", made_anew)
-    monkeypatch.setattr(Grouping, "run", deleted_after)
-    with pytest.raises(UnknownMap):
-        empty.add_frame("hall", uploads[0].data, uploads[0].meta)
-    assert blobs(empty) == []
 
 
 def test_an_upload_into_a_map_that_is_made_anew_meanwhile_is_in_the_new_one(

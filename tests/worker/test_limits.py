@@ -1,60 +1,13 @@
 """Tests of a worker's limits, its termination, and its remains."""
 
 import os
-import signal
 import subprocess
 import sys
 
 import pytest
 
 from sceneprint.errors import LostLease
-from worker.loop import HEAD, TAIL, Trace
-
-
-def run(code, *arguments):
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
-    )
-    return done.stdout.strip()
-
-
-MEMORY = """
-import sys
-import numpy as np
-from sceneprint.process import limit_memory
-limit_memory(int(sys.argv[1]))
-small = np.ones(16 << 20, np.uint8)
-mapped = np.memmap(sys.argv[2], np.uint8, mode="r")
-assert int(mapped[::4096].sum()) == 0
-try:
-    np.ones(256 << 20, np.uint8)
-    print("had it")
-except MemoryError:
-    print("not enough memory")
-"""
-
-
-@pytest.mark.parametrize(("limit", "said"), [(128 << 20, "not enough memory"), (0, "had it")])
-def test_what_is_written_is_limited_and_what_is_mapped_is_not(tmp_path, limit, said):
-    with (tmp_path / "table").open("wb") as file:
-        file.truncate(512 << 20)
-    assert run(MEMORY, str(limit), str(tmp_path / "table")) == said
-
-
-STOP = """
-import os, signal, sys
-from sceneprint.process import StopSignal
-stop = StopSignal()
-print(stop.requested)
-os.kill(os.getpid(), int(sys.argv[1]))
-stop.wait(1e6)
-print(stop.requested)
-"""
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_the_wait(number):
-    assert run(STOP, str(int(number))).split() == ["False", "True"]
+from worker.loop import HEAD, Trace
 
 
 def test_a_job_that_is_done_leaves_nothing():
@@ -77,16 +30,6 @@ def test_an_error_that_ends_the_worker_leaves_its_traceback():
     assert (left.job_id, left.token, left.timed_out) == ("ab" * 16, 12, False)
     assert left.text.startswith("Traceback (most recent call last):\n")
     assert left.text.endswith("MemoryError: all of it\n")
-    trace.close()
-
-
-def test_of_a_long_traceback_the_end_is_kept():
-    trace = Trace()
-    with pytest.raises(ValueError, match="end"), trace.job("ab", 1, 600.0):
-        raise ValueError("x" * (2 * TAIL) + "the end")
-    left = trace.read()
-    assert (left.job_id, left.token, len(left.text)) == ("ab", 1, TAIL)
-    assert left.text.endswith("xthe end\n")
     trace.close()
 
 

@@ -28,19 +28,6 @@ def test_two_workers_sign_each_frame_once(crew, frames):
     assert {line["attempt"] for line in lines} == {1}
 
 
-def test_frames_of_a_greater_priority_are_signed_first(crew, frames):
-    crew.engine.create_map(NewMap(name="ranked", model="depth"))
-    crew.pause()
-    order = [-10, 0, 3, 0, 10, 3]
-    jobs = [crew.engine.add_frame("ranked", *frames[46 + i], order[i])[0].job_id for i in range(6)]
-    crew.send(signal.SIGCONT, 1)  # two would note the times of their claims in any order
-    crew.settled("ranked", 6)
-    crew.send(signal.SIGCONT)
-    assert [crew.engine.get_job(job).priority for job in jobs] == order
-    begun = sorted(range(6), key=lambda i: crew.job(jobs[i], "started_at"))
-    assert begun == [4, 2, 5, 1, 3, 0]
-
-
 def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
     crew.engine.create_map(NewMap(name="shaken", model="depth"))
     crew.change("ALTER TABLE jobs RENAME TO away")
@@ -95,16 +82,6 @@ def test_a_worker_that_wakes_up_late_stores_nothing(crew, slow, frames):
     ) == [(indexed_at, revision)]
     crew.engine.add_frame("late", *frames[42])
     crew.settled("late", 2)
-
-
-def test_a_frame_deleted_while_it_is_signed_stays_deleted(crew, slow):
-    job = slow("gone", 43)
-    crew.engine.delete_frame("gone", job.added.frame_id)
-    job.give()
-    until(lambda: [o for o in crew.log("lease lost") if o["job_id"] == job.added.job_id])
-    assert crew.engine.get_map("gone").frames == {"deleted": 1}
-    assert crew.engine.get_job(job.added.job_id).state == "cancelled"
-    assert crew.signed("gone") == []
 
 
 def test_told_to_stop_workers_give_back_what_they_have_not_begun(crew, frames):
