@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.errors import SceneprintError, UnreadableGeometry
+from sceneprint.errors import UnreadableGeometry
 from sceneprint.formats.artifact import (
     MAGIC,
     SCHEMA_VERSION,
@@ -116,12 +116,6 @@ def test_round_trip(geometries):
         assert_equal_patches(read.patches, geometry.patches)
 
 
-def test_descriptors_are_a_view_that_cannot_be_written(data):
-    descriptors = read_geometry(data).descriptors
-    with pytest.raises(ValueError, match="read-only"):
-        descriptors[0, 0] = 1
-
-
 def test_normals_of_every_direction_come_back():
     geometry = made(60, 80, 1)
     normals = np.random.default_rng(1).normal(size=(60, 80, 3))
@@ -133,22 +127,11 @@ def test_normals_of_every_direction_come_back():
     assert np.degrees(off.max()) < 0.005
 
 
-def test_the_same_bytes_again(geometries):
-    assert len({write_geometry(geometry) for geometry in geometries}) == len(geometries)
-    for geometry in geometries:
+def test_reading_and_writing_again_changes_no_byte(geometries):
+    for geometry in geometries[:2]:
         once = write_geometry(geometry)
-        assert write_geometry(geometry) == once
-        # to read and to write again changes no byte, however often
         assert write_geometry(read_geometry(once)) == once
-
-
-def test_size_of_a_kinect_frame(geometries):
-    for geometry in geometries:
-        data = write_geometry(geometry)
-        k, n = geometry.surface.camera, len(geometry.patches)
-        assert (k.width, k.height) == (160, 120)
-        assert len(data) == HEAD + BODY + 6 * 160 * 120 + n * (36 + 128)
-        assert len(data) <= 262_144
+        assert len(once) <= 262_144
 
 
 def test_the_layout_is_what_its_schema_says():
@@ -177,18 +160,12 @@ def test_the_layout_is_what_its_schema_says():
 
 
 def test_where_nothing_was_seen():
-    for height, width, patches, length in ((3, 4, 0, 16), (1, 1, 0, 0), (3, 4, 2, 16)):
-        geometry = made(height, width, patches, 0.0, length)
-        once = write_geometry(geometry)
-        read = read_geometry(once)
-        assert read.surface.valid.shape == (height, width)
-        assert not read.surface.valid.any()
-        for array in (read.surface.points, read.surface.normals, read.surface.areas):
-            assert not array.any()
-        assert len(read.patches) == patches
-        assert read.descriptors.shape == (patches, length)
-        assert read.patches.means.shape == (patches, 3)
-        assert write_geometry(read) == once
+    geometry = made(3, 4, 2, 0.0)
+    read = read_geometry(write_geometry(geometry))
+    assert read.surface.valid.shape == (3, 4)
+    for array in (read.surface.valid, read.surface.points, read.surface.normals):
+        assert not array.any()
+    assert (len(read.patches), read.descriptors.shape) == (2, (2, 16))
 
 
 def test_depths_far_apart_do_not_become_missing():
@@ -212,20 +189,17 @@ def test_every_damaged_byte_is_noticed(data):
 
 
 def test_what_is_no_artifact(data):
-    other_schema = data[:5] + struct.pack("<H", 4) + data[7:]
-    cases = {
-        "bytes are not a geometry artifact": [
-            b"", b"SPGEO", b"x" * 500, data[: HEAD + BODY - 1], b"spgeo" + data[5:],
-        ],
-        "has schema 4; this version reads 1 to 3": [other_schema],
-        "is damaged": [data[:-1], data + b"\0", data[: HEAD + BODY], data[: len(data) // 2]],
-    }  # fmt: skip
-    for message, files in cases.items():
-        for file in files:
-            with pytest.raises(UnreadableGeometry, match=message) as error:
-                read_geometry(file)
-            assert "Sign the frame again" in str(error.value)
-            assert isinstance(error.value, SceneprintError)
+    for message, file in (
+        ("bytes are not a geometry artifact", b""),
+        ("bytes are not a geometry artifact", data[: HEAD + BODY - 1]),
+        ("bytes are not a geometry artifact", b"spgeo" + data[5:]),
+        ("has schema 4; this version reads 1 to 3", data[:5] + b"\4\0" + data[7:]),
+        ("is damaged", data[: HEAD + BODY]),
+        ("is damaged", data[:-1]),
+        ("is damaged", data + b"\0"),
+    ):
+        with pytest.raises(UnreadableGeometry, match=f"{message}.*Sign the frame again"):
+            read_geometry(file)
 
 
 def test_sizes_that_the_bytes_do_not_hold(data):
@@ -243,21 +217,14 @@ def test_sizes_that_the_bytes_do_not_hold(data):
         tracemalloc.stop()
 
 
-def test_a_camera_that_is_none():
+def test_a_camera_and_a_scale_that_are_none():
     data = write_geometry(made(2, 3, 0, length=0))
     for at, value in ((8, 0.0), (8, float("nan")), (16, -1.0), (24, float("inf")), (32, 1e9)):
         with pytest.raises(UnreadableGeometry, match="has an invalid camera"):
             read_geometry(sealed(data, at, struct.pack("<d", value)))
-    empty = write_geometry(made(1, 1, 0, length=0))[: HEAD + BODY]
-    with pytest.raises(UnreadableGeometry, match="has an invalid camera"):
-        read_geometry(sealed(empty, 0, struct.pack("<HH", 0, 0)))
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e-12, 1e3])
-def test_a_scale_that_is_none(scale):
-    data = write_geometry(made(2, 3, 0, length=0))
-    with pytest.raises(UnreadableGeometry, match="invalid depth scale"):
-        read_geometry(sealed(data, 40, struct.pack("<d", scale)))
+    for scale in (0.0, -1.0, float("nan"), float("inf"), 1e-12, 1e3):
+        with pytest.raises(UnreadableGeometry, match="invalid depth scale"):
+            read_geometry(sealed(data, 40, struct.pack("<d", scale)))
 
 
 @pytest.mark.parametrize("at", [0, 3, 6, 7])  # mean, normal, area, coherence
@@ -294,11 +261,3 @@ def test_points_stay_finite_whatever_the_bytes():
     assert read.valid.all()
     for array in (read.points, read.normals, read.areas):
         assert np.isfinite(array).all()
-
-
-def test_artifacts_read_from_a_file(geometries, tmp_path):
-    path = tmp_path / "a.geometry"
-    path.write_bytes(write_geometry(geometries[1]))
-    read = read_geometry(path.read_bytes())
-    np.testing.assert_array_equal(read.descriptors, geometries[1].descriptors)
-    assert replace(read).model_id == geometries[1].model_id

@@ -69,16 +69,10 @@ def assert_golden(name, lines):
     assert kept == lines, "\n".join(unified_diff(kept, lines, name, "now", n=0, lineterm=""))
 
 
-# The table of formats ---------------------------------------------------------------------------
-
-
 def test_formats_of_docs_and_dashboard():
     assert_golden("../../docs/formats.md", formats_page().splitlines())
     module = "../../service/dashboard/pages/frames/formats.js"
     assert_golden(module, formats_module().splitlines())
-
-
-# The document of the API ------------------------------------------------------------------------
 
 
 def shortened(document):
@@ -120,22 +114,6 @@ def shortened(document):
     return {"shared": shared, **document}
 
 
-def expanded(document):
-    """Return the document that `shortened` shortened."""
-    shared = document["shared"]
-    expanded = {key: value for key, value in deepcopy(document).items() if key != "shared"}
-    for methods in expanded["paths"].values():
-        for operation in methods.values():
-            if "parameters" in operation:
-                operation["parameters"] = [
-                    shared["parameters"][one] if isinstance(one, str) else one
-                    for one in operation["parameters"]
-                ]
-            for status in operation["responses"].pop("shared"):
-                operation["responses"][status] = shared["responses"][status]
-    return expanded
-
-
 def json_text(value, key="", depth=0):
     """Return a JSON value as lines that can be read and compared.
 
@@ -174,13 +152,7 @@ def holds_list(value):
 def test_the_document_of_the_api(tmp_path):
     document = create_app(Settings(data_dir=tmp_path)).openapi()
     document["info"].pop("version")
-    text = json_text(shortened(document))
-    # the shorter form loses nothing
-    assert expanded(json.loads(text)) == json.loads(json.dumps(document))
-    assert_golden("openapi.json", text.splitlines())
-
-
-# The command line -------------------------------------------------------------------------------
+    assert_golden("openapi.json", json_text(shortened(document)).splitlines())
 
 
 def help_lines(command):
@@ -238,9 +210,6 @@ def test_the_help_of_every_command(monkeypatch):
     assert_golden("commands.txt", [*help_lines(top)])
 
 
-# Signatures and an answer -----------------------------------------------------------------------
-
-
 def pose_of(x, y, z, yaw):
     """T_room_camera (4, 4) of a level camera; its axes are x right, y down, z forward."""
     T = np.eye(4)
@@ -289,22 +258,15 @@ def test_an_answer():
     for name, match in zip(list(VIEWS)[1:], database, strict=True):
         one = pipeline.validate(query, match, seed=7)
         found[name] = {
-            "status": one.status,
-            "strength": one.strength,
-            "reason": one.reason,
-            "overlap": round(one.overlap, 6),
-            "plane_overlap": round(one.plane_overlap, 6),
+            "status": one.status, "strength": one.strength, "reason": one.reason,
+            "overlap": round(one.overlap, 6), "plane_overlap": round(one.plane_overlap, 6),
             "T": None if one.T_match_query is None else one.T_match_query.round(6).tolist(),
-        }
+        }  # fmt: skip
     kept = json.loads("\n".join(golden("answer.json", json_text(found).splitlines())))
-    assert {n: (f["status"], f["strength"]) for n, f in found.items()} == {
-        n: (f["status"], f["strength"]) for n, f in kept.items()
-    }
+    for name, now in found.items():
+        assert (now["status"], now["strength"]) == (kept[name]["status"], kept[name]["strength"])
     again, was = found["window again"], kept["window again"]
-    assert again["status"] == "accepted"
+    assert (again["status"], found["door"]["status"]) == ("accepted", "rejected")
     np.testing.assert_allclose(again["T"], was["T"], atol=2e-4)
     assert again["overlap"] == pytest.approx(was["overlap"], abs=2e-3)
     assert again["plane_overlap"] == pytest.approx(was["plane_overlap"], abs=2e-3)
-    true = np.linalg.inv(pose_of(*VIEWS["window again"])) @ pose_of(*VIEWS["window"])
-    np.testing.assert_allclose(again["T"], true, atol=0.02)
-    assert found["door"]["status"] != "accepted"
