@@ -11,12 +11,7 @@ import pytest
 from sceneprint.errors import UnreadableGeometry
 from sceneprint.formats.artifact import MAXIMUM_POINTS, read_geometry, write_geometry
 from sceneprint.geometry.surface.range_image import directions
-from sceneprint.types import (
-    Geometry,
-    Patches,
-    Sphere,
-    Surface,
-)
+from sceneprint.types import Geometry, Patches, Sphere, Surface
 
 #: Bytes of magic, schema and checksum; and of sizes, camera, step and model id.
 HEAD, BODY = 11, 10 + 4 * 8 + 32

@@ -79,11 +79,6 @@ def test_a_mesh_with_edges_is_read_back():
     assert comments == []
 
 
-def test_nothing_is_a_file_too():
-    found, _ = read(write_ply(np.empty((0, 3)), faces=np.empty((0, 3), np.int32)))
-    assert found == {"vertex": [], "face": []}
-
-
 def test_a_comment_stays_in_its_line():
     data = write_ply(np.zeros((1, 3)), comments=["haus\nelement vertex 9", "Flur, OG \u00fc"])
     found, comments = read(data)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 import sysconfig
@@ -67,14 +66,3 @@ def test_a_service_needs_neither_lab_nor_viewers(tmp_path):
     assert code == 2
     assert "nowhere.png: The file or folder does not exist" in error
     assert not file.exists()
-
-
-def test_no_text_installs_from_an_index_what_none_has():
-    """No index has our distributions: pip would find nothing, or a package of another owner."""
-    listed = subprocess.run(
-        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.split("\n")
-    files = [ROOT / one for one in listed if Path(one).suffix in (".md", ".py", ".js", ".html")]
-    wrong = re.compile(r"pip install (-\S+ )*['\"]?sceneprint")
-    found = [path for path in files if path.exists() and wrong.search(path.read_text())]
-    assert found == []

@@ -1,6 +1,5 @@
 """Tests of the table of file formats against files, and of its copies."""
 
-import re
 from pathlib import Path
 from typing import get_args
 
@@ -13,12 +12,9 @@ from sceneprint_client.formats import (
     FORMATS,
     CloudFormat,
     format_at,
-    format_named,
     format_of,
     formats_of,
     function_at,
-    is_cloud,
-    titles_of,
 )
 
 ROOT = Path(__file__).parents[1]
@@ -61,21 +57,3 @@ def test_an_array_is_a_cloud_by_its_columns_and_type(kind):
     assert format_of(encode_npy(array)) == ("npy" if kind == "cloud" else None)
     assert format_of(encode_npy(np.ones((5, 30), "<f4"))) is None
     assert format_of(encode_npy(np.ones((5, 4), ">f8"))) == "npy"
-
-
-def test_names():
-    assert [is_cloud(name) for name in ("A.PLY", "a.npy", "a.pfm", "a.e57")] == [True] + [False] * 3
-    assert titles_of("depth", last="or") == "PNG, NPY, PFM or compressedDepth of ROS"
-    found = format_named("run.MCAP", "recording")
-    assert found.name == "mcap"
-
-
-def test_no_other_file_lists_suffixes():
-    """A new format is a row of the table and a reader: nothing else knows a suffix."""
-    rows = formats_of("depth", "cloud", "map")
-    own = {one for row in rows for one in row.suffixes} - {".png", ".npy", ".ply", ".bin"}
-    quoted = re.compile("|".join(rf"[\"']{re.escape(one)}[\"']" for one in own))
-    for folder in ("client", "sceneprint", "lab", "viewers", "service", "worker"):
-        for file in (*(ROOT / folder).rglob("*.py"), *(ROOT / folder).rglob("*.js")):
-            if file.name not in ("formats.py", "formats.js"):
-                assert not quoted.findall(file.read_text(encoding="utf-8")), file

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,15 +19,13 @@ from sceneprint.signing import (
     open_signer,
     table_statistics,
 )
-from sceneprint.types import DepthFrame, Floats, Intrinsics
+from sceneprint.types import DepthFrame, Intrinsics
 from sceneprint_lab.evaluation.protocol import overlaps, view_of
-from sceneprint_lab.synth import KINECT, Room, render, synthesise_room
+from sceneprint_lab.synth import render, synthesise_room
 from sceneprint_lab.synth.dataset import room_and_rng
 
-SPLITS = {
-    "forward": (range(0, 600, 2), range(650, 1000, 2)),
-    "reverse": (range(400, 1000, 3), range(0, 350, 3)),
-}
+#: Of the recording, for the database and for queries.
+SPLIT = (range(0, 600, 8), range(650, 1000, 8))
 
 
 def ranks(rows):
@@ -53,46 +51,22 @@ SEED = 7
 ANGLES = (10, 30, 45, 90, 135, 180, 250)
 
 
-@dataclass(frozen=True)
-class RolledView:
-    """One place and direction in a synthetic room."""
-
-    room: Room
-    pose: Floats
-    _seen: dict[tuple[float, bool], DepthFrame] = field(default_factory=dict, repr=False)
-
-    def seen(self, degrees, round_lens):
-        """The depth image after a roll about the optical axis, noise-free; rendered once."""
-        asked = (degrees, round_lens)
-        if asked not in self._seen:
-            self._seen[asked] = self._render(degrees, round_lens)
-        return self._seen[asked]
-
-    def _render(self, degrees, round_lens):
-        a = math.radians(degrees)
-        roll = np.eye(4)
-        roll[:2, :2] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
-        camera = SQUARE if round_lens else KINECT
-        depth = render(self.room, self.pose @ roll, camera)
-        if round_lens:
-            y, x = np.mgrid[: camera.height, : camera.width]
-            inside = (x - camera.cx) ** 2 + (y - camera.cy) ** 2 < 239.0**2
-            depth = np.where(inside, depth, np.float32(0))
-        return DepthFrame(depth, camera, f"rolled by {degrees:g}")
-
-
-def view(number):
-    """View `number` of rooms kept for this measurement."""
+def rolled(number, degrees):
+    """A noise-free view in a room, after a roll about the optical axis."""
     pose = synthesise_room(SEED, number, 1).frames[0].pose
-    assert pose is not None
-    return RolledView(room_and_rng(SEED, number)[0], pose)
+    a = math.radians(degrees)
+    roll = np.eye(4)
+    roll[:2, :2] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
+    depth = render(room_and_rng(SEED, number)[0], pose @ roll, SQUARE)
+    y, x = np.mgrid[: SQUARE.height, : SQUARE.width]
+    inside = (x - SQUARE.cx) ** 2 + (y - SQUARE.cy) ** 2 < 239.0**2
+    return DepthFrame(np.where(inside, depth, np.float32(0)), SQUARE)
 
 
-def shares_of_d0(one, signer, round_lens, angles=ANGLES):
+def shares_of_d0(number, signer):
     """Distance to the unrolled view, for each angle, as a share of d0."""
-    d0 = signer.model.unrelated_distance
-    still = sign(one.seen(0, round_lens), signer)
-    return [distance(still, sign(one.seen(a, round_lens), signer)) / d0 for a in angles]
+    still, *turned = (sign(rolled(number, a), signer) for a in (0, *ANGLES))
+    return [distance(still, one) / signer.model.unrelated_distance for one in turned]
 
 
 @pytest.fixture(scope="module", params=[pytest.param("paper", marks=pytest.mark.thorough), "depth"])
@@ -103,12 +77,6 @@ def signer(request):
 @pytest.fixture(scope="module")
 def paper():
     return open_signer("paper")
-
-
-@pytest.fixture(scope="module")
-def views():
-    """Rendered once for both models."""
-    return [view(i) for i in range(12)]
 
 
 def every(path, step):
@@ -144,28 +112,19 @@ def test_the_table_keeps_the_distances_of_the_exact_path(data_root, signer):
     assert np.corrcoef(pairwise(table), pairwise(exact))[0, 1] >= 0.995
 
 
-@pytest.mark.parametrize(
-    ("split", "oracle", "mean_overlap", "top1"),
-    [
-        ("forward", 0.630, 0.59, 0.81),
-        pytest.param("reverse", 0.628, 0.59, 0.70, marks=pytest.mark.thorough),
-    ],
-)
-def test_retrieval(data_root, paper, split, oracle, mean_overlap, top1):
-    """Every fourth frame of the splits of docs/model.md: .604 and .603, .84 and .73."""
+def test_retrieval(data_root, paper):
+    """Every fourth frame of a split of docs/model.md: .604, .84."""
     (sequence,) = find_sequences(data_root / "7scenes/redkitchen")
-    database, queries = (
-        [sequence.frames[i].read_depth() for i in part[::4]] for part in SPLITS[split]
-    )
+    database, queries = ([sequence.frames[i].read_depth() for i in part] for part in SPLIT)
     d, q = psi_of(database, paper), psi_of(queries, paper)
     step, metric = paper.model.quantiser_step, paper.model.metric
     stored = cross_distances(quantise(q, step), quantise(d, step), metric).astype(float)
     exact = np.stack([np.abs(d - one).sum(axis=1) for one in q])
     truth = overlaps([view_of(f) for f in queries], [view_of(f) for f in database]).mean
     first = np.take_along_axis(truth, ranks(stored), axis=1)[:, 0]
-    assert truth.max(axis=1).mean() == pytest.approx(oracle, abs=0.002)
-    assert first.mean() >= mean_overlap
-    assert (first >= 0.5).mean() >= top1
+    assert truth.max(axis=1).mean() == pytest.approx(0.630, abs=0.002)
+    assert first.mean() >= 0.59
+    assert (first >= 0.5).mean() >= 0.81
     assert (first >= 0.3).mean() >= 0.97
     assert recall_at_10(stored, exact) >= 0.99
 
@@ -180,14 +139,6 @@ def psi_of(frames, signer):
     return np.stack(found)
 
 
-def test_recall_by_hand():
-    exact = np.arange(20.0)[None]
-    assert recall_at_10(exact, exact) == 1.0
-    # the nearest four move behind all others: six of the first ten remain
-    moved = np.where(exact < 4, exact + 100, exact)
-    assert recall_at_10(moved, exact) == pytest.approx(0.6)
-
-
 def test_another_rooms_frame_is_farther(signer, room_frames):
     signed = [sign(frame, signer) for frame in room_frames]
     across = [distance(a, b) for a in signed[:3] for b in signed[3:]]
@@ -195,19 +146,13 @@ def test_another_rooms_frame_is_farther(signer, room_frames):
 
 
 @pytest.mark.thorough
-def test_a_roll_of_the_camera_changes_little(signer, views):
+def test_a_roll_of_the_camera_changes_little(signer):
     """The same content at every angle: what is left is the segmentation's own noise.
 
     A third of d0 is what we want; one of the 84 measurements misses it, as docs/limits.md
-    says, and a rectangular sensor, whose content changes, is not held to it.
+    says.
     """
-    shares = np.array([shares_of_d0(one, signer, round_lens=True) for one in views])
+    shares = np.array([shares_of_d0(i, signer) for i in range(12)])
     assert np.median(shares) <= 0.2
     assert (shares <= 1 / 3).mean() >= 0.98
     assert shares.max() <= 0.35
-
-
-@pytest.mark.thorough
-def test_a_rectangular_sensor_turned_upside_down_sees_the_same(signer):
-    shares = [shares_of_d0(view(i), signer, False, angles=(180,))[0] for i in range(4)]
-    assert max(shares) <= 1 / 3

@@ -1,8 +1,6 @@
 """Tests that answers over HTTP equal those of `sceneprint evaluate`."""
 
 import json
-import shutil
-import statistics
 import subprocess
 import sys
 
@@ -10,8 +8,7 @@ import pytest
 
 from sceneprint.formats.dataset import find_sequences
 from sceneprint_client import Client, meta_of
-from sceneprint_lab.cli.demo import choose_frames, fill, place_of, run_queries, serving
-from sceneprint_lab.evaluation.report import answer_rows, judge_answers
+from sceneprint_lab.cli.demo import serving
 
 
 def evaluate(folder, *arguments):
@@ -79,40 +76,3 @@ def test_redkitchen_over_http_is_redkitchen_evaluated(data_root, tmp_path):
         return {f"redkitchen/{frame.name}": frame for frame in some}
 
     check(tmp_path, figures, named(frames[0:600:15]), named(frames[650:1000:44]))
-
-
-@pytest.mark.thorough
-def test_the_demo_prints_the_figures_of_evaluate(building, tmp_path):
-    """The first half of a walk, signed with the smaller preset."""
-    half = tmp_path / "half"
-    shutil.copytree(building, half, ignore=shutil.ignore_patterns("frame-0000[5-9]*"))
-    figures = evaluate(tmp_path, str(half), "--preset", "depth", "--jobs", "1")
-    choice = choose_frames(half)
-    assert (len(choice.database), len(choice.queries)) == (15, 5)
-    data = tmp_path / "data"
-    data.mkdir()
-    with serving(data, workers=1) as url, Client(url) as client:
-        known = fill(client, "depth", choice)
-        asked = run_queries(client, choice)
-    places = {key: place for key, one in known.items() if (place := place_of(one)) is not None}
-    rows = answer_rows(
-        [
-            judge_answers(truth, one.ranked, one.diverse, places)
-            for one in asked
-            if (truth := place_of(one.chosen)) is not None
-        ]
-    )
-    for row in ("R", "VR", "DR", "VDR"):
-        for column in ("within_5cm_5deg", "within_10cm_10deg"):
-            assert rows[row][column] == figures[row][column], (row, column)
-        for column in ("median_translation_m", "median_rotation_deg"):
-            assert rows[row][column] == pytest.approx(figures[row][column], rel=1e-9), (row, column)
-    assert [one.diverse.counts.validated for one in asked] == [10] * 5
-    # the pose of a service is that of the evaluated answer, however many matches are listed
-    answered = [one["answer"] for one in figures["per_query"]]
-    assert [one.diverse.status for one in asked] == [one["status"] for one in answered]
-    for column, key in (
-        ("median_translation_m", "translation_m"), ("median_rotation_deg", "rotation_deg")
-    ):  # fmt: skip
-        median = statistics.median(one[key] for one in answered)
-        assert rows["pose_average"][column] == pytest.approx(median, rel=1e-6), column

@@ -5,20 +5,18 @@ from collections import Counter
 from contextlib import closing
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from benchmarks.postgres import NoServer, binaries
-from benchmarks.soak import attacks, audit, faults
-from benchmarks.soak.attacks import ATTACKS
-from benchmarks.soak.audit import AuditCounts, check, count_separated, wrong_matches
+from benchmarks.soak import audit, faults
+from benchmarks.soak.audit import AuditCounts, check, count_separated
 from benchmarks.soak.failover_client import FailoverClient, RequestLog
 from benchmarks.soak.faults import CUT_OFF, FROZEN, FULL, PRIMARY, Promotion
 from benchmarks.soak.lock_samples import LockShares
 from benchmarks.soak.operations import call_as_everybody
-from benchmarks.soak.plan import PLANS, Plan
+from benchmarks.soak.plan import Plan
 from benchmarks.soak.recordings import walks
-from benchmarks.soak.robots import Acknowledged, Ledger, Listener, Search
+from benchmarks.soak.robots import Acknowledged, Ledger, Listener
 from benchmarks.soak.run import SoakFigures, drive
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics, write_pose
@@ -109,26 +107,6 @@ def test_a_fleet_loses_nothing_whatever_becomes_of_it(tmp_path, recording, monke
 
 
 @pytest.mark.thorough
-def test_a_siege_breaks_nothing(tmp_path, recording, monkeypatch):
-    monkeypatch.setattr("benchmarks.soak.run.ROWS", 50)
-    few = ("event streams", "queries", "edits, each audited")
-    monkeypatch.setattr(attacks, "ATTACKS", {name: ATTACKS[name] for name in few})
-    plan = replace(
-        PLANS["siege"], data=recording, seconds=40, robots=1, rate=1, readers=1,
-        faults={"broken-upload": 100, "attack": 2},
-    )  # fmt: skip
-    found = drive(tmp_path, plan)
-    assert (found.broken.failed, found.broken.crashed) == ([], 0)
-    assert sum(found.broken.statuses.values()) == 100
-    assert {202, 422} <= set(found.broken.statuses)
-    assert found.broken.peak_bytes < 1 << 30
-    assert [one.name for one in found.attacks] == list(few)
-    assert [one.victim_refused for one in found.attacks] == [0, 0, 0]
-    assert all(one.sent > 0 for one in found.attacks)
-    assert found.attacks[0].refused > 0
-
-
-@pytest.mark.thorough
 def test_every_operation_answers_as_declared(tmp_path, shots):
     found = call_as_everybody(tmp_path, shots[:2], examples=2, phases="fuzzing")
     assert [one.report[-2000:] for one in found if not one.sound] == []
@@ -174,29 +152,6 @@ def test_what_is_lost_is_seen(tmp_path, shots, monkeypatch):
         before = count_separated(connection, ["fleet"])
         connection.execute(audit_table.delete().where(audit_table.c.target == kept[0].frame_id))
         assert (before, count_separated(connection, ["fleet"])) == (0, 1)
-
-
-def search(*matches, begun=5.0):
-    return Search("s0", matches, begun, begun + 0.5)
-
-
-OUT_OF_ORDER = "the matches are not in order, or one is repeated"
-
-
-@pytest.mark.parametrize(
-    ("answer", "wrong"),
-    [
-        (search(("s1", 16), ("w", 32)), []),
-        (search(("s1", 16), ("w", 33)), ["w has the wrong distance 33"]),
-        (search(("w", 32), ("s1", 16)), [OUT_OF_ORDER]),
-        (search(("w", 32)), ["s1 at 16 is missing"]),
-        (search(("s1", 16), ("w", 32), begun=8.0), ["w was deleted before the search"]),
-        (search(("s1", 16), ("w", 32), begun=6.5), []),  # it was being deleted
-    ],
-)
-def test_a_wrong_answer_is_seen(answer, wrong):
-    vectors = {"s0": np.array([0, 0]), "s1": np.array([4, 0]), "w": np.array([4, 4])}
-    assert wrong_matches(answer, {"w": (6.0, 7.0)}, ["s0", "s1"], vectors) == wrong
 
 
 @pytest.mark.parametrize(

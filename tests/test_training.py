@@ -20,7 +20,7 @@ from sceneprint.models import ModelParameters
 from sceneprint.pipeline import distance, open_signer, sign
 from sceneprint.signing import see
 from sceneprint_lab.synth import synthesise_room
-from sceneprint_lab.training import TrainingParameters, preset_parameters, preset_whitening, train
+from sceneprint_lab.training import TrainingParameters, train
 
 MODEL = ModelParameters(
     segmentation=SegmentationParameters(n_patches=200),
@@ -33,24 +33,7 @@ TRAINING = TrainingParameters(rooms=4, views=2, seed=3, pairs=4000)
 
 @pytest.fixture(scope="module")
 def trained():
-    steps = []
-    model = train("tiny", MODEL, MIXTURE, TRAINING, report=lambda *step: steps.append(step))
-    return model, steps
-
-
-@pytest.mark.thorough
-def test_processes_do_not_matter(trained):
-    helped = train("tiny", MODEL, MIXTURE, TRAINING, jobs=2)
-    assert helped.id == trained[0].id
-    other = train("tiny", MODEL, MIXTURE, replace(TRAINING, seed=4), jobs=1)
-    assert other.id != helped.id
-
-
-@pytest.mark.thorough
-def test_progress_is_told_to_the_end(trained):
-    steps = trained[1]
-    assert [s for s in steps if s[0] == "rooms"] == [("rooms", i, 4) for i in range(1, 5)]
-    assert [s for s in steps if s[0] == "mixture"] == [("mixture", i, 3) for i in range(1, 4)]
+    return train("tiny", MODEL, MIXTURE, TRAINING)
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +45,11 @@ def unseen(room_views):
 @pytest.mark.thorough
 def test_quantiser_and_d0_fit_new_rooms(trained, unseen):
     """d0 is near the median distance of rooms it never saw; few bytes are clipped."""
-    signer = open_signer(trained[0], cached=False)
+    signer = open_signer(trained, cached=False)
     signed = [sign(frame, signer) for frame in unseen]
     between = [distance(a, b) for i, a in enumerate(signed) for b in signed[:i]]
     # with five seeds: 0.78 to 0.95 of d0 and 0 to 0.0023 clipped; on another processor 0.0055
-    assert np.median(between) / trained[0].unrelated_distance == pytest.approx(1.0, abs=0.4)
+    assert np.median(between) / trained.unrelated_distance == pytest.approx(1.0, abs=0.4)
     stored = np.concatenate([s.vector for s in signed])
     assert ((stored == 0) | (stored == 255)).mean() < 0.01
     assert stored.astype(int).std() > 10  # the bytes are used
@@ -74,7 +57,7 @@ def test_quantiser_and_d0_fit_new_rooms(trained, unseen):
 
 @pytest.mark.thorough
 def test_descriptors_are_learnt_from_the_rooms(trained, unseen):
-    model = trained[0]
+    model = trained
     axes = model.compression.matrix.astype(float)
     assert axes.shape == (128, model.parameters.surroundings.dimension)
     np.testing.assert_allclose(axes @ axes.T, np.eye(128), atol=1e-5)
@@ -89,18 +72,9 @@ def test_descriptors_are_learnt_from_the_rooms(trained, unseen):
     assert ((left @ random.T) ** 2).sum() / (left**2).sum() < 0.2
 
 
-@pytest.mark.thorough
-def test_provenance_says_what_it_saw(trained):
-    seen = trained[0].provenance
-    assert (seen["frames_used"], seen["own_frames"]) == (8, 0)
-    assert seen["training"]["seed"] == 3
-    assert seen["pairs_used"] == 4000
-
-
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        (replace(TRAINING, rooms=0), "0 usable frames show fewer than two places"),
         (replace(TRAINING, rooms=1), "2 usable frames show fewer than two places"),
         (replace(TRAINING, rooms=2, pairs=100), "too few for 16 components"),
         (
@@ -125,42 +99,14 @@ def whitened_model():
 @pytest.mark.thorough
 def test_a_whitening_is_learnt_from_more_rooms(trained, whitened_model):
     """The rest of the model is as without; signatures are short, and unrelated rooms d0 apart."""
-    plain = trained[0]
+    plain = trained
     assert whitened_model.mixture.means.tolist() == plain.mixture.means.tolist()
     assert (whitened_model.metric, whitened_model.signature_bytes) == ("l2", 12)
     assert (whitened_model.levels, whitened_model.parameters.hierarchy.n_levels) == ((1,), 2)
     signer = open_signer(whitened_model, cached=False)
     signed = [sign(synthesise_room(99, i, 1).frames[0], signer) for i in range(10)]
-    assert {one.vector.shape for one in signed} == {(12,)}
-    assert {len(one.n_pairs) for one in signed} == {1}
+    assert {(one.vector.shape, len(one.n_pairs)) for one in signed} == {((12,), 1)}
     between = [distance(a, b) for i, a in enumerate(signed) for b in signed[:i]]
     assert np.median(between) / whitened_model.unrelated_distance == pytest.approx(1.0, abs=0.35)
     # unit vectors: unrelated ones are at right angles
     assert whitened_model.unrelated_distance == pytest.approx(2 * 26**2 * 12, rel=0.3)
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"whitening_rooms": 3}, "6 usable frames are too few for signatures of 12 bytes"),
-        ({"levels": (2,)}, "There is no level 2: the hierarchy has 2"),
-    ],
-)
-def test_too_little_for_a_whitening(changes, message):
-    p = replace(
-        TRAINING, whitening_rooms=4, levels=(0,), whitening=WhiteningParameters(dimension=12)
-    )
-    with pytest.raises(TrainingError, match=message):
-        train("tiny", MODEL, MIXTURE, replace(p, rooms=2, **changes))
-
-
-def test_presets():
-    model, mixture = preset_parameters("paper")
-    assert (mixture.n_components, model.hierarchy.n_levels) == (1250, 4)
-    model, mixture = preset_parameters("depth")
-    assert (mixture.n_components, model.hierarchy.n_levels) == (256, 2)
-    assert preset_whitening("paper")[2] == 0  # psi itself is stored
-    assert preset_whitening("depth")[0] == (1,)
-    with pytest.raises(TrainingError, match=r"no preset .large.\. Select .* lidar, paper\."):
-        preset_parameters("large")

@@ -24,13 +24,6 @@ def trained():
     return train("tiny", small, MixtureParameters(n_components=16, iterations=3), TRAINING)
 
 
-@pytest.mark.thorough
-def test_provenance_says_sites(trained):
-    seen = trained.provenance
-    assert seen["training"]["scenes"] == "sites"
-    assert (seen["training"]["rooms"], seen["frames_used"], seen["own_frames"]) == (2, 4, 0)
-
-
 def test_scenes_and_lengths_are_the_presets_own():
     assert [preset_scenes(name) for name in ("paper", "depth", "lidar")] == [
         ("rooms", 6), ("rooms", 6), ("sites", 3),

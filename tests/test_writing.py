@@ -107,16 +107,6 @@ def test_an_interruption_leaves_nothing(tmp_path, write, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("write", [write_whole, write_durable])
-def test_a_folder_that_is_not_there_is_named(tmp_path, write):
-    with pytest.raises(FileNotFoundError) as caught:
-        write(tmp_path / "none" / "a", b"content")
-    assert caught.value.filename == str(tmp_path / "none" / "a")
-    long = tmp_path / ("n" * 255)  # the longest name a file may have
-    write(long, b"content")
-    assert long.read_bytes() == b"content"
-
-
 def test_a_library_writes_beside_the_file(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"old")
