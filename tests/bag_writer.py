@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
@@ -43,6 +44,54 @@ LIVOX_SCAN = (
 T_BASE_CAMERA = transform(0.21, -0.05, 0.93, -0.53, 0.49, -0.47, 0.51)
 
 
+def zero(types, name):
+    plain_values = {"string": "", "bool": False, "float64": 0.0, "float32": 0.0}
+    values = {}
+    for key, (kind, told) in types.fielddefs[name][1]:
+        if kind == Nodetype.NAME:
+            values[key] = zero(types, told)
+        elif kind == Nodetype.BASE:
+            values[key] = plain_values.get(told[0], 0)
+        elif kind == Nodetype.ARRAY:
+            values[key] = np.zeros(told[1])
+        else:
+            values[key] = []
+    return types.types[name](**values)
+
+
+def rvl(samples):
+    """Return RVL as its paper writes it: number by number, nibble by nibble."""
+    nibbles, at, last = [], 0, 0
+
+    def put(number):
+        while True:
+            more = number > 7
+            nibbles.append(number & 7 | 8 * more)
+            number >>= 3
+            if not more:
+                return
+
+    values = [int(v) for v in samples.ravel()]
+    while at < len(values):
+        for is_run in (lambda v: v == 0, lambda v: v != 0):
+            end = at
+            while end < len(values) and is_run(values[end]):
+                end += 1
+            put(end - at)
+            for value in values[at:end] if values[at:end] and values[at] else ():
+                delta = value - last
+                put(2 * delta if delta >= 0 else -2 * delta - 1)
+                last = value
+            at = end
+    nibbles += [0] * (-len(nibbles) % 8)
+    height, width = samples.shape
+    words = [
+        sum(one << (28 - 4 * place) for place, one in enumerate(nibbles[i : i + 8]))
+        for i in range(0, len(nibbles), 8)
+    ]
+    return struct.pack(f"<II{len(words)}I", width, height, *words)
+
+
 class BagWriter:
     """Writer of ROS 1 or ROS 2 messages with rosbags."""
 
@@ -59,19 +108,25 @@ class BagWriter:
         self.late = 0.0  #: seconds from the stamp of a message to its recording
 
     def make(self, name, /, **fields):
-        kind = self.types.types[name]
-        if self.ros1 and name == "std_msgs/msg/Header":
-            fields["seq"] = 0
+        """Return a message with zeros in all other fields."""
         if self.ros1 and name == "sensor_msgs/msg/CameraInfo":
             fields = {k.upper() if k in "dkrp" else k: v for k, v in fields.items()}
-        return kind(**fields)
+        message = zero(self.types, name)
+        for key, value in fields.items():
+            assert hasattr(message, key), key
+            setattr(message, key, value)
+        return message
 
     def header(self, t, frame):
-        ns = round(t * 1e9)
-        stamp = self.make(
-            "builtin_interfaces/msg/Time", sec=START + ns // 10**9, nanosec=ns % 10**9
-        )
+        seconds, ns = divmod(round(t * 1e9), 10**9)
+        stamp = self.make("builtin_interfaces/msg/Time", sec=START + seconds, nanosec=ns)
         return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
+
+    def vector(self, values, name="geometry_msgs/msg/Vector3"):
+        return self.make(name, **dict(zip("xyzw", map(float, values), strict=False)))
+
+    def quaternion(self, T, length=1.0):
+        return self.vector(quaternion_of(T[:3, :3]) * length, "geometry_msgs/msg/Quaternion")
 
     def write(self, topic, name, t, message):
         self.raw(topic, name, t, self.serialized(name, message))
@@ -94,104 +149,54 @@ class BagWriter:
         """Write transforms with quaternions of a given length."""
         made = []
         for (parent, child), T in edges.items():
-            x, y, z, w = quaternion_of(T[:3, :3]) * length
-            tx, ty, tz = T[:3, 3]
-            made.append(
-                self.make(
-                    "geometry_msgs/msg/TransformStamped",
-                    header=self.header(t, parent),
-                    child_frame_id=child,
-                    transform=self.make(
-                        "geometry_msgs/msg/Transform",
-                        translation=self.make("geometry_msgs/msg/Vector3", x=tx, y=ty, z=tz),
-                        rotation=self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-                    ),
-                )
-            )
+            one = self.make(
+                "geometry_msgs/msg/TransformStamped",
+                header=self.header(t, parent), child_frame_id=child,
+            )  # fmt: skip
+            one.transform.translation = self.vector(T[:3, 3])
+            one.transform.rotation = self.quaternion(T, length)
+            made.append(one)
         message = self.make("tf2_msgs/msg/TFMessage", transforms=made)
         self.write(topic, "tf2_msgs/msg/TFMessage", t, message)
 
     def odometry(self, t, T, topic="/odom", child="base_link"):
-        x, y, z, w = quaternion_of(T[:3, :3])
-        tx, ty, tz = T[:3, 3]
-        zero = self.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-        pose = self.make(
-            "geometry_msgs/msg/Pose",
-            position=self.make("geometry_msgs/msg/Point", x=tx, y=ty, z=tz),
-            orientation=self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        )
-        twist = self.make("geometry_msgs/msg/Twist", linear=zero, angular=zero)
-        message = self.make(
-            "nav_msgs/msg/Odometry",
-            header=self.header(t, "odom"),
-            child_frame_id=child,
-            pose=self.make(
-                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)
-            ),
-            twist=self.make(
-                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)
-            ),
-        )
-        self.write(topic, "nav_msgs/msg/Odometry", t, message)
+        name, header = "nav_msgs/msg/Odometry", self.header(t, "odom")
+        message = self.make(name, header=header, child_frame_id=child)
+        message.pose.pose.position = self.vector(T[:3, 3], "geometry_msgs/msg/Point")
+        message.pose.pose.orientation = self.quaternion(T)
+        self.write(topic, name, t, message)
 
     def imu(self, t, acceleration, turn=(0, 0, 0), frame="imu"):
-        def vector(values):
-            x, y, z = map(float, values)
-            return self.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-
         message = self.make(
             "sensor_msgs/msg/Imu",
-            header=self.header(t, frame),
-            orientation=self.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
-            orientation_covariance=np.zeros(9),
-            angular_velocity=vector(turn),
-            angular_velocity_covariance=np.zeros(9),
-            linear_acceleration=vector(acceleration),
-            linear_acceleration_covariance=np.zeros(9),
-        )
+            header=self.header(t, frame), orientation=self.quaternion(np.eye(4)),
+            angular_velocity=self.vector(turn), linear_acceleration=self.vector(acceleration),
+        )  # fmt: skip
         self.write("/imu", "sensor_msgs/msg/Imu", t, message)
 
     def camera_info(
-        self,
-        t,
-        topic="/camera/depth/camera_info",
-        *,
-        frame="camera",
-        k=K,
-        size=(WIDTH, HEIGHT),
-        d=(),
-        model="plumb_bob",
-        p=None,
-        **more,
-    ):
+        self, t, topic="/camera/depth/camera_info", *, frame="camera", k=K, size=(WIDTH, HEIGHT),
+        d=(), model="plumb_bob", p=None, binning=0, **roi,
+    ):  # fmt: skip
         def matrix(fx, fy, cx, cy):
             return [fx, 0, cx, 0, fy, cy, 0, 0, 1]
 
         projection = np.zeros((3, 4))
         projection[:, :3] = np.reshape(matrix(*(p or k)), (3, 3))
-        roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
         message = self.make(
             "sensor_msgs/msg/CameraInfo",
             header=self.header(t, frame),
             height=size[1], width=size[0], distortion_model=model,
             d=np.array(d, np.float64), k=np.array(matrix(*k), np.float64),
             r=np.eye(3).ravel(), p=projection.ravel(),
-            binning_x=more.pop("binning", 0), binning_y=0,
-            roi=self.make("sensor_msgs/msg/RegionOfInterest", **(roi | more)),
+            binning_x=binning, roi=self.make("sensor_msgs/msg/RegionOfInterest", **roi),
         )  # fmt: skip
         self.write(topic, "sensor_msgs/msg/CameraInfo", t, message)
 
     def image(
-        self,
-        t,
-        samples,
-        encoding="16UC1",
-        topic="/camera/depth/image_raw",
-        *,
-        frame="camera",
-        padding=0,
-        big=False,
-    ):
+        self, t, samples, encoding="16UC1", topic="/camera/depth/image_raw", *, frame="camera",
+        padding=0, big=False,
+    ):  # fmt: skip
         """Write an image, optionally with padded rows or big-endian samples."""
         kind = np.dtype({"32FC1": "f4", "rgb8": "u1"}.get(encoding, "u2"))
         data = np.asarray(samples).astype(kind.newbyteorder(">" if big else "<"))
@@ -206,17 +211,9 @@ class BagWriter:
         self.write(topic, "sensor_msgs/msg/Image", t, message)
 
     def compressed(
-        self,
-        t,
-        samples,
-        encoding="16UC1",
-        topic="/camera/depth/image_raw/compressedDepth",
-        *,
-        a=0.0,
-        b=0.0,
-        form=None,
-        frame="camera",
-    ):
+        self, t, samples, encoding="16UC1", topic="/camera/depth/image_raw/compressedDepth", *,
+        a=0.0, b=0.0, form=None, frame="camera",
+    ):  # fmt: skip
         """Write depth of compressed_depth_image_transport: a header of 12 bytes and a PNG, or
         only the PNG in other forms.
         """
@@ -225,11 +222,12 @@ class BagWriter:
         form = f"{encoding}; compressedDepth" if form is None else form
         head = struct.pack("<iff", 0, a, b) if "compressedDepth" in form else b""
         data = head + file.getvalue()
+        self.write_compressed(topic, t, form, data, frame)
+
+    def write_compressed(self, topic, t, form, data, frame="camera"):
         message = self.make(
             "sensor_msgs/msg/CompressedImage",
-            header=self.header(t, frame),
-            format=form,
-            data=np.frombuffer(data, np.uint8),
+            header=self.header(t, frame), format=form, data=np.frombuffer(data, np.uint8),
         )  # fmt: skip
         self.write(topic, "sensor_msgs/msg/CompressedImage", t, message)
 
@@ -266,26 +264,18 @@ class BagWriter:
             header=self.header(t, frame), timebase=(START + round(t)) * 10**9,
             point_num=len(points), lidar_id=1, rsvd=np.zeros(3, np.uint8),
             points=[
-                self.make(
-                    f"{package}/msg/CustomPoint", offset_time=round(s * 1e9), x=float(x),
-                    y=float(y), z=float(z), reflectivity=7, tag=int(tag), line=2,
+                self.types.types[f"{package}/msg/CustomPoint"](
+                    offset_time=round(s * 1e9), x=float(x), y=float(y), z=float(z), reflectivity=7,
+                    tag=int(tag), line=2,
                 )
                 for (x, y, z), s, tag in rows
             ],
         )  # fmt: skip
 
     def livox(
-        self,
-        t,
-        points,
-        seconds,
-        tags=0,
-        topic="/livox/lidar",
-        *,
-        package=LIVOX[1],
+        self, t, points, seconds, tags=0, topic="/livox/lidar", *, package=LIVOX[1],
         frame="livox_frame",
-    ):
-        """Write a CustomMsg."""
+    ):  # fmt: skip
         message = self.livox_message(t, points, seconds, tags, package=package, frame=frame)
         self.write(topic, f"{package}/msg/CustomMsg", t, message)
 
@@ -317,7 +307,6 @@ def path_of(folder, container, name):
 
 
 def write(folder, fill, container="mcap", name="run", compression=""):
-    """Write a bag with the messages of `fill`."""
     folder.mkdir(parents=True, exist_ok=True)
     with open_writer(folder, container, name, compression) as writer:
         fill(writer)
@@ -325,8 +314,6 @@ def write(folder, fill, container="mcap", name="run", compression=""):
 
 
 class MessageWriter(BagWriter):
-    """Writer that serialises and decodes messages without a bag."""
-
     def __init__(self, *, ros1=False):
         super().__init__(None, ros1=ros1)
         self.written: list[tuple[str, str, Any]] = []  #: topic, type, message
@@ -336,5 +323,4 @@ class MessageWriter(BagWriter):
         self.written.append((topic, name, read(data, name)))
 
     def last(self):
-        """Return the last message."""
         return self.written[-1][2]

@@ -25,7 +25,6 @@ def frame_or_error(decode, data, camera):
 
 
 def mutations(data, number):
-    """Yield the file with random changes: bytes, flipped bits, removed or inserted parts."""
     random = np.random.default_rng(7)
     for _ in range(number):
         mutated = bytearray(data)

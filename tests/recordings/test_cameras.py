@@ -11,6 +11,7 @@ from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.outline import bag_outline
 from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint_client.ros_messages import compressed_depth, rvl_samples
+from tests.bag_writer import rvl
 
 ALL = RecordingOptions(keyframe_m=0, keyframe_s=0)
 IMAGE = np.full((60, 80), 2000, np.uint16)
@@ -91,39 +92,6 @@ def test_metres_have_no_depth_scale(tmp_path, ros):
 # Compressed images.
 
 
-def rvl(samples):
-    """RVL as its paper writes it: number by number, nibble by nibble."""
-    nibbles = []
-
-    def put(number):
-        while True:
-            more = number > 7
-            nibbles.append(number & 7 | 8 * more)
-            number >>= 3
-            if not more:
-                return
-
-    values, at, last = [int(v) for v in samples.ravel()], 0, 0
-    while at < len(values):
-        for is_run in (lambda v: v == 0, lambda v: v != 0):
-            end = at
-            while end < len(values) and is_run(values[end]):
-                end += 1
-            put(end - at)
-            for value in values[at:end] if values[at:end] and values[at] else ():
-                delta = value - last
-                put(2 * delta if delta >= 0 else -2 * delta - 1)
-                last = value
-            at = end
-    nibbles += [0] * (-len(nibbles) % 8)
-    height, width = samples.shape
-    words = [
-        sum(one << (28 - 4 * place) for place, one in enumerate(nibbles[i : i + 8]))
-        for i in range(0, len(nibbles), 8)
-    ]
-    return struct.pack(f"<II{len(words)}I", width, height, *words)
-
-
 def test_rvl_by_hand():
     """Two zeros; then 1000, 1001 and 990: differences 1000, 1 and -11, zigzag 2000, 2 and 21."""
     groups = "2 3 | 0 2 7 3 | 2 | 5 2 | 1 0"
@@ -146,13 +114,8 @@ def test_compressed_depth_by_rvl(encoding, tmp_path, ros):
     def fill(writer):
         writer.camera_info(0.0)
         head = struct.pack("<iff", 0, a, b)
-        message = writer.make(
-            "sensor_msgs/msg/CompressedImage", header=writer.header(0.0, "camera"),
-            format=f"{encoding}; compressedDepth rvl",
-            data=np.frombuffer(head + rvl(samples), np.uint8),
-        )  # fmt: skip
-        kind = "sensor_msgs/msg/CompressedImage"
-        writer.write("/camera/depth/image_raw/compressedDepth", kind, 0.0, message)
+        topic, form = "/camera/depth/image_raw/compressedDepth", f"{encoding}; compressedDepth rvl"
+        writer.write_compressed(topic, 0.0, form, head + rvl(samples))
 
     ((frame,),) = [one.frames for one in find_sequences(ros.write(tmp_path, fill), ALL)]
     metres = samples / np.float32(1000) if encoding == "16UC1" else a / (samples - b)
@@ -179,11 +142,9 @@ def test_rvl_of_more_than_16_bits_is_damaged():
 def test_an_inverse_depth_of_no_distance_is_missing(ros):
     """z = a / (v - b): at v = b it is nowhere, and below b behind the camera."""
     data = struct.pack("<iff", 0, 100.0, 7.0) + rvl(np.array([[6, 7, 8]]))
-    message = ros.messages().make(
-        "sensor_msgs/msg/CompressedImage", header=ros.messages().header(0.0, "camera"),
-        format="32FC1; compressedDepth rvl", data=np.frombuffer(data, np.uint8),
-    )  # fmt: skip
-    np.testing.assert_array_equal(compressed_depth(message).body(), [[0.0, 0.0, 100.0]])
+    messages = ros.messages()
+    messages.write_compressed("/depth", 0.0, "32FC1; compressedDepth rvl", data)
+    np.testing.assert_array_equal(compressed_depth(messages.last()).body(), [[0.0, 0.0, 100.0]])
 
 
 def test_what_cannot_be_read_is_not_promised(tmp_path, ros):
@@ -207,19 +168,6 @@ def test_png_of_16_bits(form, tmp_path, ros):
 
     (found,) = find_sequences(ros.write(tmp_path, fill), ALL)
     np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))
-
-
-def test_images_that_are_no_depth_are_named(tmp_path, ros):
-    def fill(writer):
-        writer.image(0.0, np.zeros((2, 6)), "rgb8", "/camera/color/image_raw")
-        writer.compressed(0.0, IMAGE, form="32FC1; png compressed", topic="/metres")
-
-    path = ros.write(tmp_path, fill)
-    with pytest.raises(DatasetError) as caught:
-        find_sequences(path, ALL)
-    assert "Images are /camera/color/image_raw ('rgb8'), /metres ('32FC1; png" in str(caught.value)
-    with pytest.raises(DatasetError, match=r"/metres .* has no depth images"):
-        find_sequences(path, RecordingOptions(topic="/metres"))
 
 
 def mcap_of(bag, profile):
@@ -262,20 +210,3 @@ def test_messages_of_ros_1_in_mcap(tmp_path, ros, profile):
     assert found.frames[0].camera == expected.frames[0].camera
     for one in found.frames:
         np.testing.assert_array_equal(one.read_depth().depth, np.float32(2))
-
-
-def test_an_mcap_without_a_profile(tmp_path, ros):
-    def fill(writer):
-        writer.camera_info(0.0)
-        writer.image(0.0, IMAGE)
-
-    path = ros.write(tmp_path, fill)
-    whole = path.read_bytes()
-    header = b"\x04\x00\x00\x00ros2"
-    assert whole[17:25] == header
-    # the same length, so that nothing moves: the library's name is longer
-    (length,) = struct.unpack_from("<I", whole, 25)
-    empty = bytes(4) + struct.pack("<I", length + 4) + b"none" + whole[29 : 29 + length]
-    path.write_bytes(whole[:17] + empty + whole[29 + length :])
-    (found,) = find_sequences(path, ALL)
-    np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))

@@ -76,7 +76,6 @@ def small(tmp_path_factory, ros, walk):
 
 
 def damaged(bag, folder, content, number):
-    """A copy of a bag with another content of its file."""
     if bag.is_file():
         path = folder / f"{number}{bag.suffix}"
         path.write_bytes(content)
@@ -144,22 +143,7 @@ def test_folders_with_other_metadata(text, small, tmp_path):
         find_sequences(copy)
 
 
-def test_unknown_types_beside_ours_cost_nothing(tmp_path, ros, depth):
-    def fill(writer):
-        unknown = "my_robot/msg/Thing"
-        writer.connections["/thing"] = writer.writer.add_connection(
-            "/thing", unknown, msgdef="not (a definition", rihs01="RIHS01_" + "0" * 64
-        )
-        writer.raw("/thing", unknown, 0.0, b"\x00\x01\x00\x00????")
-        writer.camera_info(0.0)
-        writer.image(0.0, depth(0))
-
-    (sequence,) = find_sequences(ros.write(tmp_path, fill))
-    assert sequence.frames[0].read().depth.any()
-
-
 def messages(writer, depth):
-    """Images whose sizes contradict each other, or are absurd."""
     name = "sensor_msgs/msg/Image"
     for width, height, step, bytes_there in (
         (80, 60, 160, 9599), (80, 60, 159, 9600), (0, 0, 0, 0),
@@ -211,13 +195,6 @@ def test_points_of_absurd_sizes(more, tmp_path, ros):
         sequence.frames[0].read()
 
 
-def test_points_without_coordinates(tmp_path, ros):
-    rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("intensity", "<f4")])
-    (sequence,) = find_sequences(ros.write(tmp_path, lambda writer: writer.points(0.0, rows)))
-    with pytest.raises(UnreadableCloud, match="has the fields x, y, intensity, but x, y and z"):
-        sequence.frames[0].read()
-
-
 @pytest.mark.parametrize(
     ("data", "message"),
     [
@@ -231,12 +208,8 @@ def test_compressed_images_that_are_none(data, message, tmp_path, ros, depth):
     def fill(writer):
         writer.camera_info(0.0)
         writer.compressed(0.0, depth(0))
-        name = "sensor_msgs/msg/CompressedImage"
-        image = writer.make(
-            name, header=writer.header(1.0, "camera"), format="16UC1; compressedDepth",
-            data=np.frombuffer(data, np.uint8),
-        )  # fmt: skip
-        writer.write("/camera/depth/image_raw/compressedDepth", name, 1.0, image)
+        topic = "/camera/depth/image_raw/compressedDepth"
+        writer.write_compressed(topic, 1.0, "16UC1; compressedDepth", data)
 
     (sequence,) = find_sequences(ros.write(tmp_path, fill))
     with pytest.raises(UnreadableFrame, match=message):

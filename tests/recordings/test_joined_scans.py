@@ -8,15 +8,7 @@ import pytest
 
 from sceneprint.errors import DatasetError, UnreadableCloud
 from sceneprint.formats.dataset import find_sequences
-from sceneprint.formats.recording.scan import BagScan
-from sceneprint.formats.recording.scan_window import scan_windows
 from sceneprint.formats.recording.selection import RecordingOptions
-from sceneprint_client import Client, Tracker
-from sceneprint_client.frame_files import meta_of
-from sceneprint_client.transforms import TransformTree
-from sceneprint_lab.synth.dataset import premises_and_rng
-from sceneprint_lab.synth.sensors import Rosette, scan
-from sceneprint_lab.synth.trajectories import walk
 
 JOINED = RecordingOptions(join_m=2.05, keyframe_m=0.5)
 #: Interval of scans, of which each takes the whole interval, and of odometry, seconds.
@@ -133,14 +125,6 @@ def test_untimed_scans_keep_their_motion(tmp_path, ros):
     check_walls(sequence, 1.0)
 
 
-def test_single_scans_of_a_livox_are_read_as_they_are(tmp_path, ros):
-    path = ros.write(tmp_path, lambda writer: write_walls(writer, "livox_ros_driver2"))
-    (sequence,) = find_sequences(path, RecordingOptions(keyframe_m=0))
-    assert len(sequence.frames) == 30
-    measured = skewed(wall(7), 0.7, np.linspace(0.0, 0.0999, 20))
-    np.testing.assert_allclose(sequence.frames[7].read().points, measured, atol=1e-6)
-
-
 def test_what_cannot_be_joined_is_refused(tmp_path, ros):
     def alone(writer):
         writer.livox(0.0, wall(0), np.zeros(20))
@@ -204,63 +188,3 @@ def test_scans_are_read_one_at_a_time(tmp_path, ros):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20e6  # all scans have 40 MB
-
-
-def test_a_window_has_the_samples_around_its_scans():
-    tree, order = TransformTree(), np.random.default_rng(3).permutation(1000)
-    for child in ("base_link", "arm"):
-        for k in order.tolist():
-            tree.add("odom", child, k * 10**8, (0.1 * k, 0, 0, 0, 0, 0, 1), fixed=False)
-    tree.add("base_link", "lidar", 0, (0, 1, 0, 0, 0, 0, 1), fixed=True)
-    scan = BagScan(stamps_ns=[k * 10**8 for k in range(1000)], places=[(k, 0) for k in range(1000)])
-    poses = dict(enumerate(map(pose, np.arange(0.0, 100.0, 0.1))))
-    names = "odom", "lidar", "lidar"
-    windows = scan_windows(scan, tree, poses, [500, 600], names, 1.05)
-    assert [stamp for stamp, _ in windows[500].scans] == [k * 10**8 for k in range(490, 501)]
-    assert windows[500].tree is windows[600].tree
-    assert windows[500].tree.frames() == ["base_link", "lidar", "odom"]
-    near = pickle.loads(pickle.dumps(windows[500])).tree
-    np.testing.assert_allclose(  # 2.5 s before the first scan to 2.5 s after the last one
-        near.samples("odom", "base_link")[:, 0], 0.1 * np.arange(465, 526)
-    )
-    (T,) = near.poses("odom", "lidar", [49_950_000_000])
-    np.testing.assert_allclose(T[:3, 3], [49.95, 1, 0])
-
-
-def write_drive(writer, count, seed, **drive):
-    """Write scans of a Livox in a hall, and odometry whose origin is that of the hall."""
-    premises, rng = premises_and_rng(4200, 0, "hall")
-    start = walk(premises, 1, rng)[0]
-    own = np.random.default_rng(seed)
-    write_odometry(writer, count, **drive)
-    for number in range(count):
-        t = SCAN_S * number
-        T = pose(t, **drive)
-        points = scan(premises.caster, start @ T, Rosette(firings=4000), own).astype(np.float64)
-        seconds = np.linspace(0.0, 0.0999, len(points))
-        writer.livox(t, skewed(points @ T[:3, :3].T + T[:3, 3], t, seconds, **drive), seconds)
-
-
-def test_from_a_bag_with_scans_of_a_livox_to_poses(tmp_path, ros):
-    """One drive is mapped; on the next one, 40 cm beside it, each answer and the tracker agree."""
-    mapped = ros.write(tmp_path, lambda writer: write_drive(writer, 30, 1), "ros1", "mapped")
-    later = ros.write(
-        tmp_path, lambda writer: write_drive(writer, 16, 2, phase=1.0, side=0.4), "mcap", "later"
-    )
-    (sequence,) = find_sequences(mapped, RecordingOptions(join_m=2.0, keyframe_m=0.5))
-    queries = find_sequences(later, RecordingOptions(join_m=2.0, keyframe_m=0.5))[0].frames
-    with Client.embedded(tmp_path / "data") as client:
-        client.create_map("hall", model="lidar")
-        added = [
-            client.upload("hall", one, meta_of(one, session="s", parent_frame="hall"))
-            for one in sequence.frames
-        ]
-        client.wait([one.job_id for one in added])
-        tracker = Tracker(client, "hall")
-        states = [tracker.update(one, one.pose, stamp=one.timestamp) for one in queries]
-        answer = client.localize("hall", queries[-1], meta_of(queries[-1], with_pose=False))
-    assert answer.status == "found"
-    truth = pose(SCAN_S * (queries[-1].sequence or 0), phase=1.0, side=0.4)
-    assert np.linalg.norm(np.array(answer.pose.matrix)[:3, 3] - truth[:3, 3]) < 0.15
-    assert states[-1].status == "tracking"
-    np.testing.assert_allclose(states[-1].T_map_odom[:3, 3], 0, atol=0.15)

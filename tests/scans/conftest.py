@@ -94,9 +94,34 @@ def lzf_of(data):
     return bytes(out)
 
 
+NAME = "sensor_msgs/msg/PointCloud2"
+LAYOUTS = (
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4")],
+    [("ring", "<u2"), ("z", "<f8"), ("x", "<f4"), ("intensity", "u1"), ("y", "<i2")],
+    [("x", ">f8"), ("rgb", ">u4"), ("y", ">f4"), ("z", ">i4")],
+)
+
+
+def rows_of(points, layout):
+    rows = np.zeros(len(points), layout)
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    return rows
+
+
+@pytest.fixture(scope="session")
+def serialize(ros):
+    writer = ros.messages()
+
+    def made(rows, *, little=True, **how):
+        writer.points(1.5, rows, **how)
+        return bytes(writer.types.serialize_cdr(writer.last(), NAME, little_endian=little))
+
+    return made
+
+
 @pytest.fixture(scope="session")
 def lzf():
-    """A simple LZF compressor."""
     return lzf_of
 
 

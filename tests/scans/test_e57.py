@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UnreadableCloud
-from sceneprint.formats.points.e57 import (
-    _checksums,
-    read_e57,
-    unpacked,
-    with_viewpoint,
-)
+from sceneprint.formats.points.e57 import _checksums, read_e57, unpacked, with_viewpoint
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is not installed")
 POINTS = np.random.default_rng(7).uniform((-9, -4, 0), (9, 4, 3), (200_003, 3))

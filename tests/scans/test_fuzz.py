@@ -2,7 +2,6 @@
 
 import io
 import random
-import struct
 import tracemalloc
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 from sceneprint.errors import FrameError
 from sceneprint.formats.points.cloud import decode_scan
+from tests.scans.conftest import LAYOUTS, rows_of
 
 TRIES = 400  #: of each file
 #: Bytes at once: files here have less than 2000, of which LZF makes 88 times as much.
@@ -24,7 +24,6 @@ WORDS = (
 
 
 def damaged(data, rng):
-    """With a few bytes, digits or pieces of it other than they were."""
     copy = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 4, 12))):
         # headers are short, and all depends on them
@@ -50,7 +49,6 @@ def damaged(data, rng):
 
 
 def tried(files, told, most, tries):
-    """How many were read and refused."""
     rng, read = random.Random(len(files[0])), 0
     for data in files:
         decode_scan(data, file_format=told)  # and so kernels are compiled
@@ -85,18 +83,6 @@ def test_ply(ply):
     assert min(read, refused) > 100
 
 
-def test_ply_with_lists():
-    header = (
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 20\nproperty list uint16 double a\n"
-        b"property float x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    rows = b"".join(
-        struct.pack(f"<H{i % 3}dfff", i % 3, *[1.0] * (i % 3), i, 2, 3) for i in range(20)
-    )
-    read, refused = tried([header + rows], None, MOST, TRIES)
-    assert min(read, refused) > 20
-
-
 def test_pcd(pcd):
     forms = ("ascii", "binary", "binary_compressed")
     read, refused = tried([pcd(form=form) for form in forms], None, MOST, TRIES)
@@ -117,6 +103,17 @@ def test_endless_headers(line):
 
 def test_las(las):
     read, refused = tried([las()], None, MOST, TRIES)
+    assert min(read, refused) > 30
+
+
+@pytest.mark.parametrize("told", [None, "pointcloud2"])
+def test_pointcloud2(serialize, points, told):
+    files = [
+        serialize(rows_of(points, layout), little=little, height=height)
+        for layout in LAYOUTS[:2]
+        for little, height in ((True, 1), (False, 3))
+    ]
+    read, refused = tried(files, told, MOST, TRIES // 2)
     assert min(read, refused) > 30
 
 

@@ -1,13 +1,12 @@
 """Tests of LAS against its description, and of LAZ against another library."""
 
-import builtins
 import io
 import struct
 
 import numpy as np
 import pytest
 
-from sceneprint.errors import MissingDependency, UnreadableCloud
+from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 from sceneprint_client.formats import format_of
 
@@ -34,14 +33,11 @@ def changed(data, at, form, value):
         (107, "I", 13, "13 points of 30 bytes, but 360 of 390"),
         (107, "I", 50_000_000, "declares 50000000 points"),
         (105, "H", 27, "records of 27 bytes"),
-        (105, "H", 31, "360 of 372"),
         (104, "B", 11, "point format 11"),
-        (25, "B", 5, "version 1.5"),
         (96, "I", 2**32 - 1, "points from byte 4294967295"),
         (96, "I", 3, "points from byte 3"),
         (94, "H", 9, "a size of 9 bytes"),
         (131, "d", 0.0, "scale"),
-        (139, "d", np.nan, "scale"),
         (155, "d", np.inf, "scale"),
         (104, "B", 0x81, "how its points are compressed"),
     ],
@@ -51,20 +47,6 @@ def test_lies(las, at, form, value, message):
         pytest.importorskip("lazrs", reason="lazrs is not installed")
     with pytest.raises(UnreadableCloud, match=message):
         decode_cloud(changed(las(), at, form, value))
-
-
-def test_without_lazrs(las, monkeypatch):
-    imported = builtins.__import__
-
-    def refuse(name, *rest):
-        if name == "lazrs":
-            raise ImportError(name)
-        return imported(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(MissingDependency, match=r"sceneprint\[las\]"):
-        decode_cloud(changed(las(), 104, "B", 0x81))
-    assert len(decode_cloud(las()).points) == 12  # LAS needs nothing
 
 
 @pytest.fixture(scope="module")

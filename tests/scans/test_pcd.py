@@ -47,7 +47,6 @@ LIES = {
     "no z": (b"FIELDS normal x y z", b"FIELDS normal x y w", "exactly one field z"),
     "z of three": (b"COUNT 3 1 1 1 1", b"COUNT 1 1 1 3 1", "exactly one field z"),
     "a field too few": (b"SIZE 4 4 4 8 2", b"SIZE 4 4 4 8", "5 FIELDS, 4 SIZE"),
-    "half floats": (b"SIZE 4 4 4 8 2", b"SIZE 4 2 4 8 2", "TYPE 'F' and SIZE '2'"),
     "endless values": (b"COUNT 3 1", b"COUNT 99999999999 1", "COUNT 99999999999"),
     "other counts": (b"POINTS 12", b"POINTS 13", "states 13 and 12"),
     "fifty million": (b"12\nHEIGHT 1\n", b"50000000\n", "50000000"),
@@ -57,9 +56,7 @@ LIES = {
         "so the type, byte order",
     ),
     "doubles for floats": (b"SIZE 4 4 4 8 2", b"SIZE 8 4 4 8 2", "360 of 504 bytes follow"),
-    "a negative count": (b"WIDTH 12", b"WIDTH -12", "WIDTH '-12'"),
     "an unknown form": (b"DATA binary", b"DATA zipped", "DATA 'zipped'"),
-    "twice": (b"HEIGHT 1", b"WIDTH 12", "line 'WIDTH 12'"),
     "no data": (b"DATA binary", b"# nothing", "no DATA line|has the invalid line"),
 }
 
@@ -154,18 +151,6 @@ def unpacked(packed):
         for _ in range(length):
             out.append(out[-distance])
     return bytes(out)
-
-
-@settings(max_examples=80)
-@given(
-    st.lists(st.tuples(st.binary(max_size=12), st.integers(0, 300)), max_size=8).map(
-        lambda parts: b"".join(part * n for part, n in parts)[:4000]
-    )
-)
-def test_packing_round(lzf, data):
-    packed = lzf(data)
-    assert unpacked(packed) == data
-    assert inflate(np.frombuffer(packed, np.uint8), len(data)).tobytes() == data
 
 
 @settings(max_examples=150)

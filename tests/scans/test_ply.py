@@ -90,7 +90,6 @@ LIES = {
         described("element vertex 10\nproperty float x\nproperty float y\n"),
         "exactly one property z",
     ),
-    "two x": (described(f"element vertex 10\n{XYZ}property float x\n"), "exactly one property x"),
     "a list of z": (
         described("element vertex 10\nproperty float x\nproperty float y\n"
                   "property list uchar float z\n"),
@@ -98,7 +97,6 @@ LIES = {
     ),
     "fifty million": (described(f"element vertex 50000000\n{XYZ}"), "declares 50000000 points"),
     "more than there are": (described(f"element vertex 11\n{XYZ}"), "at least 132 bytes, but 120"),
-    "fewer than there are": (described(f"element vertex 9\n{XYZ}"), "12 bytes follow"),
     "doubles for floats": (
         described(f"element vertex 10\n{XYZ.replace('float', 'double')}"), "240 bytes, but 120",
     ),
@@ -120,13 +118,7 @@ LIES = {
                   b"\0" * 120 + b"\xff" + b"\0" * 255 * 4),  # as many as an unsigned length tells
         "row 1 of 1, whose lists",
     ),
-    "a length that is no count": (
-        described(f"element vertex 10\n{XYZ}property list float int a\n"), "property 'list float",
-    ),
     "an unknown type": (described("element vertex 10\nproperty quad x\n"), "property 'quad x'"),
-    "a count of words": (described(f"element vertex ten\n{XYZ}"), "count 'ten'"),
-    "a negative count": (described(f"element vertex -10\n{XYZ}"), "count '-10'"),
-    "an unknown line": (described(f"vertices 10\n{XYZ}"), "line 'vertices 10'"),
     "no format": (
         b"ply\nelement vertex 10\n" + XYZ.encode() + b"end_header\n",
         "not state the format",
@@ -153,8 +145,6 @@ def test_lies(case):
         ("1.0 2.0 3.0\n" * 9 + "1.0 2.0\n", "Row 10 of 10.*fewer values"),
         ("1.0 2.0 3.0 4.0\n" * 10, "Row 1 of 10.*more values"),
         ("1.0 2.0 3.0\n" * 4 + "1.0 x 3.0\n" * 6, "Row 5 of 10.*not a number"),
-        ("1.0 2.0 3.0\n" * 4 + "1.0 2e 3.0\n" * 6, "Row 5 of 10.*not a number"),
-        ("1.0 2.0 3.0\n" * 4 + "1.0 0x2 3.0\n" * 6, "Row 5 of 10.*not a number"),
         ("1.0 2.0 3.0\n" * 4 + "1.0 2.0 3.0\0\n" * 6, "Row 5 of 10.*not a number"),
     ],
 )

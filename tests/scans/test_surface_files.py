@@ -49,7 +49,6 @@ def sorted_rows(triangles):
 
 
 def exported(mesh, form):
-    """A file by trimesh; of a glTF with its buffers embedded."""
     if form != "gltf":
         data = mesh.export(file_type=form)
         return data.encode() if isinstance(data, str) else bytes(data)
@@ -62,23 +61,6 @@ def exported(mesh, form):
 
 
 # Clouds.
-
-
-@pytest.mark.parametrize("form", ["ascii", "binary", "compressed", "ply", "ply ascii"])
-def test_clouds_by_open3d(with_open3d, tmp_path, form):
-    import open3d
-
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(path()))
-    file = tmp_path / ("map.ply" if "ply" in form else "map.pcd")
-    assert open3d.io.write_point_cloud(
-        str(file), cloud, write_ascii="ascii" in form, compressed=form == "compressed"
-    )
-    read = read_surface(file.read_bytes(), file.name)
-    np.testing.assert_allclose(read.surface.points, path(), atol=MILLIMETRE)
-    assert read.surface.triangles is None
-    assert (read.units, read.units_per_metre, read.file_points) == ("estimated", 1.0, N)
-    assert read.up_from == "estimated"
-    np.testing.assert_array_equal(read.surface.offset, 0.0)
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -205,21 +187,6 @@ def test_meshes_by_trimesh(form, name):
     assert read.units_per_metre == 1.0
 
 
-@pytest.mark.parametrize("text", [False, True])
-def test_meshes_by_open3d(with_open3d, tmp_path, text):
-    import open3d
-
-    mesh = steps()
-    made = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.faces)
-    )
-    made.compute_vertex_normals()
-    file = tmp_path / "map.ply"
-    assert open3d.io.write_triangle_mesh(str(file), made, write_ascii=text)
-    read = read_surface(file.read_bytes(), file.name, STATED)
-    np.testing.assert_allclose(corners(read.surface), sorted_rows(mesh.triangles), atol=MILLIMETRE)
-
-
 def test_parts_of_a_scene_are_placed_and_a_mirrored_one_keeps_its_front():
     box, scene = trimesh.creation.box((1, 1, 1)), trimesh.Scene()
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
@@ -330,7 +297,6 @@ def test_millimetres_are_recognised():
 
 
 def files():
-    """A file of each format."""
     mesh, cloud = steps(), trimesh.PointCloud(path(100))
     buffer = io.BytesIO()
     np.save(buffer, path(100))
@@ -461,9 +427,3 @@ def test_a_cloud_of_too_many_points_is_thinned_while_it_is_read():
     # the same file gives the same points
     other, _, _ = gather(iter(blocks), len(points), lambda _: 1.0, most=4000)
     np.testing.assert_array_equal(found, other)
-
-
-def test_few_points_are_kept_as_they_are():
-    found, origin, voxel = gather(iter([path(40)]), 40, lambda _: 1.0, most=40)
-    np.testing.assert_array_equal(found, path(40).astype(np.float32))
-    assert (voxel, origin.tolist()) == (None, [0, 0, 0])
