@@ -38,7 +38,6 @@ def room(building):
 
 @pytest.fixture(scope="session")
 def service_url(service_url, room):
-    """Return the service of all clients, with a map `room`."""
     with Client(service_url) as client:
         client.create_map("room", model="depth")
         added = [
@@ -75,10 +74,6 @@ def drive(room, ros):
 def send(writer, kind, t, samples, k):
     if kind == "depth":
         writer.image(t, samples)
-    elif kind == "metres":
-        writer.image(t, samples / 1000.0, "32FC1")
-    elif kind == "compressed_depth":
-        writer.compressed(t, samples)
     elif kind == "compressed_metres":  # quantised like the transport: z = a / (v - b)
         a, b = 10_100.0, 1 - 10_100.0 / 10.0
         with np.errstate(divide="ignore"):
@@ -93,19 +88,21 @@ def send(writer, kind, t, samples, k):
         writer.points(t, points.reshape(-1), frame="camera", height=len(points))
 
 
+def message_class(writer, name):
+    """Return a class for messages like rclpy's, with named fields and zero defaults."""
+
+    def make(**fields):
+        return writer.make(name, **fields)
+
+    make.ros_name = name
+    return make
+
+
 # The part of rclpy that our node uses.
 
 
 @dataclass
 class Bus:
-    """Subscriptions and publications of a node.
-
-    Parameters
-    ----------
-    parameters : parameters that are set; others have their defaults
-    now_ns : time of its clock
-    """
-
     parameters: dict[str, Any] = field(default_factory=dict)
     now_ns: int = 0
     callbacks: dict[str, Callable[[Any], None]] = field(default_factory=dict)
@@ -121,7 +118,6 @@ class Bus:
     is_up: bool = False
 
     def on(self, topic):
-        """Return the messages that were published on a topic."""
         return [message for name, _, message in self.published if name == topic]
 
 
@@ -213,50 +209,18 @@ def plain(message):
     return message
 
 
-def message_class(types, name):
-    """Return a class for messages like rclpy's, with named fields and zero defaults."""
-
-    def make(**fields):
-        message = zero(types, name)
-        for key, value in fields.items():
-            assert hasattr(message, key), key
-            setattr(message, key, value)
-        return message
-
-    make.ros_name = name
-    return make
-
-
-def zero(types, name):
-    """Return a message with zeros and empty lists."""
-    from rosbags.interfaces import Nodetype
-
-    plain_values = {"string": "", "bool": False, "float64": 0.0, "float32": 0.0}
-    values = {}
-    for key, (kind, told) in types.fielddefs[name][1]:
-        if kind == Nodetype.NAME:
-            values[key] = zero(types, told)
-        elif kind == Nodetype.BASE:
-            values[key] = plain_values.get(told[0], 0)
-        elif kind == Nodetype.ARRAY:
-            values[key] = np.zeros(told[1])
-        else:
-            values[key] = []
-    return types.types[name](**values)
-
-
 @pytest.fixture
 def bus(ros, monkeypatch):
     """A bus on which `start_node` runs a node with stand-in modules."""
     made = Bus()
-    types = ros.messages().types
+    writer = ros.messages()
 
     def module(name, **names):
         one = ModuleType(name)
         vars(one).update(names)
         monkeypatch.setitem(sys.modules, name, one)
 
-    kind = type("LifecycleNode", (StubNode,), {"bus": made, "types": types})
+    kind = type("LifecycleNode", (StubNode,), {"bus": made, "types": writer.types})
     stopped = type("ExternalShutdownException", (Exception,), {})
     module(
         "rclpy",
@@ -285,7 +249,7 @@ def bus(ros, monkeypatch):
         "tf2_msgs": ("TFMessage",),
     }.items():
         module(package)
-        made_of = {one: message_class(types, f"{package}/msg/{one}") for one in names}
+        made_of = {one: message_class(writer, f"{package}/msg/{one}") for one in names}
         module(f"{package}.msg", **made_of)
     monkeypatch.syspath_prepend(str(PACKAGE))
     for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):
@@ -295,7 +259,6 @@ def bus(ros, monkeypatch):
 
 @pytest.fixture
 def node_module(bus, monkeypatch):
-    """The module of the node, with the stand-ins."""
     yield import_module("sceneprint_ros.relocaliser_node")
     for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):
         sys.modules.pop(name, None)

@@ -4,19 +4,15 @@ The real rclpy is not tested here.
 """
 
 import ast
-import sys
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-import sceneprint_client
 from benchmarks.waiting import PATIENCE_S
 from sceneprint_client.poses import rotation_of
-from sceneprint_client.relocaliser import RelocaliserParameters
-from sceneprint_client.tracker import TrackerParameters, replay
+from sceneprint_client.tracker import replay
 from sceneprint_client.tracker_core import difference
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -26,7 +22,6 @@ DEPTH = "/camera/depth/image_raw"
 
 
 def pose_of(message):
-    """(4, 4) of a Pose or a Transform."""
     place = getattr(message, "position", None) or message.translation
     turn = getattr(message, "orientation", None) or message.rotation
     T = np.eye(4)
@@ -109,20 +104,6 @@ def test_a_node_on_a_drive(bus, node_module, drive, room, service_url, ros, tmp_
     assert states[-1].status == "lost"
 
 
-def test_without_transforms_and_initial_poses(bus, node_module, drive, service_url):
-    """Beside AMCL, or with another source of map -> odom: only poses are told."""
-    bus.parameters = {"url": service_url, "map": "room", "topic": "/points", "kind": "points",
-                      "publish_tf": False, "initial_pose_topic": "", "imu_topic": "/imu",
-                      "odometry_topic": "/odom", "tracker.drift": 0.02}  # fmt: skip
-    node = started(node_module)
-    assert set(bus.kinds) == {"/tf", "/tf_static", "/points", "/imu", "/odom"}
-    arrived = [one for one in drive("points", frames=4) if one[0] != "/camera/depth/camera_info"]
-    play(node, bus, arrived)
-    assert {topic for topic, _, _ in bus.published} == {"~/pose", "/diagnostics"}
-    assert node._core._tracker._core.parameters.drift == 0.02
-    node.destroy_node()
-
-
 def test_a_manager_starts_and_stops_a_node(bus, node_module, drive):
     """Topics exist from configuration to cleanup; frames count only while the node is active."""
     bus.parameters = {"map": "m", "topic": DEPTH, "autostart": False, "url": "http://127.0.0.1:9"}
@@ -157,33 +138,6 @@ def test_a_manager_starts_and_stops_a_node(bus, node_module, drive):
     node.destroy_node()
 
 
-def test_a_node_with_scans_of_a_livox(bus, node_module, ros):
-    bus.parameters = {"map": "m", "topic": "/livox/lidar", "kind": "livox", "join_m": 2.0,
-                      "url": "http://127.0.0.1:9"}  # fmt: skip
-    node = started(node_module)
-    writer = ros.messages()
-    writer.transforms(0.0, {("base_link", "livox_frame"): np.eye(4)}, "/tf_static")
-    for i in range(3):
-        writer.livox(0.2 * i, np.full((20, 3), 5.0), np.linspace(0, 0.1, 20))
-    for t in (0.0, 0.2, 0.4, 0.6):
-        writer.transforms(t, {("odom", "base_link"): ros.transform(t, 0, 0)})
-    play(node, bus, writer.written)
-    assert node._core.counts["frames"] == 3
-    assert node._core.counts["queried"] == 1  # in half a second
-    assert len(node._core._joiner[1]) == 3
-    node.destroy_node()
-
-
-def test_a_node_without_the_messages_of_livox(bus, node_module, monkeypatch):
-    monkeypatch.setitem(sys.modules, "livox_ros_driver2.msg", None)
-    bus.parameters = {"map": "m", "topic": "/livox/lidar", "kind": "livox"}
-    node = node_module.RelocaliserNode()
-    assert node.trigger_configure() == "failure"
-    assert "requires the ROS package livox_ros_driver2" in node.error
-    assert bus.callbacks == {}
-    node.destroy_node()
-
-
 @pytest.mark.parametrize(
     "wrong", [{"map": ""}, {"topic": ""}, {"kind": "colour"}, {"url": "no address"}]
 )
@@ -196,30 +150,7 @@ def test_parameters_that_are_none_end_it(wrong, bus, node_module, capsys):
     assert not bus.is_up
 
 
-def test_a_node_that_is_stopped_closes(bus, node_module):
-    """Without a service and without frames it says so, and goes."""
-    bus.parameters = {"map": "m", "topic": "/camera/depth/image_rect_raw",
-                      "url": "http://127.0.0.1:9"}  # fmt: skip
-    assert node_module.main() == 0
-    assert not bus.is_up
-    assert bus.log == ["lost: no frame has been queried"]
-
-
 # What lies beside the node.
-
-
-def test_every_parameter_is_in_the_readme(bus, node_module):
-    bus.parameters = {"map": "m", "topic": DEPTH}
-    node_module.RelocaliserNode().destroy_node()
-    text = (PACKAGE / "README.md").read_text()
-    assert min(map(len, bus.described.values())) > 5
-    missing = [name for name in bus.declared if f"`{name}`" not in text
-               and not name.startswith("tracker.")]  # fmt: skip
-    assert missing == []
-    assert {f"tracker.{name}" for name in TrackerParameters.__dataclass_fields__} \
-        == {name for name in bus.declared if name.startswith("tracker.")}  # fmt: skip
-    for name, one in RelocaliserParameters.__dataclass_fields__.items():
-        assert bus.declared.get(name, one.default) == one.default  # in two places, and equal
 
 
 def test_launch_files_set_what_the_node_declares(bus, node_module):
@@ -241,46 +172,3 @@ def test_launch_files_set_what_the_node_declares(bus, node_module):
                 keys = {key.value for one in ast.walk(given) if isinstance(one, ast.Dict)
                         for key in one.keys if isinstance(key, ast.Constant)}  # fmt: skip
                 assert keys - {"use_sim_time"} <= bus.declared.keys(), path
-
-
-def test_launched_sensors_are_those_of_the_documentation():
-    """Topics, packages and launch files, which are constants of the launch file."""
-    tree = ast.parse((PACKAGE / "launch" / "relocaliser.launch.py").read_text())
-    (table,) = (one.value for one in tree.body if isinstance(one, ast.Assign))
-    assert isinstance(table, ast.Dict)
-    pages = ROOT / "docs" / "sensors"
-    names = [key.value for key in table.keys if isinstance(key, ast.Constant)]
-    assert sorted(names) == sorted({one.stem for one in pages.glob("*.md")} - {"iphone"})
-    for name, sensor in zip(names, table.values, strict=True):
-        text = (pages / f"{name}.md").read_text()
-        assert isinstance(sensor, ast.Call)
-        topic, imu, package, file = (ast.literal_eval(one) for one in sensor.args[:4])
-        assert f"ros2 launch {package} {file}" in text
-        assert f" {topic} " in text.partition("ros2 bag record")[2]
-        assert imu in text
-        given = ast.literal_eval(sensor.args[4]) if len(sensor.args) > 4 else {}
-        assert [key for key, value in given.items() if f"{key}:={value}" not in text] == []
-        kind = [one.value for one in (*sensor.args[5:], *(k.value for k in sensor.keywords))]
-        assert kind == (["points"] if "--model lidar" in text else [])
-
-
-def test_the_package_names_what_it_is_made_of():
-    manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()
-    needed = {one.text for one in manifest.iter("exec_depend")}
-    imported = set()
-    for path in PACKAGE.rglob("*.py"):
-        for one in ast.walk(ast.parse(path.read_text())):
-            if isinstance(one, ast.ImportFrom) and one.module:
-                imported.add(one.module.partition(".")[0])
-            elif isinstance(one, ast.Import):
-                imported |= {name.name.partition(".")[0] for name in one.names}
-    ours = {"sceneprint_client", "setuptools", "__future__", "os", "sys", "dataclasses", "pathlib",
-            "functools", "collections", "importlib", "types",
-            "typing"}  # fmt: skip
-    assert imported - ours <= needed
-    setup = (PACKAGE / "setup.py").read_text()
-    version = manifest.findtext("version")
-    assert f'version="{version}"' in setup
-    assert version == sceneprint_client.__version__
-    for path in [*PACKAGE.glob("launch/*"), *PACKAGE.glob("config/*")]:
-        assert path.relative_to(PACKAGE).as_posix() in setup
