@@ -19,19 +19,18 @@ def room_frames(room_frames):
     return tuple(map(halved, room_frames))
 
 
-def write_rooms(root, frames):
-    """Write three views of each of two rooms, with poses, in 7-Scenes layout; return the folder."""
+def write_rooms(root, frames, views=3):
+    """Write some views of each room, with poses, in 7-Scenes layout; return the folder."""
     for number, frame in enumerate(frames):
-        folder = root / f"room-{number // 3}" / "seq-01"
+        folder = root / f"room-{number // views}" / "seq-01"
         folder.mkdir(parents=True, exist_ok=True)
         write_intrinsics(folder, Camera(frame.intrinsics))
-        write_depth_png(folder / f"frame-{number % 3:06d}.depth.png", frame.depth, 1000.0)
+        write_depth_png(folder / f"frame-{number % views:06d}.depth.png", frame.depth, 1000.0)
         assert frame.pose is not None
-        write_pose(folder / f"frame-{number % 3:06d}.pose.txt", frame.pose)
+        write_pose(folder / f"frame-{number % views:06d}.pose.txt", frame.pose)
     return root
 
 
 @pytest.fixture(scope="session")
 def rooms(room_frames, tmp_path_factory):
-    """Three views of each of two rooms; see `write_rooms`."""
     return write_rooms(tmp_path_factory.mktemp("rooms"), room_frames)

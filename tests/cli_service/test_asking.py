@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -36,51 +37,26 @@ def maps(service_url, rooms):
     return found
 
 
-@pytest.mark.thorough
-def test_up_goes_with_uploads_and_queries(sceneprint, service_url, rooms):
-    frame, other = (rooms / "room-0" / "seq-01" / f"frame-00000{i}.depth.png" for i in (0, 1))
-    sceneprint("upload", "level", frame, "--up", "0.6,-0.8,0")
-    with Client(service_url) as client:
-        [one] = client.frames("level")
-        assert (one.up.x, one.up.y, one.up.z) == pytest.approx((0.6, -0.8, 0.0))
-    said = sceneprint("query", "level", other, "--up=0,0,1", "--json").stdout
-    [match] = json.loads(said)["matches"]
-    assert match["validation"]["status"] == "rejected"
-    lost = sceneprint("localize", "level", other, "--up=0,0,1", expect=1).stdout
-    assert "not found; " in lost
-    line = sceneprint("maps", "--edit", "level", "--up=0,0,1").stdout
-    assert line.endswith(", up 0,0,1\n")
-    assert "up 0" not in sceneprint("maps", "--edit", "level", "--up", "none").stdout
-    assert "length is 2" in sceneprint("query", "level", other, "--up", "0,2,0", expect=2).stderr
-    with pytest.raises(SystemExit):
-        sceneprint("query", "level", other, "--up", "0,1")
-
-
 def test_a_query_says_where_frames_were_lost(sceneprint, maps, rooms):
     frame = rooms / "room-0" / "seq-01" / "frame-000000.depth.png"
     asked = ("query", "near", frame, "--candidates", 1, "--validation", "weak=0", "--no-keep")
-    said = sceneprint(*asked, "--explain", "--explain-frame", maps["near"][1], "--json").stdout
-    told = json.loads(said)
+    explained = ("--explain", "--explain-frame", maps["near"][1])
+    told = json.loads(sceneprint(*asked, *explained, "--json").stdout)
     assert (told["counts"]["selected"], told["matches"][0]["validation"]["strength"]) == (1, "weak")
-    outcomes = [one["outcome"] for one in told["explanations"]]
-    assert outcomes == ["accepted", "not_selected"]
-    lines = sceneprint(*asked, "--explain", "--explain-frame", maps["near"][1]).stdout.splitlines()
+    lines = sceneprint(*asked, *explained).stdout.splitlines()
     first, second = (f"{maps['near'][i]} (frame-00000{i}.depth.png)" for i in range(2))
     assert lines[-3].startswith(f"     1  {first}  1.00  validate: accepted; accepted:")
     assert "retrieve: not selected; most similar to the selected frame" in lines[-2]
     assert lines[-1].startswith(f"  {second}: rank 2 of 2; dropped at selection: ")
-    both = json.loads(sceneprint(*asked, "--map", "far", "--json").stdout)
+    several = ("--map", "far", "--diversity", "omega=1000", "--json")
+    both = json.loads(sceneprint(*asked, *several).stdout)
     assert (both["maps"], both["counts"]["map"]) == (["near", "far"], 4)
-    line = sceneprint(*asked, "--map", "far", "--diversity", "omega=1000").stdout.splitlines()[2]
-    assert line.split()[0] in ("near", "far")
     for options, text in (
         (["--diversity", "tau=2"], "diversity.tau"),
         (["--validation", "mode=fast"], "validation.mode"),
         (["--map", "nowhere"], "'nowhere'"),
     ):
         assert text in sceneprint(*asked, *options, expect=2).stderr
-    with pytest.raises(SystemExit):
-        sceneprint(*asked, "--validation", "strong")
 
 
 def test_a_frame_is_localized(sceneprint, maps, rooms):
@@ -89,20 +65,19 @@ def test_a_frame_is_localized(sceneprint, maps, rooms):
     assert re.search(r": found 99\.\d % \(strong\); ", lines[0])
     assert lines[1].startswith("  at ")
     assert " m in room-0/seq-01, rotation " in lines[1]
-    alone = ("localize", "near", rooms / "room-0", "--last", 1, "--json")
-    told = sceneprint(*alone, expect=1).stdout.splitlines()
-    there = [json.loads(line) for line in told]
+    alone = ("localize", "near", rooms / "room-0", "--last", 1)
+    there = [
+        json.loads(line) for line in sceneprint(*alone, "--json", expect=1).stdout.splitlines()
+    ]
     assert [one["status"] for one in there] == ["found", "found", "not_found"]
     assert [one["matches"][0] for one in there[:2]] == maps["near"]
-    queried = sceneprint("query", "near", rooms / "room-0", "--json").stdout.splitlines()
-    assert [json.loads(line)["name"] for line in queried] == [one["name"] for one in there]
+    lost = sceneprint(*alone, "--frame", 2, expect=1).stdout
+    assert ": not found; none of 2 candidates is accepted" in lost
+    assert lost.splitlines()[1] == "  cause: nothing_alike"
     prior = {"pose": {"parent_frame": "room-0/seq-01", "matrix": np.eye(4).tolist()}}
     asked = ("localize", "near", rooms / "room-0", "--prior", json.dumps(prior))
     refused = sceneprint(*asked, expect=2).stderr
     assert "has 3 frames, but --prior applies to one. Select it with --frame.\n" in refused
-    lost = sceneprint(*alone[:-1], "--frame", 2, expect=1).stdout
-    assert ": not found; none of 2 candidates is accepted" in lost
-    assert lost.splitlines()[1] == "  cause: nothing_alike"
 
 
 @pytest.fixture(scope="module")
@@ -124,41 +99,30 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(sceneprint, sides):
     told = json.loads(sceneprint("localize", "sides", file, "--json", expect=1).stdout)
     assert (told["status"], told["pose"], len(told["alternatives"])) == ("ambiguous", None, 4)
     located = sceneprint("localize", "sides", file, expect=1).stdout.splitlines()
-    sure = floored(told["confidence"])
-    assert f"/view: ambiguous {sure} %; {told['reason']} (" in located[0]
-    queried = sceneprint("query", "sides", file).stdout.splitlines()
-    assert queried[-6] == f"  {told['reason']}"
-    assert located[1:] == queried[-5:]
+    assert f"/view: ambiguous {floored(told['confidence'])} %; {told['reason']} (" in located[0]
+    assert located[1:] == sceneprint("query", "sides", file).stdout.splitlines()[-5:]
     assert located[1] == "  4 poses are supported; at most one is right:"
     places = []
     for line, one in zip(located[2:], told["alternatives"], strict=True):
         place = re.fullmatch(
             r" +(\S+) %  (\S+) (\S+) (\S+) m in hall, support 1; (\d+) planes? and "
-            r"(\d+) frames? of the map agree, (nothing|\d+%) is missing, .*",
+            r"(\d+) frames? of the map agree, (?:nothing|\d+%) is missing, .*",
             line,
         )
         assert place is not None, line
         sure, *xyz = map(float, place.groups()[:4])
         assert sure == floored(one["confidence"])
         evidence = one["evidence"]
-        planes, frames, missing = place.groups()[4:]
-        assert (int(planes), int(frames)) == (round(evidence["planes"]), evidence["frames"])
-        excess = evidence["excess"]
-        assert missing == ("nothing" if excess < 0.005 else f"{excess:.0%}")
+        assert list(map(int, place.groups()[4:])) == [round(evidence["planes"]), evidence["frames"]]
         places.append(complex(*xyz[:2]))
-        t = one["pose"]["translation"]
-        assert xyz == pytest.approx([t["x"], t["y"], t["z"]], abs=6e-3)
     # the true place turned about the cube by 0, 90, 180 and 270 degrees
     true = complex(truth[0][3], truth[1][3])
     turned = sorted((true * 1j**i for i in range(4)), key=lambda z: (z.real, z.imag))
     found = sorted(places, key=lambda z: (z.real, z.imag))
-    assert [abs(a - b) for a, b in zip(turned, found, strict=True)] == pytest.approx(
-        [0] * 4, abs=0.1
-    )
+    assert np.abs(np.subtract(turned, found)).max() < 0.1
 
 
 def floored(confidence):
-    """Per cent, as printed: rounded down to a tenth."""
     return math.floor(1000 * min(confidence, 0.999)) / 10
 
 
@@ -171,15 +135,11 @@ def test_frames_of_a_folder_are_asked_with_those_before_them(sceneprint, maps, r
     assert both["votes"] > alone["votes"]  # the frame before votes too
     here, there = (np.array(one["pose"]["matrix"]) for one in (alone, both))
     assert np.linalg.norm(here[:3, 3] - there[:3, 3]) < 0.05
-    assert " (2 frames, " in sceneprint(*asked, "--frame", 1).stdout
     up = json.loads(sceneprint(*asked, "--frame", 1, "--up", "0,-1,0", "--json").stdout)
     assert up["frames"] == 1
     # without poses beside them each frame is alone
-    for file in (rooms / "room-0").rglob("*"):
-        if file.is_file() and not file.name.endswith("pose.txt"):
-            bare = tmp_path / file.relative_to(rooms)
-            bare.parent.mkdir(parents=True, exist_ok=True)
-            bare.write_bytes(file.read_bytes())
+    no_poses = shutil.ignore_patterns("*.pose.txt")
+    shutil.copytree(rooms / "room-0", tmp_path / "room-0", ignore=no_poses)
     one = ("localize", "near", tmp_path / "room-0", "--frame", 1)
     assert json.loads(sceneprint(*one, "--json").stdout)["frames"] == 1
     for wrong, text in (
@@ -202,16 +162,13 @@ def test_a_prior_is_a_file_or_json(sceneprint, sides, tmp_path, capsys):
     by_file = json.loads(sceneprint(*asked, tmp_path / "prior.json").stdout)
     assert by_file["pose"] == there["pose"]
     lines = sceneprint("query", "sides", file, "--prior", json.dumps(prior)).stdout.splitlines()
-    assert lines[-2].startswith("  at ")
     assert "; several poses fit, and the prior decided; " in lines[-1]
-    assert lines[-1].endswith(", no other place that the prior expects fits")
     (tmp_path / "torn.json").write_text('{"pose": ')
     pose = {"translation": {"x": 0, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
     for wrong, text in (
         (tmp_path / "none.json", "cannot be read (No such file or directory). Pass the path"),
         (tmp_path / "torn.json", "the prior is not JSON ("),
         (json.dumps({"pose": pose}), "parent_frame"),
-        (json.dumps({**prior, "covariance": [1]}), "covariance: List should have at least 36"),
         (json.dumps({**prior, "deviation": 1}), "deviation: Extra inputs are not permitted"),
     ):
         with pytest.raises(SystemExit) as ended:
@@ -227,7 +184,6 @@ def test_queries_that_came_are_listed(sceneprint, service_url, rooms):
     with Client(service_url) as client:
         found = client.localize("asked", frames[0], robot="spot\u2028")
         lost = client.localize("asked", frames[1], robot="cart")
-    assert (found.status, lost.status) == ("found", "not_found")
     head, second, first = sceneprint("queries", "asked").stdout.splitlines()
     assert " ".join(head.split()) == "query time status ms map robot/session pose or reason"
     t = found.pose.translation
@@ -235,21 +191,12 @@ def test_queries_that_came_are_listed(sceneprint, service_url, rooms):
     assert re.fullmatch(
         rf"{found.query_id}  \S+ \S+  found +\d+  asked  spot\S*/seq-01  {place}", first
     ), first
-    assert re.fullmatch(
-        rf"{lost.query_id}  \S+ \S+  not_found +\d+  asked  cart/seq-01  {re.escape(lost.reason)}",
-        second,
-    )
-    said = sceneprint(
-        "queries", "asked", "--status", "found", "--status", "failed", "--json"
-    ).stdout
-    told = json.loads(said)
+    assert second.startswith(lost.query_id)
+    assert second.endswith(f"  cart/seq-01  {lost.reason}")
+    chosen = ("--status", "found", "--status", "failed", "--json")
+    told = json.loads(sceneprint("queries", "asked", *chosen).stdout)
     assert (told["query_id"], told["robot"]) == (found.query_id, "spot\u2028")
-    assert lost.query_id in sceneprint("queries", "--robot", "cart", "--limit", "1").stdout
-    none = sceneprint("queries", "asked", "--until", told["at"], "--json").stdout
-    assert none == ""
-    assert "There is no map 'nowhere'" in sceneprint("queries", "nowhere", expect=2).stderr
-    with pytest.raises(SystemExit):
-        sceneprint("queries", "asked", "--since", "yesterday")
+    assert sceneprint("queries", "asked", "--until", told["at"], "--json").stdout == ""
 
 
 def test_a_query_is_laid_on_its_match(sceneprint, service_url, rooms, tmp_path):

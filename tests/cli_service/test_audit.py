@@ -7,8 +7,6 @@ import re
 
 import pytest
 
-from sceneprint.cli import main
-
 MESSAGE = re.compile(r"<109>1 \d{4}-\d\d-\d\dT[\d:.]{12}Z \S+ sceneprint - audit - (\{.*\})")
 
 
@@ -49,10 +47,3 @@ def test_all_entries_are_exported(sceneprint, data):
     assert [one and one[1] for one in told] == lines
     sceneprint(*export, "jsonl", "--output", file, "--actor", "command")
     assert file.read_text().splitlines()[4:] == lines  # behind what was there
-
-
-def test_a_file_needs_a_format(sceneprint, data):
-    done = sceneprint("audit", "--output", data / "x", "--data", data, expect=2)
-    assert "--output requires --format" in done.stderr
-    with pytest.raises(SystemExit):
-        main(["audit", "--format", "xml"])

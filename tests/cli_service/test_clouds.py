@@ -45,20 +45,3 @@ def test_a_folder_of_scans_is_uploaded_and_found(sceneprint, scans, rooms):
     there = json.loads(sceneprint("localize", "scanned", scans / "1.ply", "--json").stdout)
     assert there["pose"]["child_frame"] == "query.sensor"
     assert np.allclose(there["pose"]["matrix"], own, atol=0.02)
-
-
-def test_rows_of_five_are_named_or_refused(sceneprint, scans, tmp_path):
-    rows = np.fromfile(scans / "0.bin", "<f4").reshape(-1, 4)
-    ring = np.arange(len(rows)) % 32
-    (tmp_path / "0.bin").write_bytes(np.c_[rows, ring].astype("<f4").tobytes())
-    without = ("--no-wait", "--model", "depth")
-    done = sceneprint("upload", "rows", tmp_path, *without, expect=2)
-    assert "/0: Judging by its values, the file has 5 numbers per row" in done.stderr
-    done = sceneprint("upload", "rows", tmp_path, "--row", "x,y,z,i,ring", *without)
-    assert "1 frames: 1 received" in done.stdout
-    assert "1 of the frames are point clouds" in done.stdout
-    assert "`sceneprint reencode rows --model lidar`" in done.stdout
-    done = sceneprint("upload", "rows", scans, "--row", "x,y,z,i", expect=2)
-    assert "--row is for .bin files, but walk has other files" in done.stderr
-    done = sceneprint("upload", "rows", scans / "1.ply", "--as-map", "--row", "x,y,z", expect=2)
-    assert "--row is for .bin files, not for maps" in done.stderr

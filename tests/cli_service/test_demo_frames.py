@@ -11,7 +11,6 @@ from sceneprint_lab.cli.demo import choose_frames
 
 
 def sequence(folder, frames):
-    """Frames that are named and never read."""
     folder.mkdir(parents=True)
     write_depth_png(folder / "frame-000000.depth.png", np.ones((2, 2), np.float32), 1000.0)
     content = (folder / "frame-000000.depth.png").read_bytes()

@@ -8,7 +8,6 @@ from pydantic import SecretStr
 from sceneprint.cli.checks import Check, store_check
 from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.settings import Settings
-from sceneprint.store import open_database
 from tests.whole_engine import Engine
 
 
@@ -16,30 +15,6 @@ def found_in(url, **other):
     settings = Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url), **other)
     found = [database(settings), *server(settings), *object_stores(settings)]
     return {one.subject: one for one in found}
-
-
-@pytest.mark.thorough
-def test_a_server_and_its_standby(postgres, tmp_path):
-    url = postgres.create("looked_at")
-    open_database(url).close()
-    standby = postgres.standby(tmp_path / "standby", synchronous=False)
-    try:
-        found = found_in(url)
-        assert found["database"].verdict == found["database server"].verdict == "ok"
-        assert found["database server"].text.startswith("PostgreSQL 1")
-        assert found["durability"].verdict == "WRONG"  # the server of tests syncs nothing
-        assert "fsync, full_page_writes off" in found["durability"].text
-        assert (found["clock"].verdict, found["connections"].verdict) == ("ok", "ok")
-        near = standby.url("looked_at")
-        assert "is a read-only standby" in found_in(near)["database server"].text
-    finally:
-        standby.kill()
-
-
-def test_more_connections_than_the_server_allows(postgres):
-    found = found_in(postgres.create("modest"), workers=250)
-    assert found["connections"].verdict == "note"
-    assert "Raise max_connections, or run fewer" in found["connections"].text
 
 
 def test_a_service_does_not_take_the_server_for_a_file(postgres_url, tmp_path):

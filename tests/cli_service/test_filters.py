@@ -24,12 +24,6 @@ def test_options_are_a_filter():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d,e,f", ""])
-def test_a_box_has_six_numbers(sceneprint, text):
-    with pytest.raises(SystemExit):
-        sceneprint("query", "m", "x.png", "--region", text)
-
-
 def test_an_upload_counts_what_was_not_kept(sceneprint, rooms):
     done = sceneprint("upload", "novel", rooms / "room-0", "--if-novel=1")
     assert done.stderr == ""  # nothing is wrong

@@ -25,8 +25,6 @@ def test_lists_files_and_edits(sceneprint, rooms, name, tmp_path):
     names = [f"frame-00000{i}.depth.png" for i in range(3)]
     table = sceneprint("frames", name, "--session", session).stdout.splitlines()
     assert [line.split()[-1] for line in table[1:]] == names
-    found = sceneprint("frames", name, "--name", "frame-000001", "--json").stdout.splitlines()
-    assert [(one["name"], one["sequence"]) for one in map(json.loads, found)] == [(names[1], 1)]
     places = tmp_path / "places.tum"
     said = sceneprint("frames", name, "--session", session, "--trajectory", places)
     assert said.stdout == f"wrote {places}: 3 poses\n"
@@ -52,9 +50,7 @@ def test_lists_files_and_edits(sceneprint, rooms, name, tmp_path):
     with Image.open(png) as image:
         assert image.size[0] == 100
     assert b"comment frame r1/room-0\n" in ply.read_bytes()
-    assert json.loads(lists.read_text())["frame_id"] == ids[0]
     assert (tmp_path / "u").read_bytes()[:4] == b"\x89PNG"
-    assert json.loads((tmp_path / "s").read_text())["dtype"] == "uint8"
 
     for i, one in enumerate(ids[:2]):
         change = {"captured_at": f"2026-11-16T09:30:0{i}Z", "tags": ["door"], "session": "s"}
@@ -64,22 +60,15 @@ def test_lists_files_and_edits(sceneprint, rooms, name, tmp_path):
         "frames", name, "--tag", "door", "--after", "2026-11-16T09:30:01Z", "--json"
     )
     assert [json.loads(line)["frame_id"] for line in tagged.stdout.splitlines()] == ids[1:2]
-    tum = tmp_path / "a.tum"
-    said = sceneprint("frames", name, "--session", "s", "--trajectory", tum)
-    assert said.stdout == f"wrote {tum}: 2 poses\n"
-    assert len(read_trajectory(tum).stamps) == 2
     sessions = sceneprint("sessions", name).stdout.splitlines()
     assert sessions[1].endswith("  r1/room-0/seq-01")
     assert sessions[2].endswith("  r1/s  [door]")
-    told = sceneprint("sessions", name, "--json").stdout.splitlines()
-    assert [json.loads(line)["frames"] for line in told] == [{"indexed": 1}, {"indexed": 2}]
 
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (("--cloud", "a.ply"), "--cloud applies to one frame"),
-        (("--edit", "{}"), "--edit applies to one frame"),
         (("--trajectory", "a.tum"), "--trajectory requires a session"),
         (("--session", "s", "--robot", "a", "--robot", "b", "--trajectory", "a"), "only one robot"),
         (("nobody", "--cloud", "a.ply"), "There is no"),
@@ -100,18 +89,11 @@ def test_a_session_is_renamed_tagged_and_deleted(sceneprint, rooms, name):
     assert said == f"edited 3 frames of session {old}\n"
     listed = sceneprint("sessions", name, new, "--robot", "r1").stdout.splitlines()
     assert listed[1].endswith(f"  r1/{new}  [door]")
-    assert sceneprint("sessions", name, old).stdout == "no sessions yet\n"
-    assert len(sceneprint("frames", name, "--tag", "door", "--json").stdout.splitlines()) == 3
-
     refused = sceneprint("sessions", name, new, "--delete", expect=2).stderr
     assert refused == (
         f"sceneprint sessions: This would delete session {new} and its 3 frames. Add "
         "--yes to confirm.\n"
     )
-    both = sceneprint("sessions", name, new, "--delete", "--tag", "a", expect=2).stderr
-    assert both.endswith(": --delete removes the session. Omit the other changes.\n")
-    nameless = sceneprint("sessions", name, "--delete", expect=2).stderr
-    assert nameless.endswith(": Specify the session after the map to edit or delete it.\n")
     said = sceneprint("sessions", name, new, "--delete", "--yes").stdout
     head, undo = said.splitlines()
     assert head == f"deleted session {new} and its 3 frames"
@@ -124,8 +106,3 @@ def test_a_session_is_renamed_tagged_and_deleted(sceneprint, rooms, name):
     assert "3" in sceneprint("sessions", name, new).stdout.split()
     again = sceneprint("sessions", name, "--undo", deletion, expect=2).stderr
     assert "has no deletion" in again
-    of_one = sceneprint("sessions", name, new, "--deletions", expect=2).stderr
-    assert "Omit the session" in of_one
-    sceneprint("sessions", name, new, "--delete", "--yes")
-    gone = sceneprint("sessions", name, new, "--delete", "--yes", expect=2).stderr
-    assert f"has no frame of session '{new}'" in gone

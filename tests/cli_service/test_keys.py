@@ -1,6 +1,5 @@
 """Tests of `sceneprint keys`: creation, list and revocation in a data folder."""
 
-import re
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -20,7 +19,6 @@ def test_keys_are_made_listed_and_revoked(sceneprint, tmp_path):
     lines = keys("--list").stdout.splitlines()
     assert [line[20:] for line in lines] == ["  robot 1  admin of all", "  robot 2  admin of all"]
     for line in lines:
-        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", line[:20])
         assert before <= datetime.fromisoformat(line[:20]) <= datetime.now(UTC)
     assert keys("--revoke", "robot 1").stdout == "key robot 1 is revoked\n"
     assert [line[22:] for line in keys("--list").stdout.splitlines()] == ["robot 2  admin of all"]
@@ -60,19 +58,8 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint, tmp_path):
     last = keys("--rotate", "robot", "--overlap", "0").stdout.strip()
     assert [named(one) for one in (old, last)] == [None, "robot"]
     assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr
-    assert (
-        "not between 0 s and 30 days"
-        in keys("--rotate", "robot", "--overlap", "31d", expect=2).stderr
-    )
-    assert "Use it with --rotate" in keys("--list", "--overlap", "1h", expect=2).stderr
-
-
-@pytest.mark.parametrize(
-    "arguments", [(), ("--list", "--revoke", "x"), ("--create", "x", "--list")]
-)
-def test_one_thing_at_a_time(sceneprint, arguments):
-    with pytest.raises(SystemExit):
-        sceneprint("keys", *arguments)
+    refused = keys("--rotate", "robot", "--overlap", "31d", expect=2).stderr
+    assert "not between 0 s and 30 days" in refused
 
 
 def test_a_key_may_do_what_it_was_made_for(sceneprint, tmp_path):
@@ -118,16 +105,7 @@ def test_tenants_are_made_listed_and_deleted(sceneprint, tmp_path):
     assert "no tenant named 'acme'" in run("keys", "--delete-tenant", "acme", expect=2).stderr
 
 
-@pytest.mark.parametrize("time", ["30", "d", "0d", "-1d", "1y", "999999w", "1 d"])
+@pytest.mark.parametrize("time", ["30", "d", "0d", "-1d", "999999w"])
 def test_a_time_is_written_as_it_is_read(sceneprint, time):
     with pytest.raises(SystemExit):
         sceneprint("keys", "--create", "x", "--expires", time)
-
-
-def test_what_a_key_may_is_said_when_it_is_made(sceneprint, tmp_path):
-    done = sceneprint("keys", "--list", "--scope", "read", "--data", tmp_path, expect=2)
-    assert "Use it with --create" in done.stderr
-    done = sceneprint("keys", "--create", "x", "--map", "No Map", "--data", tmp_path, expect=2)
-    assert "'No Map' is not a valid map name" in done.stderr
-    done = sceneprint("keys", "--create", "command", "--data", tmp_path, expect=2)
-    assert "is not a valid key name" in done.stderr

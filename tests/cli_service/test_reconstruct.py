@@ -4,20 +4,15 @@ import re
 
 import pytest
 
-from sceneprint.formats.dataset import Camera, write_depth_png, write_intrinsics
 from sceneprint_client import Client
+from tests.cli_service.conftest import write_rooms
 from tests.conftest import halved
 
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory, room_views):
-    """Six small views of one room that overlap."""
-    folder = tmp_path_factory.mktemp("walk") / "room" / "seq-01"
-    folder.mkdir(parents=True)
-    for number, frame in enumerate(map(halved, room_views(33, 1, 8).frames[:6])):
-        write_intrinsics(folder, Camera(frame.intrinsics))
-        write_depth_png(folder / f"frame-{number:06d}.depth.png", frame.depth, 1000.0)
-    return folder
+    frames = map(halved, room_views(33, 1, 8).frames[:6])
+    return write_rooms(tmp_path_factory.mktemp("walk"), frames, views=6) / "room-0" / "seq-01"
 
 
 def test_a_mesh_and_its_figures(sceneprint, service_url, walk, tmp_path, with_open3d):

@@ -2,15 +2,7 @@
 
 import re
 
-from sqlalchemy import update
-
-from sceneprint.cli import storage as command
-from sceneprint.formats.dataset import find_sequences
-from sceneprint.settings import Settings
-from sceneprint.store.tables import jobs
-from sceneprint_client import Client, meta_of
-from sceneprint_client.api import JobState
-from tests.whole_engine import Engine
+from sceneprint_client import Client
 
 
 def test_a_map_is_signed_anew_while_its_service_runs(sceneprint, service_url, data_folder, rooms):
@@ -54,31 +46,3 @@ def test_what_is_given_up_and_what_breaks_down_is_said(sceneprint, tmp_path):
     assert reencode("--cancel").stdout == first
     assert len(reencode("--cancel", expect=2).stderr.splitlines()) == 1
     assert "no such file" in reencode("--model", tmp_path / "none", expect=2).stderr.lower()
-
-
-def test_waiting_ends_where_it_is_no_use(sceneprint, tmp_path, rooms, monkeypatch):
-    """No worker runs, or a frame broke down in every try."""
-    monkeypatch.setattr(command, "STALL_S", 0.5)
-    with Client.embedded(tmp_path) as client:
-        client.create_map("hall", model="depth")
-        reference = find_sequences(rooms)[0].frames[0]
-        added, _ = client.add("hall", reference, meta_of(reference))
-        client.wait([added.job_id])
-        assert client.map("hall").frames == {"indexed": 1}
-
-    def wait():
-        return sceneprint(
-            "reencode", "hall", "--model", "paper", "--wait", "--data", tmp_path, expect=2
-        )
-
-    said = wait()
-    assert "0 frames signed, 1 waiting\n" in said.stdout
-    assert "Check that workers are running; `sceneprint work` starts some." in said.stderr
-    broken = update(jobs).where(jobs.c.kind == "reencode").values(state=JobState.DEAD)
-    engine = Engine(Settings(data_dir=tmp_path, database_url=None))
-    with engine, engine.store.database.write() as connection:
-        connection.execute(broken)
-    said = sceneprint("reencode", "hall", "--status", "--wait", "--data", tmp_path, expect=2)
-    assert "1 frames failed in every attempt, and the map does not switch until" in said.stdout
-    said = wait()  # tries it again
-    assert "0 frames signed, 1 waiting\n" in said.stdout

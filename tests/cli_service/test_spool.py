@@ -92,14 +92,3 @@ def test_the_example_goes_on_while_it_is_offline(service_url, run_example):
         ]  # fmt: skip
         assert example(service_url)[0] == "uploaded 0, already there 6, refused 0"
         assert len(list(client.frames("offline-example"))) == 6
-
-
-@pytest.mark.sqlite_only("a copy of the maps is a folder with SQLite")
-def test_the_example_localises_by_its_copy(service_url, run_example, tmp_path):
-    with Client(service_url) as client, Client.embedded(tmp_path / "copy") as robot:
-        client.delete_map("offline-example")
-        for one in (client, robot):
-            one.create_map("offline-example", model="depth")
-    copy = ("--copy", tmp_path / "copy")
-    assert run_example("http://127.0.0.1:9", *copy)[0].endswith(": not_found")
-    assert run_example(service_url, *copy)[1] == "uploaded 6, already there 0, refused 0"

@@ -16,17 +16,13 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli import main
-from sceneprint.cli.imports import unsigned_reason
-from sceneprint.errors import MissingDependency, TooLarge
 from sceneprint.formats.dataset import read_pose, write_depth_png
 from sceneprint_client import Client, http
 from sceneprint_client.api import Answer, FrameState, Map
-from sceneprint_lab.cli.demo import serving
 
 
 @pytest.fixture(scope="session")
 def house(service_url, rooms):
-    """A map with all frames of both rooms."""
     out, err = io.StringIO(), io.StringIO()
     with redirect_stdout(out), redirect_stderr(err):
         code = main(["upload", "house", str(rooms), "--robot", "r1", "--url", service_url])
@@ -94,10 +90,6 @@ def test_bad_frames_stop_no_others(sceneprint, service_url, rooms, tmp_path):
     with Client(service_url) as client:
         indexed = list(client.frames("mixed", FrameState.INDEXED))
     assert [(one.tags, one.session) for one in indexed] == [(["a", "b"], "mixed")]
-    without = sceneprint("upload", "mixed", folder, "--no-pose", "--session", "s", expect=2)
-    assert "3 refused" in without.stdout  # among them the two that are there with a pose or tags
-    assert "1 indexed" in without.stdout  # the one whose pose is none
-    assert "\nposes of 0 of 4 frames; 4 without: --no-pose; depth " in without.stdout
 
 
 def test_what_is_lost_though_nobody_asked_ends_with_code_2(sceneprint, rooms, tmp_path):
@@ -121,41 +113,6 @@ def test_what_is_lost_though_nobody_asked_ends_with_code_2(sceneprint, rooms, tm
     )
     assert "m are unusual for a depth camera" in summary  # four times as far away
     assert "3 already there; 3 indexed" in sceneprint(*options, "--no-pose").stdout
-    (tmp_path / "both").mkdir()
-    folder.rename(tmp_path / "both" / "day")
-    (tmp_path / "both" / "ir").mkdir()
-    folder = tmp_path / "both" / "day"
-    (folder / "groundtruth.txt").write_text("1.01 0 0 0 0 0 0 1\n")
-    summary = sceneprint("upload", "day2", folder.parent).stdout.splitlines()[2]
-    assert summary.startswith("poses of 1 of 3 frames; 2 without: ")
-    assert "; skipped: both/ir (" in summary
-    cloud = tmp_path / "points.ply"
-    cloud.write_bytes(b"ply\n")
-    done = sceneprint("upload", "day", cloud, "--depth-scale", "250", expect=2)
-    assert "--depth-scale is for depth images" in done.stderr
-
-
-def test_a_map_without_poses_says_so_and_gives_no_coordinates(sceneprint, service_url, rooms):
-    folder = rooms / "room-0" / "seq-01"
-    done = sceneprint("upload", "bare", folder, "--no-pose")
-    *_, last = done.stdout.splitlines()
-    assert last == "map bare has no poses, so answers have frames but no coordinates"
-    [row] = [one for one in sceneprint("maps").stdout.splitlines() if one.startswith("bare ")]
-    assert row.endswith("(no poses)")
-    there = sceneprint("localize", "bare", folder / "frame-000000.depth.png").stdout
-    assert re.search(r": found \(.*\n  no coordinates: frame .* has no pose\n", there)
-    with Client(service_url) as client:
-        assert client.localize("bare", folder / "frame-000000.depth.png").pose is None
-        client.delete_map("bare")
-
-
-def test_upload_without_waiting(sceneprint, service_url, rooms):
-    done = sceneprint("upload", "later", rooms, "--no-wait", "--model", "depth", "--parallel", 2)
-    assert "6 received" in done.stdout
-    with Client(service_url) as client:
-        assert client.map("later").model.startswith("depth-")
-        ids = [one.job_id for one in client.frames("later")]
-        assert {job.state for job in client.wait(ids, timeout_s=PATIENCE_S)} == {"succeeded"}
 
 
 def test_poses_lead_to_the_frame_that_is_named(sceneprint, service_url, rooms, tmp_path):
@@ -244,13 +201,11 @@ def test_queries_as_json(sceneprint, house, rooms):
     for line in lines:
         answer = Answer.model_validate(line)
         assert (answer.counts.map, answer.seed, answer.exact) == (6, 3, True)
-        assert min(match.distance for match in answer.matches) == 0
     file = rooms / "room-1/seq-01/frame-000002.depth.png"
-    done = sceneprint("query", house, file, "--json", "--stages", "retrieve,diversify", "--k", 2)
+    done = sceneprint("query", house, rooms, "--frame", file, "--json", "--stages", "retrieve")
     answer = Answer.model_validate_json(done.stdout)
-    assert (answer.status, len(answer.matches)) == ("unvalidated", 2)
-    by_name = sceneprint("query", house, rooms, "--frame", file, "--json", "--stages", "retrieve")
-    assert json.loads(by_name.stdout)["name"] == "room-1/seq-01/frame-000002"
+    assert answer.status == "unvalidated"
+    assert json.loads(done.stdout)["name"] == "room-1/seq-01/frame-000002"
 
 
 def test_queries_that_cannot_be_asked(sceneprint, house, rooms, tmp_path):
@@ -277,23 +232,19 @@ def test_maps_are_listed_made_and_deleted(sceneprint, house):
     assert rows[0] == ["map", "indexed", "waiting", "rejected", "failed", "model", "title"]
     by_name = {row[0]: row for row in rows[1:]}
     assert by_name[house][1:5] == ["6", "0", "0", "0"]
-    assert by_name["hall"][1:5] == ["0", "0", "0", "0"]
     assert by_name["hall"][5].startswith("depth-")
     assert by_name["hall"][6:] == ["Hall", "2"]
-    told = [
-        Map.model_validate_json(line) for line in sceneprint("maps", "--json").stdout.splitlines()
-    ]
+    told = map(Map.model_validate_json, sceneprint("maps", "--json").stdout.splitlines())
     assert {one.name: one.title for one in told}["hall"] == "Hall 2"
     assert "Add --yes" in sceneprint("maps", "--delete", "hall", expect=2).stderr
     done = sceneprint("maps", "--delete", "hall", "--yes")
     assert done.stdout == "deleted map hall and its 0 frames\n"
-    assert "hall" not in sceneprint("maps").stdout
-    assert (
-        "There is no map 'hall'" in sceneprint("maps", "--delete", "hall", "--yes", expect=2).stderr
-    )
-    refused = sceneprint("maps", "--create", "A b", expect=2)
-    assert "name: must be 1 to 63 lower-case letters" in refused.stderr
-    assert "--create NAME or --edit" in sceneprint("maps", "--title", "x", expect=2).stderr
+    for wrong, message in (
+        (("--delete", "hall", "--yes"), "There is no map 'hall'"),
+        (("--create", "A b"), "name: must be 1 to 63 lower-case letters"),
+        (("--title", "x"), "--create NAME or --edit"),
+    ):
+        assert message in sceneprint("maps", *wrong, expect=2).stderr
 
 
 def test_a_service_that_is_not_there(sceneprint, monkeypatch):
@@ -305,47 +256,17 @@ def test_a_service_that_is_not_there(sceneprint, monkeypatch):
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_an_archive_is_uploaded_as_its_folder_is(sceneprint, house, service_url, rooms, tmp_path):
+def test_an_archive_is_uploaded_as_its_folder_is(sceneprint, house, rooms, tmp_path):
     made = shutil.make_archive(str(tmp_path / "rooms"), "gztar", rooms.parent, rooms.name)
     done = sceneprint("upload", house, made, "--robot", "r1")
     assert done.stdout.startswith("6 frames: 0 received, 6 already there; 6 indexed, ")
     assert done.stdout.splitlines()[1].startswith("rooms.tar.gz: poses of 6 of 6 frames; depth ")
-    base = ("--base", "0,0,0.5,0,0,0,1", "--base-frame", "base")
-    done = sceneprint("upload", "shed", made, "--model", "depth", "--every", 3, *base)
-    assert done.stdout.splitlines()[1].startswith(
-        "2 frames: 2 received, 0 already there; 2 indexed"
-    )
-    with Client(service_url) as client:
-        frames = list(client.frames("shed"))
-        client.delete_map("shed")
-    assert {(one.session, one.base_frame) for one in frames} == {
-        ("room-0/seq-01", "base"), ("room-1/seq-01", "base"),
-    }  # fmt: skip
-    bad = tmp_path / "bad.zip"
-    bad.write_bytes(b"PK\x03\x04" + bytes(600))
     done = sceneprint("upload", house, made, "--depth-scale", 1000, expect=2)
     assert 'put the value as "depth_scale" into intrinsics.json' in done.stderr
+    bad = tmp_path / "bad.zip"
+    bad.write_bytes(b"PK\x03\x04" + bytes(600))
     done = sceneprint("upload", house, bad, expect=2)
     assert (len(done.stdout.splitlines()), len(done.stderr.splitlines())) == (1, 1)
-
-
-@pytest.mark.parametrize("error", [TooLarge("too many bytes"), MissingDependency("no lazrs")])
-def test_a_query_goes_on_after_a_file_that_is_not_taken(
-    sceneprint, house, rooms, monkeypatch, error
-):
-    ask = Client.query
-
-    def query(client, name, frame, *more, **how):
-        if frame.name.endswith("1"):
-            raise error
-        return ask(client, name, frame, *more, **how)
-
-    monkeypatch.setattr(Client, "query", query)
-    folder = rooms / "room-0" / "seq-01"
-    done = sceneprint("query", house, folder, "--stages", "retrieve", "--json", expect=2)
-    assert [json.loads(line)["name"] for line in done.stdout.splitlines()] \
-        == ["seq-01/frame-000000", "seq-01/frame-000002"]  # fmt: skip
-    assert done.stderr == f"seq-01/frame-000001: {error}\n"
 
 
 def test_a_map_has_limits(sceneprint, house):
@@ -354,62 +275,24 @@ def test_a_map_has_limits(sceneprint, house):
     changes = ("--quota-frames", "none", "--quota-bytes", "1500000", "--retention-days", "30")
     done = sceneprint("maps", "--edit", "small", "--title", "Small", *changes).stdout
     assert done.endswith(", 0.0 of 1.5 MB, kept 30 days\n")
-    [line] = [one for one in sceneprint("maps").stdout.splitlines() if one.startswith("small ")]
-    assert line.endswith("  Small  (0.0 of 1.5 MB, kept 30 days)")
     told = sceneprint("maps", "--edit", house, "--retention-days", "0.000001", expect=2).stderr
     assert "would permanently delete the 6 frames of map" in told
     assert "Add --yes" in told
-    told = sceneprint("maps", "--edit", house, "--retention-days", "1000", "--json").stdout
-    assert Map.model_validate_json(told).frames["indexed"] == 6
-    sceneprint("maps", "--edit", house, "--retention-days", "none")
     assert "There is nothing to change" in sceneprint("maps", "--edit", house, expect=2).stderr
-    assert "--create NAME or --edit" in sceneprint("maps", "--quota-bytes", "1", expect=2).stderr
     sceneprint("maps", "--delete", "small", "--yes")
 
 
-def test_an_upload_waits_for_a_service_that_compiles(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(http, "LIMIT_S", 0.0)  # asked once
-    with Client.embedded(tmp_path) as client:
-        client._worker._runner._context.signers._compiled.clear()
-        assert unsigned_reason(client, []) == "They are signed when the service is ready."
-    assert "the service is compiling its kernels" in capsys.readouterr().err
-
-
 @pytest.mark.thorough
-def test_an_upload_ends_at_its_timeout(sceneprint, tmp_path, rooms):
-    with serving(tmp_path, 0) as url:
-        arguments = ("late", rooms, "--every", "2", "--timeout", "0.2", "--url", url)
-        said = sceneprint("upload", *arguments, expect=2)
-        assert "4 frames: 4 received, 0 already there; 0 indexed" in said.stdout
-        assert (
-            "4 frames are stored and waiting, but not signed within 0.2 s. Check that workers are "
-            "running; `sceneprint work` starts some." in said.stderr
-        )
-
-
-@pytest.mark.thorough
-def test_a_map_that_is_one_file_is_uploaded_as_a_map(
-    sceneprint, service_url, room_mesh, rooms, tmp_path
-):
+def test_a_map_that_is_one_file_is_uploaded_as_a_map(sceneprint, service_url, room_mesh, tmp_path):
     file = tmp_path / "room.ply"
     file.write_bytes(room_mesh)
     small = ("--camera", "73,73,39.5,29.5,80,60", "--height", "1.2", "--offset", "0,0,1")
     done = sceneprint("upload", "mesh", file, "--as-map", "--up", "z", "--units", "m", *small)
     created, views, how, offset, *_ = done.stdout.splitlines()
     assert created.startswith("created map mesh with model depth-")
-    assert re.fullmatch(
-        r"room\.ply: \d+ views are in map mesh and see \d+% of its surface\. Their parent frame is "
-        r"room\..*",
-        views,
-    )
+    assert re.match(r"room\.ply: \d+ views are in map mesh and see \d+% of its surface\. ", views)
     assert how == "units: m (as specified); up: z (as specified)"
     assert offset.startswith("offset: 0,0,1 m; ")
-    assert re.search(
-        r"^Of \d+ test views of this file, \d+% are found in the map: ", done.stdout, re.M
-    )
-    sceneprint("upload", "mesh", next(rooms.rglob("*.png")))
-    again = sceneprint("upload", "mesh", file, "--as-map", "--no-wait")
-    assert "the poses of map mesh are in 2 parent frames" in again.stdout
     with Client(service_url) as client:
         frames = list(client.frames("mesh"))
         client.delete_map("mesh")
@@ -420,8 +303,6 @@ def test_a_map_that_is_one_file_is_uploaded_as_a_map(
     ("options", "message"),
     [
         (("--as-map", "--every", "2"), "every: does not apply to a map"),
-        (("--as-map", "--up", "0,0,1"), "up: one of x, -x"),
-        (("--offset", "0,0,1"), "--offset is only for maps in one file"),
         (("--height", "1"), "--height is only for maps in one file. Add --as-map"),
         (("--up", "z"), "--up z is an axis of a file, for --as-map"),
     ],
@@ -434,12 +315,3 @@ def test_options_of_another_upload_are_errors(
     done = sceneprint("upload", house, file, *options, expect=2)
     assert message in done.stderr
     assert len(done.stderr.splitlines()) == 1
-
-
-def test_what_is_no_map_is_refused(sceneprint, house, tmp_path):
-    file = tmp_path / "map.txt"
-    file.write_bytes(b"no map")
-    for paths in ((file,), (tmp_path,), (tmp_path / "none.pcd",)):
-        done = sceneprint("upload", house, *paths, "--as-map", expect=2)
-        assert done.stdout == ""
-        assert len(done.stderr.splitlines()) == 1

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from sceneprint.formats.dataset import (
-    Camera,
     find_sequences,
     write_depth_png,
     write_intrinsics,
-    write_pose,
 )
 from sceneprint_client import Client, http
 from sceneprint_client.api import FrameMeta, JobState
+from tests.cli_service.conftest import write_rooms
 from tests.conftest import halved
 
 
@@ -45,7 +44,6 @@ def client(tmp_path_factory):
 
 @pytest.fixture
 def map_name(request):
-    """A name that no other test uses."""
     return "m" + f"{abs(hash(request.node.nodeid)):x}"[:20]
 
 
@@ -57,15 +55,7 @@ def room_frames(room_frames):
 
 @pytest.fixture(scope="session")
 def references(room_frames, tmp_path_factory):
-    """Three views of each of two rooms, with poses, as files in 7-Scenes layout."""
-    root = tmp_path_factory.mktemp("rooms")
-    for number, frame in enumerate(room_frames):
-        folder = root / f"room-{number // 3}" / "seq-01"
-        folder.mkdir(parents=True, exist_ok=True)
-        write_intrinsics(folder, Camera(frame.intrinsics))
-        write_depth_png(folder / f"frame-{number % 3:06d}.depth.png", frame.depth, 1000.0)
-        assert frame.pose is not None
-        write_pose(folder / f"frame-{number % 3:06d}.pose.txt", frame.pose)
+    root = write_rooms(tmp_path_factory.mktemp("rooms"), room_frames)
     return tuple(one for sequence in find_sequences(root) for one in sequence.frames)
 
 
@@ -119,7 +109,6 @@ def bare_wall(tmp_path_factory, references):
 
 @pytest.fixture
 def hasty(monkeypatch):
-    """Remove the delay between retries."""
     monkeypatch.setattr(http, "FIRST_PAUSE_S", 0.01)
     monkeypatch.setattr(http, "LONGEST_PAUSE_S", 0.02)
 

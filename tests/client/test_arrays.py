@@ -60,14 +60,6 @@ def test_points_of_a_map_keep_their_precision():
     np.testing.assert_array_equal(loaded(data), far)
 
 
-def test_calls_have_no_other_keywords():
-    points = np.zeros((400, 3), np.float32)
-    with Client("http://127.0.0.1:9") as client:
-        for call in (client.upload, client.query, client.localize):
-            with pytest.raises(TypeError, match="camera"):
-                call("hall", points, camera=CAMERA)
-
-
 @pytest.mark.parametrize(
     ("array", "camera", "error", "message"),
     [
@@ -176,18 +168,6 @@ def test_images_and_cameras_of_libraries_are_taken():
     data, _ = sendable(metres, lens, with_pose=False)
     np.testing.assert_allclose(loaded(data), millimetres / 1000, rtol=1e-6)
     assert sendable(b"\x89PNG", lens, with_pose=False)[1].intrinsics == CAMERA
-
-
-def test_clouds_of_open3d_are_points():
-    o3d = pytest.importorskip("open3d")
-    points = np.arange(12, dtype=np.float64).reshape(4, 3)
-    for cloud in (
-        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)),
-        o3d.t.geometry.PointCloud(points.astype(np.float32)),
-    ):
-        data, meta = sendable(cloud, None, with_pose=False)
-        np.testing.assert_array_equal(loaded(data), points)
-        assert meta == FrameMeta()
 
 
 def test_unknown_options_are_refused_before_the_frame_is_looked_at():

@@ -18,8 +18,6 @@ MAP = "associated"
 
 @dataclass(frozen=True)
 class Filled:
-    """A client of a map with both runs."""
-
     client: Client
     numbers: dict[str, int]
 
@@ -36,37 +34,26 @@ def associated(service_url, walk):
 
 
 def test_edges_and_graphs(associated):
-    client, steps = associated.client, []
-    found = client.compute(
-        Association, MAP, sessions=["a", "b"], k=2, seed=3, progress=lambda *n: steps.append(n)
-    )
+    client = associated.client
+    found = client.compute(Association, MAP, sessions=["a", "b"], k=2, seed=3)
     assert found.state is JobState.SUCCEEDED
     name = found.job_id
     edges = list(client.edges(MAP, name))
     assert found.result.edges == len(edges) > 4
     assert found.result.joins[0].transform is not None
     assert {one.from_frame for one in edges} <= associated.numbers.keys()
-    assert steps[-1] == (3, 3)
     middle = sorted(edge.overlap for edge in edges)[len(edges) // 2]
     strongest = json.loads(client.graph(MAP, name, "json", min_overlap=middle))
     assert len(strongest["edges"]) == len(edges) - len(edges) // 2
     assert client.graph(MAP, name, odometry=True).count("EDGE_SE3:QUAT") > len(edges)
     rows = [line.split() for line in client.graph(MAP, name, "tum").splitlines()]
     assert len([row for row in rows if row[0] != "#"]) == 6
-    # over HTTP
     http, place = client._http, f"/v1/maps/{MAP}/associations/{name}"
-    for kind, media in (
-        ("g2o", "text/x-g2o"), ("tum", "text/plain; charset=utf-8"), ("json", "application/json"),
-    ):  # fmt: skip
-        by_name = http.get(f"{place}/graph", params={"format": kind})
-        by_type = http.get(f"{place}/graph", headers={"Accept": media.partition(";")[0]})
-        assert by_name.headers["Content-Type"].partition(";")[0] == media.partition(";")[0]
-        assert by_name.content == by_type.content
-        assert by_name.text == client.graph(MAP, name, kind)
+    by_type = http.get(f"{place}/graph", headers={"Accept": "text/plain"})
+    assert by_type.text == client.graph(MAP, name, "tum")
     page = http.get(f"{place}/edges", params={"limit": 3, "consistent": "true"}).json()
-    assert [edge["number"] for edge in page["items"]] == [0, 1, 2]
     rest = http.get(f"{place}/edges", params={"cursor": page["next_cursor"]}).json()
-    assert rest["items"][0]["number"] == 3
+    assert [edge["number"] for edge in page["items"] + rest["items"][:1]] == [0, 1, 2, 3]
     for path, more in (("edges", {"min_overlap": 2}), ("graph", {"format": "gtsam"})):
         assert http.get(f"{place}/{path}", params=more).status_code == 422
 
@@ -78,25 +65,18 @@ def test_the_command(associated, service_url, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     newest = next(iter(client.products(Association, MAP)))
     assert lines[0].startswith(f"association {newest.job_id}: {newest.result.edges} edges")
-    assert lines[2].startswith("joined strongly, ann/a onto ann/b: ") or lines[2].startswith(
-        "joined weakly (check it before you rely on it)"
-    )
     assert lines[-1] == f"wrote {out}"
     assert out.read_text() == client.graph(MAP, newest.job_id, odometry=True)
     undo = ["make", "association", MAP, "--url", service_url, "--undo"]
     assert main([*undo, newest.job_id]) == 0
     assert capsys.readouterr().out.splitlines() == lines[:-1]  # it moved no pose
-    assert main([*undo, "0" * 32]) == 2
-    assert "There is no association" in capsys.readouterr().err
-    assert main([*of, "--apart", "2", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["request"]["apart"] == 2
-    assert told["result"]["joins"] == []
-    assert main([*of, "--out", str(tmp_path / "graph.gtsam")]) == 2
-    assert "has an unknown file type" in capsys.readouterr().err
     begun = len(list(client.products(Association, MAP)))
-    assert main([*of, "--out", str(tmp_path / "no" / "graph.g2o")]) == 2  # before it is begun
-    assert "No such file or directory" in capsys.readouterr().err
+    for wrong, message in (
+        ([*undo, "0" * 32], "There is no association"),
+        ([*of, "--out", str(tmp_path / "graph.gtsam")], "has an unknown file type"),
+        ([*of, "--out", str(tmp_path / "no" / "graph.g2o")], "No such file or directory"),
+        ([*of, "--session", "nobody"], "no indexed frame"),
+    ):
+        assert main(wrong) == 2
+        assert message in capsys.readouterr().err
     assert len(list(client.products(Association, MAP))) == begun
-    assert main([*of, "--session", "nobody"]) == 2
-    assert "no indexed frame" in capsys.readouterr().err

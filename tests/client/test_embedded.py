@@ -1,14 +1,11 @@
 """Tests of the service in the client's process: streaming, waiting and shutdown."""
 
-import subprocess
 import sys
-import tempfile
 import threading
 
 import httpx
 import pytest
 
-import sceneprint
 from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client, errors
 from service.embedded import LocalService, embedded_settings
@@ -18,32 +15,9 @@ BINARY = {"Content-Type": "application/octet-stream"}
 
 @pytest.fixture
 def local(tmp_path):
-    """Plain HTTP to a service in this process."""
     transport = LocalService(tmp_path / "local")
     with httpx.Client(base_url="http://here", transport=transport) as http:
         yield http
-
-
-def test_a_body_is_read_in_parts_by_who_asks(local):
-    local.post("/v1/maps", json={"name": "m"}).raise_for_status()
-    threads = set()
-
-    def archive():
-        for _ in range(3):
-            threads.add(threading.current_thread())
-            yield bytes(1 << 20)
-
-    answer = local.post("/v1/maps/m/imports", content=archive(), headers=BINARY)
-    assert (answer.status_code, answer.json()["type"]) == (422, "/problems/unreadable-archive")
-    assert threads == {threading.current_thread()}
-
-    def broken():
-        yield b"PK"
-        raise OSError("the disk is gone")
-
-    with pytest.raises(OSError, match="the disk is gone"):
-        local.post("/v1/maps/m/imports", content=broken(), headers=BINARY)
-    assert local.get("/v1/maps/m").json()["name"] == "m"
 
 
 def test_a_response_streams_until_it_is_closed(local):
@@ -97,40 +71,6 @@ def test_closing_ends_streams_and_threads(tmp_path):
     client.close()  # again: nothing more to do
     with pytest.raises(RuntimeError, match="closed"):
         client.maps()
-
-
-@pytest.mark.thorough
-def test_a_program_that_closes_nothing_ends(tmp_path):
-    code = (
-        "from sceneprint_client import Client\n"
-        f"client = Client.embedded({str(tmp_path)!r})\n"
-        "print(client.create_map('m').name)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "m\n", "")
-
-
-def test_a_temporary_folder_with_a_long_name(tmp_path, monkeypatch):
-    """The address of a socket has at most 107 bytes."""
-    folder = tmp_path / ("long" * 25)
-    folder.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    with Client.embedded(tmp_path / "data") as client:
-        assert client.create_map("m").name == "m"
-
-
-def test_a_folder_that_cannot_be_opened(tmp_path):
-    (tmp_path / "file").write_text("no folder")
-    before = threading.active_count()
-    with pytest.raises(errors.UnusableStore):
-        sceneprint.Client.embedded(tmp_path / "file")
-    assert threading.active_count() <= before + 1
 
 
 def test_without_the_package_of_the_service(tmp_path, monkeypatch):

@@ -5,9 +5,7 @@ import os
 import numpy as np
 import pytest
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint_client.api import FrameMeta
-from sceneprint_client.errors import InvalidRequest
 from sceneprint_client.frame_files import file_name, meta_of, sendable, seven_scenes_number
 
 
@@ -53,29 +51,3 @@ def test_a_frame_is_sent_with_its_name_and_a_query_without(references, tmp_path)
     alone = tmp_path / "alone.npy"
     np.save(alone, depth)
     assert labels(alone, meta.intrinsics) == ("alone.npy", None)
-
-
-def test_names_come_back_in_matches_and_are_searched(client, references, map_name):
-    client.create_map(map_name)
-    for one in reversed(references[:3]):
-        client.upload(map_name, one, wait_s=PATIENCE_S)
-    names = [f"frame-00000{i}.depth.png" for i in range(3)]
-    assert [one.name for one in client.frames(map_name)] == names[::-1]
-    taken = client.frames(map_name, session="seq-01", order="taken")
-    session = next(client.frames(map_name)).session
-    assert [one.sequence for one in client.frames(map_name, session=session, order="taken")] \
-        == [0, 1, 2]  # fmt: skip
-    assert [one.name for one in client.frames(map_name, name="frame-000001")] == names[1:2]
-    assert [one.name for one in client.frames(map_name, name="frame-", order="desc")] == names
-    assert list(client.frames(map_name, name="000001")) == []  # the beginning alone
-    assert list(taken) == []
-    with pytest.raises(InvalidRequest, match="`taken` requires exactly one `session`"):
-        client.frames(map_name, order="taken")
-    answer = client.query(map_name, references[1], explain=True)
-    first = next(one for one in answer.matches if one.rank == 1)
-    assert (first.name, first.sequence) == (names[1], 1)
-    assert {one.name for one in answer.explanations} == set(names)
-    details = client.match_details(answer.query_id, first.frame_id)
-    assert (details.name, details.sequence) == (names[1], 1)
-    path = client.trajectory(map_name, str(session))
-    assert (path.stamps, [row[0] for row in path.poses]) == ("sequence", [0.0, 1.0, 2.0])

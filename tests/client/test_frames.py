@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 import sceneprint
-from benchmarks.waiting import PATIENCE_S
 from sceneprint import errors
 from sceneprint.formats.dataset import FrameReference
 from sceneprint_client import Client, meta_of
-from sceneprint_client.api import FrameState, JobState
 from sceneprint_client.frame_files import sendable
 
 
@@ -51,24 +49,19 @@ def test_a_path_is_sent_with_the_camera_beside_it(references, tmp_path):
 
 def test_up_is_sent_as_given_or_as_beside_the_frame(references, tmp_path):
     assert meta_of(references[0]).up is None
-    told = meta_of(references[0], up=(0, -1, 0)).up
-    assert told.unit == [0.0, -1.0, 0.0]
-    for name in (references[0].path.name, "intrinsics.json"):
-        source = references[0].path.with_name(name)
-        shutil.copy(source if source.is_file() else source.parents[1] / name, tmp_path / name)
-    beside = json.loads((tmp_path / "intrinsics.json").read_text())
-    (tmp_path / "intrinsics.json").write_text(json.dumps(beside | {"up": [0.6, -0.8, 0]}))
+    assert meta_of(references[0], up=(0, -1, 0)).up.unit == [0.0, -1.0, 0.0]
     path = tmp_path / references[0].path.name
+    shutil.copy(references[0].path, path)
+    beside = json.loads((references[0].path.parents[1] / "intrinsics.json").read_text())
+    (tmp_path / "intrinsics.json").write_text(json.dumps(beside | {"up": [0.6, -0.8, 0]}))
     for up, expected in ((None, [0.6, -0.8, 0.0]), ([0, 0, 1], [0.0, 0.0, 1.0])):
         _, meta = sendable(path, None, with_pose=False, up=up)
         assert meta.up.unit == pytest.approx(expected)
-    _, bare = sendable(path, None, with_pose=False)
-    data, other = sendable(path.read_bytes(), bare, with_pose=False, up=[1, 0, 0])
-    assert other == bare.model_copy(update={"up": other.up})
-    assert other.up.x == 1.0
+    data, known = path.read_bytes(), meta
+    assert sendable(data, known, with_pose=False, up=[1, 0, 0])[1].up.x == 1.0
     for wrong in ([0, 0, 2], [0, 1], []):
         with pytest.raises(errors.InvalidRequest, match="The up vector"):
-            sendable(data, bare, with_pose=False, up=wrong)
+            sendable(data, known, with_pose=False, up=wrong)
 
 
 def test_a_query_needs_no_pose(embedded, references, tmp_path):
@@ -81,22 +74,6 @@ def test_a_query_needs_no_pose(embedded, references, tmp_path):
     assert (answer.status, answer.matches, answer.counts.map) == ("not_found", [], 0)
     with pytest.raises(errors.InvalidPose, match=r"frame-000000\.pose\.txt"):
         embedded.upload("m", path)
-
-
-def test_a_stopped_job_waits_for_the_next_worker(embedded, references, monkeypatch):
-    def stopped(*_):
-        raise KeyboardInterrupt
-
-    embedded.create_map("m")
-    with monkeypatch.context() as patch:
-        patch.setattr("sceneprint.engine.jobs.signature_job.prepare", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            embedded.upload("m", references[0], wait_s=PATIENCE_S)
-    (frame,) = embedded.frames("m")
-    job = embedded.job(frame.job_id)
-    assert (frame.state, job.state, job.attempts) == (FrameState.RECEIVED, JobState.QUEUED, 0)
-    (job,) = embedded.wait([job.job_id], timeout_s=PATIENCE_S)  # at once: no lease has to run out
-    assert (job.state, job.attempts) == (JobState.SUCCEEDED, 1)
 
 
 def test_a_folder_is_all_there_is(tmp_path, monkeypatch):

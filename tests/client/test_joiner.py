@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprint_client.joiner import MOST_SCANS, Joiner, window_start
-from sceneprint_client.poses import SensorTrajectory, interpolate, rotation_of
+from sceneprint_client.poses import rotation_of
 from sceneprint_client.transforms import TransformTree
 
 SECOND = 1_000_000_000
@@ -20,8 +20,6 @@ def pose(x, y=0.0, yaw=0.0):
 
 
 def along_x(metres_per_second, *, yaw=0.0):
-    """A joiner for a sensor that moves along x and turns at constant rates."""
-
     def odometry(stamps_ns):
         return [pose(metres_per_second * ns / SECOND, 0.0, yaw * ns / SECOND) for ns in stamps_ns]
 
@@ -47,36 +45,6 @@ def test_a_quarter_turn_by_hand():
     angle = np.radians(9)
     expected = [[10 * np.cos(angle), 10 * np.sin(angle), 0]]
     np.testing.assert_allclose(joiner.cloud(), expected, atol=1e-5)
-
-
-def test_every_point_is_where_its_own_pose_puts_it():
-    """Odometry of 20 Hz along a bend, and an oracle that interpolates the pose of each point."""
-    rng = np.random.default_rng(3)
-    tree, rows, stamps = TransformTree(), [], np.arange(0, 1.0, 0.05)
-    for t in stamps:
-        yaw = 1.5 * t + 0.4 * t * t
-        row = [3 * np.cos(t), 3 * np.sin(t), 0.2 * t, 0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]
-        tree.add("odom", "lidar", SECOND + round(t * SECOND), row, fixed=False)
-        rows.append(row)
-    table = np.array(rows)
-    trajectory = SensorTrajectory(stamps, table[:, :3], table[:, 3:])
-    joiner = Joiner(partial(tree.poses, "odom", "lidar"), voxel_m=1e-4)
-    expected = []
-    for start in (0.31, 0.41):
-        points, seconds = rng.uniform(-20, 20, (500, 3)), rng.uniform(0, 0.1, 500)
-        assert joiner.add(SECOND + round(start * SECOND), points, seconds)
-        poses = interpolate(trajectory, (start + seconds).tolist())
-        expected += [
-            T[:3, :3] @ p + T[:3, 3] for T, p in zip(poses, points, strict=True) if T is not None
-        ]
-    assert len(expected) == 1000
-    (newest,) = interpolate(trajectory, [0.41])
-    assert newest is not None
-    back = np.linalg.inv(newest)
-    moved = np.array(expected) @ back[:3, :3].T + back[:3, 3]
-    found = joiner.cloud()
-    # the joiner takes line segments of 2 ms, and kinks of the odometry lie within segments
-    np.testing.assert_allclose(found, np.vstack([moved[500:], moved[:500]]), atol=2e-3)
 
 
 def test_scans_of_the_last_metres_are_joined_and_thinned():

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from datetime import UTC, datetime
 
 import httpx
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import Conflict, InvalidRequest, UnknownMap, Unreachable
+from sceneprint.errors import Conflict, InvalidRequest, UnknownMap
 from sceneprint.models import PRESETS, read_model
 from sceneprint_client import Client
 from sceneprint_client.api.admin import Event
@@ -28,60 +27,16 @@ def test_events_that_are_kept(client, map_name, references):
         ("frame.indexed", added.frame_id),
         ("frame.deleted", added.frame_id),
     ]
-    assert len({one.id for one in found}) == 4
-    assert {one.map for one in found} == {map_name}
     page = client.event_page(map_name, kinds=["frame."], limit=2)
     assert page.items == found[:1:-1]
     rest = client.event_page(map_name, kinds=["frame."], limit=2, cursor=page.next_cursor)
     assert (rest.items, rest.next_cursor) == (found[1:2], None)
-    assert client.event_page(map_name).newest == found[-1].id
-    assert list(client.events(map_name, after="0", follow=False)) == found
     assert list(client.events(map_name, after=found[2].id, follow=False)) == found[3:]
-    with pytest.raises(InvalidRequest, match="is not valid"):
-        client.event_page(cursor="none")
     for follow in (False, True):
         with pytest.raises(InvalidRequest, match="Start again"):
             next(client.events(after="none", follow=follow))
         with pytest.raises(UnknownMap):
             next(client.events("nowhere", follow=follow))
-
-
-def test_events_as_they_happen(client, map_name):
-    before = client.event_page().newest
-    client.create_map(map_name, model="depth")
-    (made,) = client.events(map_name, follow=False)
-    names = [f"{map_name[:18]}{i}" for i in range(3)]
-
-    def write():
-        for name in names:
-            client.create_map(name, model="depth")
-
-    stream = client.events(kinds=["map.created"], after=before)
-    assert next(stream) == made
-    writer = threading.Thread(target=write)
-    writer.start()
-    found = list(itertools.islice((one for one in stream if one.map in names), 3))
-    writer.join()
-    assert [one.map for one in found] == names
-    stream.close()
-
-
-def test_figures(client, map_name, references):
-    client.create_map(map_name, model="depth")
-    client.upload(map_name, references[0], wait_s=PATIENCE_S)
-    own = client.stats(map_name, minutes=2)
-    assert (own.map, own.maps, own.frames, own.jobs) == (
-        map_name, 1, {"indexed": 1}, {"succeeded": 1}
-    )  # fmt: skip
-    assert (own.total.received, own.total.indexed, own.waiting) == (1, 1, 0)
-    assert own.oldest_waiting_s == {}
-    assert len(own.minutes) == 2
-    every = client.stats(minutes=1)
-    assert every.maps == len(client.maps())
-    assert every.frames["indexed"] >= 1
-    assert every.bytes.blobs > 0
-    with pytest.raises(UnknownMap):
-        client.stats("nowhere")
 
 
 def test_models_and_reencoding(embedded, map_name):
@@ -97,13 +52,7 @@ def test_models_and_reencoding(embedded, map_name):
     assert told.reencoding.model_id == read_model("paper").id
     with pytest.raises(Conflict):
         client.reencode(map_name, depth.model_id)
-    with pytest.raises(InvalidRequest):
-        client.reencode(map_name, "small")
     assert client.cancel_reencoding(map_name) == made
-    with pytest.raises(Conflict):
-        client.cancel_reencoding(map_name)
-    with pytest.raises(UnknownMap):
-        client.cancel_reencoding("nowhere")
 
 
 EVENT = Event(
@@ -136,8 +85,6 @@ STREAMS = [
 
 
 class Stream:
-    """A network whose answers are those of a stream."""
-
     def __init__(self):
         self.after: list[str | None] = []
 
@@ -156,8 +103,3 @@ def test_a_broken_stream_continues_where_it_broke():
     with client:
         assert list(itertools.islice(client.events(), 3)) == [EVENT] * 3
     assert stream.after == [None, "5", "5", "8"]
-
-
-def test_where_no_service_is_that_is_said_at_once():
-    with Client("http://127.0.0.1:9") as client, pytest.raises(Unreachable):
-        next(client.events())

@@ -12,13 +12,10 @@ from typing import get_args
 
 import pytest
 
-import sceneprint
 import sceneprint_client
-from sceneprint import errors as our_errors
 from sceneprint.geometry.retrieval.ranking import DiversityParameters, Metric
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters, Mode
 from sceneprint.models import PRESETS
-from sceneprint_client import errors
 from sceneprint_client.api import Diversity, ValidationOptions
 from sceneprint_client.api import maps as map_records
 from sceneprint_client.api.admin import ModelInfo
@@ -43,17 +40,6 @@ def test_a_robot_loads_the_client_alone():
     assert (heavy | {"numpy"}) & client == set()
     assert {"httpx", "pydantic"} <= client
     assert heavy & frames == set()
-
-
-def test_the_same_classes_go_by_both_names():
-    assert sceneprint.Client is sceneprint_client.Client
-    for name in our_errors.__all__:
-        assert getattr(our_errors, name) is vars(errors).get(name, vars(our_errors)[name])
-    there = {name for name, one in vars(errors).items() if isinstance(one, type)}
-    assert there - {"Iterator"} <= set(our_errors.__all__)
-    with pytest.raises(AttributeError, match="has no attribute 'Server'"):
-        sceneprint_client.Server  # noqa: B018
-    assert set(dir(sceneprint_client)) == set(sceneprint_client.__all__)
 
 
 def test_the_records_say_what_the_service_does():

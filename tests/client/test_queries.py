@@ -3,8 +3,8 @@
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame, UnknownMap, UnknownQuery
-from sceneprint_client.api import Answer, NamedFrame, ValidationOptions
+from sceneprint.errors import UnknownFrame, UnknownMap, UnknownQuery
+from sceneprint_client.api import NamedFrame, ValidationOptions
 
 STAGES = (("retrieve",), ("retrieve", "diversify", "validate"))
 
@@ -42,23 +42,12 @@ def test_answers_are_equal(remote, embedded, map_name, references, filled):
     for stages in STAGES:
         how = {"stages": stages, "k": 2, "seed": 7, "exact": True}
         over_http, told = ask(remote, filled[0], frame=references[1], **how)
-        in_process, same = ask(embedded, filled[1], frame=references[1], **how)
+        _, same = ask(embedded, filled[1], frame=references[1], **how)
         assert told == same
-        assert type(over_http) is type(in_process) is Answer
-        assert over_http.milliseconds.keys() == in_process.milliseconds.keys()
         assert (over_http.seed, over_http.exact, over_http.counts.map) == (7, True, 3)
         assert over_http.matches[0].distance == 0  # the frame itself is in the map
         assert filled[0][over_http.matches[0].frame_id] == 1
-    assert over_http.status == "found"
     assert over_http.location.pose.parent_frame == "room-0/seq-01"
-    by_id = {
-        client: {n: i for i, n in ids.items()}
-        for client, ids in zip((remote, embedded), filled, strict=True)
-    }
-    stored, told = ask(remote, filled[0], frame_id=by_id[remote][2])
-    _, same = ask(embedded, filled[1], frame_id=by_id[embedded][2])
-    assert told == same
-    assert by_id[remote][2] not in [match.frame_id for match in stored.matches]
     remote.delete_map(map_name)
 
 
@@ -74,39 +63,24 @@ def test_all_ways_of_asking(client, map_name, references):
         "validation": ValidationOptions(strong=1.0), "explain": True, "keep": False,
         "filter": {"exclude_frames": [ids[4]]}, "stages": "retrieve,diversify,validate",
     }  # fmt: skip
-    explained = client.query(map_name, references[1], **options)
-    assert len(explained.explanations) == 5
-    asked = client.query(map_name, frame_id=ids[0], explain_frame=ids[4], deadline_ms=600_000)
-    assert asked.explained_frame.frame_id == ids[4]
+    assert len(client.query(map_name, references[1], **options).explanations) == 5
     several = client.query(maps=[map_name, other], frame=references[1], **options)
     assert several.maps == [map_name, other]
     stored = client.query(map_name, frame_id=ids[1], maps=f"{other},{map_name}")
-    assert stored.status == "found"
     assert (stored.matches[0].map, stored.matches[0].distance) == (other, 0)
     found = client.localize(map_name, references[0], seed=2, robot="spot")
     assert (found.pose.parent_frame, found.seed) == ("room-0/seq-01", 2)
-    placed = client.localize(map_name, frame_id=ids[3], robot="cart")
-    assert placed.map == map_name
     named = client.similarity((map_name, ids[0]), (other, added), seed=1)
     sent = client.similarity(NamedFrame(map=other, frame_id=added), references[0])
     assert sent.distance == named.distance > 0
     bare = client.similarity(references[0], references[1], validate=False, model="depth")
     assert bare.validation is None
     # each query left a record, the newest first; the comparisons left none
-    came = list(client.queries(map_name))
-    assert [one.query_id for one in came[:2]] == [placed.query_id, found.query_id]
+    assert next(client.queries(map_name)).query_id == found.query_id
     assert next(client.queries(other)).query_id == stored.query_id  # where its match is
-    assert {one.query_id for one in came} <= {one.query_id for one in client.queries()}
     (spot,) = client.queries(map_name, robot="spot", status=["found", "failed"])
     assert (spot.query_id, spot.session, spot.key) == (found.query_id, "room-0/seq-01", None)
-    assert spot.pose.translation == found.pose.translation
-    (cart,) = client.queries(robot="cart", since=spot.at)
-    assert cart.frame.frame_id == ids[3]
     assert list(client.queries(map_name, robot="spot", until=spot.at)) == []
-    with pytest.raises(InvalidRequest, match="status"):
-        next(client.queries(map_name, status="lost"))
-    with pytest.raises(UnknownMap):
-        next(client.queries("nowhere"))
     client.delete_queries(map_name)
     assert list(client.queries(map_name)) == []
 
@@ -138,12 +112,7 @@ def test_what_an_answer_rests_on(client, map_name, references):
     overlay = client.overlay(answer.query_id, best, color="residual")
     assert f"comment frame {best}.optical\n".encode() in overlay
     assert client.query_cloud(answer.query_id).startswith(b"ply\n")
-    alike = client.similarities(answer.query_id).similarity
-    assert [len(row) for row in alike] == [3, 3, 3]
-    assert alike[0][1] == 1.0  # the query is the frame
-    bare = client.query(map_name, references[1], stages=("retrieve",))
-    with pytest.raises(NotIndexed):
-        client.query_cloud(bare.query_id)
+    assert client.similarities(answer.query_id).similarity[0][1] == 1.0  # the query is the frame
     for call in (client.answer, client.query_cloud, client.similarities):
         for wrong in ("0" * 32, "..", "", "a/b"):
             with pytest.raises(UnknownQuery):

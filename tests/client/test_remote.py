@@ -5,15 +5,11 @@ import socket
 import time
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
-from importlib.util import find_spec
-from io import BytesIO
 
 import pytest
 
 from sceneprint import errors as our_errors
 from sceneprint_client import Client, errors, http, meta_of
-from sceneprint_client.api.base import is_loopback
-from sceneprint_client.api.frames import ImportOptions
 from sceneprint_client.http import retry_after_s
 from service.problems import type_of
 
@@ -104,11 +100,7 @@ def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted):
 
 @pytest.mark.parametrize(
     ("kind", "status", "error"),
-    [
-        ("damaged-blob", 500, errors.DamagedBlob),
-        ("method-not-allowed", 405, errors.Refused),
-        ("of-the-future", 400, errors.Refused),
-    ],
+    [("damaged-blob", 500, errors.DamagedBlob), ("of-the-future", 400, errors.Refused)],
 )
 def test_problems_become_errors(scripted, kind, status, error):
     server = scripted([problem(kind, status)])
@@ -136,15 +128,6 @@ def test_another_kind_of_server(scripted):
             client.map("m")
         with Client(server.url) as client:
             assert not client.healthy()
-
-
-def test_a_head_that_is_too_long(scripted):
-    server = scripted([(400, {}, "Invalid HTTP request received.")])
-    options = ImportOptions(tags=["地" * 121] * 16)
-    with Client(server.url) as client, pytest.raises(errors.Refused, match="fewer or shorter tags"):
-        client.import_archive("m", BytesIO(b"PK"), options)
-    with Client(server.url) as client, pytest.raises(errors.Refused, match="Check the address"):
-        client.map("m")
 
 
 def test_pages_are_followed(scripted):
@@ -231,13 +214,6 @@ def test_a_key_is_sent_without_the_newline_of_its_file(scripted):
     assert [headers["Authorization"] for headers in server.headers] == ["Bearer secret"]
 
 
-@pytest.mark.skipif(find_spec("socksio") is not None, reason="SOCKS proxies work here")
-def test_a_socks_proxy_needs_its_package(monkeypatch):
-    monkeypatch.setenv("ALL_PROXY", "socks5://127.0.0.1:9")
-    with pytest.raises(errors.MissingDependency, match=r"httpx\[socks\]"):
-        Client("http://maps.example")
-
-
 def test_too_large_a_body_is_refused_by_the_service(remote, map_name, references):
     remote.create_map(map_name)
     with pytest.raises(errors.TooLarge, match="the limit of 2097152 bytes"):
@@ -288,13 +264,5 @@ def test_no_proxy_stands_before_this_machine(monkeypatch, host, proxied):
     monkeypatch.delenv("NO_PROXY", raising=False)
     monkeypatch.delenv("no_proxy", raising=False)
     monkeypatch.setenv("http_proxy", "http://192.0.2.7:3128")
-    asked = []
-
-    def noted(given):
-        asked.append(given)
-        return is_loopback(given)
-
-    monkeypatch.setattr("sceneprint_client.http.is_loopback", noted)
     with Client(f"http://{host}:8008") as client:
-        mounts = client._http._mounts
-    assert (len(mounts) > 0, asked) == (proxied, [host.strip("[]").lower()])
+        assert bool(client._http._mounts) == proxied

@@ -3,7 +3,7 @@
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import InvalidRequest, UnknownDeletion, UnknownFrame, UnknownQuery
+from sceneprint.errors import InvalidRequest, UnknownDeletion
 
 
 def test_frames_are_deleted_edited_and_restored(client, map_name, references):
@@ -13,8 +13,6 @@ def test_frames_are_deleted_edited_and_restored(client, map_name, references):
     before = {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)}
     assert before == dict.fromkeys(ids, ("monday", ["door"]))
     assert [one.frame_id for one in client.frames(map_name, find=ids[1])] == ids[1:2]
-    assert len(list(client.frames(map_name, find="mon"))) == 3
-
     count, inverse = client.edit_frames(
         map_name, filter={"session": ["monday"]}, session=None, remove_tags=["door"]
     )
@@ -22,8 +20,6 @@ def test_frames_are_deleted_edited_and_restored(client, map_name, references):
     assert [(one.session, one.tags) for one in client.frames(map_name)] == [(None, [])] * 3
     for one in inverse:
         client.edit_frames(map_name, **one)
-    assert {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)} == before
-
     count, (deletion,) = client.delete_frames(map_name, filter={"tag": ["door"]})
     assert (count, deletion.frames) == (3, 3)
     assert list(client.deletions(map_name)) == [deletion]
@@ -34,10 +30,6 @@ def test_frames_are_deleted_edited_and_restored(client, map_name, references):
     assert {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)} == before
     with pytest.raises(UnknownDeletion):
         client.restore_deletion(map_name, deletion.deletion_id)
-    client.delete_frame(map_name, ids[0])
-    assert client.restore_frame(map_name, ids[0]).tags == ["door"]
-    with pytest.raises(UnknownFrame):
-        client.restore_frame(map_name, ids[0])
     with pytest.raises(InvalidRequest, match="`filter` has no condition"):
         client.delete_frames(map_name, filter={})
 
@@ -46,16 +38,11 @@ def test_an_answer_is_kept_and_released(client, map_name, references):
     client.create_map(map_name)
     added = client.upload(map_name, references[0], wait_s=PATIENCE_S)
     answer = client.query(map_name, frame_id=added.frame_id, robot="cart")
-    (record,) = client.queries(map_name)
     told = client.stored_query(answer.query_id)
     assert (told.kept_at, told.title, told.model) == (None, None, answer.model)
-    assert told.expires_at is not None
     kept = client.keep_answer(answer.query_id, "by the door")
     assert (kept.title, kept.expires_at) == ("by the door", None)
     (listed,) = client.queries(map_name, kept=True)
-    assert (listed.query_id, listed.robot, listed.at) == (answer.query_id, "cart", record.at)
-    assert (listed.title, listed.kept_at) == ("by the door", kept.kept_at)
+    assert (listed.query_id, listed.robot, listed.title) == (answer.query_id, "cart", "by the door")
     client.release_answer(answer.query_id)
     assert list(client.queries(map_name, kept=True)) == []
-    with pytest.raises(UnknownQuery):
-        client.release_answer(answer.query_id)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.waiting import until
 from sceneprint.errors import InvalidRequest, NotFound, UnknownMap
 from sceneprint_client.api import JobState
 from sceneprint_client.api.surface import SurfaceTile
@@ -20,7 +19,6 @@ PATH = f"/v1/maps/{MAP}/surface"
 
 @pytest.fixture(scope="module")
 def fused(produced, walk):
-    """A client of a map with four posed frames and their surface, and of one without poses."""
     produced.create_map(PLAIN, model="depth")
     [(data, meta)] = walk(1)
     plain = produced.upload(PLAIN, data, meta.model_copy(update={"pose": None}))
@@ -38,29 +36,23 @@ def test_tiles_and_the_frames_that_saw_them(fused):
     assert (told.state, told.frames, told.sessions) == ("ready", 4, ["a", "b"])
     assert fused.begin_surface(MAP) == told  # there is nothing to do
     (parent,) = told.parents
-    assert (parent.parent_frame, parent.frames) == ("room", 4)
     cells, sessions = 0, set()
     for level in parent.levels:
         tiles = list(fused.surface_tiles(MAP, "room", level.level))
         assert (len(tiles), sum(one.bytes for one in tiles)) == (level.tiles, level.bytes)
         for tile in tiles:
             found = decode_tile(fused.surface_tile(MAP, tile.digest), tile, level.tile_m)
-            assert (np.floor(found.points / level.tile_m)
-                    == [tile.column, tile.row, tile.floor]).all()  # fmt: skip
+            place = [tile.column, tile.row, tile.floor]
+            assert (np.floor(found.points / level.tile_m) == place).all()
             sessions.update(found.sessions.tolist())
             cells += len(found.points)
     assert cells == sum(level.cells for level in parent.levels)
     assert sessions == {0, 1}
     spot = found.points[0].tolist()  # of the coarsest level: near what was seen
-    seen = list(fused.surface_frames(MAP, spot, radius=1.0))
-    assert seen
-    distances = [one.distance_m for one in seen]
-    assert distances == sorted(distances, key=float)
+    assert list(fused.surface_frames(MAP, spot, radius=1.0))
     every = [-100.0, -100.0, -100.0, 100.0, 100.0, 100.0]
     boxed = list(fused.surface_frames(MAP, box=every, parent="room"))
     assert {one.frame_id for one in boxed} == {one.frame_id for one in fused.frames(MAP)}
-    assert {one.robot for one in boxed} == {"ann"}
-    assert list(fused.surface_frames(MAP, spot, parent="elsewhere")) == []
 
 
 def test_what_a_surface_refuses(fused):
@@ -70,14 +62,9 @@ def test_what_a_surface_refuses(fused):
     with pytest.raises(InvalidRequest):
         fused.begin_surface(PLAIN)
     assert (fused.surface(PLAIN).state, fused.surface(PLAIN).frames_left) == ("none", 0)
-    with pytest.raises(NotFound, match=r"There is no tile '\.\./x'"):
-        fused.surface_tile(MAP, "../x")
-    with pytest.raises(NotFound):
-        fused.surface_tile(MAP, "0" * 32)
-    with pytest.raises(NotFound):
-        fused.surface_plan(MAP, "elsewhere")
-    with pytest.raises(InvalidRequest, match="width"):
-        fused.surface_plan(MAP, width=5000)
+    for name in ("../x", "0" * 32):
+        with pytest.raises(NotFound):
+            fused.surface_tile(MAP, name)
     with pytest.raises(InvalidRequest, match="Specify either `at` or `box`"):
         list(fused.surface_frames(MAP))
     tile = SurfaceTile(column=0, row=0, floor=0, cells=2, bytes=16, digest="x")
@@ -90,34 +77,15 @@ def test_a_tile_is_kept_for_ever_and_a_plan_asked_for_again(fused, service_url):
     with httpx.Client(base_url=service_url) as http:
         first = http.get(f"{PATH}/tiles/{tile.digest}")
         assert first.headers["cache-control"] == "private, max-age=31536000, immutable"
-        assert len(first.content) == tile.bytes
         plan = http.get(f"{PATH}/plan.png")
         assert plan.headers["cache-control"] == "private, no-cache"
         for path, known in ((f"tiles/{tile.digest}", first), ("plan.png", plan)):
             again = {"If-None-Match": known.headers["etag"]}
             assert http.get(f"{PATH}/{path}", headers=again).status_code == 304
-        assert http.get(f"{PATH}/plan.png?high=0").headers["etag"] != plan.headers["etag"]
-        for query in ("at=1,2", "at=1,2,nan", "at=1,2,1e300", "at=a,b,c", "box=1,2,3",
-                      "at=1,2,3&box=1,2,3,4,5,6", "at=1,2,3&radius=9", "at=1,2,3&cursor=x",
-                      "box=1,2,3,4,5,6&cursor=x"):  # fmt: skip
-            refused = http.get(f"{PATH}/frames?{query}")
-            assert refused.status_code == 422, query
-            assert refused.json()["type"] == "/problems/invalid-request"
+        for query in ("at=1,2", "at=1,2,nan", "at=1,2,1e300", "box=1,2,3",
+                      "at=1,2,3&box=1,2,3,4,5,6", "at=1,2,3&radius=9",
+                      "at=1,2,3&cursor=x"):  # fmt: skip
+            assert http.get(f"{PATH}/frames?{query}").status_code == 422, query
     image = Image.open(io.BytesIO(plan.content))
     (parent,) = fused.surface(MAP).parents
     assert (image.mode, image.size) == ("RGBA", (parent.plan.width, parent.plan.height))
-
-
-def test_a_deleted_surface_comes_back_when_asked_for(fused):
-    before = fused.surface(MAP)
-    tile = next(fused.surface_tiles(MAP))
-    fused.delete_surface(MAP)
-    told = fused.surface(MAP)
-    assert (told.state, told.frames, told.parents, told.job_id) == ("none", 0, [], None)
-    with pytest.raises(NotFound):
-        fused.surface_tile(MAP, tile.digest)
-    assert list(fused.surface_tiles(MAP)) == []
-    fused.begin_surface(MAP)
-    again = until(lambda: (one := fused.surface(MAP)).state == "ready" and one)
-    assert again.parents == before.parents
-    assert next(fused.surface_tiles(MAP)) == tile

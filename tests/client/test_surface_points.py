@@ -5,7 +5,6 @@ import struct
 import numpy as np
 import pytest
 
-from benchmarks.waiting import PATIENCE_S
 from sceneprint.errors import Refused
 from sceneprint.formats.export import encode_points
 from sceneprint_client.surface_encoding import decode_points
@@ -52,20 +51,3 @@ def test_bytes_that_are_no_points_are_refused():
     ):
         with pytest.raises(Refused, match=why):
             decode_points(bad)
-
-
-def test_points_of_frames_and_queries(client, map_name, references):
-    client.create_map(map_name)
-    frame_id = client.upload(map_name, references[0], wait_s=PATIENCE_S).frame_id
-    cloud = client.cloud(map_name, frame_id).partition(b"end_header\n")[2]
-    exact = np.frombuffer(cloud, "<f4").reshape(-1, 6)[:, :3]
-    told = client.frame_points(map_name, frame_id)
-    assert told.total == len(told.points) == len(exact)
-    np.testing.assert_allclose(told.points, exact, atol=1e-4)
-    T = references[0].pose
-    some = client.frame_points(map_name, frame_id, "parent", limit=50)
-    assert (some.points.shape, some.total) == ((50, 3), told.total)
-    back = (some.points - T[:3, 3]) @ T[:3, :3]
-    assert all(np.linalg.norm(told.points - one, axis=1).min() < 2e-4 for one in back)
-    answer = client.query(map_name, references[0])
-    np.testing.assert_array_equal(client.query_points(answer.query_id).points, told.points)

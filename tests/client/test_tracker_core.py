@@ -276,43 +276,6 @@ def test_stamps_that_do_not_rise_are_refused():
     assert core.update(0.5, at(7), found(at(10, 27, 0, 90))).status == "tracking"
 
 
-def walk():
-    rng = np.random.default_rng(3)
-    calls = []
-    for i in range(40):
-        x = 0.3 * i
-        where = at(10 + rng.normal(0, 0.02), 20 + x, 0, 90 + rng.normal(0, 0.5))
-        kind = rng.integers(5)
-        answer = [
-            found(where), found(where, strong=False), several(where, at(40, x)), NOTHING,
-            found(at(*rng.uniform(0, 99, 2))),
-        ][kind]  # fmt: skip
-        calls.append((float(i), at(x), answer))
-    return calls
-
-
-def test_equal_calls_give_equal_states_and_the_order_of_alternatives_none():
-    one, other, turned = TrackerCore(), TrackerCore(), TrackerCore()
-    statuses = set()
-    for stamp, odometry, answer in walk():
-        a, b = one.update(stamp, odometry, answer), other.update(stamp, odometry, answer)
-        back = Observation(
-            answer.status, answer.poses[::-1], answer.strong, answer.by_prior, answer.reason
-        )
-        c = turned.update(stamp, odometry, back)
-        statuses.add(a.status)
-        for same in (b, c):
-            assert (a.status, a.reason, a.age, a.parent_frame) == (
-                same.status, same.reason, same.age, same.parent_frame,
-            )  # fmt: skip
-            if a.T_map_odom is None:
-                assert same.T_map_odom is None
-            else:
-                np.testing.assert_array_equal(a.T_map_odom, same.T_map_odom)
-                np.testing.assert_array_equal(a.covariance, same.covariance)
-    assert "tracking" in statuses
-
-
 def test_a_long_run_forgets_votes():
     core = TrackerCore(TrackerParameters(most_votes=4))
     for i in range(20):
