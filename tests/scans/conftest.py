@@ -72,25 +72,14 @@ def pcd():
 
 
 def lzf_of(data):
-    """Return data compressed with the longest repetition at each byte."""
+    """Return data as literals of LZF, and each repetition of a byte as a reference."""
     out, i = bytearray(), 0
     while i < len(data):
-        best, back = 0, 0
-        for distance in range(1, min(i, 40) + 1):
-            n = 0
-            while n < 264 and i + n < len(data) and data[i + n] == data[i + n - distance]:
-                n += 1
-            if n > best:
-                best, back = n, distance - 1
-        if best < 3:
-            out += bytes([0, data[i]])
-            i += 1
-        elif best < 9:
-            out += bytes([(best - 2) << 5 | back >> 8, back & 255])
-            i += best
-        else:
-            out += bytes([7 << 5 | back >> 8, best - 9, back & 255])
-            i += best
+        same = len(data[i : i + 9]) - len(data[i : i + 9].lstrip(data[i : i + 1]))
+        out += bytes([0, data[i]])
+        if same > 3:  # the byte, and a reference to it of 3 to 8 bytes
+            out += bytes([(same - 3) << 5, 0])
+        i += same if same > 3 else 1
     return bytes(out)
 
 
@@ -118,11 +107,6 @@ def serialize(ros):
         return bytes(writer.types.serialize_cdr(writer.last(), NAME, little_endian=little))
 
     return made
-
-
-@pytest.fixture(scope="session")
-def lzf():
-    return lzf_of
 
 
 @pytest.fixture(scope="session")
