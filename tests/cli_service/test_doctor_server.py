@@ -5,26 +5,14 @@ from pathlib import Path
 import pytest
 from pydantic import SecretStr
 
-from sceneprint.cli.checks import Check, store_check
 from sceneprint.cli.doctor import database, object_stores, server
 from sceneprint.settings import Settings
-from tests.whole_engine import Engine
 
 
 def found_in(url, **other):
     settings = Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url), **other)
     found = [database(settings), *server(settings), *object_stores(settings)]
     return {one.subject: one for one in found}
-
-
-def test_a_service_does_not_take_the_server_for_a_file(postgres_url, tmp_path):
-    settings = Settings(data_dir=tmp_path, database_url=SecretStr(postgres_url))
-    with Engine(settings) as engine:
-        stats = engine.statistics.collect(1)
-    assert stats.bytes.database is not None
-    size = f"{stats.bytes.database / 1e6:.1f}"
-    text = f"database of {size} MB, blobs of 0.0 MB, indexes of 0.0 MB"
-    assert store_check(stats) == Check("ok", "store", text)
 
 
 @pytest.mark.parametrize(

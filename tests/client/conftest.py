@@ -18,9 +18,36 @@ from sceneprint.formats.dataset import (
     write_intrinsics,
 )
 from sceneprint_client import Client, http
-from sceneprint_client.api import FrameMeta, JobState
+from sceneprint_client.api import FrameMeta, JobState, Localization
+from sceneprint_client.poses import quaternion_of
 from tests.cli_service.conftest import write_rooms
 from tests.conftest import halved
+
+
+def answer(status, at=0.0, parent="map", **fields):
+    """Return an answer of the service; `at` is the pose, or its x in metres."""
+    matrix = np.array(at, float)
+    if not matrix.shape:
+        matrix = np.eye(4)
+        matrix[0, 3] = at
+    pose = {
+        "parent_frame": parent, "child_frame": "query.optical", "matrix": matrix.tolist(),
+        "translation": dict(zip("xyz", matrix[:3, 3], strict=True)),
+        "rotation": dict(zip("xyzw", quaternion_of(matrix[:3, :3]), strict=True)),
+    }  # fmt: skip
+    found = status == "found"
+    told = {
+        "status": status, "reason": f"{status}, told by a test", "map": "m",
+        "pose": pose if found else None, "support": 3 * found, "votes": 3 * found,
+        "spread_m": None, "spread_deg": None, "strength": "strong" if found else None,
+        "verified_by": "matches" if found else None,
+        "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
+        "milliseconds": {},
+        "alternatives": [{"pose": pose, "confidence": 0.5, "support": 1}]
+        if status == "ambiguous" else [],
+        **fields,
+    }  # fmt: skip
+    return Localization.model_validate(told)
 
 
 @pytest.fixture

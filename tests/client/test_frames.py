@@ -52,7 +52,7 @@ def test_up_is_sent_as_given_or_as_beside_the_frame(references, tmp_path):
     assert meta_of(references[0], up=(0, -1, 0)).up.unit == [0.0, -1.0, 0.0]
     path = tmp_path / references[0].path.name
     shutil.copy(references[0].path, path)
-    beside = json.loads((references[0].path.parents[1] / "intrinsics.json").read_text())
+    beside = json.loads(references[0].path.with_name("intrinsics.json").read_text())
     (tmp_path / "intrinsics.json").write_text(json.dumps(beside | {"up": [0.6, -0.8, 0]}))
     for up, expected in ((None, [0.6, -0.8, 0.0]), ([0, 0, 1], [0.0, 0.0, 1.0])):
         _, meta = sendable(path, None, with_pose=False, up=up)

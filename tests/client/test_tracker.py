@@ -21,32 +21,10 @@ from sceneprint_client.frame_files import camera_of
 from sceneprint_client.tracker import TrackerParameters, replay
 from sceneprint_client.tracker_core import difference, inverse, observation_of, rotation_matrix
 from sceneprint_lab.synth import synthesise_lookalike
+from tests.client.conftest import answer
 
 DEPTH = np.ones((3, 4), np.float32)
 K = (5.0, 5.0, 1.5, 1.0)
-
-
-def answer(status, x=0.0, **fields):
-    matrix = np.eye(4)
-    matrix[0, 3] = x
-    pose = {
-        "parent_frame": "map", "child_frame": "query.optical",
-        "translation": {"x": x, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1},
-        "matrix": matrix.tolist(),
-    }  # fmt: skip
-    found = status == "found"
-    told = {
-        "status": status, "reason": f"{status}, told by a test", "map": "m",
-        "pose": pose if found else None, "support": 3 * found, "votes": 3 * found,
-        "spread_m": None, "spread_deg": None, "strength": "strong" if found else None,
-        "verified_by": "matches" if found else None,
-        "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
-        "milliseconds": {},
-        "alternatives": [{"pose": pose, "confidence": 0.5, "support": 1}]
-        if status == "ambiguous" else [],
-        **fields,
-    }  # fmt: skip
-    return Localization.model_validate(told)
 
 
 @dataclass

@@ -11,10 +11,9 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client, Tracker
-from sceneprint_client.api import Localization
-from sceneprint_client.poses import quaternion_of
 from sceneprint_client.relocaliser import Level, Relocaliser, RelocaliserParameters, planar
 from sceneprint_client.tracker_core import difference
+from tests.client.conftest import answer
 
 KINDS = ("depth", "compressed_metres", "points")
 SECOND = 1_000_000_000
@@ -29,32 +28,11 @@ class ScriptedLocalizer:
 
     def localize(self, map_name, frame, meta=None, **how):
         self.asked.append({"frame": frame, "meta": meta, **how})
-        return self._answer()
+        matrix = self.found_at(len(self.asked) - 1)
+        return answer("not_found") if matrix is None else answer("found", matrix, "site")
 
     def localize_sequence(self, map_name, frames, metas, **how):
-        self.asked.append({"frame": frames[-1], "meta": metas[-1], **how})
-        return self._answer()
-
-    def _answer(self):
-        matrix = self.found_at(len(self.asked) - 1)
-        pose = None
-        if matrix is not None:
-            x, y, z, w = quaternion_of(matrix[:3, :3]).tolist()
-            tx, ty, tz = matrix[:3, 3].tolist()
-            pose = {
-                "parent_frame": "site", "child_frame": "query.optical", "matrix": matrix.tolist(),
-                "translation": {"x": tx, "y": ty, "z": tz},
-                "rotation": {"x": x, "y": y, "z": z, "w": w},
-            }  # fmt: skip
-        found = pose is not None
-        return Localization.model_validate({
-            "status": "found" if found else "not_found", "reason": "told by a test", "map": "m",
-            "pose": pose, "support": 3 * found, "votes": 3 * found, "spread_m": None,
-            "spread_deg": None, "strength": "strong" if found else None,
-            "verified_by": "matches" if found else None,
-            "best": None, "matches": [], "query_id": "q", "seed": 0, "model": "depth",
-            "milliseconds": {}, "alternatives": [],
-        })  # fmt: skip
+        return self.localize(map_name, frames[-1], metas[-1], **how)
 
 
 @contextmanager
