@@ -39,13 +39,6 @@ def test_without_split_files_the_first_60_percent_are_the_map_and_5_are_left_out
     assert {(one.parent, one.session) for one in choice.queries} == {("scene", "seq-01")}
 
 
-def test_long_sequences_are_thinned_evenly(scene):
-    sequence(scene / "seq-01", 1000)
-    choice = choose_frames(scene)
-    assert numbers(choice.database) == list(range(0, 600, 2))  # 300 at most
-    assert numbers(choice.queries) == list(range(650, 1000, 2))  # 180 at most
-
-
 def test_split_files_decide_where_they_are(scene):
     sequence(scene / "seq-01", 3)
     sequence(scene / "seq-02", 2)

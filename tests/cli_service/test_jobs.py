@@ -53,15 +53,6 @@ def test_dead_jobs_are_listed_and_tried_again(sceneprint, dead, service_url):
     assert said == "0 jobs queued again, 0 cannot be retried\n"
 
 
-def test_one_job_is_cancelled_or_tried_again(sceneprint, dead):
-    said = sceneprint("jobs", "--cancel", dead[1], expect=2)
-    assert said[1].startswith(f"sceneprint jobs: Job {dead[1]} is succeeded: ")
-    (said_out, _) = sceneprint("jobs", "--retry", dead[0], "--json")
-    again = json.loads(said_out)
-    assert (again["state"], again["map"], again["priority"]) == ("queued", "jobs", -3)
-    assert "There is no job" in sceneprint("jobs", "--cancel", "nobody", expect=2)[1]
-
-
 def test_a_priority_out_of_its_range_is_refused(capsys):
     for wrong in ("11", "-11", "x", "--5", "1.0"):
         with pytest.raises(SystemExit):

@@ -32,20 +32,16 @@ def test_what_was_not_tried_is_not_told_to_be_there(sceneprint, rooms, tmp_path)
 
 def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_path):
     spool, bare = tmp_path / "robot.spool", tmp_path / "bare"
-    said = sceneprint("spool", spool, expect=2)
-    assert "there is no spool here" in said.stderr
+    assert "there is no spool here" in sceneprint("spool", spool, expect=2).stderr
     assert not spool.exists()
     added = sceneprint("spool", spool, rooms, "--robot", "cart", "--most-bytes", 10**8)
-    assert added.stdout == ("6 frames: 6 added, 0 already there, 0 refused; 6 wait, 0 thinned\n")
-    again = sceneprint("spool", spool, rooms / "room-0", "--robot", "cart")
-    assert again.stdout == ("3 frames: 0 added, 3 already there, 0 refused; 6 wait, 0 thinned\n")
+    assert added.stdout == "6 frames: 6 added, 0 already there, 0 refused; 6 wait, 0 thinned\n"
     bare.mkdir()
     (bare / "clouds.json").write_text("{}")
     (bare / "broken.ply").write_bytes(b"ply\nno cloud")
     sceneprint("spool", spool, bare)
     said = sceneprint("spool", spool, "--to", "spool-nowhere", expect=2)
     assert said.stdout == "0 frames uploaded; 0 refused, 7 wait\n"
-    assert "spool-nowhere" in said.stderr
     with Client(service_url) as client:
         client.create_map("spooled", model="depth")
         said = sceneprint("spool", spool, "--to", "spooled", "--priority", 1, expect=2)
@@ -54,16 +50,14 @@ def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_pat
         assert summary.startswith("poses of 6 of 7 frames; depth ")
         assert said.stderr.startswith("broken.ply: ")
         found = list(client.frames("spooled"))
-    assert len(found) == 6
-    assert {one.robot for one in found} == {"cart"}
+    assert [one.robot for one in found] == ["cart"] * 6
     assert {one.pose.parent_frame for one in found if one.pose} == {"cart/room-0", "cart/room-1"}
     lines = sceneprint("spool", spool).stdout.splitlines()
     assert lines[0] == "0 frames wait; 0.0 of 100.0 MB"
     assert lines[1] == "6 uploaded, 1 refused, 0 thinned, 0 refused and discarded"
     assert lines[2].startswith("  broken.ply: ")
     told = json.loads(sceneprint("spool", spool, "--json").stdout)
-    assert (told["uploaded"], told["oldest"], told["bytes"]) == (6, None, 8192)
-    assert told["refusals"][0]["name"] == "broken.ply"
+    assert (told["uploaded"], told["refusals"][0]["name"]) == (6, "broken.ply")
     said = sceneprint("spool", spool, "--to", "spooled", "--retry-refused", expect=2)
     assert said.stdout.startswith("0 frames uploaded; 1 refused, 0 wait\nposes of 0 of 1 frames")
 

@@ -1,7 +1,5 @@
 """Tests of the client's methods for maps, frames and jobs."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import pytest
 
@@ -11,29 +9,12 @@ from sceneprint.errors import (
     FrameConflict,
     InvalidRequest,
     JobOver,
-    MapExists,
     UnknownFrame,
     UnknownJob,
     UnknownMap,
 )
 from sceneprint_client import meta_of
 from sceneprint_client.api import FrameState, JobState
-
-
-def test_maps(client, map_name):
-    made = client.create_map(map_name, "Hall 2", "depth")
-    assert (made.name, made.title, made.revision) == (map_name, "Hall 2", 0)
-    assert made.model.startswith("depth-")
-    assert made.model.endswith(made.model_id[:12])
-    assert client.create_map(map_name, "Hall 2", "depth") == made
-    assert client.map(map_name) == made
-    assert made in client.maps()
-    with pytest.raises(MapExists):
-        client.create_map(map_name, "Hall 3", "depth")
-    client.delete_map(map_name)
-    with pytest.raises(UnknownMap, match=map_name):
-        client.delete_map(map_name)
-    assert made not in client.maps()
 
 
 def test_a_frame_from_upload_to_deletion(client, map_name, references):
@@ -112,20 +93,3 @@ def test_what_is_not_there(client, map_name, references):
     with pytest.raises(UnknownMap):
         next(client.frames("nobody"))
     assert client.map(map_name).name == map_name
-
-
-def test_threads_share_a_client(client, map_name, references):
-    client.create_map(map_name, model="depth")
-    references = references[:3]
-    with ThreadPoolExecutor(6) as pool:
-        both = (*references, *references)  # each frame twice at the same time
-        added = list(pool.map(lambda one: client.add(map_name, one), both))
-        assert sum(new for _, new in added) == len(references)
-        ids = {one.frame_id for one, _ in added}
-        client.wait({one.job_id for one, _ in added})
-        answers = list(
-            pool.map(lambda i: client.query(map_name, frame_id=i, k=1, stages="retrieve"), ids)
-        )
-    assert len(ids) == len(references)
-    assert {answer.counts.map for answer in answers} == {len(references) - 1}
-    assert client.healthy()

@@ -184,14 +184,6 @@ def test_it_is_read_as_the_folder_is(kind, which, kitchen, desk, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_several_streams_and_any_chunks_are_one_tar(kitchen):
-    plain = tarred(kitchen)
-    for pack in PACKERS.values():
-        data = pack(plain[:5000]) + pack(plain[5000:]) + bytes(8)
-        for step in (1, 511, 1 << 20):
-            assert inflated(data, step=step) == plain
-
-
 def test_what_has_no_folder_is_named_by_the_caller(kitchen, tmp_path):
     members = [(p.name, p.read_bytes()) for p in sorted((kitchen / "seq-01").glob("*.depth.png"))]
     camera = ("intrinsics.json", (kitchen / "intrinsics.json").read_bytes())
@@ -401,15 +393,6 @@ def test_a_zip_of_too_many_members_is_refused_before_they_are_read(kitchen, tmp_
         looked_into(zipped(kitchen), tmp_path),
     ):
         pass
-
-
-def test_names_of_a_zip_that_are_no_utf8_are_read(kitchen, tmp_path):
-    data = zipped(kitchen, method=zipfile.ZIP_STORED).replace(b"kitchen/", b"k\x81tchen/")
-    with looked_into(data, tmp_path) as archive:
-        assert [s.name for s in archive.sequences] == ["seq-01", "seq-02"]
-        reference = archive.sequences[0].frames[0]
-        assert archive.name_of(reference) == "kütchen/seq-01/frame-000000.depth.png"
-        assert len(archive.data_of(reference)) == archive.size_of(reference)
 
 
 @pytest.mark.parametrize(

@@ -17,11 +17,6 @@ def write(path, fields):
     return path
 
 
-def test_the_least_that_is_needed(tmp_path):
-    camera = read_camera(write(tmp_path / "intrinsics.json", GOOD))
-    assert camera == Camera(Intrinsics(640, 480, 525.0, 526.5, 319.5, 239.0), 1000.0, False)
-
-
 def test_all_that_may_be_said(tmp_path):
     fields = GOOD | {
         "depth_scale": 5000, "distortion": [0.1, -0.2, 0, 1e-3, 4], "depth_along_ray": True,

@@ -23,17 +23,6 @@ def test_the_range_of_depth_leaves_missing_pixels_out():
     assert [found.near, found.median, found.far] == pytest.approx([0.595, 5.05, 9.505])
 
 
-def test_the_range_of_large_images_is_of_some_of_their_samples():
-    depth = np.full((480, 640), 2.0, np.float32)
-    depth[:, :64] = 0.0
-    lens = Intrinsics(640, 480, 500, 500, 320, 240)
-    found = sample_range(DepthFrame(depth, lens))
-    assert found == of(2.0, 2.0, 2.0).model_copy(update={"count": 480 * 576, "valid": 0.9})
-    alone = np.zeros((480, 640), np.float32)
-    alone[1, 1] = 3.0  # between those that are looked at
-    assert sample_range(DepthFrame(alone, lens)).median == 3.0
-
-
 def test_the_range_of_points_is_their_distance_from_the_sensor():
     points = np.zeros((101, 3), np.float32)
     points[:, 1] = -np.arange(101)

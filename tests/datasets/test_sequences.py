@@ -1,7 +1,5 @@
 """Tests that written folders are recognised, and that invalid folders raise errors."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -64,15 +62,6 @@ def test_a_camera_that_is_given_stands_in_for_a_missing_one_alone(kitchen):
     (kitchen / "intrinsics.json").write_text("{}")
     with pytest.raises(InvalidIntrinsics):
         find_sequences(kitchen, camera=given)
-
-
-def test_one_sequence_of_a_scene(kitchen, monkeypatch):
-    monkeypatch.chdir(kitchen / "seq-02")
-    for path in (kitchen / "seq-02", Path(), Path("../seq-02")):
-        (sequence,) = find_sequences(path)
-        assert (sequence.name, sequence.parent_frame, sequence.split) == (
-            "seq-02", "kitchen", "test",
-        )  # fmt: skip
 
 
 def test_a_pose_is_read_when_asked_for(kitchen):
@@ -191,13 +180,3 @@ def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen):
     assert places(singles, "all") == [[1], [0], [3], [2]]
     in_turns = [singles[i] for i in (1, 3, 0, 2)]
     assert places(in_turns, "all") == [[0], [2], [1], [3]]
-
-
-def test_files_without_a_number_are_numbered_as_they_were_named(tmp_path):
-    write_intrinsics(tmp_path, CAMERA)
-    for name in ("b.png", "a.png"):
-        write_depth_png(tmp_path / name, DEPTH, 1000.0)
-    singles = [find_sequences(tmp_path / name)[0] for name in ("b.png", "a.png")]
-    told = numbered_sequences(singles, None)
-    assert [one.frames[0].sequence for one in told] == [0, 1]
-    assert numbered_sequences(singles[:1], None)[0].frames[0].sequence is None

@@ -141,21 +141,6 @@ def test_polycam(room, tmp_path, cameras):
     assert above.name == "flat"
 
 
-def test_polycam_prefers_optimised_poses_and_says_what_is_left_out(room, tmp_path):
-    folder = polycam(tmp_path / "flat", room)
-    shutil.copytree(folder / "keyframes/corrected_cameras", folder / "keyframes/cameras")
-    depths = sorted((folder / "keyframes/depth").iterdir())
-    depths[0].unlink()
-    (folder / "keyframes/corrected_cameras" / f"{depths[1].stem}.json").write_text('{"fx": true}')
-    [sequence] = find_sequences(folder)
-    assert len(sequence.frames) == 1
-    assert "1 cameras without a depth image" in sequence.note
-    assert "1 frames that are damaged (fx is True, not a finite number" in sequence.note
-    shutil.rmtree(folder / "keyframes/depth")
-    with pytest.raises(DatasetError, match=r"has depth.*turn on developer mode"):
-        find_sequences(folder)
-
-
 @pytest.mark.parametrize("per_frame", [False, True])
 @pytest.mark.parametrize("suffix", ["png", "npy"])
 def test_nerfstudio(room, tmp_path, suffix, per_frame):
@@ -163,13 +148,6 @@ def test_nerfstudio(room, tmp_path, suffix, per_frame):
     assert sequence.layout is Layout.NERFSTUDIO
     assert max(errors(room, sequence, np.eye(4))) < 1e-3
     assert sequence.frames[0].original == f"depth/frame_00000.{suffix}"
-
-
-@pytest.mark.parametrize(("suffix", "factor"), [("npy", 1.0), ("npy", 0.01), ("png", 2e-4)])
-def test_units_of_nerfstudio(room, tmp_path, suffix, factor):
-    folder = nerfstudio(tmp_path / "a", room, suffix, depth_unit_scale_factor=factor)
-    [sequence] = find_sequences(folder)
-    assert max(errors(room, sequence, np.eye(4))) < 1e-3
 
 
 def test_the_applied_transform_of_nerfstudio_is_undone(room, tmp_path):
@@ -262,14 +240,6 @@ def test_broken_captures_of_record3d_are_refused(room, tmp_path):
     file.write_bytes(file.read_bytes()[:-30])
     with pytest.raises(DatasetError, match=r"cannot be read.*\.r3d"):
         find_sequences(file)
-
-
-def test_depth_as_openexr_is_refused_with_the_export_to_choose(tmp_path):
-    for name in ("depth", "rgb"):
-        (tmp_path / "EXR_RGBD" / name).mkdir(parents=True)
-    (tmp_path / "EXR_RGBD/metadata.json").write_text("{}")
-    with pytest.raises(DatasetError, match=r"OpenEXR, which is not supported.*export.*\.r3d"):
-        find_sequences(tmp_path)
 
 
 # Zips, as they are sent to a service.

@@ -105,24 +105,6 @@ def test_metres_are_taken_as_they_are(tmp_path, ros, walk, depth):
         np.testing.assert_array_equal(reference.read().depth, expected)
 
 
-def test_inverse_depth_by_hand(tmp_path, ros, walk, depth):
-    """z = a / (v - b), with the parameters that the transport writes for a depth up to 10 m."""
-    a, b = 10100.0, 1.0 - 10100.0 / 10.0
-    stored = np.zeros((60, 80), np.uint16)
-    stored[:, 1:] = np.arange(1, 80) * 100
-
-    def put(writer, i, t):
-        writer.compressed(t, stored, "32FC1", a=a, b=b)
-
-    path = ros.write(tmp_path, lambda writer: drive(writer, ros, walk, put))
-    found = only(path).frames[3].read().depth
-    assert (found[:, 0] == 0).all()
-    # v = 100: 10100 / (100 + 1009) m; v = 7900: 10100 / 8909 m
-    assert found[5, 1] == pytest.approx(9.107304, abs=1e-5)
-    assert found[5, 79] == pytest.approx(1.133685, abs=1e-5)
-    np.testing.assert_allclose(found[0, 1:], a / (stored[0, 1:] - b), rtol=1e-6)
-
-
 @pytest.mark.parametrize("container", ["mcap", "sqlite3", "ros1"])
 def test_points_have_the_pose_of_their_sensor(container, tmp_path, ros, walk):
     xyz = np.random.default_rng(3).uniform(-5, 5, (120, 3)).astype(np.float32)
@@ -480,24 +462,6 @@ def test_a_camera_elsewhere_is_found_by_its_frame(tmp_path, ros, depth):
 
 
 # References.
-
-
-def test_several_messages_at_one_time_are_told_apart(tmp_path, ros, depth):
-    for container in ros.containers:
-
-        def fill(writer):
-            writer.camera_info(0.0)
-            for i in range(3):
-                message = depth(i)
-                writer.image(0.5, message)
-
-        frames = only(
-            ros.write(tmp_path / container, fill, container), RecordingOptions(keyframe_s=0)
-        ).frames
-        for i in range(3):
-            np.testing.assert_array_equal(
-                frames[i].read().depth, (depth(i) / 1000).astype(np.float32)
-            )
 
 
 def test_one_image_of_another_encoding_costs_no_other(tmp_path, ros, depth):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader as Ros1Reader
 
-from sceneprint.errors import DatasetError, UnreadableFrame
+from sceneprint.errors import UnreadableFrame
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.outline import bag_outline
 from sceneprint.formats.recording.selection import RecordingOptions
@@ -78,15 +78,6 @@ def test_depth_in_other_units(tmp_path, ros):
     assert str(bag_outline(path, scaled).range) == (
         "depth 1.5 to 1.5 m (5th to 95th percentile), 100 % of pixels valid"
     )
-
-
-def test_metres_have_no_depth_scale(tmp_path, ros):
-    def fill(writer):
-        writer.camera_info(0.0)
-        writer.image(0.0, np.full((60, 80), 1.5), "32FC1")
-
-    with pytest.raises(DatasetError, match=r"has 32FC1 in metres, .* Omit --depth-scale"):
-        find_sequences(ros.write(tmp_path, fill), RecordingOptions(depth_scale=4000))
 
 
 # Compressed images.

@@ -1,7 +1,6 @@
 """Tests of scans of a recording that are joined by odometry, from messages to poses."""
 
 import pickle
-import tracemalloc
 
 import numpy as np
 import pytest
@@ -169,22 +168,3 @@ def test_empty_and_damaged_scans_at_the_start_change_nothing(tmp_path, ros):
 
     (sequence,) = find_sequences(ros.write(tmp_path, fill), JOINED)
     assert sequence.note.endswith(", corrected for motion")
-
-
-def test_scans_are_read_one_at_a_time(tmp_path, ros):
-    def fill(writer):
-        write_odometry(writer, 20)
-        wide = {"names": ["x", "y", "z"], "formats": ["<f4"] * 3, "offsets": [0, 4, 8]}
-        for number in range(20):
-            rows = np.zeros(20, np.dtype({**wide, "itemsize": 100_000}))  # 2 MB
-            for axis, name in enumerate("xyz"):
-                rows[name] = wall(number)[:, axis]
-            writer.points(SCAN_S * number, rows, "/livox/lidar", frame="livox_frame")
-
-    path = ros.write(tmp_path, fill, "sqlite3")
-    (sequence,) = find_sequences(path, RecordingOptions(join_m=2.0, keyframe_m=0))
-    tracemalloc.start()
-    assert len(sequence.frames[-1].read().points) == 400
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 20e6  # all scans have 40 MB

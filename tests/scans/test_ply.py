@@ -6,16 +6,10 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import UnreadableCloud
-from sceneprint.formats.export import write_ply
 from sceneprint.formats.points.cloud import decode_cloud, decode_scan
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 BINARY = "ply\nformat binary_little_endian 1.0\n"
-
-
-def test_our_own(points):
-    data = write_ply(points, points, np.zeros((12, 3), np.uint8), np.array([[0, 1, 2]]))
-    np.testing.assert_array_equal(decode_cloud(data).points, points)
 
 
 @pytest.mark.parametrize(

@@ -63,25 +63,6 @@ def exported(mesh, form):
 # Clouds.
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_far_coordinates_by_laspy_keep_their_millimetres(packed):
-    laspy = pytest.importorskip("laspy", reason="laspy is not installed")
-    header = laspy.LasHeader(point_format=3, version="1.2")
-    far = np.array([432_100.0, 5_412_345.0, 310.0])
-    header.scales, header.offsets = [0.001] * 3, far
-    record = laspy.LasData(header)
-    record.x, record.y, record.z = (path() + far).T
-    file = io.BytesIO()
-    record.write(file, do_compress=packed)
-    read = read_surface(file.getvalue(), "map.laz")
-    surface = read.surface
-    np.testing.assert_allclose(surface.points + (surface.offset - far), path(), atol=MILLIMETRE)
-    assert np.abs(surface.points).max() < 100
-    np.testing.assert_array_equal(surface.offset, np.round(surface.offset))
-    np.testing.assert_array_equal(surface.up, [0, 0, 1])
-    assert (read.units, read.up_from) == ("estimated", "file")
-
-
 def test_scans_by_libe57_are_one_cloud(tmp_path):
     pye57 = pytest.importorskip("pye57", reason="pye57 is not installed")
     file = tmp_path / "map.e57"
