@@ -67,10 +67,10 @@ APART = (
 #: Long files that start next, so that no process ends up alone with one of them.
 LONG = (
     "test_shared_index.py", "test_lifecycle.py", "test_survival.py", "test_surfaces.py",
-    "test_restoration.py", "test_map_imports.py", "test_recording_imports.py",
+    "test_restoration.py", "test_map_imports.py", "test_imports.py",
     "test_surface_decoder.py", "test_every_call.py", "test_map_copy.py", "test_sequences.py",
     "test_associations.py", "test_hostile.py", "test_decoders.py", "test_cli.py",
-    "test_evaluate.py", "test_joined_scans.py", "test_reencoding_switch.py", "test_fuzz.py",
+    "test_evaluate.py", "test_joined_scans.py", "test_reencoding.py", "test_fuzz.py",
     "test_failover.py", "test_purging.py", "test_work.py", "test_recovery.py",
     "test_connections.py", "test_tracker.py", "test_tenancy.py", "test_limits.py",
 )  # fmt: skip

@@ -5,13 +5,9 @@ import pytest
 
 from sceneprint.decoders import LocalDecoders
 from sceneprint.engine.ingest.frame_decoder import content_id, read_upload
-from sceneprint.engine.search.verification import thresholds
 from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.export import write_ply
-from sceneprint.geometry.validation.acceptance import Evidence, belief, objection
-from sceneprint.geometry.validation.validation import ValidationParameters
 from sceneprint_client.api import FrameMeta, JobState, Query
-from sceneprint_client.api.query import ValidationOptions
 
 HERE = LocalDecoders(1)
 
@@ -40,21 +36,6 @@ def test_minus_nought_is_no_other_viewpoint():
     data = write_ply(np.eye(3)[np.arange(12) % 3])
     mine = read_upload(data, said(viewpoint={"x": -0.0, "y": 0, "z": -0.0}), HERE)
     assert content_id(mine) == content_id(read_upload(data, said(), HERE))
-
-
-def test_what_a_caller_asks_of_matches_is_asked_without_free_space_too():
-    blind = Evidence(0.0, 0.0, overlap=0.5, plane_overlap=0.5, violations=None, stiffness=1.0)
-    usual = ValidationParameters()
-    assert objection(blind, thresholds(None, usual)[0].acceptance, "full") is None
-    for asked, why in (
-        ({"evidence": 0.6}, "only 50% of the surfaces agree"), ({"plane_overlap": 0.6}, "plane"),
-    ):  # fmt: skip
-        p, mode = thresholds(ValidationOptions.model_validate(asked), usual)
-        found = objection(blind, p.acceptance, mode)
-        assert why in found[1]
-    p, _ = thresholds(ValidationOptions(ambiguous_share=0.1), usual)
-    assert belief(blind, 0.1, usual.acceptance)[0] == "accepted"
-    assert belief(blind, 0.1, p.acceptance)[0] == "ambiguous"
 
 
 def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(empty, uploads, work_off):

@@ -1,41 +1,29 @@
-"""Tests of two equal rooms, of which C may contain only one."""
+"""Tests of equal rooms and other rivals of an answer, for a service and an evaluation."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sceneprint.formats.artifact import read_geometry, write_geometry
+from sceneprint.geometry.rigid import pose_difference
 from sceneprint.localization import rival_rows
 from sceneprint.settings import Settings
 from sceneprint_client.api import Query
+from sceneprint_lab.evaluation.judgement import Candidate, Judge, QueryTask, answer_of, rank
+from sceneprint_lab.evaluation.sites import signed
 from tests.whole_engine import Engine
 
 #: What looks for frames of another place.
 RIVAL_ROWS = "sceneprint.localization.rival_rows"
 #: From one room to its twin, metres.
 APART = 30.0
-
-
-@dataclass
-class Twins:
-    """A map of two equal rooms, with the ids of the frames of each."""
-
-    engine: Engine
-    asked: Any
-    first: list[str]
-    second: list[str]
-
-    def ask(self, **how):
-        """Where the asked frame was taken, of which the map holds the twin alone."""
-        query = Query.model_validate({"keep": False, **how})
-        meta = self.asked.meta.model_copy(update={"pose": None})
-        return self.engine.queries.upload(["hall"], self.asked.data, meta, query)
 
 
 def equal(frame, rng):
@@ -61,10 +49,19 @@ def twin_folder(signed_folder, uploads, make_upload, work_off, tmp_path_factory)
 
 @pytest.fixture
 def twins(twin_folder, make_engine, uploads, ids, tmp_path):
-    engine = make_engine(shutil.copytree(twin_folder, tmp_path / "twins"))
+    """A function that asks where a frame was taken, of which the map holds the twin alone; with
+    that frame, and the ids of the frames of each room.
+    """
+    engine, asked = make_engine(shutil.copytree(twin_folder, tmp_path / "twins")), uploads[8]
     every = ids(engine)
     engine.delete_frame("hall", every[8])
-    return Twins(engine, uploads[8], every[6:12], every[12:])
+    meta = asked.meta.model_copy(update={"pose": None})
+
+    def ask(**how):
+        query = Query.model_validate({"keep": False, **how})
+        return engine.queries.upload(["hall"], asked.data, meta, query)
+
+    return SimpleNamespace(ask=ask, asked=asked, first=every[6:12], second=every[12:])
 
 
 #: So many candidates are all but one of the twin room.
@@ -128,3 +125,74 @@ def test_what_the_deadline_leaves_uncompared_is_not_found(twins, monkeypatch):
     assert "the deadline passed before similar frames of other places" in answer.reason
     [pose] = answer.alternatives
     assert pose.pose.matrix[0][3] - twins.asked.pose[0, 3] == pytest.approx(APART, abs=0.05)
+
+
+@pytest.fixture
+def both(empty, work_off, signer):
+    """Ask a service and an evaluation of the same frames."""
+
+    def ask(in_map, queries, candidates=10):
+        for one in in_map:
+            empty.add_frame("hall", one.data, one.meta)
+        work_off(empty)
+        shown, sent = ([replace(one.frame, pose=one.pose) for one in some]
+                       for some in (in_map, queries))  # fmt: skip
+        _, database, of_map = signed(shown, "room", signer, 0)
+        _, members, of_queries = signed(sent, "room", signer, len(database))
+        geometries = [read_geometry(write_geometry(one)) for one in (*of_map, *of_queries)]
+        model, n = signer.model, len(database)
+        judge = Judge(
+            geometries.__getitem__, "full", 0, model.parameters.validation, database=database,
+            answer=model.answer, unrelated_distance=model.unrelated_distance,
+        )  # fmt: skip
+        ranked = rank(
+            np.stack([one.signature for one in members]),
+            np.stack([one.signature for one in database]),
+            np.ones((len(members), n), np.bool_), metric=model.metric, candidates=candidates,
+        )  # fmt: skip
+        pairs = []
+        for one, query, r in zip(queries, members, ranked, strict=True):
+            among = tuple(Candidate(j, j, "room", database[j].pose, 0.0, 0.0) for j in r.selection)
+            task = QueryTask(
+                query.number, "room", query.pose, [], r.selection, among, np.arange(n), r.retrieved
+            )
+            meta = one.meta.model_copy(update={"pose": None})
+            how = Query(candidates=candidates, keep=False)
+            served = empty.queries.upload(["hall"], one.data, meta, how)
+            pairs.append((served, answer_of(judge, task)))
+            see_same(*pairs[-1], one.pose)
+        return pairs
+
+    return ask
+
+
+def see_same(served, evaluated, truth):
+    """See that a service and an evaluation answer alike."""
+    assert served.status == evaluated.status
+    poses = list(served.alternatives)
+    if served.location is not None:
+        poses = [served.location]
+        assert served.location.strength == evaluated.strength
+        off = pose_difference(np.array(served.location.pose.matrix), truth)
+        assert (evaluated.error.metres, evaluated.error.radians) == pytest.approx(off, abs=1e-6)
+    for pose, place in zip(poses, evaluated.places, strict=False):
+        assert pose.confidence == pytest.approx(place.confidence, abs=1e-6)
+        # an answer has three decimals
+        assert pose.evidence.model_dump() == pytest.approx(vars(place.evidence), abs=6e-4)
+
+
+def test_guided_matches_that_are_searched_for_change_both_answers(both, make_upload, room_views):
+    """Two frames whose poses are 3 m off vote elsewhere, after others have guided the rest."""
+    path = room_views(21, 0, 48, along_path=True, step=3).frames
+    in_map = []
+    for i in (2, 6, 0, 10, 11):
+        pose = np.array(path[i].pose)
+        pose[0, 3] += 3.0 * (i >= 10)
+        in_map.append(make_upload(replace(path[i], pose=pose), "room"))
+    [(served, _)] = both(in_map, [make_upload(path[4], "room")])
+    assert served.status == "ambiguous"
+    assert {one.validation.search for one in served.matches} == {"correspondences"}
+    first = served.alternatives[0]
+    assert first.support > 2  # that many had guided the others, which vote now as well
+    assert pose_difference(np.array(first.pose.matrix), np.array(path[4].pose))[0] < 0.02
+    assert first.evidence.rival_weight >= 0.8  # the two frames that are off vote elsewhere

@@ -9,9 +9,11 @@ from sceneprint.engine.serializers import transform
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownFrame
 from sceneprint.formats.export import points_of
 from sceneprint.geometry.registration.icp import adjoint
-from sceneprint.geometry.rigid import pose_difference
+from sceneprint.geometry.rigid import pose_difference, transform_points
+from sceneprint.geometry.validation.inspection import patches_at
 from sceneprint.pipeline import distance, validate
 from sceneprint_client.api import Query, ValidationOptions
+from sceneprint_client.surface_encoding import HEADER, POINT
 
 
 def vertices(data):
@@ -93,7 +95,6 @@ def test_what_a_match_rests_on(full, prepared, asked, ids):
     assert counted == v.inliers
     against = len(told.query.violations) + len(told.match.violations)
     assert against / max(against + counted, 1) == pytest.approx(v.violations)
-    assert told.patches is not None
     T, pairs = v.T_match_query, told.patches
     assert len(pairs.query) == len(set(pairs.query)) == len(set(pairs.match)) > 20
     for k, (i, j) in enumerate(zip(pairs.query, pairs.match, strict=True)):
@@ -208,7 +209,47 @@ def test_a_guided_match_is_labelled_and_had_again(empty, make_upload, work_off, 
         assert (told.validation, told.transform) == (match.validation, match.transform)
         assert told.uncertainty == match.uncertainty
     for match in guided:
-        assert match.predicted is not None
-        assert match.transform is not None
         predicted, found = (np.array(T.matrix) for T in (match.predicted, match.transform))
         assert pose_difference(predicted, found)[0] < 0.05
+
+
+def rows_of(data):
+    """Header, rows, and their positions in metres."""
+    head = HEADER.unpack_from(data)
+    rows = np.frombuffer(data, POINT, offset=HEADER.size)
+    return head, rows, np.array(head[5:8]) + rows["position"] / 65535 * np.array(head[8:11])
+
+
+def test_the_points_of_a_frame(full, prepared, ids):
+    geometry = prepared[3][1]
+    points, normals = points_of(geometry.surface)
+    whole = full.points.frame("hall", ids(full)[3])
+    head, rows, at = rows_of(whole.make())
+    assert (head[2], head[3], head[11], head[12]) == (3, len(points), len(points), 0)
+    assert at == pytest.approx(points, abs=1e-4)
+    assert rows["normal"] / 127 == pytest.approx(normals, abs=0.5 / 127 + 1e-6)
+    found = patches_at(np.hstack([points, normals]), geometry.patches)
+    assert (rows["patch"] == np.where(found < 0, 65535, found)).all()
+    assert len(set(found.tolist())) > 0.9 * len(geometry.patches)
+    assert (rows["residual"] == 255).all()
+    fewer = full.points.frame("hall", ids(full)[3], limit=100)
+    assert rows_of(fewer.make())[0][3] == 100
+    assert rows_of(fewer.make())[0][11] == len(points)
+    assert fewer.tag != whole.tag
+    with pytest.raises(InvalidRequest, match="no T_base_sensor"):
+        full.points.frame("hall", ids(full)[3], "base")
+    pose = np.array(full.get_frame("hall", ids(full)[3]).pose.matrix)
+    _, _, there = rows_of(full.points.frame("hall", ids(full)[3], "parent").make())
+    assert there == pytest.approx(transform_points(pose, points.astype(float)), abs=1e-4)
+
+
+def test_what_cannot_be_drawn(full, asked, ids):
+    best = asked.matches[0].frame_id
+    with pytest.raises(InvalidRequest, match="no rival"):
+        full.points.match(asked.query_id, best, by="rival").make()
+    bare = full.query_frame("hall", ids(full)[3], Query(k=1, stages=("retrieve",)))
+    with pytest.raises(NotIndexed):
+        full.points.query(bare.query_id)
+    full.delete_frame("hall", best)
+    with pytest.raises(UnknownFrame, match="was deleted"):
+        full.points.match(asked.query_id, best)

@@ -110,7 +110,6 @@ def test_a_pulled_map_answers_as_the_service_and_follows_it(robot, walk):
         assert (told.title, told.created_at) == ("The hall", service.map(MAP).created_at)
     again = robot.pull()
     assert (again.written, again.removed, again.artifacts, again.bytes) == (0, 0, 0, 0)
-
     # one is new, one is gone, one edited, and one uploaded again under its id
     upload(service, walk[10:11])
     service.delete_frame(MAP, ids[1])
@@ -124,7 +123,6 @@ def test_a_pulled_map_answers_as_the_service_and_follows_it(robot, walk):
     assert (second.frames, second.written, second.removed, second.artifacts) == (5, 3, 1, 2)
     assert robot.answers(asked) == answers(service, asked)
     assert robot.pull().written == 0
-
     # the map is deleted and created again
     service.delete_map(MAP)
     service.create_map(MAP, model="depth")

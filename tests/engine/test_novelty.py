@@ -3,7 +3,6 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.signature_job import find_nearest
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.errors import InvalidRequest
-from sceneprint.store import maps as stored_maps
-from sceneprint.store.signatures import StoredSignature
 from sceneprint.store.tables import signatures
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
 from sceneprint_client.api.base import NOVEL, novelty_of
@@ -169,19 +166,6 @@ def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkey
     assert set(frames) == {FrameState.INDEXED, FrameState.REDUNDANT}
     assert frames[FrameState.INDEXED].frame_id in str(frames[FrameState.REDUNDANT].reason)
     assert rows(engines[0]) == 1
-
-
-def test_signatures_of_another_model_are_not_compared(empty, uploads, send, prepared):
-    send(empty, 0)
-    with empty.store.database.read() as connection:
-        row = stored_maps.find_map(connection, "hall")
-    vector = prepared[1][0].vector.tobytes()
-    made = StoredSignature(row.model_id, vector, "00" * 32, [1], [1])
-    database, readers = empty.store.database, empty.readers
-    seen = find_nearest(database, readers, row, made)
-    assert seen.nearest is not None
-    assert find_nearest(database, readers, row, replace(made, model_id="ab" * 32)) is None
-    assert find_nearest(database, readers, replace(row, number=99), made) is None
 
 
 def test_what_may_be_asked():

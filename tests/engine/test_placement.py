@@ -101,7 +101,6 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
     own_p = replace(model_parameters(frames), voted_only=True)
     by_library = localize(frames, poses, rooms, views_of, p=own_p)
     assert by_library.verified_by in (None, "map")
-
     how = {"candidates": candidates, "validation": {"ambiguous": 0.0}}
     if without:
         how["filter"] = {"exclude_frames": [names[i] for i in without]}

@@ -131,7 +131,6 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     answers = {"queries", "sceneprint.db" if is_sqlite else "table queries"}  # one is kept
     assert found["signature"] == {truth, *answers, "index .faiss"}
     assert found["artifact"] == {"blobs", *answers}
-
     with engine.store.database.write() as connection:  # of the others, which stay
         row = find_map(connection, "hall")
         for name in ids(engine)[1:]:

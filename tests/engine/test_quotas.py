@@ -1,12 +1,10 @@
 """Tests that quotas are exact for concurrent uploads and all changes of frames."""
 
-import io
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 
 import numpy as np
 import pytest
-from PIL import Image
 from sqlalchemy import select
 
 from sceneprint.engine.ingest.uploads import Upload
@@ -18,7 +16,7 @@ from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import MapUsage, counted_usage, find_map, map_usage
 from sceneprint.store.tables import frames
 from sceneprint_client.api import FrameState, NewMap
-from tests.engine.conftest import used
+from tests.engine.conftest import packed_again, used
 
 
 def limit(engine, **limits):
@@ -164,12 +162,10 @@ def test_a_failed_frame_that_comes_larger_needs_room_too(empty, uploads):
         row = find_map(connection, "hall")
         number = maps.find_frame(connection, row, added.frame_id).number
         stored.set_state(connection, number, FrameState.FAILED, "it broke down")
-    picture = Image.open(io.BytesIO(one.data))
-    loose = io.BytesIO()
-    picture.save(loose, "png", compress_level=0)
-    limit(empty, quota_frames=1, quota_bytes=len(loose.getvalue()) - 1)
-    with pytest.raises(QuotaExceeded, match=f"{len(loose.getvalue()) - len(one.data)} more bytes"):
-        empty.add_frame("hall", loose.getvalue(), one.meta)
+    loose = packed_again(one.data)
+    limit(empty, quota_frames=1, quota_bytes=len(loose) - 1)
+    with pytest.raises(QuotaExceeded, match=f"{len(loose) - len(one.data)} more bytes"):
+        empty.add_frame("hall", loose, one.meta)
     assert used(empty) == MapUsage(1, len(one.data))
     again, new = empty.add_frame("hall", one.data, one.meta)  # as it was: no more room than before
     assert (again.frame_id, new, used(empty)) == (added.frame_id, True, MapUsage(1, len(one.data)))

@@ -103,21 +103,3 @@ def test_what_is_no_rigid_transform_is_no_pose():
     for bad in (np.diag([1.0, 1, -1, 1]), np.diag([2.0, 2, 2, 1]), np.zeros((4, 4))):
         with pytest.raises(InvalidPose):
             pose_matrix(GivenPose(matrix=bad.tolist()))
-
-
-def test_a_frame_is_told_as_it_was_sent(empty, uploads, work_off):
-    given = uploads[0].meta.model_copy(update={"pose": None}).model_dump() | {
-        "robot": "R2", "session": "night", "tags": ["a", "b"],
-        "captured_at": "2026-03-01T12:00:00.123456+05:30", "pose": {"matrix": EYE},
-    }  # fmt: skip
-    added, _ = empty.add_frame("hall", uploads[0].data, FrameMeta.model_validate(given))
-    work_off(empty)
-    frame = empty.get_frame("hall", added.frame_id)
-    assert (frame.robot, frame.session, frame.tags) == ("R2", "night", ["a", "b"])
-    assert frame.captured_at.isoformat() == "2026-03-01T06:30:00.123456+00:00"
-    assert frame.intrinsics == uploads[0].meta.intrinsics
-    assert (frame.bytes, frame.map, frame.job_id) == (len(uploads[0].data), "hall", added.job_id)
-    assert (frame.pose.parent_frame, frame.pose.matrix) == ("R2/night", EYE)
-    assert frame.pose.child_frame == f"{frame.frame_id}.optical"
-    assert frame.indexed_at is not None
-    assert frame.received_at < frame.indexed_at

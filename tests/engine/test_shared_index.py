@@ -1,26 +1,23 @@
-"""Tests of shared indexes: built once, fetched completely, and deleted everywhere."""
+"""Tests of nodes that share a database and objects, and build, fetch and delete indexes."""
 
 import os
 import shutil
 import time
-from functools import partial
 
-import numpy as np
 import pytest
 from pydantic import ValidationError
 from sqlalchemy import select
 
+from sceneprint.engine.admin import statistics as measuring
+from sceneprint.engine.context import require_writable
 from sceneprint.engine.search import index_place, local_index
 from sceneprint.engine.search.index_place import IN_USE_S
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import DamagedIndex, UnusableStore
 from sceneprint.index.index_manifest import manifests
-from sceneprint.index.index_version import clear, newest, publish
 from sceneprint.settings import Settings
 from sceneprint.store.blobs.object_client import open_objects
-from sceneprint.store.events import anchor_of_now
-from sceneprint.store.maps import find_map
 from sceneprint.store.postgres.session_locks import index_turn
 from sceneprint.store.tables import frames, signatures
 from sceneprint_client.api import NewMap, Query
@@ -80,17 +77,8 @@ def built(host, fill):
     return engine
 
 
-def shared(engine):
-    return engine.indexes
-
-
-def row_of(engine, name="hall"):
-    with engine.store.database.read() as connection:
-        return find_map(connection, name)
-
-
 def folder_of(engine, name="hall"):
-    return index_folder(engine.settings.indexes, row_of(engine, name))
+    return index_folder(engine.settings.indexes, engine.row(name))
 
 
 def numbers(engine):
@@ -118,7 +106,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, upl
     assert stored == own
     assert "0000000001.json" in own
     first = ask(other, uploads)  # it waits for nothing
-    shared(other).finish()
+    other.indexes.finish()
     second = ask(other, uploads)
     assert second.index_version == 1
     assert found(second) == found(first) == found(ask(built, uploads))
@@ -127,69 +115,10 @@ def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, upl
     fill(other, range(4, 8))
     assert (other.publish_due(), built.publish_due()) == (1, 0)
     ask(built, uploads)
-    shared(built).finish()
+    built.indexes.finish()
     assert ask(built, uploads).index_version == 2
     assert found(ask(built, uploads)) == found(ask(other, uploads))
     assert ask(built, uploads).counts.map == 8
-
-
-@pytest.fixture
-def append(place):
-    """Publish and share signatures that no frame has, as the next version of map "hall"."""
-
-    def run(engine, n, drop=frozenset(), **more):
-        row, folder = row_of(engine), folder_of(engine)
-        previous = newest(folder, row.model_id, 448)
-        first = 0 if previous is None else int(previous.keys[-1]) + 1
-        rows = np.random.default_rng(first).integers(0, 256, (n, 448), np.uint8)
-        made = publish(
-            folder, model_id=row.model_id, revision=row.revision, previous=previous, drop=drop,
-            blocks=[(np.arange(first, first + n), rows)], after=shared(engine).last_number(row),
-            anchor=partial(anchor_of_now, engine.store.database, "hall"),
-            share=lambda manifest: shared(engine).share(row, manifest), **more,
-        )  # fmt: skip
-        assert made is not None
-        return made
-
-    return run
-
-
-def test_a_builder_that_dies_at_any_step_leaves_what_was_shared(
-    built, append, place, host, monkeypatch
-):
-    """Of a merge: files first, and the manifest last; the next builder goes on from what is put."""
-    built.create_map(NewMap(name="other", model="depth"))
-    row, objects, other = row_of(built), open_objects(place), host("two")
-    shared(built).withdraw(row)
-    clear(folder_of(built))
-    append(built, 100)
-    before, store = shared(built).head(row), shared(built)._store
-    for kind in (".keys", ".faiss", ".json"):
-
-        def dying(put, kind=kind):
-            def run(key, *arguments, **more):
-                if key.endswith(kind):
-                    raise UnusableStore("gone")
-                return put(key, *arguments, **more)
-
-            return run
-
-        with monkeypatch.context() as patch:
-            patch.setattr(store, "put_file", dying(store.put_file))
-            patch.setattr(store, "put", dying(store.put))
-            with pytest.raises(UnusableStore, match="gone"):
-                append(built, 60)
-        assert shared(built).head(row) == before
-        assert len(numbers(built)) == 1
-        assert shared(other).sync(row) == before
-    assert len([key for key in keys(objects) if key.endswith(".faiss")]) == 2
-    made = append(built, 60)
-    assert len(made.segments) == 1
-    assert shared(other).sync(row) == made.manifest
-    shared(built).prune(row, clean=True)
-    assert set(keys(objects)) == {
-        f"{made.number:010d}.json", *(name for name, _ in made.manifest.files)
-    }  # fmt: skip
 
 
 def test_who_lost_the_turn_publishes_nothing(built):
@@ -211,11 +140,11 @@ def test_who_lost_the_turn_publishes_nothing(built):
 
 def test_a_number_is_given_once(built):
     """Two that publish the same number: the second finds out, and what is there stays."""
-    row = row_of(built)
-    head = shared(built).head(row)
-    assert shared(built).share(row, head)  # a try whose answer was lost
-    assert not shared(built).share(row, head.model_copy(update={"anchor": "another"}))
-    assert shared(built).head(row) == head
+    row = built.row("hall")
+    head = built.indexes.head(row)
+    assert built.indexes.share(row, head)  # a try whose answer was lost
+    assert not built.indexes.share(row, head.model_copy(update={"anchor": "another"}))
+    assert built.indexes.head(row) == head
 
 
 @pytest.mark.sqlite_only("a folder is put back with its database")
@@ -240,7 +169,7 @@ def test_a_restored_database_is_not_given_what_came_after(
     engine = make_engine(data, **given)
     names = fill(engine, range(5, 8))
     answer = ask(engine, uploads, 5)
-    shared(engine).finish()
+    engine.indexes.finish()
     assert numbers(engine) == []  # not even fetched
     assert (answer.matches[0].frame_id, answer.counts.map) == (names[0], 5)
     assert engine.publish_due() == 1
@@ -263,7 +192,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, id
     other, service = host("two"), host("three", purge_deadline_s=1)
     for engine in (other, service):
         ask(engine, uploads)
-        shared(engine).finish()
+        engine.indexes.finish()
         assert numbers(engine) == [1]
     objects, secret = open_objects(place), signature(built, ids(built)[0])
 
@@ -292,7 +221,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, id
 def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, host, uploads, ids):
     service = host("two", purge_deadline_s=1)
     ask(service, uploads)
-    shared(service).finish()
+    service.indexes.finish()
     built.delete_frame("hall", ids(built)[0])
     left = []
     for _ in range(2):
@@ -306,7 +235,7 @@ def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, 
 def test_nothing_is_shared_of_maps_that_are_gone(built, place, host, uploads):
     service = host("two", purge_deadline_s=1)
     ask(service, uploads)
-    shared(service).finish()
+    service.indexes.finish()
     folder, objects = folder_of(service), open_objects(place)
     built.delete_map("hall")
     built.purging.now()
@@ -323,10 +252,10 @@ def test_what_is_damaged_in_the_store_is_withdrawn_and_built_anew(built, host, u
     data[-5] ^= 1
     objects.put(key, bytes(data))
     with pytest.raises(DamagedIndex, match="index 1 of map 'hall' is damaged"):
-        shared(other).sync(row_of(other))
+        other.indexes.sync(other.row("hall"))
     assert list(folder_of(other).glob("[0-9a-f]*.faiss")) == []
     assert host("three").publish_due() == 1
-    shared(other).sync(row_of(other))
+    other.indexes.sync(other.row("hall"))
     assert numbers(other) == [2]
     assert ask(other, uploads).index_version == 2
 
@@ -356,7 +285,7 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
         names = fill(engine, range(4))
         assert engine.publish_due() == 0
         answer = ask(engine, uploads)
-        shared(engine).finish()
+        engine.indexes.finish()
         assert (answer.matches[0].frame_id, answer.index_version) == (names[1], 0)
         assert numbers(engine) == []
     said = {record.message for record in caplog.records}
@@ -373,11 +302,11 @@ def test_room_is_made_of_indexes_that_nobody_uses(built, host, fill, uploads, id
     one = sum(path.stat().st_size for path in folder_of(built).glob("*.*"))
     node = host("two", index_cache_bytes=one + one // 2)
     ask(node, uploads)
-    shared(node).finish()
+    node.indexes.finish()
     ago = time.time() - idle_s
     os.utime(folder_of(node) / ".used", (ago, ago))
     ask(node, uploads, name="other")
-    shared(node).finish()
+    node.indexes.finish()
     assert bool(manifests(folder_of(node))) == left
     assert bool(manifests(folder_of(node, "other"))) != left
     for name in ("hall", "other"):
@@ -388,9 +317,60 @@ def test_another_database_is_refused(built, make_engine, place, tmp_path):
     stranger = make_engine(tmp_path / "stranger", index_url=place)
     stranger.create_map(NewMap(name="hall", model="depth"))
     with pytest.raises(UnusableStore, match="another database"):
-        shared(stranger).head(row_of(stranger))
+        stranger.indexes.head(stranger.row("hall"))
 
 
 def test_memory_is_shared_with_nobody():
     with pytest.raises(ValidationError, match="only in one process"):
         Settings(index_url="memory:///")
+
+
+@pytest.fixture
+def nodes(make_engine, postgres_url, bucket, tmp_path):
+    """Two, each with a data folder of its own."""
+    shared = {"database_url": postgres_url, "blob_url": f"{bucket}/fleet"}
+    one, other = (make_engine(tmp_path / name, **shared) for name in ("one", "other"))
+    return one, other
+
+
+def keys_of(objects, prefix):
+    return sorted(one.key for one in objects.list(prefix))
+
+
+def test_what_one_node_takes_another_works_on(nodes, uploads, work_off, bucket):
+    one, other = nodes
+    objects = open_objects(f"{bucket}/fleet")
+    one.create_map(NewMap(name="hall", model="depth"))
+    added = [one.add_frame("hall", each.data, each.meta)[0] for each in uploads[:2]]
+    assert len(keys_of(objects, "blobs/")) == 2
+    assert work_off(other) == ["succeeded"] * 2
+    assert len(keys_of(objects, "blobs/")) == 4  # with the artifacts
+    told = one.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(k=1))
+    assert told.status == "found"
+    assert told.matches[0].frame_id == added[0].frame_id
+    assert one.query_log.flush(60)
+    assert other.query_log.find(told.query_id).answer == told
+    assert keys_of(objects, "queries/") == [f"queries/{told.query_id}"]
+    assert not (one.settings.data_dir / "blobs").exists()
+    assert not (one.settings.data_dir / "queries").exists()
+    size = measuring.sizes(one.settings, one.store)
+    assert size.blobs == sum(each.size for each in objects.list("blobs/"))
+    assert size.database > 1 << 20
+    row_of = {each.digest: each.place for each in one.store.blobs.entries()}
+    assert all(place.startswith(f"{bucket}/fleet/blobs/") for place in row_of.values())
+    # what is deleted for good is gone from the bucket at once, and with the map so is everything
+    other.delete_frame("hall", added[1].frame_id)
+    assert len(keys_of(objects, "blobs/")) == 4  # it can be restored
+    assert one.tombstones.purge(everything=True) == 1
+    assert len(keys_of(objects, "blobs/")) == 2
+    one.delete_map("hall")
+    assert keys_of(objects, "blobs/") == []
+
+
+def test_what_ends_with_a_process_is_for_one_process_alone(make_engine, uploads, work_off):
+    engine = make_engine(blob_url="memory:///")
+    engine.create_map(NewMap(name="hall", model="depth"))
+    engine.add_frame("hall", uploads[0].data, uploads[0].meta)
+    assert work_off(engine) == ["succeeded"]
+    with pytest.raises(UnusableStore, match=r"memory:///.*Client.embedded"):
+        require_writable(engine.settings)

@@ -87,14 +87,20 @@ def cells_of(engine, parent, level=0):
     return SurfaceCells(*columns), own.cell_m
 
 
-def oracle(engine, cell_m):
-    """What each frame saw of each cell: its mean, its session and its time, by parent frame."""
-    found = {}
+def seen(engine):
+    """Frames of the map where they were taken, and their artifacts."""
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
         numbers = numbers_of_runs(connection, row.number, None, None)
         stops = path_frames(connection, numbers)
         blobs = geometry_blobs(connection, numbers, row.model_id)
+    return stops, blobs
+
+
+def oracle(engine, cell_m):
+    """What each frame saw of each cell: its mean, its session and its time, by parent frame."""
+    found = {}
+    stops, blobs = seen(engine)
     for number in sorted(stops):
         stop = stops[number]
         if stop.pose is None or stop.parent is None:
@@ -296,11 +302,7 @@ def test_a_spot_is_seen_by_the_frames_that_have_a_point_there(engine):
     parent = engine.surfaces.get("hall").parents[0]
     cells, cell_m = cells_of(engine, parent.parent_frame)
     spot = cells.points[int(np.argmax(cells.seen))].tolist()
-    with engine.store.database.read() as connection:
-        row = find_map(connection, "hall")
-        numbers = numbers_of_runs(connection, row.number, None, None)
-        stops = path_frames(connection, numbers)
-        blobs = geometry_blobs(connection, numbers, row.model_id)
+    stops, blobs = seen(engine)
     expected = []
     for number, stop in stops.items():
         if stop.parent != parent.parent_frame:
@@ -325,20 +327,18 @@ def test_a_spot_is_seen_by_the_frames_that_have_a_point_there(engine):
 
 def test_frames_in_a_box(engine):
     parent = engine.surfaces.get("hall").parents[1].parent_frame
-    own = [
-        frame for frame in engine.list_frames("hall").items
-        if frame.pose is not None and frame.pose.parent_frame == parent
-    ]  # fmt: skip
-    at = {one.frame_id: np.array(one.pose.matrix)[:3, 3] for one in own if one.pose is not None}
-    first = next(iter(at.values()))
-    half = np.array([0.6, 5.0, 5.0])
-    low, high = first - half, first + half
+    posed = [one for one in engine.list_frames("hall").items if one.pose is not None]
+    at = {
+        one.frame_id: np.array(one.pose.matrix)[:3, 3]
+        for one in posed if one.pose.parent_frame == parent
+    }  # fmt: skip
+    first, half = next(iter(at.values())), np.array([0.6, 5.0, 5.0])
+    low, high = (first - half).tolist(), (first + half).tolist()
     expected = {name for name, one in at.items() if abs(one[0] - first[0]) <= 0.6}
-    assert len(expected) > 0
-    found = engine.surfaces.frames_in("hall", high.tolist(), low.tolist(), parent)
-    assert {one.frame_id for one in found.items} == expected
+    found = engine.surfaces.frames_in("hall", high, low, parent)
+    assert {one.frame_id for one in found.items} == expected != set()
     assert {one.distance_m for one in found.items} == {None}
-    one_by_one = engine.surfaces.frames_in("hall", low.tolist(), high.tolist(), parent, None, 1)
+    one_by_one = engine.surfaces.frames_in("hall", low, high, parent, None, 1)
     assert [one.frame_id for one in one_by_one.items] == [found.items[0].frame_id]
     assert (one_by_one.next_cursor is not None) == (len(expected) > 1)
 
@@ -357,17 +357,16 @@ def test_a_plan_shows_what_lies_between_two_heights(engine):
     whole = picture()
     assert whole.shape == (parent.plan.height, parent.plan.width, 4)
     assert max(whole.shape) == 1024
-    flat = cells.points @ axes.T
+    assert max(picture(width=100).shape) == 100
+    flat, heights = cells.points @ axes.T, cells.points @ up
     x = ((flat[:, 0] - parent.plan.left) / parent.plan.m_per_pixel).astype(int)
     y = ((parent.plan.top - flat[:, 1]) / parent.plan.m_per_pixel).astype(int)
     assert (whole[y, x, 3] > 0).all()
     assert 0.05 < (whole[..., 3] == 0).mean() < 0.95
-    small = picture(width=100)
-    assert max(small.shape) == 100
-    heights = cells.points @ up
     middle = float(np.median(heights))
-    low, high = picture(high=middle), picture(low=middle)
-    for cut, inside in ((low, heights <= middle), (high, heights >= middle)):
+    for cut, inside in (
+        (picture(high=middle), heights <= middle), (picture(low=middle), heights >= middle),
+    ):  # fmt: skip
         assert (cut[y[inside], x[inside], 3] > 0).all()
         assert (cut[..., 3] > 0).sum() < (whole[..., 3] > 0).sum()
     assert not picture(low=heights.max() + 1)[..., 3].any()

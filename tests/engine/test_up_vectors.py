@@ -10,7 +10,7 @@ from sceneprint.engine.search.query import localization_of
 from sceneprint.engine.search.up_vectors import known_ups
 from sceneprint.errors import FrameConflict, InvalidRequest, MapExists
 from sceneprint.store.maps import find_frame, find_map
-from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query
+from sceneprint_client.api import NewMap, Query
 from sceneprint_client.api.base import FrameMeta, checked
 
 Z = [0.0, 0.0, 1.0]  #: up in the world of synthetic rooms
@@ -171,14 +171,3 @@ def test_a_stored_frame_asks_with_the_up_that_is_known_of_it(level, ids):
     told = level.query_frame("hall", name, Query(keep=False))
     assert told.status == "found"
     assert told.matches[0].validation.tilt_deg == pytest.approx(0.0, abs=2.0)
-
-
-def test_two_frames_are_compared_with_their_ups(level, ids, uploads):
-    one = uploads[1]
-    stored = NamedFrame(map="hall", frame_id=ids(level)[2])
-    for tilt, status in ((0, "accepted"), (20, "rejected")):
-        sent = one.data, with_up(one.meta, up_of(one, tilt))
-        told = level.queries.compare(sent, stored, Comparison()).validation
-        assert told.status == status
-    alone = level.queries.compare((one.data, one.meta), stored, Comparison()).validation
-    assert (alone.status, alone.tilt_deg) == ("accepted", None)

@@ -73,7 +73,6 @@ def test_a_signature_whose_artifact_is_swept_before_its_commit_is_made_again(
     added, _ = empty.add_frame("hall", uploads[0].data, uploads[0].meta)
     (upload,) = blobs(empty)
     claimed = empty.claim("w")
-    assert claimed is not None
     sweep_before(empty, "INSERT INTO signatures", lambda: [b for b in blobs(empty) if b != upload])
     if empty.store.database.is_sqlite:
         assert empty.run(claimed) == JobState.QUEUED

@@ -127,7 +127,6 @@ class Slow:
     """A frame whose bytes come from a pipe, like those of a slow disk."""
 
     added: Added
-    path: Path
     pipe: Path
     data: bytes
 
@@ -142,12 +141,6 @@ class Slow:
             return os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK)
         except OSError:
             return 0  # the pipe has no reader yet
-
-    def mend(self):
-        """Replace the pipe by a file for later readers."""
-        other = self.path.with_suffix(".mended")
-        other.write_bytes(self.data)
-        other.replace(self.path)
 
 
 @pytest.fixture
@@ -166,6 +159,6 @@ def slow(crew, frames):
         path.hardlink_to(pipe)
         crew.send(signal.SIGCONT)
         until(lambda: crew.pid(added.job_id))
-        return Slow(added, path, pipe, frames[number][0])
+        return Slow(added, pipe, frames[number][0])
 
     return make

@@ -1,6 +1,5 @@
 """Tests of worker processes, which sign each frame once after faults of disk and database."""
 
-import os
 import re
 import signal
 import time
@@ -55,33 +54,6 @@ def test_a_job_that_takes_many_leases_is_kept_by_its_worker(crew, slow):
     assert crew.pid(job_id) == holder
     assert crew.signed("patient") == [1]
     assert [one for one in crew.log("lease lost") if one["job_id"] == job_id] == []
-
-
-def test_a_worker_that_wakes_up_late_stores_nothing(crew, slow, frames):
-    job = slow("late", 41)
-    sleeper, job_id = crew.pid(job.added.job_id), job.added.job_id
-    os.kill(sleeper, signal.SIGSTOP)
-    try:
-        job.mend()
-        crew.settled("late", 1)
-        assert crew.job(job_id, "state, attempts, token") == ("succeeded", 2, 2)
-        other = crew.pid(job_id)
-        assert other != sleeper
-        ((indexed_at, revision),) = crew.rows(
-            f"SELECT indexed_at, revision FROM frames WHERE id = '{job.added.frame_id}'"
-        )
-    finally:
-        os.kill(sleeper, signal.SIGCONT)  # opens the file once more, and finds the mended one
-    (lost,) = until(lambda: [one for one in crew.log("lease lost") if one["job_id"] == job_id])
-    assert (lost["attempt"], lost["level"]) == (1, "warning")
-    assert crew.job(job_id, "state, attempts, token") == ("succeeded", 2, 2)
-    assert crew.pid(job_id) == other
-    assert crew.signed("late") == [1]
-    assert crew.rows(
-        f"SELECT indexed_at, revision FROM frames WHERE id = '{job.added.frame_id}'"
-    ) == [(indexed_at, revision)]
-    crew.engine.add_frame("late", *frames[42])
-    crew.settled("late", 2)
 
 
 def test_told_to_stop_workers_give_back_what_they_have_not_begun(crew, frames):
