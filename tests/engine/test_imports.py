@@ -13,6 +13,7 @@ import pytest
 
 from sceneprint.decoders.recording_decoder import RecordingDecoder, RecordingIndex
 from sceneprint.engine.ingest import archive_import
+from sceneprint.engine.ingest import uploads as uploading
 from sceneprint.engine.jobs.lifecycle import cancel, list_jobs, worker_died
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.maps.map_lifecycle import edit_map
@@ -348,3 +349,21 @@ def test_damage_is_the_fault_of_the_file(engine, ros, tmp_path):
     notes.write_bytes(b"no recording" * 1000)
     with pytest.raises(UnreadableArchive, match=r"notes\.txt"):
         begun(engine, notes)
+
+
+def test_a_frame_that_memory_does_not_do_for_costs_no_other(empty, uploads, monkeypatch):
+    decode, asked = uploading.read_upload, []
+
+    def decoded(data, meta, decoders):
+        asked.append(data)
+        if data == uploads[1].data:
+            raise MemoryError
+        return decode(data, meta, decoders)
+
+    monkeypatch.setattr(uploading, "read_upload", decoded)
+    job = begin_import(empty, packed(uploads[:3]))
+    assert empty.run(claim_long(empty)) == JobState.SUCCEEDED
+    items = empty.imports.items("hall", job.job_id).items
+    assert [one.status for one in items] == [202, 422, 202]
+    assert len(asked) == 5  # two of three together, then each alone
+    assert "needs more memory than a worker may use" in items[1].problem.detail

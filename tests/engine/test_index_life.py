@@ -216,3 +216,23 @@ def test_a_map_made_anew_has_none_of_the_old_frames(data, make_engine, uploads, 
         answer = ask(engine, uploads, 7)
         assert found(answer) == [(added.frame_id, 0)]
         assert answer.index_version == 0
+
+
+def test_a_node_that_is_far_behind_begins_with_the_newest_index(
+    data, make_engine, uploads, more, monkeypatch
+):
+    monkeypatch.setattr(local_index, "READ_MOST", 2)
+    reader, builder = make_engine(data, unindexed_frames=2), make_engine(data, unindexed_frames=2)
+    ask(reader, uploads)
+    more(builder, 3)
+    assert builder.publish_due() == 1
+    read, changes_since = [], local_index.changes_since
+
+    def noted(*given, **named):
+        for block in changes_since(*given, **named):
+            read.extend(block)
+            yield block
+
+    monkeypatch.setattr(local_index, "changes_since", noted)
+    answer = ask(reader, uploads)
+    assert (len(found(answer)), answer.index_version, read) == (15, 1, [])

@@ -176,3 +176,22 @@ def test_what_may_be_asked():
         with pytest.raises(InvalidRequest, match="above 0 and up to 1") as caught:
             novelty_of(wrong)
         assert [place for place, _ in caught.value.fields] == ["if_novel"]
+
+
+def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(
+    empty, uploads, send, share, monkeypatch
+):
+    nearest, other = send(empty, 2), send(empty, 1)
+    assert share(3, 2) < share(3, 1)
+    looks = []
+
+    def interrupted(*given):
+        looks.append(find_nearest(*given))
+        if len(looks) == 1:
+            empty.delete_frame("hall", nearest.frame_id)
+        return looks[-1]
+
+    monkeypatch.setattr(working, "find_nearest", interrupted)
+    frame = send(empty, 3, share(3, 1))
+    assert (len(looks), frame.state) == (2, FrameState.REDUNDANT)
+    assert other.frame_id in frame.reason

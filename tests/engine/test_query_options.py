@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy import update
 
-from sceneprint.engine.search import retrieval
+from sceneprint.engine.search import local_index, retrieval
 from sceneprint.engine.search.retrieval import FIRST_S, Deadline
 from sceneprint.engine.search.verification import thresholds
 from sceneprint.errors import UnknownFrame
@@ -259,3 +259,44 @@ def test_a_frame_that_is_not_searched_is_explained(full, ids):
     assert (bad.lost_at, bad.state) == ("state", "rejected")
     with pytest.raises(UnknownFrame, match="'nobody' in map 'hall'"):
         ask(full, names[0], explain_frame="nobody")
+
+
+def test_what_an_approximate_index_missed_is_said(full, ids, monkeypatch):
+    names = ids(full)
+    near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
+    real, lost = local_index.search, near[1]
+    number = names.index(lost) + 1
+
+    def search(*given, dead, exact, **more):
+        if exact:
+            return real(*given, dead=dead, exact=True, **more)
+        return replace(real(*given, dead=dead | {number}, exact=False, **more), exact=False)
+
+    monkeypatch.setattr(local_index, "search", search)
+    monkeypatch.setattr(retrieval, "ranking_size", lambda n: min(n, 3))
+    for rank, name in enumerate(near[:5], 1):
+        answer = ask(full, names[0], explain_frame=name, stages=["retrieve"], k=3)
+        assert (answer.exact, answer.counts.compared) == (False, 10)
+        one = answer.explained_frame
+        assert (one.rank, one.shortlisted) == (rank, name != lost)
+        lost_at = "shortlist" if name == lost else (None if rank <= 4 else "ranking")
+        assert (one.lost_at, one.ranked) == (lost_at, lost_at is None)  # one place is free
+
+
+def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(full, ids, monkeypatch):
+    name, asked = ids(full)[0], []
+    last = ask(full, name, k=50, stages=["retrieve"]).matches[-1].frame_id
+
+    def so_often(self):
+        asked.append(self)
+        self.reached = len(asked) > 3
+        return not self.reached
+
+    monkeypatch.setattr(Deadline, "allows", so_often)
+    how = {"candidates": 3, "stages": VR, "deadline_ms": 600_000, "validation": {"evidence": 1.0}}
+    answer = ask(full, name, **how, explain_frame=last)
+    one = answer.explained_frame
+    assert (len(asked), one.lost_at) == (4, "selection")
+    assert one.validation.reason == "the deadline passed before it was validated"
+    assert (answer.counts.validated, answer.counts.accepted) == (3, 0)
+    assert (answer.status, answer.deadline_reached) == ("not_found", False)  # all were tried

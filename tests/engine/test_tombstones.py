@@ -251,3 +251,15 @@ def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
     assert (now.state, now.reason) == (FrameState.REJECTED, "as a test says")
     assert empty.get_frame("hall", made[1].frame_id).state == FrameState.DELETED
     assert used(empty) == use
+
+
+def test_a_frame_of_a_map_that_has_another_model_now_is_signed_again(full, work_off, small_model):
+    first = next(iter(frames(full)))
+    full.delete_frame("hall", first)
+    full.reencode("hall", small_model)
+    work_off(full)
+    full.publish_due()
+    assert full.get_map("hall").model_id == small_model.id
+    full.tombstones.restore_one("hall", first)
+    assert full.get_frame("hall", first).state == FrameState.RECEIVED
+    assert work_off(full) == ["succeeded"]

@@ -7,7 +7,7 @@ import pytest
 from sqlalchemy import update
 
 from sceneprint.engine import signers
-from sceneprint.engine.search import local_index, verification
+from sceneprint.engine.search import local_index, retrieval, verification
 from sceneprint.engine.search.retrieval import Deadline, prepare_stored
 from sceneprint.engine.upkeep import index_upkeep
 from sceneprint.errors import InvalidRequest, UnknownMap, UnreadableModel
@@ -246,3 +246,21 @@ def test_what_is_deleted_while_an_index_is_published_stays_deleted(
         assert answer.index_version == 1
         assert answer.counts.map == answer.counts.ranked == len(answer.matches) == 10
         assert {m.frame_id for m in answer.matches} == set(names[1:11])
+
+
+def test_what_was_not_asked_for_long_is_not_held(make_engine, uploads, work_off, monkeypatch):
+    engine = make_engine()
+    for name in ("hall", "other"):
+        engine.create_map(NewMap(name=name, model="depth"))
+        engine.add_frame(name, uploads[0].data, uploads[0].meta)
+    work_off(engine)
+
+    def held():
+        for name in ("hall", "other", "hall"):
+            answer = engine.queries.upload([name], uploads[0].data, uploads[0].meta, ALL)
+            assert answer.matches[0].distance == 0
+        return list(engine.readers._open)
+
+    assert held() == ["other", "hall"]
+    monkeypatch.setattr(retrieval, "HELD_BYTES", 2 * 64 * 448 - 1)  # 64 rows are set aside at once
+    assert held() == ["hall"]
