@@ -280,6 +280,7 @@ def test_a_long_run_forgets_votes():
     core = TrackerCore(TrackerParameters(most_votes=4))
     for i in range(20):
         step(core, i, i, several(at(10, 20 + i), at(40, 20 + i)))
+    assert len(core._votes) <= 8
     state = step(core, 20, 20, found(at(10, 40), strong=False))
     assert state.status in ("ambiguous", "lost")
 

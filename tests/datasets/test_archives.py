@@ -115,30 +115,6 @@ def tar_of(*members):
     return made.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("image", "pose"),
-    [
-        ("scene/frame_depth_1.png", "scene/frame_pose_1.txt"),
-        ("scene/depth/1.png", "scene/pose/1.txt"),
-        ("scene/1.png", "scene/1.pose.txt"),
-    ],
-)
-def test_an_archive_has_the_poses_that_its_folder_has(image, pose, tmp_path):
-    folder = tmp_path / "packed"
-    for one in (image, pose):
-        (folder / one).parent.mkdir(parents=True, exist_ok=True)
-    write_depth_png(folder / image, DEPTH, 1000.0)
-    write_pose(folder / pose, pose_at(3.0))
-    write_intrinsics(folder / "scene", CAMERA)
-    (of_folder,) = find_sequences(folder / "scene")
-    assert of_folder.frames[0].pose is not None
-    with looked_into(zipped(folder / "scene"), tmp_path) as archive:
-        (of_archive,) = archive.sequences
-        pose = of_archive.frames[0].pose
-    assert pose is not None
-    np.testing.assert_array_equal(pose, of_folder.frames[0].pose)
-
-
 def inflated(data, most=1 << 30, step=1 << 16):
     inflater = Inflater(most)
     parts = [p for i in range(0, len(data), step) for p in inflater.pieces(data[i : i + step])]

@@ -175,16 +175,6 @@ def test_a_mesh_does_not_hide_the_images_below_it(hall):
     assert [s.layout for s in find_sequences(hall)] == [Layout.CLOUDS]
 
 
-def test_damaged_clouds_and_names(hall):
-    (hall / "scan-1.ply").write_bytes(b"ply\n")
-    with pytest.raises(UnreadableCloud, match=r"scan-1\.ply: The PLY header has no end_header"):
-        find_sequences(hall)[0].frames[0].read()
-    (hall / "scan-1.ply").unlink()
-    (hall / "scan-3.pcd").write_bytes(b"")
-    with pytest.raises(DatasetError, match=r"same name as scan-3\.BIN, hall/scan-3"):
-        find_sequences(hall)
-
-
 def test_files_that_are_neither_depth_nor_points_are_named_as_such(tmp_path):
     (tmp_path / "points.csv").write_text("x,y,z\n1,2,3\n")
     with pytest.raises(DatasetError, match=r"points\.csv: The file is neither a depth image \("):

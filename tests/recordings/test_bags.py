@@ -202,19 +202,6 @@ def test_without_poses_frames_are_taken_by_time(tmp_path, ros, depth):
     assert len(only(path, RecordingOptions(keyframe_s=0)).frames) == 20
 
 
-def test_odometry_gives_poses_where_tf_does_not(tmp_path, ros, walk, depth):
-    def fill(writer):
-        writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
-        writer.camera_info(0.0)
-        for i, (t, T) in enumerate(walk):
-            writer.odometry(t, T)
-            writer.image(t, depth(i))
-
-    frames = only(ros.write(tmp_path, fill)).frames
-    for (_, T), frame in zip(walk, frames, strict=True):
-        np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
-
-
 def test_odometry_with_more_messages_is_used_and_the_other_is_named(tmp_path, ros, walk, depth):
     def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")

@@ -4,7 +4,6 @@ import struct
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Reader as Ros1Reader
 
 from sceneprint.errors import UnreadableFrame
 from sceneprint.formats.dataset import find_sequences
@@ -159,45 +158,3 @@ def test_png_of_16_bits(form, tmp_path, ros):
 
     (found,) = find_sequences(ros.write(tmp_path, fill), ALL)
     np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))
-
-
-def mcap_of(bag, profile):
-    """Return the messages of a ROS 1 bag in MCAP, without an index, as its specification says."""
-
-    def text(value):
-        return struct.pack("<I", len(value)) + value.encode()
-
-    def record(kind, content):
-        return struct.pack("<BQ", kind, len(content)) + content
-
-    magic = b"\x89MCAP0\r\n"
-    data = magic + record(1, text(profile) + text("by hand"))
-    with Ros1Reader(bag) as reader:
-        for one in reader.connections:
-            name = one.msgtype.replace("/msg/", "/")
-            data += record(
-                3, struct.pack("<H", one.id + 1) + text(name) + text("ros1msg") + text("")
-            )
-            channel = struct.pack("<HH", one.id + 1, one.id + 1)
-            data += record(4, channel + text(one.topic) + text("ros1") + text(""))
-        for one, log_ns, body in reader.messages():
-            data += record(5, struct.pack("<HIQQ", one.id + 1, 0, log_ns, log_ns) + bytes(body))
-    return data + record(15, bytes(4)) + record(2, bytes(20)) + magic
-
-
-@pytest.mark.parametrize("profile", ["ros1", ""])
-def test_messages_of_ros_1_in_mcap(tmp_path, ros, profile):
-    def fill(writer):
-        for t in (0.0, 1.0):
-            writer.camera_info(t)
-            writer.image(t, IMAGE)
-
-    bag = ros.write(tmp_path, fill, "ros1")
-    path = tmp_path / "other" / "run.mcap"
-    path.parent.mkdir()
-    path.write_bytes(mcap_of(bag, profile))
-    (expected,), (found,) = find_sequences(bag, ALL), find_sequences(path, ALL)
-    assert [one.timestamp for one in found.frames] == [one.timestamp for one in expected.frames]
-    assert found.frames[0].camera == expected.frames[0].camera
-    for one in found.frames:
-        np.testing.assert_array_equal(one.read_depth().depth, np.float32(2))

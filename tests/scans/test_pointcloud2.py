@@ -93,10 +93,3 @@ def test_wrong_numbers_are_named(serialize, points):
     assert decode_scan(data + bytes(3)).file_points == len(points)  # as middleware fills up
     with pytest.raises(UnreadableCloud, match="8 bytes follow"):
         decode_scan(data + bytes(8))
-
-
-def test_axes_may_be_upper_case(serialize, points):
-    rows = np.zeros(len(points), [("X", "<f4"), ("Z", "<f4"), ("Y", "<f4")])
-    rows["X"], rows["Y"], rows["Z"] = (points + 10).T
-    scan = decode_scan(serialize(rows))
-    np.testing.assert_array_equal(scan.cloud.points, (points + 10).astype(np.float32))
