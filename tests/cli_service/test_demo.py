@@ -1,5 +1,6 @@
 """Tests of `sceneprint demo`, which removes its data however it ends."""
 
+import json
 import os
 import re
 import signal
@@ -13,6 +14,8 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.options import ended_by_signals
+from sceneprint.errors import DatasetError
+from sceneprint_lab.cli.demo import choose_frames
 from tests.cli_service.conftest import write_rooms
 
 
@@ -113,3 +116,43 @@ def test_signals_that_are_ignored_stay_so_and_others_are_given_back():
     finally:
         for number, handler in zip((signal.SIGTERM, signal.SIGHUP), before, strict=True):
             signal.signal(number, handler)
+
+
+# Selection of frames.
+
+
+@pytest.fixture
+def scene(tmp_path):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    camera = {"width": 2, "height": 2, "fx": 1, "fy": 1, "cx": 0, "cy": 0}
+    (scene / "intrinsics.json").write_text(json.dumps(camera))
+    return scene
+
+
+def sequence(folder, frames):
+    folder.mkdir(parents=True)
+    for i in range(frames):
+        (folder / f"frame-{i:06d}.depth.png").write_bytes(b"never read")
+
+
+def test_without_split_files_the_first_60_percent_are_the_map_and_5_are_left_out(scene):
+    sequence(scene / "seq-01", 100)
+    choice = choose_frames(scene)
+    database, queries = ([int(one.reference.name[-6:]) for one in some]
+                         for some in (choice.database, choice.queries))  # fmt: skip
+    assert (database, queries) == (list(range(60)), list(range(65, 100)))
+    assert {(one.parent, one.session) for one in choice.queries} == {("scene", "seq-01")}
+
+
+def test_split_files_decide_where_they_are(scene):
+    sequence(scene / "seq-01", 3)
+    sequence(scene / "seq-02", 2)
+    (scene / "TrainSplit.txt").write_text("sequence2\n")
+    (scene / "TestSplit.txt").write_text("sequence1\n")
+    choice = choose_frames(scene)
+    assert {one.session for one in choice.database} == {"seq-02"}
+    assert (len(choice.database), len(choice.queries)) == (2, 3)
+    (scene / "TestSplit.txt").unlink()
+    with pytest.raises(DatasetError, match=r"\(found: 2\) .* \(found: 0\)"):
+        choose_frames(scene)

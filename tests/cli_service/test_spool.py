@@ -10,10 +10,8 @@ from pathlib import Path
 import pytest
 
 from sceneprint_client import Client
-from sceneprint_client.api import CameraIntrinsics
 
 ROOT = Path(__file__).resolve().parents[2]
-CAMERA = CameraIntrinsics(width=16, height=12, fx=14, fy=14, cx=7.5, cy=5.5)
 
 
 def test_what_was_not_tried_is_not_told_to_be_there(sceneprint, rooms, tmp_path):

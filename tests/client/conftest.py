@@ -15,7 +15,6 @@ import pytest
 from sceneprint.formats.dataset import (
     find_sequences,
     write_depth_png,
-    write_intrinsics,
 )
 from sceneprint_client import Client, http
 from sceneprint_client.api import FrameMeta, JobState, Localization
@@ -120,18 +119,6 @@ def produced(service_url, walk):
         jobs = [client.upload("produced", *frame).job_id for frame in frames]
         assert {job.state for job in client.wait(jobs)} == {JobState.SUCCEEDED}
         yield client
-
-
-@pytest.fixture(scope="session")
-def bare_wall(tmp_path_factory, references):
-    """A frame that decodes but has no surface to sign: 30 samples of a wall."""
-    folder = tmp_path_factory.mktemp("bare")
-    lens = references[0].camera.intrinsics
-    depth = np.zeros((lens.height, lens.width), np.float32)
-    depth[100:105, 100:106] = 2.0
-    write_intrinsics(folder, references[0].camera)
-    write_depth_png(folder / "wall.png", depth, 1000.0)
-    return folder / "wall.png"
 
 
 @pytest.fixture

@@ -39,9 +39,13 @@ def test_a_frame_from_upload_to_deletion(client, map_name, references):
     assert [one.frame_id for one in client.frames(map_name, FrameState.DELETED)] == [added.frame_id]
 
 
-def test_jobs_are_waited_for(client, map_name, references, bare_wall):
+def test_jobs_are_waited_for(client, map_name, references):
     client.create_map(map_name)
-    added = [client.upload(map_name, one) for one in (*references[:2], bare_wall)]
+    lens = meta_of(references[0]).intrinsics
+    wall = np.zeros((lens.height, lens.width), np.float32)
+    wall[100:105, 100:106] = 2.0  # no surface to sign: 30 samples
+    added = [client.upload(map_name, one) for one in references[:2]]
+    added.append(client.upload(map_name, wall, lens))
     seen = []
     ids = [one.job_id for one in added]
     jobs = client.wait([*ids, ids[0]], timeout_s=PATIENCE_S, progress=lambda *n: seen.append(n))

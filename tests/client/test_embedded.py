@@ -10,8 +10,6 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import Client, errors
 from service.embedded import LocalService, embedded_settings
 
-BINARY = {"Content-Type": "application/octet-stream"}
-
 
 @pytest.fixture
 def local(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sceneprint.errors import FrameError
-from sceneprint.formats.dataset import Camera, make_frame
+from sceneprint.formats.dataset import Camera, make_frame, write_depth_png, write_pose
 from sceneprint.types import Intrinsics
 
 CAMERA = Camera(Intrinsics(4, 3, 5.0, 5.0, 1.5, 1.0), 1000.0)
@@ -40,6 +40,17 @@ def mutations(data, number):
                 case _:
                     mutated[place:place] = random.bytes(int(random.integers(1, 9)))
         yield bytes(mutated)
+
+
+def seven_scenes(folder, frames=2, farther=0):
+    """Write a sequence of 7-Scenes with colour; return its folder."""
+    folder.mkdir(parents=True)
+    for i in range(frames):
+        depth = DEPTH + np.float32(i + farther)
+        write_depth_png(folder / f"frame-{i:06d}.depth.png", depth, 1000.0)
+        write_pose(folder / f"frame-{i:06d}.pose.txt", pose_at(i))
+        (folder / f"frame-{i:06d}.color.png").write_bytes(b"colour")
+    return folder
 
 
 def pose_at(x):

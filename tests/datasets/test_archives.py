@@ -27,9 +27,8 @@ from sceneprint.formats.dataset import (
     find_sequences,
     write_depth_png,
     write_intrinsics,
-    write_pose,
 )
-from tests.datasets.shared import CAMERA, DEPTH, pose_at
+from tests.datasets.shared import CAMERA, DEPTH, seven_scenes
 
 PACKERS = {
     "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress,
@@ -57,13 +56,7 @@ def kitchen(tmp_path_factory):
     """A scene of 7-Scenes with two sequences and colour."""
     scene = tmp_path_factory.mktemp("scenes") / "kitchen"
     for number in (1, 2):
-        folder = scene / f"seq-{number:02d}"
-        folder.mkdir(parents=True)
-        for i in range(3):
-            depth = DEPTH + np.float32(i + 10 * number)
-            write_depth_png(folder / f"frame-{i:06d}.depth.png", depth, 1000.0)
-            write_pose(folder / f"frame-{i:06d}.pose.txt", pose_at(i))
-            (folder / f"frame-{i:06d}.color.png").write_bytes(b"colour")
+        seven_scenes(scene / f"seq-{number:02d}", frames=3, farther=10 * number)
     (scene / "TrainSplit.txt").write_text("sequence1\n")
     write_intrinsics(scene, CAMERA)
     return scene

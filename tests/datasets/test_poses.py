@@ -55,7 +55,6 @@ def test_a_rounded_rotation_becomes_the_nearest_true_one():
     assert rough[0, 0] == round(POSE[0, 0], 3)  # the caller's matrix is as it was
 
 
-ROWS = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
 BAD = {
     "": "0 words",
     "1 " * 17: "17 words",

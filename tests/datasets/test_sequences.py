@@ -11,20 +11,10 @@ from sceneprint.formats.dataset import (
     sequences,
     write_depth_png,
     write_intrinsics,
-    write_pose,
 )
 from sceneprint.formats.dataset.frame_reference import numbered_sequences
 from sceneprint.types import Intrinsics
-from tests.datasets.shared import CAMERA, DEPTH, pose_at
-
-
-def seven_scenes(folder, frames=2):
-    folder.mkdir(parents=True)
-    for i in range(frames):
-        write_depth_png(folder / f"frame-{i:06d}.depth.png", DEPTH + np.float32(i), 1000.0)
-        write_pose(folder / f"frame-{i:06d}.pose.txt", pose_at(i))
-        (folder / f"frame-{i:06d}.color.png").write_bytes(b"colour")
-    return folder
+from tests.datasets.shared import CAMERA, DEPTH, pose_at, seven_scenes
 
 
 @pytest.fixture

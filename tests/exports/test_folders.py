@@ -7,7 +7,6 @@ import zipfile
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from sceneprint.errors import DatasetError, UnreadableArchive, UnreadableFrame
 from sceneprint.formats.archive import open_archive
@@ -16,7 +15,6 @@ from sceneprint.formats.depth_file import decode_frame, encode_png
 from sceneprint_client.frame_files import meta_of, sendable
 from sceneprint_client.poses import quaternion_of
 
-Floats = NDArray[np.float64]
 #: From optical axes to those of OpenGL and ARKit: y up, z backward.
 FLIP = np.diag([1.0, -1, -1, 1])
 #: From the room's world, z up, to ARKit's, y up: (x, y, z) is (x, z, -y) there.

@@ -9,7 +9,6 @@ from contextlib import closing, suppress
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
 from sceneprint.errors import DatasetError, SceneprintError, UnreadableCloud, UnreadableFrame
@@ -20,7 +19,6 @@ from sceneprint.formats.exports.rtabmap_blobs import depth_samples
 from sceneprint_client.frame_files import meta_of
 from tests import bag_writer
 
-Floats = NDArray[np.float64]
 #: A camera on a robot: 0.2 m ahead, 0.5 m up, looking forward; optical axes to the base.
 LOCAL = np.array([[0.0, 0, 1, 0.2], [-1, 0, 0, 0.1], [0, -1, 0, 0.5], [0, 0, 0, 1]])
 #: Columns of Node and Data by version, beside those that all have.
