@@ -27,8 +27,9 @@ from sceneprint.formats.dataset import (
     find_sequences,
     write_depth_png,
     write_intrinsics,
+    write_pose,
 )
-from tests.datasets.shared import CAMERA, DEPTH, seven_scenes
+from tests.datasets.shared import CAMERA, DEPTH, pose_at, seven_scenes
 
 PACKERS = {
     "gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress,
@@ -151,6 +152,30 @@ def test_it_is_read_as_the_folder_is(kind, which, kitchen, desk, tmp_path):
         first = archive.sequences[0].frames[0]
         assert archive.name_of(first).startswith(f"{folder.name}/")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("image", "pose"),
+    [
+        ("scene/frame_depth_1.png", "scene/frame_pose_1.txt"),
+        ("scene/depth/1.png", "scene/pose/1.txt"),
+        ("scene/1.png", "scene/1.pose.txt"),
+    ],
+)
+def test_an_archive_has_the_poses_that_its_folder_has(image, pose, tmp_path):
+    folder = tmp_path / "packed"
+    for one in (image, pose):
+        (folder / one).parent.mkdir(parents=True, exist_ok=True)
+    write_depth_png(folder / image, DEPTH, 1000.0)
+    write_pose(folder / pose, pose_at(3.0))
+    write_intrinsics(folder / "scene", CAMERA)
+    (of_folder,) = find_sequences(folder / "scene")
+    assert of_folder.frames[0].pose is not None
+    with looked_into(zipped(folder / "scene"), tmp_path) as archive:
+        (of_archive,) = archive.sequences
+        pose = of_archive.frames[0].pose
+    assert pose is not None
+    np.testing.assert_array_equal(pose, of_folder.frames[0].pose)
 
 
 def test_what_has_no_folder_is_named_by_the_caller(kitchen, tmp_path):

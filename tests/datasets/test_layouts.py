@@ -179,3 +179,11 @@ def test_natural_order():
     names = ["a10", "a9", "a", "10", "9", "a01", "a1", "b²", "b", "a1b2", "a1b10", "9" * 5000]
     expected = ["9", "10", "9" * 5000, "a", "a01", "a1", "a1b2", "a1b10", "a9", "a10", "b", "b²"]
     assert sorted(names, key=natural) == expected
+
+
+def test_a_file_of_two_kinds_has_one_name(tmp_path):
+    write_intrinsics(tmp_path, CAMERA)
+    np.save(tmp_path / "a.npy", DEPTH)
+    write_depth_png(tmp_path / "a.png", DEPTH, 1000.0)
+    with pytest.raises(DatasetError, match=r"a\.png: .*same name"):
+        find_sequences(tmp_path)

@@ -85,6 +85,12 @@ def test_no_pose_file(tmp_path):
         read_pose(tmp_path / "b.txt")
 
 
+@pytest.mark.parametrize("matrix", [np.eye(3), np.ones(16), [["a"] * 4] * 4, [[1], [2, 3]], None])
+def test_bad_matrices(matrix):
+    with pytest.raises(InvalidPose):
+        rigid_transform(matrix)
+
+
 def test_only_whole_poses_are_written(tmp_path):
     with pytest.raises(InvalidPose):
         write_pose(tmp_path / "a.txt", np.zeros((4, 4)))

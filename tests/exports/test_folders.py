@@ -139,6 +139,21 @@ def test_polycam(room, tmp_path, cameras):
     assert above.name == "flat"
 
 
+def test_polycam_prefers_optimised_poses_and_says_what_is_left_out(room, tmp_path):
+    folder = polycam(tmp_path / "flat", room)
+    shutil.copytree(folder / "keyframes/corrected_cameras", folder / "keyframes/cameras")
+    depths = sorted((folder / "keyframes/depth").iterdir())
+    depths[0].unlink()
+    (folder / "keyframes/corrected_cameras" / f"{depths[1].stem}.json").write_text('{"fx": true}')
+    [sequence] = find_sequences(folder)
+    assert len(sequence.frames) == 1
+    assert "1 cameras without a depth image" in sequence.note
+    assert "1 frames that are damaged (fx is True, not a finite number" in sequence.note
+    shutil.rmtree(folder / "keyframes/depth")
+    with pytest.raises(DatasetError, match=r"has depth.*turn on developer mode"):
+        find_sequences(folder)
+
+
 @pytest.mark.parametrize("per_frame", [False, True])
 @pytest.mark.parametrize("suffix", ["png", "npy"])
 def test_nerfstudio(room, tmp_path, suffix, per_frame):
@@ -146,6 +161,13 @@ def test_nerfstudio(room, tmp_path, suffix, per_frame):
     assert sequence.layout is Layout.NERFSTUDIO
     assert max(errors(room, sequence, np.eye(4))) < 1e-3
     assert sequence.frames[0].original == f"depth/frame_00000.{suffix}"
+
+
+@pytest.mark.parametrize(("suffix", "factor"), [("npy", 1.0), ("npy", 0.01), ("png", 2e-4)])
+def test_units_of_nerfstudio(room, tmp_path, suffix, factor):
+    folder = nerfstudio(tmp_path / "a", room, suffix, depth_unit_scale_factor=factor)
+    [sequence] = find_sequences(folder)
+    assert max(errors(room, sequence, np.eye(4))) < 1e-3
 
 
 def test_the_applied_transform_of_nerfstudio_is_undone(room, tmp_path):
@@ -213,6 +235,13 @@ def test_record3d(room, tmp_path, as_file):
     assert (sequence.layout, sequence.name) == (Layout.RECORD3D, "flat")
     assert max(errors(room, sequence, np.linalg.inv(Y_UP))) < 1e-5  # depth is float32
     assert meta_of(sequence.frames[0]).captured_at is not None
+
+
+def test_record3d_with_a_camera_for_each_frame(room, tmp_path):
+    coefficients = [list(of_colour(room.lens).values())] * 3
+    folder = record3d(tmp_path / "a", room, perFrameIntrinsicCoeffs=coefficients, K=None)
+    [sequence] = find_sequences(folder)
+    assert max(errors(room, sequence, np.linalg.inv(Y_UP))) < 1e-5
 
 
 def test_broken_captures_of_record3d_are_refused(room, tmp_path):

@@ -216,6 +216,15 @@ def test_images_of_several_cameras_are_split(room, tmp_path, version, packed):
         assert all(error_of(room, one) < 1e-3 for one in sequence.frames)
 
 
+def test_depth_may_be_smaller_than_the_image_of_the_calibration(room, tmp_path):
+    large = type(room.lens)(420.0, 412.0, 154.0, 124.0, 320, 240)
+    nodes = nodes_of(room, "0.21.4")
+    for node in nodes:
+        node["calibration"] = calibration("0.21.4", large, LOCAL)
+    [sequence] = find_sequences(write(tmp_path / "a.db", "0.21.4", nodes))
+    assert all(error_of(room, one) < 1e-3 for one in sequence.frames)
+
+
 @pytest.mark.parametrize("version", ["0.11.11", "0.16.1", "0.21.4"])
 def test_laser_scans_are_taken_where_there_is_no_depth(room, tmp_path, version):
     mounting = np.array([[0.0, -1, 0, 0.3], [1, 0, 0, 0], [0, 0, 1, 0.9], [0, 0, 0, 1]])

@@ -272,6 +272,23 @@ def test_a_map_comes_before_odometry_and_either_can_be_chosen(tmp_path, ros, wal
         only(path, RecordingOptions(pose_frame="mars"))
 
 
+def test_fixed_joints_that_are_published_again_and_again(tmp_path, ros, walk, depth):
+    """As by robot_state_publisher of ROS 1, seldom and at other times than the frames."""
+
+    def fill(writer):
+        writer.camera_info(0.0)
+        for i, (t, T) in enumerate(walk):
+            if i in (0, 10):
+                writer.transforms(t, {("base_footprint", "camera"): ros.camera})
+            writer.transforms(t, {("odom", "base_footprint"): T})
+            writer.image(t, depth(i))
+
+    frames = only(ros.write(tmp_path, fill, "ros1")).frames
+    assert len(frames) == len(walk)
+    np.testing.assert_allclose(frames[20].pose, walk[20][1] @ ros.camera, atol=1e-9)
+    assert frames[20].base.base_frame == "base_footprint"
+
+
 def test_up_of_an_imu_at_rest(tmp_path, ros, depth):
     """The IMU hangs upside down beside the camera; the robot stands, and drives off after 3 s."""
     T_base_imu = ros.transform(0, 0.1, 0.2, 1, 0, 0, 0)  # half a turn about x

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from sceneprint.errors import UnreadableFrame
+from sceneprint.errors import DatasetError, UnreadableFrame
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.outline import bag_outline
 from sceneprint.formats.recording.selection import RecordingOptions
@@ -158,3 +158,12 @@ def test_png_of_16_bits(form, tmp_path, ros):
 
     (found,) = find_sequences(ros.write(tmp_path, fill), ALL)
     np.testing.assert_array_equal(found.frames[0].read_depth().depth, np.float32(2))
+
+
+def test_metres_have_no_depth_scale(tmp_path, ros):
+    def fill(writer):
+        writer.camera_info(0.0)
+        writer.image(0.0, np.full((60, 80), 1.5), "32FC1")
+
+    with pytest.raises(DatasetError, match=r"has 32FC1 in metres, .* Omit --depth-scale"):
+        find_sequences(ros.write(tmp_path, fill), RecordingOptions(depth_scale=4000))

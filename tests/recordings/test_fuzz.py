@@ -273,3 +273,10 @@ def test_a_chunk_of_ros_1_that_grows(small, tmp_path, monkeypatch):
     monkeypatch.setattr("sceneprint.formats.recording.bag.MAXIMUM_CHUNK_BYTES", 2000)
     with pytest.raises(DatasetError):
         find_sequences(small["bz2"], RecordingOptions(topic="/points"))
+
+
+def test_points_without_coordinates(tmp_path, ros):
+    rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("intensity", "<f4")])
+    (sequence,) = find_sequences(ros.write(tmp_path, lambda writer: writer.points(0.0, rows)))
+    with pytest.raises(UnreadableCloud, match="has the fields x, y, intensity, but x, y and z"):
+        sequence.frames[0].read()
