@@ -83,6 +83,15 @@ class Engine:
     def reencode(self, name, model):
         return map_lifecycle.begin_reencoding(self.store, self.bell, name, model)
 
+    def fetch(self, statement):
+        """Return the result of a statement that reads the database."""
+        with self.store.database.read() as connection:
+            return connection.execute(statement).freeze()()
+
+    def write(self, statement):
+        with self.store.database.write() as connection:
+            connection.execute(statement)
+
     def row(self, map_name):
         with self.store.database.read() as connection:
             return stored_maps.find_map(connection, map_name)

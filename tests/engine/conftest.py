@@ -238,10 +238,7 @@ def told():
 
     def tell(engine):
         number_events(engine.store.database)
-        with engine.store.database.read() as connection:
-            return list(
-                connection.execute(select(events.c.kind).order_by(events.c.number)).scalars()
-            )
+        return list(engine.fetch(select(events.c.kind).order_by(events.c.number)).scalars())
 
     return tell
 

@@ -133,9 +133,8 @@ def test_parent_frames_are_associated_unasked(engine, work_off):
     work_off(engine)
     assert look() == []  # the two sessions have not grown
     sides = {"source": [1, 2, 3, 4], "target": [5, 6, 7, 8, 9]}
-    with engine.store.database.write() as connection:  # 9 frames, and 12 are a quarter more
-        of_kind = jobs.c.kind == associations.Associations.kind
-        connection.execute(update(jobs).where(of_kind).values(progress=sides))
+    of_kind = jobs.c.kind == associations.Associations.kind  # 9 frames, and 12 are a quarter more
+    engine.write(update(jobs).where(of_kind).values(progress=sides))
     (request,) = look()
     assert request.sessions == ["b", "a"]
     # but never again once it was undone, whatever the sessions have become
@@ -146,8 +145,7 @@ def test_parent_frames_are_associated_unasked(engine, work_off):
     undone = engine.associations.undo_join("hall", begun)
     assert undone.state is JobState.SUCCEEDED
     engine.associations.remove("hall", begun)
-    with engine.store.database.write() as connection:
-        connection.execute(update(jobs).where(of_kind).values(progress=sides))
+    engine.write(update(jobs).where(of_kind).values(progress=sides))
     assert look() == []
 
 
@@ -314,8 +312,7 @@ def test_what_cannot_be_associated(engine, monkeypatch):
 
 
 def test_a_session_of_two_robots_needs_a_name(engine, work_off):
-    with engine.store.database.write() as connection:
-        connection.execute(update(frames).values(session="same"))
+    engine.write(update(frames).values(session="same"))
     with pytest.raises(InvalidRequest, match="several robots: 'ann, bob'"):
         engine.associations.begin("hall", NewAssociation(sessions=["same"]))
     told = done(engine, work_off, sessions=["same", "same"], robots=["ann", "bob"], k=1)

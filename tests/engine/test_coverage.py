@@ -224,8 +224,7 @@ def test_cells_that_became_better_are_told(engine, work_off, rooms):
     assert {(cell.column, cell.row) for cell in plan.cells} == places
     assert {cell.trend for cell in plan.cells} == {"better"}
     assert told.trends == dict.fromkeys(told.trends, 0) | {"better": len(places)}
-    with engine.store.database.read() as connection:
-        items = list(connection.execute(select(job_items.c.data)).scalars())
+    items = list(engine.fetch(select(job_items.c.data)).scalars())
     frames = [item for item in items if "frame" in item]
     assert len(frames) > 20
     written = json.dumps(frames)  # a deleted frame leaves no position behind

@@ -29,9 +29,8 @@ def after(engine, days):
 
 def rows(engine):
     """Id and state of all frames that have a row."""
-    with engine.store.database.read() as connection:
-        found = connection.execute(select(frames.c.id, frames.c.state).order_by(frames.c.number))
-        return [(one[0], one[1]) for one in found]
+    found = engine.fetch(select(frames.c.id, frames.c.state).order_by(frames.c.number))
+    return [(one[0], one[1]) for one in found]
 
 
 def found(engine, uploads):
@@ -45,18 +44,16 @@ def pruned(engine):
 
 def ended_ago(engine, state):
     """How many seconds ago frames in a state ended."""
-    with engine.store.database.read() as connection:
-        of = select(frames.c.ended_at).where(frames.c.state == state)
-        ended = connection.execute(of).scalars().all()
+    of = select(frames.c.ended_at).where(frames.c.state == state)
+    ended = engine.fetch(of).scalars().all()
     return [None if at is None else time.time() - at for at in ended]
 
 
 def test_rows_of_deleted_frames_go_with_their_jobs_once_their_days_are_over(full, ids):
     full.tombstones = Tombstones(full.store, 0.0, full.bell.ring)
     names, use = ids(full), full.get_map("hall").used_frames
-    with full.store.database.read() as connection:
-        of = select(jobs.c.id).join(frames, frames.c.number == jobs.c.frame_number)
-        job = connection.execute(of.where(frames.c.id == names[1])).scalar_one()
+    of = select(jobs.c.id).join(frames, frames.c.number == jobs.c.frame_number)
+    job = full.fetch(of.where(frames.c.id == names[1])).scalar_one()
     for name in names[1:3]:
         full.delete_frame("hall", name)
     revision = full.get_map("hall").revision
@@ -163,9 +160,8 @@ def aged(full, ids):
 def test_what_is_too_old_goes_with_its_bytes(aged, ids, uploads, monkeypatch):
     monkeypatch.setattr(purge, "AT_ONCE", 2)
     names, revision = ids(aged), aged.get_map("hall").revision
-    with aged.store.database.read() as connection:
-        made = select(signatures.c.geometry).order_by(signatures.c.frame_number).limit(5)
-        first = list(connection.execute(made).scalars())
+    made = select(signatures.c.geometry).order_by(signatures.c.frame_number).limit(5)
+    first = list(aged.fetch(made).scalars())
     assert aged.get_map("hall").overdue is None
     assert Retention(aged.store, ROWS_DAYS).run() == 0  # nobody has said how long
     told = edit_map(aged.store, "hall", {"retention_days": 7.0})

@@ -165,9 +165,8 @@ def test_when_there_is_something_to_do_next(empty, uploads):
         connection.execute(update(jobs).values(run_after=start + 50.0))
         connection.execute(update(jobs).where(jobs.c.number == 3).values(run_after=start + 40.0))
     assert 20.0 < due(empty) <= 40.0
-    with empty.store.database.write() as connection:
-        changed = update(jobs).where(jobs.c.number == running.number)
-        connection.execute(changed.values(leased_until=start + 20.0, run_after=1.0))
+    changed = update(jobs).where(jobs.c.number == running.number)
+    empty.write(changed.values(leased_until=start + 20.0, run_after=1.0))
     assert 0.0 < due(empty) <= 20.0
 
 
@@ -325,8 +324,7 @@ def test_a_slice_of_a_worker_that_fell_silent_counts_once(engine, work_off):
     engine.handle("count", count_to(engine, 2))
     job, _ = engine.begin_task("count", "hall", {})
     late = engine.claim("silent")
-    with engine.store.database.write() as connection:
-        connection.execute(update(jobs).values(leased_until=1.0))
+    engine.write(update(jobs).values(leased_until=1.0))
     assert work_off(engine) == [JobState.QUEUED, JobState.SUCCEEDED]
     assert engine.run(late) is None  # its slice is refused whole
     assert items(engine, job) == [0, 1]
@@ -389,8 +387,7 @@ def test_tries_before_a_slice_that_came_through_count_no_more(engine):
     job, _ = engine.begin_task("count", "hall", {})
     for _ in range(12):  # a machine that is restarted within every other slice
         assert isinstance(engine.claim("killed"), LongJob)
-        with engine.store.database.write() as connection:
-            connection.execute(update(jobs).values(leased_until=1.0))
+        engine.write(update(jobs).values(leased_until=1.0))
         again = engine.claim("w")
         assert engine.run(again) == JobState.QUEUED
     assert items(engine, job) == list(range(12))

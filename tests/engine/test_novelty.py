@@ -54,8 +54,7 @@ def found(engine, uploads):
 
 
 def rows(engine):
-    with engine.store.database.read() as connection:
-        return len(connection.execute(select(signatures.c.frame_number)).all())
+    return len(engine.fetch(select(signatures.c.frame_number)).all())
 
 
 def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share, told):

@@ -105,9 +105,8 @@ def numbers(engine, names=None, **wanted):
 
 
 def count(engine, *conditions):
-    with engine.store.database.read() as connection:
-        asked = select(func.count()).select_from(queries).where(*conditions)
-        return connection.execute(asked).scalar_one()
+    asked = select(func.count()).select_from(queries).where(*conditions)
+    return engine.fetch(asked).scalar_one()
 
 
 def test_answers_and_failures_become_rows(full, uploads):
@@ -338,17 +337,15 @@ def test_old_and_surplus_queries_are_removed_in_blocks(engine, monkeypatch):
     for i in range(14):
         engine.query_log.note(row(i, map="attic" if i >= 10 else "hall"))
     assert engine.query_log.flush(60)
-    with engine.store.database.write() as connection:
-        aged = update(queries).where(queries.c.id.in_(f"{i:032x}" for i in range(4)))
-        connection.execute(aged.values(at=time.time() - 31 * DAY_S))
+    aged = update(queries).where(queries.c.id.in_(f"{i:032x}" for i in range(4)))
+    engine.write(aged.values(at=time.time() - 31 * DAY_S))
     assert engine.query_log.remove_surplus() == 4
     assert numbers(engine) == list(range(13, 3, -1))
     monkeypatch.setattr(query_log, "MOST_QUERIES", 2)
     assert engine.query_log.remove_surplus() == 6
     assert numbers(engine) == [13, 12, 9, 8]
     monkeypatch.setattr(query_log, "TIDY_S", 0.0)
-    with engine.store.database.write() as connection:
-        connection.execute(update(queries).values(at=1.0))
+    engine.write(update(queries).values(at=1.0))
     engine.publish_due()  # workers do so
     assert count(engine) == 0
 

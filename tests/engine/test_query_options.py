@@ -253,8 +253,7 @@ def test_a_frame_that_is_not_searched_is_explained(full, ids):
     full.delete_frame("hall", names[4])
     gone = ask(full, names[0], explain_frame=names[4]).explained_frame
     assert (gone.lost_at, gone.state, gone.validation) == ("state", "deleted", None)
-    with full.store.database.write() as connection:
-        connection.execute(update(frames).where(frames.c.id == names[5]).values(state="rejected"))
+    full.write(update(frames).where(frames.c.id == names[5]).values(state="rejected"))
     bad = ask(full, names[0], explain_frame=names[5]).explained_frame
     assert (bad.lost_at, bad.state) == ("state", "rejected")
     with pytest.raises(UnknownFrame, match="'nobody' in map 'hall'"):

@@ -83,17 +83,15 @@ def said(engine, answer):
 
 def models_of(engine):
     """How many signatures each model has."""
-    with engine.store.database.read() as connection:
-        found = connection.execute(select(signatures.c.model_id)).scalars().all()
+    found = engine.fetch(select(signatures.c.model_id)).scalars().all()
     return {model_id: found.count(model_id) for model_id in set(found)}
 
 
 def queued(engine):
-    with engine.store.database.read() as connection:
-        asked = select(jobs.c.kind, jobs.c.priority, jobs.c.model_id).where(
-            jobs.c.state == JobState.QUEUED
-        )
-        return [tuple(row) for row in connection.execute(asked)]
+    asked = select(jobs.c.kind, jobs.c.priority, jobs.c.model_id).where(
+        jobs.c.state == JobState.QUEUED
+    )
+    return [tuple(row) for row in engine.fetch(asked)]
 
 
 def test_after_the_switch_the_map_is_as_if_made_with_that_model(

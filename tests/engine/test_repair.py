@@ -15,22 +15,19 @@ from tests.engine.conftest import flip, packed_again
 
 
 def number_of(engine, frame_id):
-    with engine.store.database.read() as connection:
-        found = connection.execute(select(frames.c.number).where(frames.c.id == frame_id))
-        return int(found.scalar_one())
+    found = engine.fetch(select(frames.c.number).where(frames.c.id == frame_id))
+    return int(found.scalar_one())
 
 
 def column(engine, frame_id, name):
     asked = select(signatures.c[name]).where(
         signatures.c.frame_number == number_of(engine, frame_id)
     )
-    with engine.store.database.read() as connection:
-        return connection.execute(asked).scalar_one()
+    return engine.fetch(asked).scalar_one()
 
 
 def upload_of(engine, frame_id):
-    with engine.store.database.read() as connection:
-        return connection.execute(select(frames.c.blob).where(frames.c.id == frame_id)).scalar_one()
+    return engine.fetch(select(frames.c.blob).where(frames.c.id == frame_id)).scalar_one()
 
 
 def artifact(engine, frame_id):
@@ -39,8 +36,7 @@ def artifact(engine, frame_id):
 
 def waiting(engine):
     asked = select(jobs).where(jobs.c.state == JobState.QUEUED)
-    with engine.store.database.read() as connection:
-        return list(connection.execute(asked).all())
+    return list(engine.fetch(asked).all())
 
 
 def damage_signature(engine, frame_id):
@@ -49,8 +45,7 @@ def damage_signature(engine, frame_id):
     data = bytearray(sound)
     data[100] ^= 8
     own = signatures.c.frame_number == number_of(engine, frame_id)
-    with engine.store.database.write() as connection:
-        connection.execute(update(signatures).where(own).values(vector=bytes(data)))
+    engine.write(update(signatures).where(own).values(vector=bytes(data)))
     return sound
 
 
@@ -148,8 +143,7 @@ def test_what_cannot_be_healed_is_not_tried_for_ever(full, uploads, ids, work_of
     assert statuses(ask())[hurt][0] == "skipped"
     assert waiting(full) == []
     assert full.get_frame("hall", hurt).state == "indexed"  # it is found all the while
-    with full.store.database.write() as connection:
-        connection.execute(update(jobs).values(created_at=jobs.c.created_at - PAUSE_S))
+    full.write(update(jobs).values(created_at=jobs.c.created_at - PAUSE_S))
     ask()
     assert len(waiting(full)) == 1
 
@@ -196,18 +190,16 @@ def _row(engine):
 
 
 def _due(engine):
-    with engine.store.database.write() as connection:
-        connection.execute(update(scrubs).values(next_at=0.0))
+    engine.write(update(scrubs).values(next_at=0.0))
 
 
 def _blobs(engine):
     """Uploads, artifacts and ids of the frames, in their order."""
-    with engine.store.database.read() as connection:
-        rows = connection.execute(
-            select(frames.c.blob, signatures.c.geometry, frames.c.id)
-            .join(signatures, signatures.c.frame_number == frames.c.number)
-            .order_by(frames.c.number)
-        ).all()
+    rows = engine.fetch(
+        select(frames.c.blob, signatures.c.geometry, frames.c.id)
+        .join(signatures, signatures.c.frame_number == frames.c.number)
+        .order_by(frames.c.number)
+    ).all()
     place = engine.store.blobs.path
     return [place(r[0]) for r in rows], [place(r[1]) for r in rows], [r[2] for r in rows]
 

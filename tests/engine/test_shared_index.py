@@ -179,12 +179,11 @@ def test_a_restored_database_is_not_given_what_came_after(
 
 
 def signature(engine, frame_id):
-    with engine.store.database.read() as connection:
-        return bytes(
-            connection.execute(
-                select(signatures.c.vector).join(frames).where(frames.c.id == frame_id)
-            ).scalar_one()
-        )
+    return bytes(
+        engine.fetch(
+            select(signatures.c.vector).join(frames).where(frames.c.id == frame_id)
+        ).scalar_one()
+    )
 
 
 def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, ids, place, tmp_path):

@@ -147,9 +147,8 @@ def test_a_surface_is_that_of_its_frames(engine):
     assert sorted(told.sessions) == ["a", "b"]
     assert (told.last_taken - told.first_taken).total_seconds() == 110.0
     number_events(engine.store.database)
-    with engine.store.database.read() as connection:
-        own = select(events.c.data).where(events.c.kind == "surface.updated")
-        (data,) = connection.execute(own).scalars()
+    own = select(events.c.data).where(events.c.kind == "surface.updated")
+    (data,) = engine.fetch(own).scalars()
     tiles = sum(level.tiles for parent in told.parents for level in parent.levels)
     assert data == {"frames": 12, "tiles": tiles}
     for parent in told.parents:
@@ -205,9 +204,8 @@ def test_frames_that_go_and_move_take_their_share_along(engine, work_off):
 
 
 def test_a_surface_whose_frames_are_all_gone_is_none(engine, work_off):
-    with engine.store.database.read() as connection:
-        columns = surface_tiles.c.blob, surface_tiles.c.digest
-        blobs = [row[0] for row in connection.execute(select(*columns))]
+    columns = surface_tiles.c.blob, surface_tiles.c.digest
+    blobs = [row[0] for row in engine.fetch(select(*columns))]
     assert blobs
     for frame in engine.list_frames("hall").items:
         engine.delete_frame("hall", frame.frame_id)
@@ -242,9 +240,8 @@ def test_a_lost_tile_is_made_again(engine, work_off):
     parent = engine.surfaces.get("hall").parents[0].parent_frame
     for level in (2, 0):
         tile = engine.surfaces.tiles("hall", parent, level).items[0]
-        with engine.store.database.read() as connection:
-            own = select(surface_tiles.c.blob).where(surface_tiles.c.digest == tile.digest)
-            blob = connection.execute(own).scalar_one()
+        own = select(surface_tiles.c.blob).where(surface_tiles.c.digest == tile.digest)
+        blob = engine.fetch(own).scalar_one()
         engine.settings.data_dir.joinpath("blobs", blob[:2], blob).unlink()
         with pytest.raises(DamagedBlob):
             engine.surfaces.tile("hall", tile.digest).make()

@@ -44,8 +44,7 @@ def restore(engine, deletion):
 
 def end_undo(engine):
     """Let the time of all deletions be over."""
-    with engine.store.database.write() as connection:
-        connection.execute(update(frames_table).values(ended_at=frames_table.c.ended_at - 601))
+    engine.write(update(frames_table).values(ended_at=frames_table.c.ended_at - 601))
 
 
 def nearest(engine, upload):

@@ -95,8 +95,7 @@ def test_a_model_that_cannot_be_read_costs_its_maps_alone(make_engine, uploads, 
     for name, model in (("hall", "depth"), ("old", "paper")):
         engine.create_map(NewMap(name=name, model=model))
     old = engine.get_map("old").model_id
-    with engine.store.database.write() as connection:
-        connection.execute(update(models).where(models.c.id == old).values(content=b"of old"))
+    engine.write(update(models).where(models.c.id == old).values(content=b"of old"))
     fresh = make_engine()
     fresh.signers.warm()
     (error,) = [r for r in caplog.records if r.levelname == "ERROR"]

@@ -77,8 +77,7 @@ def test_a_signature_whose_artifact_is_swept_before_its_commit_is_made_again(
     if empty.store.database.is_sqlite:
         assert empty.run(claimed) == JobState.QUEUED
         assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
-        with empty.store.database.write() as connection:
-            connection.execute(update(jobs).values(run_after=0.0))
+        empty.write(update(jobs).values(run_after=0.0))
         assert work_off(empty) == [JobState.SUCCEEDED]
     else:  # it was committed with its only statement, and is put again
         assert empty.run(claimed) == JobState.SUCCEEDED
