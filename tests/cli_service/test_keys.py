@@ -8,10 +8,20 @@ from sceneprint.settings import Settings
 from tests.whole_engine import Engine
 
 
-def test_keys_are_made_listed_and_revoked(sceneprint, tmp_path):
-    def keys(*arguments, expect=0):
+@pytest.fixture
+def keys(sceneprint, tmp_path):
+    def run(*arguments, expect=0):
         return sceneprint("keys", *arguments, "--data", tmp_path, expect=expect)
 
+    return run
+
+
+def listed(keys, what="--list"):
+    """Return the lines of keys or tenants without the time of their creation."""
+    return [line[22:] for line in keys(what).stdout.splitlines()]
+
+
+def test_keys_are_made_listed_and_revoked(keys, tmp_path):
     assert keys("--list").stdout == ""
     before = datetime.now(UTC).replace(microsecond=0)
     secrets = [keys("--create", name).stdout.strip() for name in ("robot 1", "robot 2")]
@@ -20,7 +30,7 @@ def test_keys_are_made_listed_and_revoked(sceneprint, tmp_path):
     for line in lines:
         assert before <= datetime.fromisoformat(line[:20]) <= datetime.now(UTC)
     assert keys("--revoke", "robot 1").stdout == "key robot 1 is revoked\n"
-    assert [line[22:] for line in keys("--list").stdout.splitlines()] == ["robot 2  admin of all"]
+    assert listed(keys) == ["robot 2  admin of all"]
     again = keys("--revoke", "robot 1", expect=2)
     assert again.stderr.startswith("sceneprint keys: There is no key named 'robot 1'")
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
@@ -28,10 +38,7 @@ def test_keys_are_made_listed_and_revoked(sceneprint, tmp_path):
     assert [one and (one.name, one.grants) for one in found] == [None, ("robot 2", {"*": "admin"})]
 
 
-def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint, tmp_path):
-    def keys(*arguments, expect=0):
-        return sceneprint("keys", *arguments, "--data", tmp_path, expect=expect)
-
+def test_a_key_gets_a_new_secret_while_the_old_one_works(keys, tmp_path):
     def named(secret):
         with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
             found = engine.find_key(secret)
@@ -44,10 +51,10 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint, tmp_path):
     until = datetime.fromisoformat(said[1].removeprefix("the old secret works until "))
     assert timedelta(seconds=7000) < until - datetime.now(UTC) <= timedelta(hours=2)
     assert [named(one) for one in (old, new)] == ["robot", "robot"]
-    listed = keys("--list")
-    assert "robot  read of all, until 2" in listed.stdout
-    assert f", old secret until {until:%Y-%m-%dT%H:%M:%SZ}" in listed.stdout
-    assert listed.stderr == "expiring within 7 days: robot. Create new keys with --create.\n"
+    done = keys("--list")
+    assert "robot  read of all, until 2" in done.stdout
+    assert f", old secret until {until:%Y-%m-%dT%H:%M:%SZ}" in done.stdout
+    assert done.stderr == "expiring within 7 days: robot. Create new keys with --create.\n"
     last = keys("--rotate", "robot", "--overlap", "0").stdout.strip()
     assert [named(one) for one in (old, last)] == [None, "robot"]
     assert "no key named 'nobody'" in keys("--rotate", "nobody", expect=2).stderr
@@ -55,50 +62,41 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(sceneprint, tmp_path):
     assert "not between 0 s and 30 days" in refused
 
 
-def test_a_key_may_do_what_it_was_made_for(sceneprint, tmp_path):
+def test_a_key_may_do_what_it_was_made_for(keys, tmp_path):
     given = ("--scope", "write", "--map", "hall", "--map", "yard", "--expires", "30d")
-    sceneprint("keys", "--create", "robot", *given, "--data", tmp_path)
-    sceneprint("keys", "--create", "screen", "--scope", "read", "--data", tmp_path)
+    keys("--create", "robot", *given)
+    keys("--create", "screen", "--scope", "read")
     before = datetime.now(UTC)
-    robot, screen = sceneprint("keys", "--list", "--data", tmp_path).stdout.splitlines()
-    assert screen[22:] == "screen  read of all"
-    told, until = robot[22:].split(", until ")
+    robot, screen = listed(keys)
+    assert screen == "screen  read of all"
+    told, until = robot.split(", until ")
     assert told == "robot  write of hall, write of yard"
     left = datetime.fromisoformat(until) - before
     assert timedelta(days=30) - timedelta(seconds=60) < left <= timedelta(days=30)
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
         engine.create_key("late", expires_at=before - timedelta(days=1))
-    (late,) = [
-        line for line in sceneprint("keys", "--list", "--data", tmp_path).stdout.splitlines()
-        if "late" in line
-    ]  # fmt: skip
+    (late,) = [line for line in listed(keys) if "late" in line]
     assert ", expired " in late
 
 
-def test_tenants_are_made_listed_and_deleted(sceneprint, tmp_path):
-    def run(*arguments, expect=0):
-        return sceneprint(*arguments, "--data", tmp_path, expect=expect)
-
-    assert run("keys", "--create-tenant", "acme").stdout == "tenant acme is created\n"
-    assert "A tenant named 'acme'" in run("keys", "--create-tenant", "acme", expect=2).stderr
-    run("keys", "--create", "robot", "--tenant", "acme", "--scope", "read")
-    run("keys", "--create", "alone", "--scope", "read")
-    done = run("keys", "--create", "x", "--tenant", "other", expect=2)
+def test_tenants_are_made_listed_and_deleted(keys):
+    assert keys("--create-tenant", "acme").stdout == "tenant acme is created\n"
+    assert "A tenant named 'acme'" in keys("--create-tenant", "acme", expect=2).stderr
+    keys("--create", "robot", "--tenant", "acme", "--scope", "read")
+    keys("--create", "alone", "--scope", "read")
+    done = keys("--create", "x", "--tenant", "other", expect=2)
     assert "There is no tenant named 'other'" in done.stderr
-    listed = [line[22:] for line in run("keys", "--list").stdout.splitlines()]
-    assert listed == ["alone  read of all", "robot  read of all, tenant acme"]
-    listed = [line[22:] for line in run("keys", "--list-tenants").stdout.splitlines()]
-    assert listed == ["acme  1 key", "alone  1 key"]
-    assert "has keys" in run("keys", "--delete-tenant", "acme", expect=2).stderr
+    assert listed(keys) == ["alone  read of all", "robot  read of all, tenant acme"]
+    assert listed(keys, "--list-tenants") == ["acme  1 key", "alone  1 key"]
+    assert "has keys" in keys("--delete-tenant", "acme", expect=2).stderr
     for name in ("robot", "alone"):  # the tenant that came with a key goes with it
-        run("keys", "--revoke", name)
-    listed = [line[22:] for line in run("keys", "--list-tenants").stdout.splitlines()]
-    assert listed == ["acme  0 keys"]
-    assert run("keys", "--delete-tenant", "acme").stdout == "tenant acme is deleted\n"
-    assert "no tenant named 'acme'" in run("keys", "--delete-tenant", "acme", expect=2).stderr
+        keys("--revoke", name)
+    assert listed(keys, "--list-tenants") == ["acme  0 keys"]
+    assert keys("--delete-tenant", "acme").stdout == "tenant acme is deleted\n"
+    assert "no tenant named 'acme'" in keys("--delete-tenant", "acme", expect=2).stderr
 
 
 @pytest.mark.parametrize("time", ["30", "d", "0d", "-1d", "999999w"])
-def test_a_time_is_written_as_it_is_read(sceneprint, time):
+def test_a_time_is_written_as_it_is_read(keys, time):
     with pytest.raises(SystemExit):
-        sceneprint("keys", "--create", "x", "--expires", time)
+        keys("--create", "x", "--expires", time)

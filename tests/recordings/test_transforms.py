@@ -15,9 +15,11 @@ IMAGE = np.full((60, 80), 2000, np.uint16)
 MOUNTING = {("base_link", "camera"): np.eye(4)}
 
 
-def sequences(ros, folder, fill, **how):
+def sequences(ros, folder, fill, mounting=None, **how):
     def with_camera(writer):
         writer.camera_info(0.0)
+        if mounting is not None:
+            writer.transforms(0.0, mounting, "/tf_static")
         fill(writer)
 
     return find_sequences(ros.write(folder, with_camera, **how), ALL)
@@ -33,7 +35,6 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
     """A simulation is reset twice; each run drives along x, ten metres beside the one before."""
 
     def fill(writer):
-        writer.transforms(0.0, MOUNTING, "/tf_static")
         for run, last in enumerate((4, 3, 6)):
             writer.late = 60.0 * run
             for i in range(last):
@@ -44,7 +45,7 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
                     writer.odometry(1 + 0.5 * i, T)
                 writer.image(1.2 + 0.5 * i, IMAGE)
 
-    found = sequences(ros, tmp_path, fill, container=container)
+    found = sequences(ros, tmp_path, fill, MOUNTING, container=container)
     assert [one.name for one in found] == ["run.part1", "run.part2", "run.part3"]
     assert [one.parent_frame for one in found] == [f"run.part{i}/odom" for i in (1, 2, 3)]
     # the last frame of each run lies after its last sample, and not before those of the next run
@@ -61,14 +62,13 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
 
 def test_stamps_that_are_out_of_order_by_little_split_nothing(tmp_path, ros):
     def fill(writer):
-        writer.transforms(0.0, MOUNTING, "/tf_static")
         for i in (0, 1, 3, 2, 4):
             t = 1 + 0.05 * i
             writer.late = 1.0 + 0.1 * len(writer.connections) - t
             writer.transforms(t, {("odom", "base_link"): ros.transform(0.1 * i, 0, 0)})
             writer.image(t, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill)
+    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
     assert sorted(positions(found)) == [[round(0.1 * i, 6), 0, 0] for i in range(5)]
 
 
@@ -76,7 +76,6 @@ def test_two_publishers_with_delays_of_their_own_split_nothing(tmp_path, ros):
     """Both say the same; the stamps of one are a second ahead."""
 
     def fill(writer):
-        writer.transforms(0.0, MOUNTING, "/tf_static")
         for i in range(40):
             for ahead in (0.0, 1.0):
                 t = 0.1 * i + ahead
@@ -85,7 +84,7 @@ def test_two_publishers_with_delays_of_their_own_split_nothing(tmp_path, ros):
             writer.late = 0.0
             writer.image(0.1 * i, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill)
+    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
     assert positions(found) == [[round(0.1 * i, 6), 0, 0] for i in range(40)]
 
 
@@ -94,7 +93,6 @@ def test_two_publishers_with_delays_of_their_own_split_nothing(tmp_path, ros):
 )
 def test_two_publishers_that_contradict_each_other(period, order, tmp_path, ros):
     def fill(writer):
-        writer.transforms(0.0, MOUNTING, "/tf_static")
         for i in range(36):
             t, who = period * i, order[i % len(order)]
             T = ros.transform(0.2 * t, 0.0 if who == "A" else 8.0, 0)
@@ -103,7 +101,7 @@ def test_two_publishers_that_contradict_each_other(period, order, tmp_path, ros)
                 writer.image(t - 0.3 * period, IMAGE)
 
     with pytest.raises(DatasetError) as caught:
-        sequences(ros, tmp_path, fill)
+        sequences(ros, tmp_path, fill, MOUNTING)
     assert (
         "0 of 35 frames of /camera/depth/image_raw taken, poses of 0 of 35 frames; 35 without: "
         "samples of odom -> base_link contradict each other (two publishers, or 50 m/s)"
@@ -116,13 +114,12 @@ def test_frames_within_a_jump_are_left_out(tmp_path, ros):
     x = [0, 0.5, 1, 1.5, 21.5, 22, 22.4, 22.5, 22.4, 22, 21.5]
 
     def fill(writer):
-        writer.transforms(0.0, MOUNTING, "/tf_static")
         for i, one in enumerate(x):
             writer.transforms(0.1 * i, {("odom", "base_link"): ros.transform(one, 0, 0)})
             if i:
                 writer.image(0.1 * i - 0.05, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill)
+    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
     middle = [[round((a + b) / 2, 6), 0, 0] for a, b in pairwise(x)]
     assert positions(found) == [*middle[:3], *middle[4:]]
     assert "1 without: samples of odom -> base_link contradict each other" in found.note
@@ -133,12 +130,11 @@ def test_samples_at_the_stamps_of_frames_are_too_fast(tmp_path, ros):
     x = [0.0, 100.0, 200.0, 201.0, 202.0, 303.0]  # metres, in seconds
 
     def fill(writer):
-        writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
         for i, at in enumerate(x):
             writer.transforms(1.0 * i, {("odom", "base_link"): ros.transform(at, 0, 0)})
             writer.image(1.0 * i, IMAGE)
 
-    (found,) = sequences(ros, tmp_path, fill)
+    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
     assert positions(found) == [[at, 0, 0] for at in (200.0, 201.0, 202.0)]
     assert "3 without: samples of odom -> base_link contradict each other" in found.note
     assert found.lost == 3
@@ -157,13 +153,12 @@ def test_frames_that_miss_the_poses_of_the_recording_are_lost(
     child, frame, shift_s, why, tmp_path, ros
 ):
     def fill(writer):
-        writer.transforms(0.0, {("base_link", "camera"): np.eye(4)}, "/tf_static")
         for i in range(3):
             writer.image(1.0 * i, IMAGE, frame=frame)
         for i in range(3):
             writer.odometry(i + shift_s, ros.transform(1.0 * i, 0, 0), child=child)
 
-    (found,) = sequences(ros, tmp_path, fill)
+    (found,) = sequences(ros, tmp_path, fill, MOUNTING)
     assert found.lost == len(found.frames) == 3
     assert why in found.note
 

@@ -307,7 +307,7 @@ def test_an_error_of_the_service_is_told(service_url, ros):
     assert "nowhere" in reports[1].message
 
 
-def turning_scans(ros, every=0.2):
+def turning_scans(ros):
     """Scans of four points on a wall at x = 10, taken while the robot drives and turns."""
     writer = ros.messages()
     writer.transforms(0.0, {("base_link", "lidar"): ros.transform(0, 0, 1)}, "/tf_static")
@@ -320,15 +320,15 @@ def turning_scans(ros, every=0.2):
     for scan in range(3):
         points = np.empty((4, 3))
         for i, s in enumerate(seconds):
-            T = np.linalg.inv(pose(every * scan + s) @ ros.transform(0, 0, 1))
+            T = np.linalg.inv(pose(0.2 * scan + s) @ ros.transform(0, 0, 1))
             points[i] = T[:3, :3] @ (wall[i] + [0, 0.3 * scan, 0]) + T[:3, 3]
         rows = np.zeros(4, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
         for axis, name in enumerate("xyz"):
             rows[name] = points[:, axis]
         rows["time"] = seconds
-        writer.points(every * scan, rows)
+        writer.points(0.2 * scan, rows)
         for k in range(11):  # odometry at 100 Hz arrives after the scan
-            t = every * scan + 0.01 * k
+            t = 0.2 * scan + 0.01 * k
             writer.transforms(t, {("odom", "base_link"): pose(t)})
     return list(writer.written)
 
@@ -343,15 +343,3 @@ def test_scans_of_a_drive_are_joined_without_their_motion(ros):
     in_odom = points @ T_odom_sensor[:3, :3].T + T_odom_sensor[:3, 3]
     expected = [[10, y + 0.3 * scan, 1] for scan in (2, 1) for y in (-3, -1, 1, 3)]
     np.testing.assert_allclose(in_odom, expected, atol=1e-3)
-
-
-def test_a_scan_waits_for_the_odometry_of_its_last_point(ros):
-    arrived = turning_scans(ros)[:13]  # the mounting, a scan, and odometry of 0 to 0.1 s
-    with scripted(join_m=0.5) as (core, client):
-        steps = []
-        for one in arrived:
-            take(core, *one)
-            steps.append(core.step())
-        assert core.wait(PATIENCE_S)
-    assert steps == [0] * 12 + [1]
-    assert len(client.asked) == 1
