@@ -110,7 +110,6 @@ class Bus:
     qos: dict[str, object] = field(default_factory=dict)
     publishers: list[object] = field(default_factory=list)
     declared: dict[str, Any] = field(default_factory=dict)
-    described: dict[str, str] = field(default_factory=dict)
     services: dict[str, Callable[[Any, Any], Any]] = field(default_factory=dict)
     timers: list[tuple[float, Callable[[], None]]] = field(default_factory=list)
     published: list[Arrived] = field(default_factory=list)
@@ -135,7 +134,6 @@ class StubNode:
 
     def declare_parameter(self, name, default, descriptor):
         self.bus.declared[name] = default
-        self.bus.described[name] = descriptor.description
 
     def get_parameter(self, name):
         default = self.bus.declared[name]
