@@ -13,9 +13,8 @@ from sceneprint.geometry.validation.confidence import (
     Penalty,
     PlaceEvidence,
     compute_confidences,
-    compute_penalties,
 )
-from sceneprint_lab.confidence import JudgedQuery, fit, steps_of
+from sceneprint_lab.confidence import JudgedQuery, fit
 from sceneprint_lab.evaluation.measures import calibration
 
 #: Only these kinds cost anything.
@@ -32,23 +31,6 @@ def drawn(rng):
     values |= {"frames": 5.0 + values["frames"], "accepted": 5.0 * values.pop("acceptance")}
     names = [one.name for one in fields(PlaceEvidence)]
     return PlaceEvidence(**{name: values.get(name, 0.0) for name in names})
-
-
-def test_the_penalty_is_the_sum_of_its_steps():
-    rng = np.random.default_rng(0)
-    evidence = [drawn(rng) for _ in range(50)]
-    steps = steps_of(evidence)
-    assert steps.shape == (50, 3 * len(KNOTS))
-    assert (steps >= 0).all()
-    assert (steps <= 1).all()
-    increments = [
-        size
-        for name in KNOTS
-        for p in (getattr(TRUTH, name),)
-        for size in (p.fair, p.poor - p.fair, p.worst - p.poor)
-    ]
-    by_hand = [sum(compute_penalties(e, TRUTH).values()) for e in evidence]
-    np.testing.assert_allclose(steps @ np.array(increments), by_hand, atol=1e-9)
 
 
 def test_what_was_drawn_from_a_model_is_learnt_again():

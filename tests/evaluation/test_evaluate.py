@@ -1,15 +1,11 @@
 """Tests of `sceneprint evaluate` on a small synthetic building."""
 
 import json
-import math
 import shutil
 
 import pytest
-from PIL import Image
 
-import sceneprint as sp
 from sceneprint.cli import main
-from sceneprint.geometry.rigid import pose_difference
 from sceneprint.models import save_model
 
 ROW = {"within_5cm_5deg", "within_10cm_10deg", "median_translation_m", "median_rotation_deg"}
@@ -74,81 +70,6 @@ def test_neighbouring_frames_of_a_room_are_found(figures):
     assert found["validation"]["accepted_strong_of_other_scenes"] == 0
 
 
-@pytest.mark.thorough
-def test_the_number_of_processes_changes_nothing(figures, ranges, model_file, tmp_path):
-    alone, _ = figures
-    several = evaluated(tmp_path, *ranges, "--model", model_file, "--jobs", 2)
-    assert several["milliseconds"].keys() == alone["milliseconds"].keys()
-    assert several | {"milliseconds": None} == alone | {"milliseconds": None}
-
-
-def test_the_answers_are_those_of_the_library(building, small_model, model_file, tmp_path):
-    """What a service gives for the same frames, with the seed it is given, and no other."""
-    room, seed = building / "room-000", 3
-    found = evaluated(
-        tmp_path, room, "--db", "0:12:2", "--queries", "1:9:4", "--model", model_file,
-        "--seed", seed, "--jobs", 1,
-    )  # fmt: skip
-    signer = sp.open_signer(small_model)
-    (sequence,) = sp.find_sequences(room)
-    seen = [sp.prepare(reference.read(), signer) for reference in sequence.frames]
-    names = [f"room-000/{reference.name}" for reference in sequence.frames]
-    database = range(0, 12, 2)
-    signatures = [seen[i][0] for i in database]
-    stored = [sp.write_geometry(geometry) for _, geometry in seen]
-    assert [one["name"] for one in found["per_query"]] == [names[i] for i in (1, 5)]
-    for i, one in zip((1, 5), found["per_query"], strict=True):
-        ranking = sp.retrieve(seen[i][0], signatures, signer.model)
-        chosen = sp.diversify(ranking, signatures)
-        matches = sp.associate(
-            sp.read_geometry(stored[i]),
-            ranking,
-            chosen.indices.tolist(),
-            lambda index: sp.read_geometry(stored[database[index]]),
-            k=99,
-            seed=seed,
-        )
-        assert one["ranking"] == [names[database[j]] for j in ranking.indices[:10]]
-        assert one["selection"] == [names[database[ranking.indices[j]]] for j in chosen.indices]
-        assert {match.validation.seed for match in matches} == {seed}
-        # the average turns on the last bits of sums, whose order differs with where arrays lie
-        expected = answer_by_library(room, i, stored, ranking, chosen, seed)
-        assert one["answer"] == {
-            name: value if isinstance(value, str) else pytest.approx(value, rel=1e-9)
-            for name, value in expected.items()
-        }
-        assert one["matches"] == [
-            {
-                "match": names[database[match.index]],
-                "distance": match.distance,
-                "status": match.validation.status,
-                "strength": match.validation.strength,
-                "T_match_query": None if (T := match.validation.T_match_query) is None
-                else T.tolist(),
-            }
-            for match in matches
-        ]  # fmt: skip
-
-
-def answer_by_library(room, i, stored, ranking, chosen, seed):
-    """The whole answer to frame `i`, of every second frame: stopped at five accepted matches."""
-    (sequence,) = sp.find_sequences(room)
-    poses = [reference.read().pose for reference in sequence.frames]
-    query, *_ = geometries = [sp.read_geometry(one) for one in (stored[i], *stored[0:12:2])]
-    matches = sp.associate(
-        query, ranking, chosen.indices.tolist(), lambda row: geometries[row + 1], seed=seed
-    )
-    views_of = sp.views_of_rows(matches, poses[0:12:2], lambda row: geometries[row + 1])
-    there = sp.localize([sp.QueryFrame(query, matches)], poses[0:12:2], None, views_of)
-    metres, radians = pose_difference(there.average.T, poses[i])
-    return {
-        "status": "found",
-        "strength": there.strength,
-        "translation_m": metres,
-        "rotation_deg": math.degrees(radians),
-    }
-
-
 def test_a_scene_that_is_absent(ranges, model_file, tmp_path, capsys):
     options = ("--absent", "--levels", 1, "--metric", "l2", "--jobs", 1)
     found = evaluated(tmp_path, *ranges, "--model", model_file, *options)
@@ -170,91 +91,6 @@ def test_frames_that_cannot_be_used_are_named(building, model_file, tmp_path, ca
     assert "its pose is unknown" in reasons["room/seq-01/frame-000001"]
     assert "frame-000002" in reasons["room/seq-01/frame-000002"]
     assert "left out" in capsys.readouterr().out
-
-
-def test_distractors_need_no_poses(building, model_file, tmp_path):
-    plain = tmp_path / "elsewhere"
-    plain.mkdir()
-    room = building / "room-001"
-    (plain / "intrinsics.json").write_bytes((room / "intrinsics.json").read_bytes())
-    for i in range(2):
-        depth = (room / "seq-01" / f"frame-{i:06d}.depth.png").read_bytes()
-        (plain / f"{i}.png").write_bytes(depth)
-    asked = (building / "room-000", "--queries", "0:1", "--distractors", plain)
-    found = evaluated(tmp_path, *asked, "--model", model_file, "--jobs", 1)
-    assert found["counts"] == {"queries": 1, "database": 2, "left_out": 0}
-    assert found["absent"]["queries"] == 1
-
-
-def test_only_frames_that_overlap_little(building, model_file, tmp_path):
-    asked = (building / "room-000", "--db", "0:12:3", "--queries", "1:9:3", "--max-overlap", 0.7)
-    found = evaluated(tmp_path, *asked, "--model", model_file, "--jobs", 1)
-    assert found["oracle"]["mean_overlap"] is None or found["oracle"]["mean_overlap"] < 0.9
-    assert found["settings"]["max_overlap"] == 0.7
-
-
-@pytest.fixture(scope="module")
-def seven_scenes(building, tmp_path_factory):
-    """Two scenes laid out as in the official download: splits, a picture, no intrinsics.json."""
-    folder = tmp_path_factory.mktemp("7scenes")
-    for room, scene in (("room-000", "chess"), ("room-001", "redkitchen")):
-        for number, frames in ((1, range(0, 12, 3)), (2, range(1, 12, 6))):
-            own = folder / scene / f"seq-{number:02d}"
-            own.mkdir(parents=True)
-            for i in frames:
-                for end in ("depth.png", "pose.txt"):
-                    name = f"frame-{i:06d}.{end}"
-                    shutil.copyfile(building / room / "seq-01" / name, own / name)
-        (folder / scene / "TrainSplit.txt").write_text("sequence1\r\n")
-        (folder / scene / "TestSplit.txt").write_text("sequence2\r\n")
-        Image.new("RGB", (4, 4)).save(folder / scene / f"{scene}.png")
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["--db", "0:4"], "Omit --db"),
-        (["elsewhere"], "Omit PATH"),
-        (["--queries", "0:4"], "Omit --queries"),
-        (["--gap-m", "3"], "Omit --gap-m"),
-        (["--distractors", "elsewhere"], "Omit --distractors"),
-    ],
-)
-def test_seven_scenes_have_splits_of_their_own(more, message, seven_scenes, capsys):
-    assert main(["evaluate", *more, "--7scenes", str(seven_scenes)]) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_seven_scenes_that_are_not_there(tmp_path, capsys):
-    assert main(["evaluate", "--7scenes", str(tmp_path)]) == 2
-    assert "There is no folder chess, fire, heads" in capsys.readouterr().err
-    (tmp_path / "chess").mkdir()
-    (tmp_path / "chess" / "seq-01.zip").touch()  # not unpacked yet
-    assert main(["evaluate", "--7scenes", str(tmp_path)]) == 2
-    assert "chess" in capsys.readouterr().err.splitlines()[-1]
-    assert main(["evaluate"]) == 2
-    assert "Specify a PATH, or --7scenes DIR" in capsys.readouterr().err
-
-
-def test_what_cannot_be_written_is_said_before_the_work(
-    building, model_file, tmp_path, capsys, monkeypatch
-):
-    def work(*_):
-        raise AssertionError("hours of it")
-
-    monkeypatch.setattr("sceneprint_lab.evaluation.run.evaluate", work)
-    (tmp_path / "file").touch()
-    asked = [str(building / "room-000"), "--db", "0:4", "--queries", "5:6"]
-    asked += ["--model", str(model_file), "--jobs", "1"]
-    for option, path in (
-        ("--json", tmp_path),
-        ("--json", tmp_path / "file" / "figures.json"),
-    ):
-        assert main(["evaluate", *asked, option, str(path)]) == 2
-        (line,) = capsys.readouterr().err.strip().splitlines()
-        assert str(tmp_path) in line
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_wrong_options_leave_no_folder(building, model_file, tmp_path):

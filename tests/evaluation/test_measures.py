@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from sceneprint_lab.evaluation.measures import (
 from sceneprint_lab.evaluation.protocol import (
     Error,
     JudgedAnswer,
-    pose_error,
 )
 from sceneprint_lab.evaluation.report import (
     per_query,
@@ -152,20 +150,6 @@ def test_views_to_average(make_pair):
     assert views_to_average([pairs[2]]) == []
 
 
-def test_pose_error():
-    truth = np.eye(4)
-    truth[:3, 3] = (1, 2, 3)
-    off = truth.copy()
-    c, s = math.cos(0.3), math.sin(0.3)
-    off[:3, :3] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
-    off[:3, 3] += (0.03, 0.0, 0.04)
-    found = pose_error(off, truth)
-    assert (found.metres, found.radians) == (pytest.approx(0.05), pytest.approx(0.3))
-    half_turn = np.diag([-1.0, -1, 1, 1])
-    assert pose_error(half_turn, np.eye(4)).radians == pytest.approx(math.pi)
-    assert pose_error(truth, truth) == Error(0.0, 0.0)
-
-
 CAMERA = Intrinsics(40, 4, 100.0, 100.0, 0.0, 0.0)
 
 
@@ -213,36 +197,3 @@ def test_json_has_null_for_what_is_infinite(three):
     assert read["per_query"][0]["pose_average"]["translation_m"] == pytest.approx(0.01)
     with pytest.raises(ValueError, match="not JSON compliant"):
         to_json({"x": math.nan})
-
-
-def test_answers_of_a_query_by_hand(make_outcome, make_pair):
-    """Three of R count; C has a weak one, a rejected, a strong and an ambiguous one."""
-
-    def found(match, T, *how):
-        one = make_pair(match, *how)
-        return replace(one, validation=replace(one.validation, T_match_query=T))
-
-    moved = np.eye(4)
-    moved[:3, 3] = (1.5, -2.0, math.inf)
-    pairs = [
-        found(4, np.eye(4), "accepted", "weak"),
-        found(2, None, "rejected"),
-        found(0, np.eye(4)),
-        found(3, moved),
-        found(1, np.eye(4), "ambiguous"),
-    ]
-    one = make_outcome([4, 2, 0, 3, 1], [4, 2, 3, 1], pairs)
-    one = replace(one, distances=np.array([7, 11, 13, 17, 19]))
-    said = json.loads(to_json(without_infinities(per_query(one, ["a", "b", "c", "d", "e"]))))
-    assert said["ranking"] == ["e", "c", "a"]
-    assert said["selection"] == ["e", "c", "d", "b"]
-    still = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]
-    off = [[1.0, 0, 0, 1.5], [0, 1.0, 0, -2.0], [0, 0, 1.0, None], [0, 0, 0, 1.0]]
-    keys = ("match", "distance", "status", "strength", "T_match_query")
-    assert [tuple(match[key] for key in keys) for match in said["matches"]] == [
-        ("d", 17, "accepted", "strong", off),
-        ("e", 7, "accepted", "weak", still),
-        ("c", 11, "rejected", None, None),
-        ("b", 19, "ambiguous", None, still),
-    ]
-    assert all(set(match) == set(keys) for match in said["matches"])

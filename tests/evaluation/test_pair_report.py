@@ -1,6 +1,5 @@
 """Tests of the figures of pairs against manual results."""
 
-import json
 import math
 from dataclasses import replace
 
@@ -10,13 +9,9 @@ import pytest
 from sceneprint.geometry.validation.acceptance import AcceptanceParameters
 from sceneprint_lab.evaluation.pair_report import (
     pair_figures,
-    pair_table,
-    second_pairs,
-    support,
 )
-from sceneprint_lab.evaluation.pair_run import BINS, Drawn, Other, PairEvaluation, Tried
+from sceneprint_lab.evaluation.pair_run import BINS, Drawn, PairEvaluation, Tried
 from sceneprint_lab.evaluation.protocol import RIGHT, Error, SignedFrame
-from sceneprint_lab.evaluation.report import to_json
 
 ACCEPTANCE = AcceptanceParameters()
 CM3, CM7, CM15, AWAY = Error(0.03, 0.0), Error(0.07, 0.0), Error(0.15, 0.0), Error(2.0, 1.0)
@@ -103,68 +98,3 @@ def test_failures_are_named_the_worst_first(found):
     assert found["failures"][0]["translation_m"] is None  # there is no truth
     assert found["failures"][2]["translation_m"] == pytest.approx(0.15)
     assert found["failures"][3]["reason"] == "as given"
-
-
-def test_baselines_beside_ours(tried):
-    others = {
-        "FPFH + RANSAC": Other(CM15, CM7, CM3, 400.0),
-        "FPFH + FGR": Other(AWAY, AWAY, AWAY, 200.0),
-    }
-    beside = [
-        replace(one, others=others, milliseconds=100.0) for one in tried if one.drawn.bin == "30-50"
-    ]
-    beside.append(replace(tried[0], others={}, milliseconds=100.0))  # too few points for them
-    found = pair_figures(evaluation([*beside, *tried[5:]]), {})["baselines"]
-    ransac, fgr = (found["methods"][name] for name in others)
-    of = ransac["bins"]["30-50"]
-    assert [of[step]["within_10cm_10deg"] for step in ("start", "icp", "ours")] == [0, 1, 1]
-    assert [of[step]["within_5cm_5deg"] for step in ("start", "icp", "ours")] == [0, 0, 1]
-    assert ransac["bins"]["10-30"]["icp"]["right"] == 0.0  # none is a failure
-    assert (ransac["time_ratio"], fgr["time_ratio"]) == (0.25, 0.5)
-    assert (found["pairs"], found["milliseconds"]) == (4, 100.0)
-
-
-def test_the_json_is_one_and_the_table_says_it(found):
-    assert json.loads(to_json(found)) == json.loads(json.dumps(found))
-    lines = "\n".join(pair_table(found))
-    assert "1 wrongly accepted, 1 not believed, 1 near, 1 not found" in lines
-    assert "here | there" in lines
-    assert f"{1 - math.sqrt(0.05):.5f}" in lines
-
-
-def at(x):
-    T = np.eye(4)
-    T[0, 3] = x
-    return T
-
-
-def test_a_second_pair_from_another_viewpoint_supports(make_pair):
-    """Matches stand at 0, 1 and .05 m; what a pair says of its query is where it puts it."""
-    members = [replace(member(i, "here"), pose=at(x)) for i, x in enumerate((0.0, 1.0, 0.05))]
-    members += [member(i, "here") for i in (3, 4, 5)]
-
-    def pair(query, match, says, status="accepted"):
-        one = make_pair(match, status, off=CM3)
-        T = at(says - float(members[match].pose[0, 3]))
-        drawn = Drawn(query, match, "overlapping", "30-50", 0.4, 0.4, planar=False)
-        return Tried(
-            drawn, replace(one, validation=replace(one.validation, T_match_query=T)), None, None
-        )
-
-    tried = [
-        # one place, to 10 cm, from two viewpoints and a third that is nearly the first
-        pair(3, 0, 5.0), pair(3, 1, 5.1), pair(3, 2, 5.0),
-        # two places, and one that nothing was said of
-        pair(4, 0, 2.0), pair(4, 1, 7.0), pair(4, 2, 7.0, "rejected"),
-        # one place, but from one viewpoint only
-        pair(5, 0, 2.0), pair(5, 2, 2.0),
-    ]  # fmt: skip
-    seconds = second_pairs(replace(evaluation(tried), members=members))
-    assert seconds == [
-        *["supported"] * 3, "contradicted", "contradicted", None, "alone", "alone",
-    ]  # fmt: skip
-    wrong = [*tried[:3], *(replace(one, pair=replace(one.pair, error=AWAY)) for one in tried[3:])]
-    assert support(wrong, seconds) == {
-        "supported": 3, "precision": 1.0, "contradicted": 2, "precision_contradicted": 0.0,
-        "alone": 2, "precision_alone": 0.0,
-    }  # fmt: skip

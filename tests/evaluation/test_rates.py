@@ -16,12 +16,6 @@ def test_the_bound_is_that_of_clopper_and_pearson(seen, of):
     assert binom.cdf(seen, of, bound) == pytest.approx(0.05, rel=1e-6)
 
 
-def test_none_seen_is_the_rule_of_three():
-    assert upper_bound(0, 2000) == pytest.approx(1 - 0.05 ** (1 / 2000), rel=1e-12)
-    assert upper_bound(0, 2000) == pytest.approx(3 / 2000, rel=3e-3)
-    assert upper_bound(0, 2000, 0.99) == pytest.approx(4.6 / 2000, rel=2e-3)
-
-
 def test_a_curve_by_hand():
     right = np.array([True, True, False, True, False])
     curve = roc(np.array([5.0, 4.0, 3.0, 3.0, 1.0]), right)
@@ -33,13 +27,3 @@ def test_a_curve_by_hand():
     assert curve.thinned() == [
         [0.0, 0.0, np.inf], [0.0, 1 / 3, 5.0], [0.0, 2 / 3, 4.0], [0.5, 1.0, 3.0], [1.0, 1.0, 1.0]
     ]  # fmt: skip
-
-
-def test_the_area_is_the_share_of_couples_in_order():
-    rng = np.random.default_rng(4)
-    scores = rng.normal(size=400).round(1)
-    scores[:30] = -np.inf
-    right = rng.random(400) < 0.3 + 0.3 * (scores > 0)
-    curve = roc(scores, right)
-    good, bad = scores[right][:, None], scores[~right]
-    assert curve.area == pytest.approx(((good > bad) + (good == bad) / 2).mean())

@@ -2,10 +2,7 @@
 
 import math
 
-import pytest
-
 from sceneprint.models import read_model
-from sceneprint.pipeline import open_signer
 from sceneprint_lab.evaluation import sites
 from sceneprint_lab.evaluation.protocol import Error, JudgedAnswer
 from sceneprint_lab.evaluation.sites import ask_site, kinds_of
@@ -14,33 +11,6 @@ from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
 #: A scan may be off by so much and still be right.
 SCAN = (0.5, 10.0)
-
-
-@pytest.mark.thorough
-def test_a_site_is_asked_and_every_answer_is_one_of_three(small_signer):
-    answers = ask_site(small_signer, ("object", 0, 2), seed=5)
-    assert [(one.site, one.query, one.answerable) for one in answers] == [
-        ("object-000", 0, True),
-        ("object-000", 1, True),
-    ]
-    for one in answers:
-        assert one.answer.status in ("found", "ambiguous", "not_found")
-        assert (one.answer.strength is None) == (one.answer.status != "found")
-        assert one.answer.milliseconds > 0
-    again = ask_site(small_signer, ("object", 0, 2), seed=5)
-    assert [(a.answer.status, a.answer.error) for a in again] == [
-        (a.answer.status, a.answer.error) for a in answers
-    ]
-
-
-@pytest.mark.thorough
-def test_a_prior_decides_between_places_that_look_alike():
-    signer = open_signer(read_model("depth"))
-    alone = ask_site(signer, ("object", 0, 2), seed=5)
-    assert [one.answer.status for one in alone] == ["ambiguous", "ambiguous"]
-    told_where = ask_site(signer, ("object", 0, 2), seed=5, prior=(0.0, 0.3))
-    assert [one.answer.status for one in told_where] == ["found", "found"]
-    assert max(one.answer.error.metres for one in told_where) < 0.1
 
 
 def test_a_model_is_asked_at_places_of_its_sensor():
@@ -66,12 +36,3 @@ def test_a_site_whose_map_is_one_surface_is_asked_of_views(small_signer, monkeyp
     places = [place for one in answers for place in one.answer.places]
     assert places
     assert all(place.evidence.rendered for place in places)
-
-
-@pytest.mark.thorough
-def test_a_scanned_site_is_asked():
-    signer = open_signer(read_model("lidar"))
-    (answer,) = ask_site(signer, ("bays", 0, 1), seed=1)
-    assert (answer.site, answer.answerable) == ("bays-000", True)
-    assert answer.answer.limits == pytest.approx(SCAN)
-    assert answer.answer.status == "not_found" or answer.answer.error.metres < 100.0

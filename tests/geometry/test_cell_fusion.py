@@ -49,24 +49,6 @@ def test_points_go_to_their_cells():
     assert found[1, 0, 0]["key"].tolist() == [63 * 64**2]
 
 
-def test_cells_are_those_of_one_point_after_the_other():
-    points = np.random.default_rng(3).uniform(-4.0, 4.0, (4000, 3)).round(2)
-    expected = {}
-    for point in points:
-        expected.setdefault(tuple(np.floor(point / CELL_M).astype(int).tolist()), []).append(point)
-    found = view_cells(points, CELL_M, ViewStamp(1, None, NO_SESSION))
-    cells = {
-        (64 * x + key % 64, 64 * y + key // 64 % 64, 64 * z + key // 64**2): sums / 256
-        for (x, y, z), rows in found.items()
-        for key, sums in zip(rows["key"].astype(int).tolist(), rows["sums"], strict=True)
-    }
-    assert cells.keys() == expected.keys()
-    for key, within in cells.items():
-        mean = np.mean(expected[key], axis=0) / CELL_M - key
-        np.testing.assert_allclose(within, mean, atol=2 / 256)
-    assert all((np.diff(rows["key"].astype(int)) > 0).all() for rows in found.values())
-
-
 def test_a_view_of_points_all_over_fills_few_tiles():
     far = (np.arange(2000.0)[:, None] + 0.5) * [TILE_M, 0.0, 0.0]
     twice = far[700:800] + np.array([0.0, 0.1, 0.0])

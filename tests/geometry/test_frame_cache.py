@@ -2,9 +2,6 @@
 
 import gc
 import weakref
-from dataclasses import replace
-
-import numpy as np
 
 from sceneprint.geometry.kernel import cached_per_frame
 from sceneprint.geometry.registration.overlap import (
@@ -53,19 +50,8 @@ def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames):
         plane_view(geometry, PlaneParameters()).weights,
         symmetries(geometry.patches, AmbiguityParameters()),
     )
-    again = replace(geometry, surface=replace(geometry.surface), patches=replace(geometry.patches))
-    for one, other in zip(
-        made,
-        (
-            sample_points(again.surface, 5),
-            overlap_target(again.surface, OverlapParameters()).points,
-            plane_view(again, PlaneParameters()).weights,
-            symmetries(again.patches, AmbiguityParameters()),
-        ),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)
     parts = [weakref.ref(one) for one in (geometry, geometry.surface, geometry.patches)]
-    del geometry, one, other
+    del geometry
     gc.collect()
     assert [part() for part in parts] == [None, None, None]
+    assert all(len(one) for one in made)

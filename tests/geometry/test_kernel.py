@@ -6,15 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numba
-import numpy as np
 import pytest
 from numba.core.registry import cpu_target
-from numba.extending import intrinsic
 
-from sceneprint.geometry import kernel as kernel_module
-from sceneprint.geometry import kernel_cache
-from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES, prefetch
+from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
 from sceneprint.geometry.kernel_cache import runs_on
 from sceneprint.geometry.signature.pair_features import _count
 
@@ -156,31 +151,6 @@ def test_what_a_processor_needs_for_code_that_was_brought():
     assert runs_on(f"+adx,{TARGET_FEATURES},-avx512bw")
     assert not runs_on(TARGET_FEATURES.replace("+avx2", "-avx2"))
     assert not runs_on("")
-
-
-def second(table, row):
-    prefetch(table, row)
-    return float(table[row, 1])
-
-
-def test_a_row_is_asked_for_and_nothing_else_happens():
-    compiled = numba.njit(second)
-    table = np.arange(6.0).reshape(3, 2)
-    for row in (0, 2, np.int32(1), np.uint64(1)):
-        assert compiled(table, row) == second(table, row) == table[row, 1]
-    for text in compiled.inspect_llvm().values():
-        assert text.count("call void @llvm.prefetch") == 2
-
-
-def test_what_asks_for_a_row_is_part_of_the_mark(monkeypatch):
-    mark = kernel_module._constant_text(prefetch, "a.module")
-    assert mark == kernel_module._code_text(kernel_cache._prefetch_row.__code__)
-
-    def nothing(_context, table, row):
-        return numba.types.void(table, row), lambda context, *_: context.get_dummy_value()
-
-    monkeypatch.setattr(kernel_cache, "prefetch_row", intrinsic(nothing))
-    assert kernel_module._constant_text(prefetch, "a.module") not in ("", mark)
 
 
 def test_kernels_import_numba_when_they_are_called():

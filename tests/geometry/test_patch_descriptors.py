@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.registration import patch_descriptors as patch_descriptors_module
 from sceneprint.geometry.registration.patch_descriptors import (
     ANGLES,
     RANGE,
@@ -18,13 +17,6 @@ from sceneprint.geometry.registration.patch_descriptors import (
 from sceneprint.types import Patches
 
 P = PatchDescriptorParameters()
-
-
-def bin_of(scale, distance, height, cosine, radial):
-    """Where in a row the bin of these five numbers is."""
-    counts = P.scales[:, 1:].astype(int)
-    start = int((counts[:scale].prod(axis=1)).sum()) * ANGLES * ANGLES
-    return start + ((distance * counts[scale, 1] + height) * ANGLES + cosine) * ANGLES + radial
 
 
 def two(normal, place, area=0.7):
@@ -78,36 +70,6 @@ def test_sizes():
     assert (found.shape, found.dtype) == ((0, P.dimension), np.float32)
 
 
-def test_two_patches_by_hand():
-    # 25 cm off in the plane, level, at right angles, and across the way there: (2, 2, 1, 1) of
-    # the nearest scale, whose bins are 10 cm and 16 cm; one unit of it all in one bin
-    row = patch_descriptors(two([0, 1, 0], [0.25, 0, 0]), P)[0]
-    expected = np.zeros(P.dimension)
-    expected[bin_of(0, 2, 2, 1, 1)] = 1.0
-    # bins of 16 cm, 25 cm is 1.0625 of them past the middle of the first; 7 heights
-    expected[bin_of(1, 1, 3, 1, 1)] = 0.9375
-    expected[bin_of(1, 2, 3, 1, 1)] = 0.0625
-    # bins of 160 / 6 cm, 0.4375 past the first's middle; 8 heights, level is between two of them
-    for height in (3, 4):
-        expected[bin_of(2, 0, height, 1, 1)] = 0.5625 / 2
-        expected[bin_of(2, 1, height, 1, 1)] = 0.4375 / 2
-    np.testing.assert_allclose(row, np.sqrt(expected / 3), atol=1e-6)
-
-
-def test_angles_by_hand():
-    # straight above, facing the same way: no direction in the plane, so radial 0, the middle bin;
-    # cosine 1 is the middle of no bin: all of it in the last
-    row = patch_descriptors(two([0, 0, 1], [0, 0, 0.16]), P)[0]
-    near = row[: bin_of(1, 0, 0, 0, 0)]
-    assert np.flatnonzero(near).tolist() == [bin_of(0, 0, 3, 2, 1)]
-    # towards the first patch and 60 degrees up: cosine 1/2, 3/4 of the way from bin 1 to 2;
-    # radial -sqrt(3)/2, beyond the middle of bin 0
-    row = patch_descriptors(two([-(3**0.5) / 2, 0, 0.5], [0.25, 0, 0]), P)[0]
-    near = row[: bin_of(1, 0, 0, 0, 0)]
-    assert np.flatnonzero(near).tolist() == [bin_of(0, 2, 2, 1, 0), bin_of(0, 2, 2, 2, 0)]
-    np.testing.assert_allclose(near[near > 0], np.sqrt(np.array([0.25, 0.75]) / 3), atol=1e-6)
-
-
 def test_equals_the_oracle(scenes):
     rng = np.random.default_rng(0)
     for patches in (scenes.random_patches(rng, 40, 0.8), scenes.room(rng, 60)):
@@ -151,33 +113,6 @@ def test_compression_by_hand():
     assert row.tolist() == [192] * 64
 
 
-def learnt(scenes, rng):
-    rooms = [patch_descriptors(scenes.room(rng), P) for _ in range(12)]
-    return np.concatenate(rooms)
-
-
-def test_bytes_keep_the_order_of_distances(scenes):
-    from scipy.stats import spearmanr  # slow to import
-
-    rng = np.random.default_rng(6)
-    rows = learnt(scenes, rng)
-    by = fit_compression(rows, 128)
-    exact = (rows.astype(float) - by.mean) @ by.matrix.T.astype(float)
-    exact /= np.linalg.norm(exact, axis=1, keepdims=True)
-    stored = compress(rows, by).astype(int)
-    i, j = rng.integers(0, len(rows), (2, 4000))
-    kept = np.clip(exact, -RANGE, RANGE)
-    of_bytes, of_kept = (
-        np.linalg.norm(x[i] - x[j], axis=1) for x in (stored * (RANGE / 127), kept)
-    )
-    np.testing.assert_allclose(of_bytes, of_kept, atol=0.02)
-    assert spearmanr(of_kept, of_bytes).statistic > 0.9995  # measured: 0.9999
-    # what is beyond the range is meant to be lost, and comes to no more than the range
-    assert np.abs(exact).max() > 2 * RANGE
-    assert stored.min() == 0
-    assert stored.max() == 255
-
-
 def test_principal_components_equal_those_of_the_svd():
     rng = np.random.default_rng(7)
     scales = np.linspace(3, 0.2, 12)
@@ -198,42 +133,3 @@ def test_components_that_cannot_be_learnt():
         with pytest.raises(ValueError, match=f"determine {dimension} components"):
             fit_compression(rows[:count], dimension)
     assert fit_compression(rows, 12).matrix.shape == (12, 12)
-
-
-def test_lengths_are_those_of_all_bins_to_the_last_bit():
-    rng = np.random.default_rng(7)
-    rows = rng.uniform(0.1, 9, (5, P.dimension)).astype(np.float32)
-    rows[rng.random(rows.shape) < 0.6] = 0
-    rows[1, : 4 * 5 * ANGLES**2] = 0  # nothing within the nearest reach
-    rows[2] = 0
-    expected, start = np.zeros_like(rows), 0
-    for _, distances, heights in P.scales:
-        end = start + int(distances * heights) * ANGLES**2
-        for row, own in zip(rows[:, start:end], expected[:, start:end], strict=True):
-            total = sum(float(value) for value in row)  # in their order, empty ones too
-            if total > 0:
-                own[:] = np.sqrt(row).astype(float) * (1 / np.sqrt(total * 3))
-        start = end
-    patch_descriptors_module._normalise(P.scales, ANGLES, rows)
-    assert expected.any(axis=1).tolist() == [True, True, False, True, True]
-    assert rows.tobytes() == expected.tobytes()
-
-
-@pytest.mark.parametrize(("bins", "filled"), [*((24, n) for n in range(10)), (600, 301)])
-def test_compression_skips_empty_bins_to_the_last_bit(bins, filled):
-    """Filled bins are multiplied four at a time, and long histograms in blocks."""
-    rng = np.random.default_rng(filled)
-    histograms = np.zeros((3, bins), np.float32)
-    for row in histograms:
-        places = rng.choice(bins, filled, replace=False)
-        row[places] = rng.uniform(0.1, 1.1, filled).astype(np.float32)
-    by = Compression(
-        rng.random(bins, dtype=np.float32), rng.standard_normal((5, bins)).astype(np.float32)
-    )
-    plain = np.tile(-by.offset, (3, 1))
-    for i, row in enumerate(histograms):
-        for b in np.flatnonzero(row):
-            plain[i] += row[b] * by.matrix[:, b]
-    out = np.empty((3, 5), np.float32)
-    patch_descriptors_module._project(histograms, np.ascontiguousarray(by.matrix.T), by.offset, out)
-    assert np.array_equal(out, plain)

@@ -2,12 +2,6 @@
 
 import numpy as np
 
-from sceneprint.geometry.registration.overlap import sample_points
-from sceneprint.geometry.signature.segmentation import (
-    SegmentationParameters,
-    extract_patches,
-    segment,
-)
 from sceneprint.geometry.validation.inspection import patches_at
 from sceneprint.types import Patches
 
@@ -33,16 +27,6 @@ def test_it_is_the_nearest_that_fits():
                 best, index = apart, j
         assert one == index
     assert 0 < (found < 0).sum() < m
-
-
-def test_it_is_nearly_the_segmentation(scenes):
-    seen, _ = scenes.corner()
-    labels = segment(seen, SegmentationParameters())
-    found = patches_at(sample_points(seen, 1), extract_patches(seen, labels))
-    truth = labels[seen.valid]
-    told = truth >= 0
-    assert told.any()
-    assert (found[told] == truth[told]).mean() > 0.8
 
 
 def test_no_patches_hold_no_points():

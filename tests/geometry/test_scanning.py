@@ -4,8 +4,6 @@ import mmap
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sceneprint.geometry.retrieval.ranking import scan
 
@@ -22,7 +20,7 @@ def random_bytes(seed, *shape):
     return np.random.default_rng(seed).integers(0, 256, shape, np.uint8)
 
 
-@pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 31, 33, 63, 64, 65, 127, 200, 4095, 4161, 8193])
+@pytest.mark.parametrize("n", [0, 1, 15, 17, 33, 63, 65, 200, 4161, 8193])
 def test_any_length(n):
     """Multiples of no width, and past a tile; more rows and queries than go together."""
     queries, database, rows = random_bytes(n, 5, n), random_bytes(n + 1, 6, n), np.arange(6)
@@ -32,18 +30,7 @@ def test_any_length(n):
     assert scan(queries[3:4], database, rows).tolist() == expected[3:4]
 
 
-@settings(max_examples=60)
-@given(n_queries=st.integers(0, 10), n_rows=st.integers(0, 40), seed=st.integers(0, 9))
-def test_any_number_of_queries_and_rows(n_queries, n_rows, seed):
-    """Rows in any order, some of them twice; full blocks, and what is left of them."""
-    queries, database = random_bytes(seed, n_queries, 70), random_bytes(seed + 1, 9, 70)
-    rows = np.random.default_rng(seed).integers(0, 9, n_rows)
-    found = scan(queries, database, rows)
-    assert (found.shape, found.dtype) == ((n_queries, n_rows), np.int64)
-    assert found.tolist() == oracle(queries, database, rows)
-
-
-@pytest.mark.parametrize("number", [*range(10), 33])
+@pytest.mark.parametrize("number", [0, 1, 2, 5, 9, 33])
 def test_half_of_all_pairs(number):
     signatures, rows = random_bytes(number, number, 130), np.arange(number)
     found = scan(signatures, signatures, rows, half=True)
@@ -61,7 +48,7 @@ def test_sums_beyond_32_bits():
     assert scan(database[:1], database, rows).tolist() == expected[:1]
 
 
-@pytest.mark.parametrize("offset", [1, 8, 31, 63])
+@pytest.mark.parametrize("offset", [1, 31])
 def test_any_place_in_memory_and_in_a_mapped_file(offset, tmp_path):
     """Rows on no boundary, read-only; the last one ends where the file does."""
     n, rows = 4096 - 3, np.array([0, 1, 2, 3, 7, 5, 6])

@@ -10,7 +10,6 @@ from sceneprint.geometry.signature.segmentation import (
     extract_patches,
     segment,
 )
-from sceneprint.types import Surface
 
 
 def parameters(n_patches=120, minimum_size=0.15, minimum_pixels=4):
@@ -73,29 +72,6 @@ def test_labels_have_no_gaps_and_follow_the_image(scenes):
     np.testing.assert_array_equal(np.unique(labels), np.arange(-1, labels.max() + 1))
 
 
-@pytest.mark.parametrize("n_patches", [30, 120, 300])
-def test_number_and_extent_of_patches(scenes, n_patches):
-    seen = wall(scenes)
-    labels = segment(seen, parameters(n_patches))
-    patches = extract_patches(seen, labels)
-    assert len(patches) == pytest.approx(n_patches, rel=0.1)
-    spacing = np.sqrt(80 * 60 / n_patches) * 2.0 / 73.0  # metres, at 2 m
-    reach = np.linalg.norm(seen.points - patches.means[labels], axis=2)
-    # the corner of a square cell is at 0.71; cells at the border may be somewhat wider
-    assert reach.max() < 0.85 * spacing  # measured: 0.73
-    assert np.percentile(reach, 95) < 0.7 * spacing  # 0.62
-
-
-def test_patches_are_compact_on_slanted_walls(scenes):
-    seen, _ = scenes.corner()
-    labels = segment(seen, parameters())
-    patches = extract_patches(seen, labels)
-    at = labels >= 0
-    spacing = np.sqrt(80 * 60 / 120) / 73.0 * patches.means[labels[at], 2]
-    reach = np.linalg.norm(seen.points[at] - patches.means[labels[at]], axis=1)
-    assert (reach / spacing).max() < 1.4  # measured: 1.22, where a wall leans away
-
-
 def test_patches_respect_depth_edges(scenes):
     # one wall half a metre before the other, with the same normal: only position tells them apart
     towards = np.array([0.0, 0.0, -1.0])
@@ -135,21 +111,6 @@ def test_patches_of_equals_the_loop(scenes):
         np.testing.assert_allclose(patches.normals[k], normal / np.linalg.norm(normal), atol=1e-6)
         assert patches.areas[k] == pytest.approx(area, rel=1e-6)
         assert patches.sizes[k] == size
-
-
-def test_areas_weigh(scenes):
-    # two pixels of areas 1 and 3, whose normals are at right angles
-    seen = Surface(
-        np.array([[[0, 0, 1], [4, 0, 1]]], np.float32),
-        np.array([[[0, 0, -1], [-1, 0, 0]]], np.float32),
-        np.ones((1, 2), bool),
-        np.array([[1, 3]], np.float32),
-        scenes.CAMERA,
-    )
-    patches = extract_patches(seen, np.zeros((1, 2), np.int32))
-    np.testing.assert_allclose(patches.means, [[3, 0, 1]])
-    np.testing.assert_allclose(patches.normals, [[-3 / 10**0.5, 0, -1 / 10**0.5]], rtol=1e-6)
-    assert (patches.areas.tolist(), patches.sizes.tolist()) == ([4.0], [2])
 
 
 def test_nothing_seen_gives_no_patch(scenes):
@@ -195,24 +156,3 @@ def test_pixels_get_the_nearest_of_nine_centres(height, width, spacing):
     expected = naive_assignment(pixels, centres, spacing, weight, columns)
     np.testing.assert_array_equal(labels, np.where(valid, expected, -1))
     assert len(np.unique(labels)) > 0.4 * len(centres)
-
-
-def test_centres_by_the_definition():
-    """Of labels with pixels, with none, with normals that cancel; beside numpy, bit by bit."""
-    rng = np.random.default_rng(2)
-    sums = rng.normal(size=(60, 8))
-    sums[:, 0], sums[:, 3] = rng.uniform(0.5, 40, 60), rng.uniform(1, 90, 60)
-    sums[5], sums[6, 4:7], sums[7, 4:7] = 0.0, 0.0, 1e-9
-    centres = np.empty((60, 7), np.float32)
-    module._centres(sums, 4.4, 146.0, centres)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean, normal = sums[:, 1:4] / sums[:, :1], sums[:, 4:7] / sums[:, :1]
-        length = np.linalg.norm(normal, axis=1)
-        normal = normal / length[:, None]
-        scale = (146.0 / (4.4 * mean[:, 2])) ** 2
-    live = np.delete(np.arange(60), [5, 6, 7])
-    expected = np.column_stack([mean, normal, scale]).astype(np.float32)
-    assert centres[live].tobytes() == expected[live].tobytes()
-    assert centres[5:8, 6].tolist() == [0, 0, 0]
-    np.testing.assert_array_equal(centres[5], 0)
-    np.testing.assert_array_equal(centres[6, :3], mean[6].astype(np.float32))

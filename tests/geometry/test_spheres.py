@@ -145,67 +145,10 @@ def test_points_where_the_image_begins_are_in_its_first_column():
         assert cosines.min() > np.cos(camera.step)
 
 
-def test_nobody_sees_through_a_wire():
-    """It is too narrow for a plane of its own, and the wall behind it is not invented there."""
-    step = P.image_angle
-    azimuth, elevation = np.meshgrid(
-        np.arange(-0.5, 0.5, step / 2.5), np.arange(-0.3, 0.3, step / 2.5)
-    )
-    rays = np.stack([np.ones_like(azimuth), np.tan(azimuth), np.tan(elevation)], axis=2)
-    rays /= np.linalg.norm(rays, axis=2)[..., None]
-    reach = np.where(np.abs(azimuth) < 0.4 * step, 1.5, 4.0 / rays[..., 0])
-    surface = range_image(Cloud((rays * reach[..., None]).reshape(-1, 3).astype(np.float32)), P)
-    camera = surface.camera
-    assert isinstance(camera, Sphere)
-    wire = round(-camera.left / camera.step)
-    inner = surface.valid[3:-3]
-    assert not inner[:, wire].any()
-    assert inner[:, wire + 3 : -3].all()
-    assert inner[:, 3 : wire - 2].all()
-
-
-def test_any_order_gives_the_same_bytes(cloud_scenes):
-    cloud = cloud_scenes.room(10_000)
-    a, b = range_image(cloud, P), range_image(cloud_scenes.shuffled(cloud), P)
-    assert a.camera == b.camera
-    assert a.points.tobytes() == b.points.tobytes()
-    assert a.normals.tobytes() == b.normals.tobytes()
-
-
 def test_points_in_one_direction_show_no_surface():
     ray = np.linspace(1, 9, 5000)[:, None] * np.array([1.0, 0.1, 0.1])
     with pytest.raises(UselessFrame, match="1 pixels"):
         range_image(Cloud(ray.astype(np.float32)), P)
-
-
-def test_agrees_with_the_depth_image_it_is_of(room_frames):
-    from sceneprint.models import ModelParameters
-    from sceneprint.signing import see
-
-    frame = room_frames[0]
-    k = frame.intrinsics
-    y, x = np.nonzero(frame.depth > 0)
-    z = frame.depth[y, x].astype(float)
-    points = np.column_stack([(x - k.cx) / k.fx * z, (y - k.cy) / k.fy * z, z])
-    image = range_image(Cloud(points.astype(np.float32)), CloudParameters())
-    seen = see(frame, ModelParameters())
-    camera = image.camera
-    assert isinstance(camera, Sphere)
-    at = seen.points[seen.valid].astype(float)
-    unit = at / np.linalg.norm(at, axis=1)[:, None]
-    a, b = (camera.pole + 1) % 3, (camera.pole + 2) % 3
-    turn = np.mod(np.arctan2(unit[:, b], unit[:, a]) - camera.left, 2 * np.pi)
-    columns = np.rint(turn / camera.step).astype(int)
-    rows = np.rint((camera.top - np.arcsin(unit[:, camera.pole])) / camera.step).astype(int)
-    inside = (rows >= 0) & (rows < camera.height) & (columns < camera.width)
-    rows, columns = rows[inside], columns[inside]
-    both = image.valid[rows, columns]
-    assert both.mean() > 0.97
-    n = seen.normals[seen.valid][inside][both].astype(float)
-    cosine = (image.normals[rows, columns][both] * n).sum(axis=1)
-    assert np.median(cosine) > 0.998
-    off = ((image.points[rows, columns][both] - at[inside][both]) * n).sum(axis=1)
-    assert np.median(np.abs(off)) < 0.002
 
 
 def test_rays_meet_planes_as_numpy_has_it():

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.registration.overlap import first_per_cube, sample_points, thin_points
-from sceneprint.geometry.registration.plan_search import PlanParameters, draw_plan
-from sceneprint.geometry.surface.cloud import CloudParameters
-from sceneprint.geometry.surface.range_image import SPREAD_POINTS, range_image, spread_points
+from sceneprint.geometry.surface.range_image import SPREAD_POINTS
 from sceneprint.geometry.validation.validation import refine_transform
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
@@ -75,29 +73,10 @@ def test_points_lie_on_what_is_shown_and_evenly(surface):
     assert far > 1.5 * (shown[:, 0] < -14.9).mean()
 
 
-def test_the_order_of_a_cloud_changes_nothing(lidar, surface):
-    cloud = hall((1.0, 0.5, 1.5))
-    shuffled = replace(cloud, points=np.random.default_rng(0).permutation(cloud.points))
-    one, other = surface.spread, geometry(shuffled, lidar).surface.spread
-    assert one.points.tobytes() == other.points.tobytes()
-    assert one.normals.tobytes() == other.normals.tobytes()
-
-
 def test_a_scan_that_sees_a_part_keeps_its_image_alone(lidar):
     part = geometry(hall((1.0, 0.5, 1.5), half=1.0), lidar).surface
     assert part.spread is None
     assert part.fitted is part
-
-
-def test_where_finer_pixels_fix_no_plane_the_image_helps():
-    p = CloudParameters(image_angle=0.025, maximum_range=60.0, gap_px=0)
-    rings = np.radians(np.arange(-15, 16, 1.5))
-    cloud = hall((1.0, 0.5, 1.5))
-    elevation = np.arctan2(cloud.points[:, 2], np.hypot(cloud.points[:, 0], cloud.points[:, 1]))
-    near = np.abs(elevation[:, None] - rings).min(axis=1) < 0.011
-    sparse = replace(cloud, points=cloud.points[near])
-    image = range_image(sparse, p)
-    assert spread_points(sparse, image, p).points.shape[1] >= int(image.valid.sum())
 
 
 def test_as_many_are_counted_as_of_a_depth_image(surface):
@@ -106,13 +85,6 @@ def test_as_many_are_counted_as_of_a_depth_image(surface):
     assert len(sample_points(surface, 2)) == pytest.approx(n / 2, abs=1)
     assert len(sample_points(surface, 1)) == int(surface.valid.sum())
     assert len(thin_points(surface.spread, 100, 1.0).points[0]) <= 100
-
-
-def test_plans_are_of_the_points(surface):
-    plan = draw_plan(surface, PlanParameters(cell=0.5, voxel=0.4))
-    assert surface.spread is not None
-    alone = draw_plan(surface.spread, PlanParameters(cell=0.5, voxel=0.4))
-    np.testing.assert_array_equal(plan.points, alone.points)
 
 
 def test_refinement_works_on_the_points(lidar):

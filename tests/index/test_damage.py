@@ -84,26 +84,6 @@ def test_what_is_open_does_not_vouch_for_what_is_gone(folder):
     assert found.number == 1
 
 
-def test_files_removed_while_they_are_opened_are_not_damaged(
-    folder, walk, published, monkeypatch, caplog
-):
-    """A builder that publishes twice between the listing of a folder and the opening."""
-    passed = False
-
-    def late(path):
-        nonlocal passed
-        if not passed:
-            passed = True
-            signatures = walk(10, LENGTH, seed=3)
-            published(np.arange(10), signatures, published(np.arange(5), signatures[:5]))
-            assert not path.exists() or int(path.name[:10]) > 2
-        return read_manifest(path)
-
-    monkeypatch.setattr("sceneprint.index.index_version.read_manifest", late)
-    assert number_of(folder) == 4
-    assert caplog.record_tuples == []
-
-
 def test_without_a_sound_version_there_is_none(folder, walk, published):
     for path in folder.glob("*.faiss"):
         path.write_bytes(b"")

@@ -144,31 +144,6 @@ def test_two_versions_are_kept_and_only_our_files_removed(walk, published, tmp_p
     assert files(folder) == {".lock", "notes.txt"}
 
 
-def test_what_is_open_is_taken_from_there(walk, published, tmp_path, monkeypatch):
-    folder, signatures = tmp_path / "map", walk(150)
-    first = published(np.arange(100), signatures[:100])
-    assert newest(folder, "model", LENGTH, previous=first) is first
-    assert newest(folder, "model", LENGTH) is not first
-    second = published(np.arange(100, 150), signatures[100:], first)
-    read = []
-    monkeypatch.setattr(
-        "sceneprint.index.index_version.verify", lambda _, name, __: read.append(name) or iter(())
-    )
-    found = newest(folder, "model", LENGTH, previous=first)
-    assert found is not None
-    assert holds(found, frames_of(np.arange(150), signatures))
-    assert read == [name for name, _ in second.manifest.files if name not in first.inodes]
-    read.clear()
-    assert newest(folder, "model", LENGTH, sound=second.inodes) is not None
-    assert read == []
-    read.clear()
-    published(np.arange(0), signatures[:0], second, revision=3)  # the same files
-    again = newest(
-        folder, "model", LENGTH, previous=newest(folder, "model", LENGTH, previous=second)
-    )
-    assert again.revision == 3
-
-
 def test_what_was_mapped_survives_its_file(walk, tmp_path):
     """In a process of its own, which a lost mapping would kill."""
     code = """

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from sceneprint.index.index_version import (
     Tail,
-    publish,
     search,
     signatures_of,
 )
@@ -46,34 +45,6 @@ def test_a_tail_alone(n, size, seed, dead, metric):
     )
     assert answer(hits) == ([k for _, k in right[:size]], [d for d, _ in right[:size]])
     assert (hits.exact, hits.compared) == (True, len(alive))
-
-
-@settings(max_examples=30)
-@given(
-    kinds=st.integers(1, 30),
-    n=st.integers(1, 300),
-    length=st.sampled_from([1, 3, 8, 16, 24, 384]),
-    seed=st.integers(0, 999),
-    share=st.sampled_from([0.3, 0.8, 1.0]),
-)
-def test_of_equal_frames_the_smaller_keys_are_found(
-    tmp_path_factory, nearest, kinds, n, length, seed, share
-):
-    """Duplicates by the dozen, so that the cut lies among equal distances."""
-    rng = np.random.default_rng(seed)
-    signatures = rng.integers(0, 256, (kinds, length), np.uint8)[rng.integers(0, kinds, n)]
-    keys = rng.permutation(5 * n)[:n].astype(np.int64)
-    version = publish(
-        tmp_path_factory.mktemp("map"), model_id="model", revision=0, previous=None,
-        blocks=[(keys, signatures)],
-    )  # fmt: skip
-    assert version is not None
-    query = signatures[0] if seed % 2 else rng.integers(0, 256, length, np.uint8)
-    dead = frozenset(keys[rng.random(n) >= share].tolist())
-    frames = {k: x for k, x in frames_of(keys, signatures).items() if k not in dead}
-    for size in {1, 5, n // 2, n - 1, n}:
-        hits = search_l2(query, version, Tail.empty(length), size, dead=dead)
-        assert answer(hits) == nearest(query, frames, size)
 
 
 def test_distances_that_floats_cannot_hold_are_exact(published, nearest):

@@ -65,50 +65,6 @@ def test_merges_by_hand():
     assert merge_plan([3**i for i in range(10)]) == [[0, 1, 2], *([i] for i in range(3, 10))]
 
 
-def test_all_writing_together_is_in_n_log_n(walk, published):
-    """From nothing to n in equal steps: each frame is written once, and at each merge again."""
-    step, length = 16, 64
-    n = 128 * step
-    signatures, made, total, most = walk(n, length), None, 0, 0
-    for start in range(0, n, step):
-        keys = np.arange(start, start + step)
-        before, made = made, published(keys, signatures[keys], made, revision=start)
-        total += written(before, made)
-        most = max(most, len(made.segments))
-        assert len(made) == start + step
-        assert made.manifest.frames == start + step
-    head = 200  # of FAISS, in each file
-    # signature and key of each frame 5.4 times on average; all anew each time would be 64 times
-    assert n * (length + 8) <= total <= 5.4 * n * (length + 8) + 2 * 128 * head
-    assert most == 4
-
-
-def test_an_append_of_a_sixteenth_writes_a_sixteenth(walk, published):
-    signatures = walk(3400, 64)
-    first = published(np.arange(3200), signatures[:3200])
-    second = published(np.arange(3200, 3400), signatures[3200:], first, drop=frozenset([7, 9]))
-    assert sizes(second) == [3198, 200]
-    assert written(None, first) == pytest.approx(3200 * 72, rel=0.01)
-    assert written(first, second) == pytest.approx(200 * 72 + 2 * 8, rel=0.02)
-    assert second.segments[0].gone.tolist() == [7, 9]
-    assert second.segments[0].vectors.shape == (3200, 64)
-
-
-def test_what_is_open_stays_open(walk, published, tmp_path):
-    """A reader that follows maps only what is new."""
-    signatures = walk(130)
-    first = published(np.arange(100), signatures[:100])
-    second = published(np.arange(100, 110), signatures[100:110], first)
-    found = newest(tmp_path / "map", "model", 256, previous=first)
-    assert [one is first.segments[0] for one in found.segments] == [True, False]
-    assert second.segments[0] is first.segments[0]
-    third = published(*([part[:0] for part in (np.arange(0), signatures)]), second,
-                      drop=frozenset([5]))  # fmt: skip
-    assert third.segments[0] is not first.segments[0]
-    assert third.segments[1] is second.segments[1]
-    assert (len(first.segments[0]), len(third.segments[0])) == (100, 99)
-
-
 @settings(max_examples=40)
 @given(data=st.data(), flat=st.sampled_from([0, 1 << 30]), seed=st.integers(0, 999))
 def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, flat, seed):
@@ -226,28 +182,6 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(walk, published,
                      drop=frozenset(range(2500, 2530)), flat_bytes=flat)  # fmt: skip
     assert [one.sketches for one in less.segments] == [None, None]
     assert less.manifest.recall.probes == 0
-
-
-def test_segments_find_as_much_as_one_file(walk, published, tmp_path):
-    """Recall of the ten nearest, of frames of the map and of queries from elsewhere."""
-    length, n = 64, 5916
-    signatures = walk(n, length, walks=40)
-    one = published(np.arange(n), signatures, folder=tmp_path / "one", flat_bytes=0)
-    order, made = np.random.default_rng(3).permutation(n), None
-    for start, end in ((0, 4000), (4000, 5300), (5300, 5730), (5730, 5870), (5870, n)):
-        keys = order[start:end]
-        made = published(keys, signatures[keys], made, flat_bytes=0)
-    assert len(made.segments) == 5
-    noise = np.random.default_rng(7).normal(0, 6, (80, length))
-    queries = np.clip(signatures[40::70][:80] + noise, 0, 255).astype(np.uint8)
-    empty, kept = Tail.empty(length), {"one": 0.0, "several": 0.0}
-    for query in queries:
-        right = search(query, one, empty, 10, metric="l2", exact=True)
-        for name, version in (("one", one), ("several", made)):
-            found = search(query, version, empty, 10, metric="l2")
-            kept[name] += np.isin(right.keys, found.keys).mean() / len(queries)
-    assert kept["several"] >= kept["one"] - 0.005
-    assert kept["several"] >= 0.97
 
 
 @pytest.fixture

@@ -152,18 +152,6 @@ def test_sketches_by_hand():
     assert own.candidates(query, 9, ~free & False).tolist() == []
 
 
-@pytest.mark.parametrize("length", [1, 63, 64, 65, 448])
-def test_bits_are_compared_whatever_the_length(length):
-    rows = np.random.default_rng(length).integers(0, 256, (300, length), np.uint8)
-    own, free = make_sketches(rows), np.arange(300) % 3 > 0
-    assert codes_of(own).shape == (300, -(-length // 8))
-    bits = differing_bits(rows[5], rows, own.means)
-    assert [bits[row] for row in own.nearest(rows[5], 300)] == sorted(bits)
-    some = own.nearest(rows[5], 100, free)
-    assert free[some].all()
-    assert [bits[row] for row in some] == sorted(np.array(bits)[free].tolist())[:100]
-
-
 @pytest.mark.parametrize("most", [1, 20, 299, 400])
 def test_neighbours_are_the_nearest_by_exact_distance(walk, monkeypatch, most):
     signatures, chosen = walk(300, LENGTH, walks=3), np.array([0, 6, 7, 150, 299])
@@ -186,12 +174,3 @@ def test_one_frame_and_equal_frames_have_lists_too(published, tmp_path):
         hits = search_l2(same[0], made, EMPTY, 5)
         assert hits.keys.tolist() == list(range(min(n, 5)))
         assert made.manifest.recall.share == 1
-
-
-@pytest.mark.parametrize(("n", "limit"), [(5, 5), (5, 9), (100, 7), (1000, 999)])
-def test_a_draw_is_one_of_each_stretch(n, limit):
-    rows = draw(n, limit, 4)
-    assert len(rows) == min(n, limit)
-    assert (np.diff(rows) > 0).all()
-    assert 0 <= rows[0] <= rows[-1] < n
-    assert rows.tolist() == draw(n, limit, 4).tolist()

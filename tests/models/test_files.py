@@ -110,11 +110,6 @@ def test_whitenings_that_are_none(small_whitened, tmp_path):
         parse_model(with_header(good, lambda header: header.update(schema_version=2)), "a file")
 
 
-def test_sizes(small_model):
-    assert small_model.level_length == 25 * 8
-    assert small_model.signature_bytes == 25 * 8 * 2
-
-
 @pytest.mark.parametrize(
     ("preset", "g", "size", "metric"),
     [("depth", 256, 448, "l2"), ("paper", 1250, 125_000, "l1")],

@@ -5,13 +5,11 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint_client import meta_of
-from sceneprint_client.api import Alternative
 from sceneprint_viewers.answer_scene import MANY, ONE, AnswerScene
 from sceneprint_viewers.map_scene import map_runs
 from sceneprint_viewers.scene import (
     QUERY,
     STRONG,
-    UNSURE,
     Moment,
     Placement,
     SceneEntity,
@@ -82,47 +80,6 @@ def test_matches_lie_where_the_map_has_them(client, frame, answer):
     assert f"{space}/matches/{len(placed) + 1}" not in there
 
 
-def test_rejected_matches_are_not_placed(client, frame, answer):
-    first, *others = answer.matches
-    verdict = first.validation.model_copy(update={"status": "rejected", "strength": None})
-    rejected = first.model_copy(update={"validation": verdict, "pose_in_map": None})
-    changed = answer.model_copy(update={"matches": [rejected, *others]})
-    before = drawn(client, answer).contents()
-    there = drawn(client, changed).contents()
-    children = [one.child for one in there.values() if isinstance(one, Placement)]
-    assert f"{first.frame_id}.optical" not in children
-    assert len(before) - len(there) == 5  # placement, points, sensor, label, vote
-
-
-def test_alternatives_are_told_from_the_answer(client, frame, answer):
-    pose = answer.location.pose
-    shifted = np.array(pose.matrix)
-    shifted[:3, 3] += (1.0, 2.0, 0.5)
-    other = pose.model_copy(update={"matrix": shifted.tolist()})
-    rivals = [
-        Alternative(pose=one, map=MAP, confidence=sure, weight=1.4, support=2, score=0.9)
-        for one, sure in ((pose, 0.5), (other, None))
-    ]
-    unsure = answer.model_copy(
-        update={"status": "ambiguous", "location": None, "alternatives": rivals}
-    )
-    there = drawn(client, unsure).contents()
-    space = pose.parent_frame
-    assert f"{space}/query" not in there
-    np.testing.assert_array_equal(there[f"{space}/alternatives/1"].T_parent_child, pose.matrix)
-    np.testing.assert_array_equal(there[f"{space}/alternatives/2"].T_parent_child, shifted)
-    one, two = (there[f"{space}/alternatives/{n}"].child for n in (1, 2))
-    assert one != two
-    assert (
-        there[f"{space}/alternatives/1/label"].text == "alternative 1: support 2, confidence 0.50"
-    )
-    assert there[f"{space}/alternatives/2/label"].text == "alternative 2: support 2"
-    points = there[f"{space}/alternatives/1/points"]
-    assert set(map(tuple, points.colours.tolist())) == {UNSURE}
-    assert 1000 < len(points.points) <= 2 * ONE.match
-    assert there["query.optical/query/label"].text == "my frame: ambiguous"
-
-
 def test_what_is_not_found_lies_in_a_space_of_its_own(client, answer):
     lost = answer.model_copy(update={"status": "not_found", "location": None, "matches": []})
     writer = drawn(client, lost)
@@ -130,13 +87,6 @@ def test_what_is_not_found_lies_in_a_space_of_its_own(client, answer):
     assert {path.partition("/")[0] for path in there} == {"query.optical", "answer"}
     assert [one for one in there.values() if isinstance(one, Placement)] == []
     assert writer.contents(-2)["query.optical"].up.tolist() == [0, -1, 0]
-
-
-def test_a_query_without_validation_has_no_points(client, frame):
-    ranked = client.query(MAP, frame, stages=("retrieve",))
-    there = drawn(client, ranked, map_frames=0).contents()
-    assert len(there["query.optical/query/points"].points) == 0
-    assert there["query.optical/query/label"].text == "my frame: unvalidated"
 
 
 def test_the_map_is_drawn_once_and_where_its_frames_are(client, answer):

@@ -86,19 +86,6 @@ def test_the_frames_of_a_map_are_shown(sceneprint, client, tmp_path):
         np.testing.assert_allclose(told, [[at.x, at.y, at.z]], atol=1e-6)
 
 
-def test_one_frame_is_shown(sceneprint, client, tmp_path):
-    mcap = tmp_path / "a.mcap"
-    frame = next(client.frames(MAP, session="yard"))
-    sceneprint("frames", MAP, frame.frame_id, "--mcap", mcap)
-    rows = mcap_rows(mcap)
-    seen = client.frame_points(MAP, frame.frame_id).points
-    told = values(rows, f"/yard/{frame.frame_id}/points", "Points3D:positions")
-    np.testing.assert_allclose(told, seen, atol=1e-6)
-    [move] = moves_of(rows, frame.pose.child_frame)
-    at = move.values["Transform3D:translation"]
-    np.testing.assert_allclose(at, [np.array(frame.pose.matrix)[:3, 3]], atol=1e-6)
-
-
 @pytest.fixture
 def halves(client, walk):
     """The walk as two sessions, every other frame of each, in frames of their own: that of the

@@ -1,8 +1,6 @@
 """Tests of written scenes, which Rerun reads back."""
 
 import resource
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -183,9 +181,3 @@ def test_without_stamps_moments_are_a_second_apart(tmp_path):
             stream.write(Moment([SceneEntity(("answer",), TextPage(f"{i}"))], i))
     logs = at(mcap_rows(path), "/log", "TextLog:text")
     assert [row.time_ns for row in logs] == [0, 1_000_000_000, 4_000_000_000]
-
-
-def test_nothing_is_loaded_that_no_option_needs():
-    code = "import sys; import sceneprint.cli.query; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "foxglove" not in done.stdout.split()

@@ -7,14 +7,11 @@ from sceneprint_lab.synth.mesh import (
     Opening,
     Wall,
     area,
-    ceiling,
     face_normals,
-    floor_plan,
     shell,
     volume,
     walls_of,
 )
-from sceneprint_lab.synth.rooms import CELL, Floor, PiecePose
 
 L_PLAN = np.array([(0, 0), (4, 0), (4, 2), (2, 2), (2, 3), (0, 3)], float)
 
@@ -31,29 +28,6 @@ def test_shell_encloses_the_room_and_its_recesses():
     np.testing.assert_allclose(face_normals(mesh).sum(axis=0), 0, atol=1e-12)
     lost = mesh.loss > 0
     assert np.linalg.norm(face_normals(mesh)[lost], axis=1).sum() / 2 == pytest.approx(0.5 * 0.5)
-
-
-def test_plans_and_ceilings_keep_to_their_bounds():
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        outline = floor_plan(rng)
-        x, y = outline.T
-        assert np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1)) > 0  # counter-clockwise
-        assert 2.5 <= np.ptp(x) <= 8.0
-        assert 2.5 <= np.ptp(y) <= 8.2
-        assert 2.09 < ceiling(rng, outline).at(outline).min() < 3.2
-
-
-def test_floor_is_claimed_once_and_only_inside():
-    floor = Floor(L_PLAN)
-    assert np.count_nonzero(floor.inside) * CELL**2 == pytest.approx(10.0)
-    assert floor.claim(PiecePose(1, 1, 0.5), 0.8, 0.6)
-    assert np.count_nonzero(floor.claimed & floor.inside) * CELL**2 == pytest.approx(0.48, abs=0.05)
-    before = floor.claimed.copy()
-    assert not floor.claim(PiecePose(1.3, 1, 0), 0.8, 0.6)
-    assert not floor.claim(PiecePose(3.5, 2.5, 0), 0.4, 0.4)
-    np.testing.assert_array_equal(floor.claimed, before)
-    assert floor.claim(PiecePose(1.5, 1, 0), 0.6, 0.6, overlap=0.6)
 
 
 def test_rooms_are_furnished():
