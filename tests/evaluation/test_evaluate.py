@@ -25,12 +25,6 @@ def evaluated(folder, *arguments):
     return json.loads(path.read_text(), parse_constant=pytest.fail)
 
 
-def copied(room, to):
-    """A room of which frames may be spoilt."""
-    shutil.copytree(room, to)
-    return to
-
-
 @pytest.fixture(scope="module")
 def ranges(building):
     room = building / "room-000"
@@ -80,7 +74,7 @@ def test_a_scene_that_is_absent(ranges, model_file, tmp_path, capsys):
 
 
 def test_frames_that_cannot_be_used_are_named(building, model_file, tmp_path, capsys):
-    copy = copied(building / "room-000", tmp_path / "room")
+    copy = shutil.copytree(building / "room-000", tmp_path / "room")
     (copy / "seq-01" / "frame-000001.pose.txt").unlink()
     (copy / "seq-01" / "frame-000002.depth.png").write_bytes(b"no picture")
     found = evaluated(
@@ -104,14 +98,9 @@ def test_wrong_options_leave_no_folder(building, model_file, tmp_path):
     ("arguments", "message"),
     [
         (["{room}"], "Add --db and --queries"),
-        (["{room}", "--db", "0:4"], "--db requires --queries"),
-        (["{room}", "--db", "0-4", "--queries", "5:6"], "is not a range of frames"),
         (["{room}", "--db", "0:4", "--queries", "5:99"], "outside the 12 frames"),
         (["{room}", "--db", "0:4", "--queries", "3:6"], "selected twice"),
-        (["{room}@db=0:4,queries=5:6", "--db", "0:4", "--queries", "5:6"], "Omit --db and"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--levels", "9"], "Choose from 1 to"),
-        (["{room}", "--db", "0:4", "--queries", "5:6", "--max-overlap", "2"], "--max-overlap"),
-        (["{room}", "--db", "0:4", "--queries", "5:6", "--metric", "l3"], "--metric"),
         (["{room}", "--db", "0:4", "--queries", "5:6", "--db-step", "0"], "--db-step"),
         (["/nowhere", "--db", "0:4", "--queries", "5:6"], "does not exist"),
     ],

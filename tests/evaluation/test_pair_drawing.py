@@ -52,15 +52,3 @@ def test_neighbours_of_one_sequence_are_left_out():
     within = {(2, 0), (5, 3)}
     between = {(i, j) for i in (3, 4, 5) for j in (0, 1, 2)}  # two runs have no neighbours
     assert couples(drawn, "70-100") == within | between
-
-
-def test_so_many_of_each_bin_each_once_and_the_same_every_time():
-    rng = np.random.default_rng(1)
-    truth = of_matrix(np.tril(rng.random((40, 40)), -1))
-    few = replace(ALL, pairs=20, seed=3)
-    drawn = draw(places("a", 40), truth, NO_PLANES[:40], few)
-    assert [len(couples(drawn, name)) for name in BINS] == [20, 20, 20, 20]
-    assert draw(places("a", 40), truth, NO_PLANES[:40], few) == drawn
-    other = draw(places("a", 40), truth, NO_PLANES[:40], replace(few, seed=4))
-    assert couples(other, "30-50") != couples(drawn, "30-50")
-    assert all(truth.least[one.query, one.match] == one.overlap_least for one in drawn)

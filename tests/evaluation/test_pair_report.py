@@ -85,16 +85,3 @@ def test_negatives_and_how_many_may_be(found):
     assert found["scenes"]["here"]["validation"]["accepted"] == 2
     assert found["scenes"]["there"]["validation"]["precision"] is None
     assert found["counts"]["planar"] == {"here": 1, "there": 1}
-
-
-def test_failures_are_named_the_worst_first(found):
-    told = [(one["number"], one["what"], one["match"]) for one in found["failures"]]
-    assert told == [
-        (8, "wrongly_accepted", "there/2"),
-        (4, "not_believed", "here/0"),
-        (1, "near", "here/0"),
-        (0, "not_found", "here/0"),
-    ]
-    assert found["failures"][0]["translation_m"] is None  # there is no truth
-    assert found["failures"][2]["translation_m"] == pytest.approx(0.15)
-    assert found["failures"][3]["reason"] == "as given"

@@ -6,7 +6,7 @@ import pytest
 from sceneprint_lab.evaluation.measures import roc, upper_bound
 
 
-@pytest.mark.parametrize(("seen", "of"), [(0, 1), (0, 2000), (1, 10), (3, 40), (9, 10), (37, 700)])
+@pytest.mark.parametrize(("seen", "of"), [(0, 2000), (3, 40), (9, 10)])
 def test_the_bound_is_that_of_clopper_and_pearson(seen, of):
     from scipy.stats import beta, binom  # slow to import
 

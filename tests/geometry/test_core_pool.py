@@ -62,22 +62,6 @@ def test_halves_run_in_turn_without_a_free_core(two):
     alone.close()
 
 
-def test_a_half_takes_no_core_of_its_own_half(two):
-    """What a half calls runs in turn: it has one core, and the other half the other."""
-    inner = []
-    barrier = threading.Barrier(2)
-
-    def half():
-        barrier.wait(PATIENCE_S)
-        inner.append((threading.current_thread().name, threads_of()))
-        barrier.wait(PATIENCE_S)
-
-    with two.shared():
-        run_both(half, half)
-    assert len(inner) == 2
-    assert all(names == [own, own] for own, names in inner)
-
-
 @pytest.mark.parametrize("lent", [True, False])
 def test_what_a_half_raises_is_raised_and_the_core_is_free_again(two, lent):
     def fail(why):

@@ -10,7 +10,6 @@ from sceneprint.geometry.signature.segmentation import (
     hierarchy,
     segment,
 )
-from sceneprint.types import Surface
 
 
 def parameters(n_levels=4, factor=2.0):
@@ -43,36 +42,6 @@ def test_counts_fall_by_the_factor(scenes, factor):
         assert level.sizes.sum() == (finest >= 0).sum()
     assert len(result.levels[0]) == n
     np.testing.assert_array_equal(result.labels[0], finest)
-
-
-def strip(scenes, x, normals, largest=0.04):
-    """One row of pixels, each a patch of its own, halved once."""
-    n = len(x)
-    areas = np.full((1, n), 0.04, np.float32)
-    areas[0, 0] = largest
-    points = np.zeros((1, n, 3), np.float32)
-    points[0, :, 0], points[0, :, 2] = x, 2.0
-    seen = Surface(
-        points,
-        np.array([normals], np.float32),
-        np.ones((1, n), bool),
-        areas,
-        scenes.CAMERA,
-    )
-    return hierarchy(seen, np.arange(n, dtype=np.int32)[None], parameters(2, 2.0))
-
-
-def test_two_clusters_by_hand(scenes):
-    front, side = [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]
-    # near and far: {0, .1} and {2, 2.1}, all facing alike
-    labels = strip(scenes, [0.0, 2.1, 0.1, 2.0], [front] * 4).labels[1][0].tolist()
-    assert labels in ([0, 1, 0, 1], [1, 0, 1, 0])
-    # side by side, but two of them face elsewhere
-    result = strip(scenes, [0.0, 0.1, 0.2, 0.3], [front, side, front, side])
-    assert result.labels[1][0].tolist() in ([0, 1, 0, 1], [1, 0, 1, 0])
-    order = np.argsort(result.levels[1].means[:, 0])
-    np.testing.assert_allclose(result.levels[1].means[order, 0], [0.1, 0.2], rtol=1e-6)
-    np.testing.assert_allclose(result.levels[1].normals[order], [front, side], atol=1e-7)
 
 
 def test_deep_levels_never_fall_below_one(scenes):

@@ -4,17 +4,12 @@ import os
 import pickle
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from numba.core.registry import cpu_target
 
-from sceneprint.geometry.kernel import TARGET, TARGET_FEATURES
+from sceneprint.geometry.kernel import TARGET_FEATURES
 from sceneprint.geometry.kernel_cache import runs_on
 from sceneprint.geometry.signature.pair_features import _count
-
-#: What numba compiles for: its words for the system, the processor and its features.
-HOST = cpu_target.target_context.codegen().magic_tuple()
 
 INNER = """
 from sceneprint.geometry.kernel import kernel
@@ -99,51 +94,6 @@ def test_the_marks_are_the_same_in_every_process():
     ]  # fmt: skip
     assert int(said[0].split()[0]) > 80
     assert said[0] == said[1]
-
-
-ALONE = """
-from sceneprint.geometry.kernel import code_folder, kernel
-
-@kernel
-def thrice(x):
-    return x * 3
-
-before = code_folder(thrice)[1]
-value = thrice(5.0)
-folder, there = code_folder(thrice)
-print(value, sum(thrice.stats.cache_hits.values()), before, there, folder)
-"""
-
-
-def called(folder, **environment):
-    """What `ALONE` gives, how often it was loaded, if its code was there before, after; where."""
-    done = subprocess.run(
-        [sys.executable, "-c", "import alone"],
-        cwd=folder, env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", **environment},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    value, hits, before, there, place = done.stdout.split()
-    return float(value), int(hits), before == "True", there == "True", place
-
-
-@pytest.mark.thorough
-@pytest.mark.skipif(not runs_on(HOST[2]), reason="an older processor, or none of x86")
-def test_code_that_was_brought_is_found_wherever_own_code_is_kept(tmp_path):
-    """As that of a wheel: compiled for any processor of a kind, in a folder that nobody writes."""
-    (tmp_path / "alone.py").write_text(ALONE)
-    own, brought = str(tmp_path / "own"), str(tmp_path / "__pycache__")
-    kind = {"NUMBA_CPU_NAME": TARGET, "NUMBA_CPU_FEATURES": TARGET_FEATURES, "NUMBA_CACHE_DIR": ""}
-    assert called(tmp_path, **kind) == (15.0, 0, False, True, brought)
-    here = {"NUMBA_CACHE_DIR": own}
-    assert called(tmp_path, **here) == (15.0, 1, True, True, brought)
-    assert not [*Path(own).rglob("*.nb?")]
-    # code for another processor is what was asked for, and is kept apart
-    other = {**here, "NUMBA_CPU_NAME": "generic"}
-    hits = [called(tmp_path, **other)[1] for _ in range(2)]
-    assert hits == [0, 1]
-    # code of something else is not taken
-    (tmp_path / "alone.py").write_text(ALONE.replace("x * 3", "x * 4"))
-    assert called(tmp_path, **here)[:3] == (20.0, 0, False)
 
 
 def test_what_a_processor_needs_for_code_that_was_brought():

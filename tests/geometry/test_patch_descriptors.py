@@ -19,17 +19,6 @@ from sceneprint.types import Patches
 P = PatchDescriptorParameters()
 
 
-def two(normal, place, area=0.7):
-    """One patch at the origin facing along z, and another."""
-    return Patches(
-        np.array([[0.0, 0, 0], place]),
-        np.array([[0.0, 0, 1], normal]),
-        np.array([0.3, area]),
-        np.ones(2, np.int32),
-        np.ones(2),
-    )
-
-
 def oracle(patches, p):
     """The same histograms by hat functions on clipped coordinates, pair after pair."""
 

@@ -89,47 +89,6 @@ def test_the_edits_by_hand():
     assert alignment_cost(a, a[:0], P) == 1.0
 
 
-def test_a_sequence_by_hand():
-    """Round a patch that looks up: neighbours at 90, 170, 200 and 350 degrees."""
-    degrees = np.radians([90.0, 170.0, 200.0, 350.0])
-    about = np.stack([np.cos(degrees), np.sin(degrees), np.array([0.0, 0.2, -0.1, 0.0])], axis=1)
-    up = np.array([0.0, 0.0, 1.0])
-    normals = np.stack([up, up, up, np.array([-1.0, 0.0, 0.0])])
-    centre = patches_at(np.zeros((1, 3)), up[None])
-    found = neighbour_sequences(centre, patches_at(about, normals), P)
-    assert found.lengths.tolist() == [4]
-    # the widest gap is the 150 degrees from 200 to 350: the round begins with the last
-    np.testing.assert_allclose(found.symbols[0, :4, 0], 1.0, atol=1e-12)
-    np.testing.assert_allclose(found.symbols[0, :4, 1], [0.0, 0.0, 0.2, -0.1], atol=1e-12)
-    right = np.pi / 2
-    np.testing.assert_allclose(found.symbols[0, :4, 2], [right, 0.0, 0.0, 0.0], atol=1e-7)
-    along = np.arccos([-np.cos(degrees[3]), 0.0, 0.2 / np.sqrt(1.04), -0.1 / np.sqrt(1.01)])
-    np.testing.assert_allclose(found.symbols[0, :4, 3], along, atol=1e-12)
-
-
-def test_too_near_and_too_far_are_no_neighbours():
-    means = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.5, 0, 0], [1.7, 0, 0]])
-    some = patches_at(means, np.tile([0.0, 0.0, 1.0], (4, 1)))
-    found = neighbour_sequences(some, some, P)
-    assert found.lengths.tolist() == [1, 1, 3, 1]
-    alone = patches_at(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]))
-    assert neighbour_sequences(alone, alone, P).lengths.tolist() == [0]
-    assert len(sequence_correspondences(alone, alone, np.random.default_rng(0), P)) == 0
-
-
-def test_coarse_patches_by_hand():
-    means = np.array([[0.0, 0, 0], [0.1, 0, 0], [2.0, 0, 0], [2.2, 0, 0], [0.0, 3.0, 0]])
-    areas = np.array([3.0, 1.0, 1.0, 1.0, 0.5])
-    some = patches_at(means, np.tile([0.0, 0.0, 1.0], (5, 1)), areas)
-    # the largest, the farthest from it, the farthest from both
-    found = coarse_patches(some, replace(P, n_coarse=3))
-    expected = np.array([[0.025, 0.0, 0.0], [0.0, 3.0, 0.0], [2.1, 0.0, 0.0]])
-    np.testing.assert_allclose(found.means, expected, atol=1e-12)
-    np.testing.assert_array_equal(found.areas, [4.0, 0.5, 2.0])
-    np.testing.assert_array_equal(found.sizes, [100, 50, 100])
-    assert len(coarse_patches(some, P)) == 5
-
-
 def test_golden():
     """Every number of the alignment at once: changed only on purpose."""
     source, target = scattered(40, 50), carried(scattered(40, 50), motion(3))

@@ -7,14 +7,11 @@ import pytest
 
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.surface.cloud import CloudParameters
-from sceneprint.geometry.surface.range_image import _average_pixels as average_pixels
 from sceneprint.geometry.surface.range_image import _lift_surface as lift_surface
 from sceneprint.geometry.surface.range_image import (
     directions,
-    fit_camera,
     pole_of,
     range_image,
-    to_angles,
 )
 from sceneprint.types import Cloud, Sphere
 
@@ -129,20 +126,6 @@ def test_gaps_between_rings_are_closed_on_one_plane_only():
     assert len(empty) == 2  # the gap at the step
     x = two.points[two.valid][:, 0]
     assert (np.minimum(np.abs(x - 3), np.abs(x - 4)) < 1e-3).all()
-
-
-def test_points_where_the_image_begins_are_in_its_first_column():
-    """At azimuth 0, the left edge of column 0 but for rounding: half a wall, from y = 0 on."""
-    y, z = np.meshgrid(np.arange(0, 2, 0.01), np.arange(-0.6, 0.6, 0.01))
-    for x in 2 + 0.01 * np.arange(60):
-        points = np.stack([np.full(y.shape, x), y, z], axis=2).reshape(-1, 3).astype(np.float32)
-        angles = np.empty((len(points), 3))
-        to_angles(points, 2, angles)
-        camera = fit_camera(angles, 2, replace(P, image_angle=0.0068 + 0.0089 * (x - 2)))
-        q, u = average_pixels(angles, camera, P)
-        u /= np.maximum(np.linalg.norm(u, axis=2, keepdims=True), 1e-9)
-        cosines = (u * directions(camera)).sum(axis=2)[q > 0]
-        assert cosines.min() > np.cos(camera.step)
 
 
 def test_points_in_one_direction_show_no_surface():

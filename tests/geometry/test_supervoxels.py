@@ -8,7 +8,6 @@ import pytest
 
 from sceneprint.geometry.signature.segmentation import (
     SegmentationParameters,
-    extract_patches,
     supervoxels,
 )
 from sceneprint.geometry.surface.cloud import CloudParameters
@@ -17,25 +16,6 @@ from sceneprint.types import Cloud
 
 P = CloudParameters(voxel_angle=0.03, voxel_size=0.06)
 S = SegmentationParameters()
-
-
-def parts(seen, labels):
-    """How many parts each patch is in, by a walk over its links."""
-    found = []
-    links = seen.links
-    for k in range(int(labels.max()) + 1):
-        left, n = set(np.flatnonzero(labels[0] == k).tolist()), 0
-        while left:
-            n += 1
-            stack = [left.pop()]
-            while stack:
-                i = stack.pop()
-                near = links.indices[links.offsets[i] : links.offsets[i + 1]].tolist()
-                fresh = left.intersection(near)
-                left -= fresh
-                stack += fresh
-        found.append(n)
-    return found
 
 
 @pytest.mark.parametrize("has_viewpoint", [True, False])
@@ -51,19 +31,6 @@ def test_voxels_lie_on_the_walls(cloud_scenes, has_viewpoint):
     size = cloud_scenes.HIGH - cloud_scenes.LOW
     whole = 2 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
     assert seen.areas.sum() == pytest.approx(whole, rel=0.2)
-
-
-@pytest.mark.parametrize("has_viewpoint", [True, False])
-def test_patches_hang_together_and_respect_edges(cloud_scenes, has_viewpoint):
-    seen = voxels(replace(cloud_scenes.room(60_000), has_viewpoint=has_viewpoint), P)
-    labels = supervoxels(seen, 5.0, 1000, S)
-    assert (labels >= 0).mean() > 0.97
-    assert set(parts(seen, labels)) == {1}
-    patches = extract_patches(seen, labels)
-    assert len(patches) > 100
-    assert np.median(patches.coherences) > 0.9999
-    assert np.mean(np.abs(patches.normals).max(axis=1) > 0.99) > 0.8
-    assert patches.sizes.min() >= max(S.minimum_pixels, S.minimum_size * 25)
 
 
 def test_no_patch_crosses_a_gap():

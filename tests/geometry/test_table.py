@@ -148,14 +148,3 @@ def test_leading_posteriors():
     assert (table.components >= 0).all()
     assert (table.components < 20).all()
     np.testing.assert_allclose(table.posteriors.sum(axis=1), 1, atol=1e-6)
-
-
-def test_fewer_components_than_are_kept():
-    projection, mixture = model(np.random.default_rng(2), 3)
-    table = compute_bins(0, 100, SMALL, P, projection, mixture)
-    exact = posteriors(project(properties(bin_centres(SMALL, 0, 100, P), P), projection), mixture)
-    for shares, components, expected in zip(table.posteriors, table.components, exact, strict=True):
-        assert sorted(components[:3].tolist()) == [0, 1, 2]
-        kept = np.where(expected < LEAST_POSTERIOR, 0.0, expected)[components[:3]]
-        np.testing.assert_allclose(shares[:3], kept / kept.sum(), atol=1e-4)
-        assert not shares[3:].any()

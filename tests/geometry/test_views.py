@@ -9,13 +9,10 @@ import pytest
 from sceneprint.errors import InvalidRequest
 from sceneprint.geometry.rigid import transform_points
 from sceneprint.geometry.views import Renderer, choose_views, view_parameters
-from sceneprint.geometry.views.free_space import find_floors
 from sceneprint.geometry.views.plan import level_axes
 from sceneprint.geometry.views.raster import draw_triangles, pinhole
 from sceneprint.geometry.views.render import rays_of
 from sceneprint.geometry.views.samples import (
-    average_cells,
-    project_to_planes,
     surfels,
 )
 from sceneprint.models import read_model
@@ -177,27 +174,6 @@ def test_triangles_are_drawn_as_rays_meet_them():
     assert (back.ravel()[seen] == behind[seen]).all()
 
 
-def test_points_of_a_cell_become_their_mean():
-    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [2.5, 0.0, 0.0]], np.float32)
-    found = average_cells(points, 1.0)
-    # cells are counted from the least corner
-    np.testing.assert_allclose(np.sort(found, axis=0)[:, 0], [0.2, 2.5], atol=1e-6)
-    assert len(found) == 2
-
-
-def test_the_normal_of_a_plane_of_points():
-    rng = np.random.default_rng(8)
-    flat = rng.uniform(-1, 1, (3000, 2))
-    points = np.column_stack([flat, 0.5 * flat[:, 0]]).astype(np.float32)
-    _, normals, spacing = project_to_planes(points, 0.15)
-    inner = np.abs(flat).max(axis=1) < 0.9
-    expected = np.array([-0.5, 0, 1]) / math.sqrt(1.25)
-    assert np.abs(normals[inner] @ expected).min() > 0.9999
-    assert 0.02 < np.median(spacing) < 0.05  # 3000 points on 4.5 square metres: 0.039 m
-    scattered = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
-    assert (project_to_planes(scattered, 0.3)[1] == 0).all(axis=1).mean() > 0.9
-
-
 def test_both_sides_of_a_thin_wall_are_pieces_of_their_own():
     points, triangles = box(np.array([2.0, 0.02, 2.0]), inwards=False)
     pieces = surfels(ReferenceSurface(points, triangles, np.zeros(3), UP), 0.2, 10_000)
@@ -235,22 +211,6 @@ def test_a_table_is_no_floor():
     heights = plan.poses[:, 2, 3]
     assert heights.min() < 0.9
     assert heights.max() > 1.5
-
-
-def test_ground_beside_a_slope_is_a_floor_to_a_scanner():
-    """A field of 24 x 12 m, a wall behind it, and a bank of 45 degrees that falls 12 m from it."""
-    x, y = (one.ravel() for one in np.meshgrid(np.arange(0, 24, 0.2), np.arange(0, 24, 0.2)))
-    field = np.column_stack([x, y, np.minimum(12.0 - y, 0.0)])
-    along, up = (one.ravel() for one in np.meshgrid(np.arange(0, 24, 0.2), np.arange(0, 4, 0.2)))
-    wall = np.column_stack([along, np.zeros(along.size), up])
-    points = np.concatenate([field, wall]).astype(np.float32)
-    surface = ReferenceSurface(points, None, np.zeros(3), UP)
-    p = view_parameters(read_model("lidar").parameters)
-    plan = choose_views(surface, p)
-    assert plan.floor == pytest.approx(0.0, abs=0.05)
-    assert len(plan.poses) > 5
-    # a camera may have seen a table, and what lies below it
-    assert find_floors(surfels(surface, p.cell, 10_000), 2 * p.spacing).lowest is None
 
 
 def test_a_scanner_stands_on_both_sides_of_a_partition():

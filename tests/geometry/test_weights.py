@@ -22,11 +22,6 @@ def test_by_hand():
     np.testing.assert_allclose(weights, [2 / 1.375, 0.75 / 1.375], rtol=1e-12)
 
 
-def test_exponents_of_zero_give_the_papers_equal_pairs():
-    weights = patch_weights(patches([4, 36], [1.0, 0.5]), WeightParameters(0.0, 0.0))
-    np.testing.assert_array_equal(weights, [1.0, 1.0])
-
-
 def test_coherence_is_the_length_of_the_mean_normal():
     """Patch 0 is flat; patch 1 has normals 90 degrees apart, seen over areas of 3 and 1."""
     normals = np.array([[[0, 0, -1], [0, 0, -1], [0, 0, -1], [1, 0, 0]]], np.float32)

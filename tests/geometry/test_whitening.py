@@ -67,20 +67,6 @@ def test_axes_are_principal_and_whitened(psi, fit):
     np.testing.assert_allclose(np.abs((own * axes[:32]).sum(axis=1)), 1.0, atol=1e-3)
 
 
-@pytest.mark.parametrize(("exponent", "spread"), [(1.0, 0.0), (0.5, 0.5), (0.0, 1.0)])
-def test_partial_whitening_keeps_some_spread(psi, exponent, spread):
-    p = WhiteningParameters(32, exponent)
-    fit = fit_whitening(psi_units(psi), (1,), p)
-    full = fit_whitening(psi_units(psi), (1,), WhiteningParameters(32))
-    left = fit.scales / full.scales  # of each axis, its standard deviation to this power
-    deviation = np.linalg.norm(
-        (psi_units(psi) - psi_units(psi).mean(axis=0)) @ (full.basis.T * full.scales), axis=0
-    )
-    np.testing.assert_allclose(deviation, np.sqrt(len(psi)), rtol=0.02)
-    slope = np.polyfit(np.log(1 / full.scales), np.log(left), 1)[0]
-    assert slope == pytest.approx(spread, abs=0.05)
-
-
 def test_the_mean_itself_and_a_zero(psi, fit):
     nothing = replace(fit, offsets=np.zeros(32))
     assert whiten(np.zeros(300), nothing).tolist() == [128] * 32

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sceneprint.errors import DamagedIndex
-from sceneprint.index import part_files
 from sceneprint.index.faiss_index import map_index
 from sceneprint.index.index_manifest import manifests, read_manifest, scrub
 from sceneprint.index.index_version import newest
@@ -125,8 +124,6 @@ def test_a_damaged_file_is_written_again_when_its_content_is(folder, walk, publi
         {"segments": [{"files": [[f"{'0' * 64}.keys", 8]], "recall": RECALL}]},
         {"segments": [{"files": [], "recall": None}]},
         {"segments": 3},
-        {"segments": None},
-        {"number": None},
         {"unknown": 1},
     ],
 )
@@ -152,18 +149,10 @@ def test_scrubbing_names_what_is_damaged(folder, kind):
     assert [each for each in scrub(folder) if each is not None] == [path] * (kind != "json")
 
 
-def test_scrubbing_stops_between_blocks(folder, monkeypatch):
-    monkeypatch.setattr(part_files, "BLOCK_BYTES", 100)
-    steps = list(scrub(folder))
-    sizes = [size for _, size in read_manifest(manifests(folder)[0][1]).files]
-    assert len(steps) == sum(-(-size // 100) for size in sizes)
-
-
 @pytest.mark.parametrize(
     ("kind", "dimension", "qtype", "n"),
     [
         ("IndexFlat", LENGTH, None, 45),
-        ("IndexScalarQuantizer", LENGTH, "QT_8bit", 45),
         ("IndexScalarQuantizer", LENGTH, "QT_8bit_direct", 44),
         ("IndexScalarQuantizer", LENGTH - 1, "QT_8bit_direct", 45),
     ],

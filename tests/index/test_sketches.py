@@ -96,18 +96,6 @@ def test_recall_is_what_searches_find(walk, published, monkeypatch):
     assert 0.5 <= recall.share < 1
 
 
-def test_what_queries_from_elsewhere_find(walk, published):
-    """Places of the map with other noise: recall of the ten nearest."""
-    signatures = walk(6000, LENGTH, walks=12)
-    version = published(np.arange(6000), signatures, flat_bytes=0)
-    noise = np.random.default_rng(7).normal(0, 4, (60, LENGTH))
-    found = []
-    for query in np.clip(signatures[70::100][:60] + noise, 0, 255).astype(np.uint8):
-        right = search_l2(query, version, EMPTY, 10, exact=True)
-        found.append(np.isin(right.keys, search_l2(query, version, EMPTY, 10).keys).mean())
-    assert np.mean(found) >= 0.97
-
-
 def test_more_is_compared_until_almost_all_is_found(published):
     """Sketches of noise say little: 256 of 3000 rows hold less than half of the nearest."""
     noise = np.random.default_rng(8).integers(0, 256, (3000, LENGTH), np.uint8)

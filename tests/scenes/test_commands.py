@@ -47,28 +47,6 @@ def test_a_query_is_shown_where_it_was_found(sceneprint, client, unseen, tmp_pat
     assert np.linalg.norm(matrix[:3, 3] - truth[:3, 3]) < 0.05
 
 
-def test_a_folder_is_a_time_line(sceneprint, unseen, tmp_path):
-    folder = tmp_path / "two"
-    folder.mkdir()
-    for number, one in enumerate(unseen):
-        (folder / f"{number}.png").write_bytes(one.read_bytes())
-    camera = unseen[0].path.parents[1] / "intrinsics.json"
-    (folder / "intrinsics.json").write_bytes(camera.read_bytes())
-    mcap = tmp_path / "a.mcap"
-    how = ("--map-frames", 1, "--json", "--mcap", mcap)
-    said = sceneprint("localize", MAP, folder, *how).stdout
-    told = [json.loads(line)["pose"]["translation"] for line in said.splitlines()]
-    rows = mcap_rows(mcap)
-    moves = moves_of(rows, "query.optical")
-    assert [row.time_ns for row in moves] == [0, 1_000_000_000]
-    for row, one in zip(moves, told, strict=True):
-        at = [one["x"], one["y"], one["z"]]
-        np.testing.assert_allclose(row.values["Transform3D:translation"], [at], atol=1e-6)
-    clouds = [row for row in rows if row.path == "/room/query/points"]
-    times = [row.time_ns for row in clouds if "Points3D:positions" in row.values]
-    assert times == [0, 1_000_000_000]
-
-
 def test_the_frames_of_a_map_are_shown(sceneprint, client, tmp_path):
     mcap = tmp_path / "a.mcap"
     listed = sceneprint("frames", MAP, "--session", "room", "--mcap", mcap).stdout

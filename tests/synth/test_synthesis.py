@@ -7,8 +7,7 @@ import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.types import Intrinsics
-from sceneprint_lab.synth import KINECT, render, synthesise_room
-from sceneprint_lab.synth.dataset import room_and_rng
+from sceneprint_lab.synth import synthesise_room
 
 SMALL = Intrinsics(160, 120, 146.25, 146.25, 80.0, 60.0)
 
@@ -36,7 +35,7 @@ def test_the_same_seed_gives_the_same_bytes_in_any_process():
     assert there.stdout.strip() == here
 
 
-@pytest.mark.parametrize("index", range(6))
+@pytest.mark.parametrize("index", range(2))
 def test_frames_are_whole_and_mostly_valid(index):
     room = synthesise_room(3, index, 4)
     assert (room.name, len(room.frames)) == (f"room-{index:03d}", 4)
@@ -48,15 +47,3 @@ def test_frames_are_whole_and_mostly_valid(index):
         assert frame.depth[valid].min() >= 0.449
         assert frame.depth.max() <= 8.001
         np.testing.assert_allclose(frame.depth * 1000, (frame.depth * 1000).round(), atol=1e-3)
-
-
-def test_noise_stays_near_the_ideal_image():
-    room = synthesise_room(3, 1, 2)
-    scene, _ = room_and_rng(3, 1)
-    for frame in room.frames:
-        assert frame.pose is not None
-        ideal = render(scene, frame.pose, KINECT)
-        valid = frame.depth > 0
-        z, error = ideal[valid], np.abs(frame.depth - ideal)[valid]
-        assert (error < 0.01 + 0.012 * z * z).mean() > 0.97
-        assert np.median(error) < 0.004 * np.median(z) ** 2
