@@ -1,12 +1,36 @@
 """Tests that the model holds all lengths of answers, and the code none."""
 
+import ast
 import inspect
 
 import pytest
 
+from sceneprint import localization, places
+from sceneprint.engine.search import verification
+from sceneprint.geometry.validation import map_verification
 from sceneprint.geometry.validation.map_verification import MapParameters
 from sceneprint.models import read_model
 from sceneprint.models.model import POWERS, AnswerParameters, scale_lengths
+
+#: Numbers that are not lengths: shares, tiny divisors, a chi-square, and how a score is weighed.
+FREE = {0.0, 1.0, 1e-9, 1e-12, 22.458}
+
+
+@pytest.mark.parametrize("module", [localization, places, map_verification, verification])
+def test_no_bare_length_is_left(module):
+    tree = ast.parse(inspect.getsource(module))
+    records = {
+        node
+        for record in ast.walk(tree)
+        if isinstance(record, ast.ClassDef) and record.name.endswith("Parameters")
+        for node in ast.walk(record)
+    }
+    bare = {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, float) and node not in records
+    }
+    assert bare <= FREE
 
 
 def test_every_length_of_the_map_is_a_multiple_of_the_scale():
