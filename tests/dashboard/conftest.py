@@ -6,6 +6,7 @@ before tests of other folders start their own loops.
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
@@ -15,23 +16,19 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 from PIL import Image
 
 from benchmarks.rooms import circled, send
 from benchmarks.waiting import PATIENCE_S, until
 from sceneprint.formats.dataset import write_depth_png
-from sceneprint_lab.synth import SynthRoom
-
-if TYPE_CHECKING:  # only the process that runs these tests loads Playwright, which takes a second
-    from playwright.sync_api import Browser, BrowserContext, Page, Request, ViewportSize
 
 FLAGS = [
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -39,36 +36,47 @@ FLAGS = [
 ]  # fmt: skip
 #: Message of Chromium about drawing without a graphics card.
 NOISE = "GL Driver Message"
-VIEWPORT: ViewportSize = {"width": 1280, "height": 800}
+VIEWPORT = {"width": 1280, "height": 800}
 ROOMS, VIEWS = 2, 8
 #: Capture time of the first frame; frames are one second apart.
 TAKEN = "2026-11-20T09:{minute:02d}:{second:02d}Z"
-Settle = Callable[["Page"], None]
 
 
-def expect(what: Any) -> Any:
+def expect(what):
     """Return Playwright's assertions about a page or an element."""
     from playwright.sync_api import expect
 
     return expect(what)
 
 
+def colours(png):
+    """(h, w, 3) colours of a PNG."""
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+
+def drawn(canvas):
+    """(h, w, 3) colours of a canvas, as a PNG: a million numbers one by one would take seconds."""
+    png = canvas.evaluate("(canvas) => canvas.toDataURL('image/png').split(',')[1]")
+    return colours(base64.b64decode(png))
+
+
+def click_at(page, point):
+    """Click where a point of the picture's frame is drawn."""
+    project = """p => { const { viewer, scene } = document.querySelector(".paths-canvas");
+      return viewer.project(scene.near(p)); }"""
+    x, y, _ = page.evaluate(project, [float(v) for v in point])
+    page.locator(".paths-canvas").click(position={"x": x, "y": y})
+
+
 @dataclass(frozen=True)
 class Sent:
-    """An uploaded frame of the map `building`.
-
-    Parameters
-    ----------
-    frame_id : id of the frame
-    png : depth image
-    meta : metadata
-    """
+    """A depth image, with its metadata, that was uploaded to the map `building`."""
 
     frame_id: str
     png: bytes
     meta: dict[str, Any]
 
-    def form(self, **fields: object) -> dict[str, Any]:
+    def form(self, **fields):
         """Return the arguments of a request that sends the frame again, with only its camera."""
         known = {"intrinsics": self.meta["intrinsics"]}
         parts = {"frame": ("frame.png", self.png, "image/png")}
@@ -77,16 +85,7 @@ class Sent:
 
 @dataclass
 class Station:
-    """A service in separate processes.
-
-    Parameters
-    ----------
-    url : address, without a slash at the end
-    data : data folder
-    client : HTTP client of the same machine, which needs no key
-    process : id of the main process
-    frames : frames of the map `building` in order of capture
-    """
+    """A service in separate processes, and the frames of its map `building` as captured."""
 
     url: str
     data: Path
@@ -95,17 +94,17 @@ class Station:
     frames: list[Sent] = field(default_factory=list)
 
     @property
-    def home(self) -> str:
+    def home(self):
         """Address of the dashboard."""
         return f"{self.url}/dashboard"
 
-    def key(self, name: str, grants: dict[str, str], **more: object) -> str:
+    def key(self, name, grants, **more):
         """Create a key and return its secret."""
         made = self.client.post("/v1/keys", json={"name": name, "grants": grants, **more})
         assert made.status_code == 201, made.text
         return str(made.json()["secret"])
 
-    def make_map(self, name: str, **more: object) -> str:
+    def make_map(self, name, **more):
         """Create a map and return its path."""
         made = self.client.post("/v1/maps", json={"name": name, "model": "depth", **more})
         assert made.status_code == 201, made.text
@@ -113,7 +112,7 @@ class Station:
 
 
 @contextmanager
-def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
+def running(data, workers, port=0):
     """Run `sceneprint serve` on a loopback port until the context ends.
 
     Its workers build surfaces only on request, since most tests use none.
@@ -145,13 +144,13 @@ def running(data: Path, workers: int, port: int = 0) -> Iterator[Station]:
 
 
 @pytest.fixture(scope="session")
-def serve() -> Callable[..., Any]:
+def serve():
     """A function that runs a new service: `with serve(folder, workers=0, port=0) as station`."""
     return running
 
 
 @pytest.fixture(scope="session")
-def chromium() -> str:
+def chromium():
     """Path of an installed Chromium."""
     names = ("chromium", "chromium-browser", "google-chrome")
     found = next(filter(None, map(shutil.which, names)), None)
@@ -161,7 +160,7 @@ def chromium() -> str:
 
 
 @pytest.fixture(scope="session")
-def browser(chromium: str, folder_stack: ExitStack) -> Browser:
+def browser(chromium, folder_stack):
     """A browser for all tests of this folder; no other event loop may run while it exists."""
     from playwright.sync_api import expect, sync_playwright
 
@@ -174,9 +173,8 @@ def browser(chromium: str, folder_stack: ExitStack) -> Browser:
 
 @pytest.fixture(scope="session")
 def station(
-    chromium: str, tmp_path_factory: pytest.TempPathFactory, folder_stack: ExitStack,
-    room_views: Callable[..., SynthRoom],
-) -> Station:  # fmt: skip
+    chromium, tmp_path_factory, folder_stack, room_views
+):  # fmt: skip
     """A service with two workers, and an indexed map `building` of two rooms.
 
     Tests do not change `building`. The frames of a room have the parent frame ROOM and alternate
@@ -197,9 +195,9 @@ def station(
         Sent(item["frame"]["frame_id"], file[1][1], meta)
         for item, file, meta in zip(sent.json()["items"], files, metas, strict=True)
     ]
-    states: dict[str, int] = {}
+    states = {}
 
-    def signed() -> bool:
+    def signed():
         states.update(found.client.get("/v1/maps/building").json()["frames"])
         return states.get("indexed") == len(files)
 
@@ -208,7 +206,7 @@ def station(
 
 
 @pytest.fixture(scope="session")
-def four_sides(station: Station) -> dict[str, Any]:
+def four_sides(station):
     """A kept answer to a view of a cube whose four sides look the same.
 
     Its map `four-sides` has twelve views from all sides, of the run `round` in `hall`.
@@ -221,13 +219,10 @@ def four_sides(station: Station) -> dict[str, Any]:
     about = {"meta": json.dumps({"intrinsics": one.meta["intrinsics"]})}
     answer = station.client.post(f"{path}/queries", data=about, **form)
     assert answer.status_code == 200, answer.text
-    told: dict[str, Any] = answer.json()
-    return told
+    return answer.json()
 
 
-def _shots(
-    folder: Path, room_views: Callable[..., SynthRoom]
-) -> Iterator[tuple[dict[str, Any], bytes]]:
+def _shots(folder, room_views):
     """Yield views along a path through each room with their metadata, in order of capture."""
     path = folder / "frame.png"
     for room in range(ROOMS):
@@ -251,7 +246,7 @@ def _shots(
 
 
 @pytest.fixture(scope="session")
-def shared_context(browser: Browser) -> BrowserContext:
+def shared_context(browser):
     """A context for all pages without options of their own, with an empty page that stays open.
 
     Chromium creates a window for the first page of a context, which takes half a second.
@@ -261,19 +256,19 @@ def shared_context(browser: Browser) -> BrowserContext:
     return context
 
 
-def _forget(page: Page) -> None:
+def _forget(page):
     """Close a page of the shared context, and remove its state."""
     page.context.set_offline(False)
     page.context.clear_cookies()
     page.context.clear_permissions()
     browser = page.context.new_cdp_session(page)
-    for origin in page.origins:  # type: ignore[attr-defined]
+    for origin in page.origins:
         browser.send("Storage.clearDataForOrigin", {"origin": origin, "storageTypes": "all"})
     page.close()
 
 
 @pytest.fixture
-def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Callable[..., Page]]:
+def open_page(browser, shared_context):
     """A function that opens a page, in a new context if it has arguments for Browser.new_context.
 
     Without arguments the page uses a shared context, whose cookies and storage are removed.
@@ -281,33 +276,33 @@ def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Call
     The test fails on warnings and errors in the console, on exceptions, and on requests to other
     hosts. A page that provokes such messages lists parts of them in `page.allowed`.
     """
-    opened: list[Page] = []
+    opened = []
 
-    def open_one(**context: Any) -> Page:
+    def open_one(**context):
         within = (
             browser.new_context(**{"viewport": VIEWPORT, **context}) if context else shared_context
         )
         page = within.new_page()
         page.set_default_timeout(1000 * PATIENCE_S)
-        page.allowed, page.said, page.pending = [], [], set()  # type: ignore[attr-defined]
-        page.origins = set()  # type: ignore[attr-defined]
+        page.allowed, page.said, page.pending = [], [], set()
+        page.origins = set()
         page.on(
             "console",
             lambda one: (
                 one.type in ("error", "warning") and page.said.append(f"{one.type}: {one.text}")
             ),
-        )  # type: ignore[attr-defined]
-        page.on("pageerror", lambda one: page.said.append(f"thrown: {one}"))  # type: ignore[attr-defined]
+        )
+        page.on("pageerror", lambda one: page.said.append(f"thrown: {one}"))
         page.on("request", lambda one: _asked(page, one))
         for end in ("requestfinished", "requestfailed"):
-            page.on(end, lambda one: page.pending.discard(one))  # type: ignore[attr-defined, call-overload]
+            page.on(end, lambda one: page.pending.discard(one))
         opened.append(page)
         return page
 
     yield open_one
     said = [
-        text for page in opened for text in page.said  # type: ignore[attr-defined]
-        if not any(part in text for part in (NOISE, *page.allowed))  # type: ignore[attr-defined]
+        text for page in opened for text in page.said
+        if not any(part in text for part in (NOISE, *page.allowed))
     ]  # fmt: skip
     for page in opened:
         if page.context is shared_context:
@@ -318,65 +313,65 @@ def open_page(browser: Browser, shared_context: BrowserContext) -> Iterator[Call
 
 
 @pytest.fixture
-def page(open_page: Callable[..., Page]) -> Page:
+def page(open_page):
     """A new page, 1280 x 800, with the checks of `open_page`."""
     return open_page()
 
 
 @pytest.fixture
-def run(station: Station, page: Page, settle: Settle) -> Callable[..., Any]:
+def run(station, page, settle):
     """A function that evaluates JavaScript with a module of the dashboard, in a page that shows
     nothing of its own. The module is `m`, and further arguments are the array `given`.
     """
     page.goto(f"{station.home}#/nowhere")
     settle(page)
 
-    def evaluate(module: str, expression: str, *given: object) -> Any:
+    def evaluate(module, expression, *given):
         script = f"async ([url, given]) => {{ const m = await import(url); return {expression}; }}"
         return page.evaluate(script, [f"{station.url}/dashboard/{module}.js", list(given)])
 
     return evaluate
 
 
-def _asked(page: Page, request: Request) -> None:
+def _asked(page, request):
     """Record a request of a page, except streams, which never end."""
     home = httpx.URL(page.url if page.url.startswith("http") else request.url)
     there = httpx.URL(request.url.removeprefix("blob:"))
-    page.origins.add(f"{there.scheme}://{there.netloc.decode()}")  # type: ignore[attr-defined]
+    page.origins.add(f"{there.scheme}://{there.netloc.decode()}")
     if (there.host, there.port) != (home.host, home.port):
-        page.said.append(f"elsewhere: {request.url}")  # type: ignore[attr-defined]
+        page.said.append(f"elsewhere: {request.url}")
     if request.headers.get("accept") != "text/event-stream":
-        page.pending.add(request)  # type: ignore[attr-defined]
+        page.pending.add(request)
 
 
 @pytest.fixture(scope="session")
-def settle() -> Settle:
+def settle():
     """A function that waits until a page has no pending requests and is not busy."""
 
-    def wait(page: Page) -> None:
+    def wait(page):
         # The page's policy forbids wait_for_function.
         busy = "() => document.getElementById('main')?.getAttribute('aria-busy') !== 'false'"
         end, quiet = time.monotonic() + PATIENCE_S, 0
         while quiet < 3:  # an answer may cause further requests
-            assert time.monotonic() < end, [one.url for one in page.pending]  # type: ignore[attr-defined]
+            assert time.monotonic() < end, [one.url for one in page.pending]
             page.wait_for_timeout(20)
-            quiet = 0 if page.pending or page.evaluate(busy) else quiet + 1  # type: ignore[attr-defined]
+            quiet = 0 if page.pending or page.evaluate(busy) else quiet + 1
 
     return wait
 
 
 @pytest.fixture(scope="session")
-def axe() -> Callable[[Page], list[str]]:
+def axe():
     """Return axe's findings on a page; the dark theme is checked only for colours."""
     from axe_playwright_python.sync_playwright import Axe
 
     judge = Axe()
 
-    def look(page: Page) -> list[str]:
+    def look(page):
         found = []
         for theme in ("light", "dark"):
-            page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
-            options: dict[str, Any] = {"resultTypes": ["violations"]}
+            page.emulate_media(color_scheme=theme)
+            options = {"resultTypes": ["violations"]}
             if theme == "dark":
                 options["runOnly"] = ["color-contrast"]
             for one in judge.run(page, options=options).response["violations"]:
@@ -388,16 +383,16 @@ def axe() -> Callable[[Page], list[str]]:
 
 
 @pytest.fixture(scope="session")
-def pixels() -> Callable[..., Image.Image]:
+def pixels():
     """A function that returns a screenshot of an element or a page."""
     return lambda shown: Image.open(io.BytesIO(shown.screenshot())).convert("RGB")
 
 
 @pytest.fixture(scope="session")
-def written() -> Callable[[str], str]:
+def written():
     """A function that returns a reason of the API as pages write it: 0.23° and 7.5 mm."""
 
-    def short(found: re.Match[str]) -> str:
+    def short(found):
         length = float(found[1])
         return f"{1000 * length:.{1 if length < 0.01 else 0}f} mm"
 
@@ -405,7 +400,7 @@ def written() -> Callable[[str], str]:
 
 
 @pytest.fixture(scope="session")
-def free_port() -> int:
+def free_port():
     """A free port, for a service that restarts on the same port."""
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))

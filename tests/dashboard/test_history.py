@@ -1,7 +1,5 @@
 """Tests of the query history: a row for each record, and no record of a visit."""
 
-from __future__ import annotations
-
 import json
 
 import pytest
@@ -105,32 +103,3 @@ def test_new_queries_are_announced_and_looking_leaves_none(station, asked, page,
     rows = page.evaluate(ROWS)
     assert [one["id"] for one in rows] == [one["query_id"] for one in records(station)]
     assert len(rows) == len(before) + 2
-
-
-@pytest.mark.thorough
-def test_a_query_between_the_list_and_the_events_is_announced(station, asked, page, settle, until):
-    held = []
-
-    def hold(route):
-        if route.request.headers.get("accept") == "text/event-stream":
-            held.append(route)
-        else:
-            route.continue_()
-
-    def heard():
-        page.wait_for_timeout(20)  # requests are handled while the page is waited for
-        return held
-
-    page.route("**/v1/events*", hold)
-    page.goto(f"{station.home}#/maps/seen/queries")
-    settle(page)
-    until(heard)
-    before = records(station)
-    answer = station.client.post("/v1/maps/seen/queries", **station.frames[1].form())
-    assert answer.status_code == 200
-    until(lambda: len(records(station)) == len(before) + 1)
-    held.pop().continue_()
-    page.get_by_role("button", name="Show 1 new query").click()
-    settle(page)
-    shown = [one["id"] for one in page.evaluate(ROWS)]
-    assert shown == [one["query_id"] for one in records(station)]

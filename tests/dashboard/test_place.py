@@ -1,26 +1,15 @@
 """Tests of the place of a map against the API: surface, spots and robots."""
 
-from __future__ import annotations
-
-import io
 import json
-from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.dashboard.conftest import expect
-
-if TYPE_CHECKING:
-    from playwright.sync_api import Page
+from tests.dashboard.conftest import click_at, expect
 
 CANVAS = ".paths-canvas"
 CELL = np.dtype([("at", "u1", 3), ("seen", "u1"), ("session", "<u2"), ("taken", "<u2")])
-#: Where a point of the picture's frame is on the canvas, CSS pixels.
-PROJECT = """([css, p]) => { const { viewer, scene } = document.querySelector(css);
-  return viewer.project(scene.near(p)); }"""
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +32,7 @@ def built(station, until):
             "seen": np.concatenate(seen), "path": path}  # fmt: skip
 
 
-def opened(page: Page, station: Any, settle: Any, address: str, until: Any) -> None:
+def opened(page, station, settle, address, until):
     """Open a place and wait until its tiles are drawn, and nothing is drawn any more."""
     page.goto(f"{station.home}{address}")
     settle(page)
@@ -51,12 +40,12 @@ def opened(page: Page, station: Any, settle: Any, address: str, until: Any) -> N
     quiet(page, until)
 
 
-def quiet(page: Page, until: Any) -> int:
+def quiet(page, until):
     """Wait until a quarter of a second passes without a picture; how many were drawn in all."""
     frames = "css => document.querySelector(css).viewer.frames"
     before = -1
 
-    def same() -> bool:
+    def same():
         nonlocal before
         last, before = before, page.evaluate(frames, CANVAS)
         page.wait_for_timeout(250)
@@ -66,12 +55,7 @@ def quiet(page: Page, until: Any) -> int:
     return int(before)
 
 
-def click_at(page: Page, point: Any) -> None:
-    x, y, _ = page.evaluate(PROJECT, [CANVAS, [float(v) for v in point]])
-    page.locator(CANVAS).click(position={"x": x, "y": y})
-
-
-def highest(built: dict[str, Any]) -> Any:
+def highest(built):
     """The cell nearest to the middle of the canvas that no other hides in a plan."""
     up = np.array([built["parent"]["up"][k] for k in "xyz"])
     axes = np.array([built["parent"]["x_axis"], built["parent"]["y_axis"]])
@@ -86,23 +70,9 @@ def highest(built: dict[str, Any]) -> Any:
 
 @pytest.mark.thorough
 def test_a_spot_names_the_frames_that_saw_it(page, station, built, settle, axe, until):
-    asked: list[Any] = []
+    asked = []
     page.on("request", lambda one: asked.append(urlsplit(one.url)))
     opened(page, station, settle, "#/maps/building/place?parent=room-0&heights=all", until)
-    drawn = page.evaluate(
-        """(css) => { const { viewer } = document.querySelector(css);
-          const tiles = viewer.layer("surface").tiles;
-          return tiles.map((one) => [one.cell, one.data.byteLength / 8]); }""",
-        CANVAS,
-    )
-    assert sum(n for cell, n in drawn if cell == built["parent"]["levels"][0]["cell_m"]) == len(
-        built["cells"]
-    )  # a small place is drawn in its finest cells
-    # and so few need no coarser ones before them
-    fetched = [one.path for one in asked if "/surface/tiles/" in one.path]
-    assert len(built["cells"]) < 30_000
-    assert len(fetched) == len(set(fetched)) == built["parent"]["levels"][0]["tiles"]
-
     spot = highest(built)
     click_at(page, spot)
     section = page.locator("section", has=page.locator("#place-spot"))
@@ -118,110 +88,6 @@ def test_a_spot_names_the_frames_that_saw_it(page, station, built, settle, axe, 
     hrefs = links.evaluate_all("all => all.map((one) => one.getAttribute('href'))")
     assert hrefs == [f"#/maps/building/frames/{one['frame_id']}" for one in told]
     assert axe(page) == []
-    before = quiet(page, until)
-    page.wait_for_timeout(500)
-    assert page.evaluate("css => document.querySelector(css).viewer.frames", CANVAS) == before
-
-
-@pytest.mark.thorough
-def test_what_is_drawn_is_in_the_address_and_reached_by_keys(page, station, built, settle, until):
-    opened(page, station, settle, "#/maps/building/place?parent=room-0", until)
-    for _ in range(2):  # the link past the rail, and what it leads to
-        page.keyboard.press("Tab")
-        if page.evaluate("document.activeElement.classList.contains('skip')"):
-            page.keyboard.press("Enter")
-    assert page.evaluate("document.activeElement.textContent") == "Plan"
-    page.get_by_role("button", name="3-D").press("Enter")
-    page.select_option("#place-colour", "seen")
-    most = page.locator(".place-legend .number span").last
-    known = np.sort(built["seen"])
-    assert int(most.inner_text().split()[0]) <= round(2 ** (known[-1] / 16) - 1)
-    page.locator("#place-high").press("ArrowLeft")
-    expect(page.locator(".place-cut").locator("..")).to_contain_text("m to")
-    search = parse_qs(page.url.partition("?")[2])
-    assert {name: search[name] for name in ("view", "colour")} == {
-        "view": ["3d"],
-        "colour": ["seen"],
-    }
-    page.reload()
-    settle(page)
-    expect(page.locator("#place-colour")).to_have_value("seen")
-    expect(page.get_by_role("button", name="3-D")).to_have_attribute("aria-pressed", "true")
-    assert parse_qs(page.url.partition("?")[2]) == search
-    page.get_by_role("button", name="Plan").click()
-    quiet(page, until)
-    # Enter takes what is in the middle of the picture
-    page.evaluate(
-        """([css, p]) => { const { viewer, scene } = document.querySelector(css);
-          viewer.look({ target: scene.near(p) }); }""",
-        [CANVAS, highest(built).tolist()],
-    )
-    quiet(page, until)
-    page.locator(CANVAS).press("Enter")
-    expect(page.locator("#place-spot")).to_contain_text("Frames that saw")
-    page.set_viewport_size({"width": 390, "height": 844})
-    assert page.evaluate("document.documentElement.scrollWidth") == 390
-
-
-@pytest.mark.thorough
-def test_it_is_measured_and_frames_are_boxed(page, station, built, settle, until):
-    opened(page, station, settle, "#/maps/building/place?parent=room-0&heights=all", until)
-    one = highest(built)
-    page.get_by_role("button", name="Measure").click()
-    click_at(page, one)
-    # the other end is on the plan, beside the surface, at the height of the target
-    page.locator(CANVAS).click(position={"x": 6, "y": 6})
-    level = page.evaluate(
-        """([css, p]) => { const { viewer, scene } = document.querySelector(css);
-          const [x, y] = viewer.project(scene.near(p)), { orbit, canvas } = viewer;
-          const size = 2 * Math.tan(Math.PI / 8) * orbit.distance / canvas.clientHeight;
-          return Math.hypot(x - 6, y - 6) * size; }""",
-        [CANVAS, one.tolist()],
-    )
-    said = page.locator(".place-said")
-    expect(said).to_contain_text("level")
-    text = said.inner_text()
-    assert float(text.split(": ")[1].split(" m level")[0]) == pytest.approx(level, abs=0.06)
-    page.get_by_role("button", name="Select frames").press("Enter")
-    page.locator(".place-cover").press("Enter")  # all that is in view
-    section = page.locator("section", has=page.locator("#place-spot"))
-    taken = [np.array(sent.meta["pose"]["matrix"])[:3, 3] for sent in station.frames[:8]]
-    expect(section.locator("[role=status]")).to_have_text("8 frames")
-    # a box about some sensors, aslant to the axes of the room
-    page.evaluate("css => document.querySelector(css).viewer.look({ azimuth: 0.7 })", CANVAS)
-    quiet(page, until)
-    at = np.array([page.evaluate(PROJECT, [CANVAS, p.tolist()])[:2] for p in taken])
-    order = np.argsort(at[:, 0])
-    gap = int(np.argmax(np.diff(at[order, 0])))
-    low = at.min(0) - 8
-    high = np.array([at[order[gap : gap + 2], 0].mean(), at[:, 1].max() + 8])
-    page.get_by_role("button", name="Select frames").click()
-    corner = page.locator(CANVAS).bounding_box()
-    left, top = corner["x"], corner["y"]
-    page.mouse.move(left + low[0], top + low[1])
-    page.mouse.down()
-    page.mouse.move(left + high[0], top + high[1])
-    page.mouse.up()
-    count = gap + 1
-    expect(section.locator("[role=status]")).to_have_text(f"{count} frame{'s'[: count > 1]}")
-    links = section.locator(".paths-told a:first-child")
-    hrefs = links.evaluate_all("all => all.map((one) => one.getAttribute('href'))")
-    assert set(hrefs) == {
-        f"#/maps/building/frames/{station.frames[i].frame_id}" for i in order[:count]
-    }
-    with page.expect_download() as kept:
-        page.get_by_role("button", name="Save picture").click()
-    assert kept.value.suggested_filename.startswith("building-place-")
-    picture = Image.open(io.BytesIO(kept.value.path().read_bytes())).convert("RGB")
-    assert picture.size == (round(corner["width"]), round(corner["height"]))
-    x, y, _ = page.evaluate(PROJECT, [CANVAS, one.tolist()])
-    ground = picture.getpixel((picture.width - 3, 3))
-    assert picture.getpixel((round(x), round(y))) != ground
-
-
-FOLLOWED = """([css, p]) => {
-  const { viewer, scene } = document.querySelector(css), { target, distance } = viewer.camera;
-  return [Math.hypot(...scene.near(p).map((x, k) => x - target[k])), distance]; }"""
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +105,7 @@ def patrolled(station):
     return {"path": path, "answers": answers}
 
 
-def ask(station: Any, robot: str, sent: int) -> dict[str, Any]:
+def ask(station, robot, sent):
     form = station.frames[sent].form()
     meta = json.loads(form["data"]["meta"]) | {"robot": robot, "session": "patrol"}
     form["data"]["meta"] = json.dumps(meta)
@@ -252,7 +118,6 @@ def ask(station: Any, robot: str, sent: int) -> dict[str, Any]:
 def test_robots_stand_where_their_queries_found_them(page, station, patrolled, settle, axe, until):
     listed = {"map": "patrolled", "limit": 100}
     until(lambda: len(station.client.get("/v1/queries", params=listed).json()["items"]) == 4)
-    before = station.client.get("/v1/queries", params=listed).json()["items"]
     page.goto(f"{station.home}#/maps/patrolled/place")
     settle(page)
     rows = page.locator(".place-robots > li")
@@ -272,7 +137,7 @@ def test_robots_stand_where_their_queries_found_them(page, station, patrolled, s
       const [left, top] = label.style.transform.match(/[-0-9.]+(?=px)/g).map(Number);
       return Math.hypot(left - x, top - y); }"""
 
-    def stands(kind: str, text: str, answer: dict[str, Any]) -> bool:
+    def stands(kind, text, answer):
         at = [answer["location"]["pose"]["translation"][axis] for axis in "xyz"]
         return bool(page.evaluate(place, [CANVAS, kind, text, at]) < 1)
 
@@ -282,119 +147,16 @@ def test_robots_stand_where_their_queries_found_them(page, station, patrolled, s
         "href", f"#/queries/{lost['query_id']}"
     )
     assert axe(page) == []
-    # back in time: cart is not lost yet, and spot stands where it was before
-    slider = page.locator("#place-time")
-    for _ in range(2):
-        slider.press("ArrowLeft")
-    expect(page.locator(".place-when")).to_contain_text("query 2 of 4")
-    until(lambda: stands("robot", "spot", first))
-    expect(page.locator(".paths-label[data-kind=lost]")).to_have_count(0)
-    told = parse_qs(page.url.partition("?")[2])["at"]
-    assert told == [next(one["at"] for one in before if one["query_id"] == second["query_id"])]
-    page.reload()
-    settle(page)
-    expect(page.locator(".place-when")).to_contain_text("query 2 of 4")
-    page.get_by_role("button", name="Play").click()
-    expect(page.locator(".place-when")).to_contain_text("query 4 of 4")
-    expect(page.get_by_role("button", name="Play")).to_be_visible()
-    page.goto(f"{station.home}#/maps/patrolled/place?until={before[0]['at']}")
-    expect(page.locator(".place-when")).to_contain_text("query 3 of 3")
-    page.goto(f"{station.home}#/maps/patrolled/place")
-    settle(page)
-    assert station.client.get("/v1/queries", params=listed).json()["items"] == before
-
-    def followed(answer: dict[str, Any]) -> list[float]:
-        """Return the robot's offset from the middle of the picture, and its distance."""
-        at = [answer["location"]["pose"]["translation"][axis] for axis in "xyz"]
-        off, far = page.evaluate(FOLLOWED, [CANVAS, at])
-        return [round(off, 6), far]
-
-    follow = page.get_by_role("button", name="Follow cart")
-    follow.click()
-    expect(follow).to_have_attribute("aria-pressed", "true")
-    assert followed(second)[0] == 0
-    page.locator(CANVAS).press("+")
-    _, near = followed(second)
-    # a query that is answered meanwhile moves its robot, and the camera with it
+    # a query that is answered meanwhile moves its robot
     moved = ask(station, "cart", 0)
     until(lambda: stands("robot", "cart", moved))
-    expect(rows.first).to_contain_text("cart")
-    assert followed(moved) == [0, near]
-    follow.press("Enter")  # and no longer
-    expect(follow).to_have_attribute("aria-pressed", "false")
-    left = ask(station, "cart", 2)
-    until(lambda: stands("robot", "cart", left))
-    assert followed(moved) == [0, near]
-
-
-@pytest.mark.thorough
-def test_a_query_between_the_list_and_the_events_moves_its_robot_too(
-    page, station, patrolled, settle, until
-):
-    held: list[Any] = []
-
-    def hold(route: Any) -> None:
-        if route.request.headers.get("accept") == "text/event-stream":
-            held.append(route)
-        else:
-            route.continue_()
-
-    def heard() -> bool:
-        page.wait_for_timeout(20)  # requests are handled while the page is waited for
-        return bool(held)
-
-    page.route("**/v1/events*", hold)
-    page.goto(f"{station.home}#/maps/patrolled/place")
-    settle(page)
-    until(heard)
-    rows = page.locator(".place-robots > li")
-    assert "late" not in rows.evaluate_all("all => all.map((one) => one.dataset.robot)")
-    moved = ask(station, "late", 0)
-
-    def listed() -> bool:
-        found = station.client.get("/v1/queries", params={"map": "patrolled"}).json()["items"]
-        return any(one["query_id"] == moved["query_id"] for one in found)
-
-    until(listed)
-    held.pop().continue_()
-    expect(rows.first).to_contain_text("late", timeout=60_000)
-
-
-@pytest.mark.thorough
-def test_what_is_missing_is_told(page, open_page, station, built, settle, until):
-    path = station.make_map("poseless")
-    station.client.post(f"{path}/frames", **station.frames[0].form())
-    until(lambda: station.client.get(path).json()["frames"].get("indexed") == 1)
-    page.goto(f"{station.home}#/maps/poseless/place")
-    expect(page.get_by_role("heading", name="This map has no poses")).to_be_visible()
-    expect(page.get_by_role("link", name="Show its frames")).to_have_attribute(
-        "href", "#/maps/poseless"
-    )
-    # frames with poses, and no surface yet: it is asked for here, and comes
-    form = station.frames[1].form()
-    form["data"]["meta"] = json.dumps({**station.frames[1].meta, "session": None})
-    station.client.post(f"{path}/frames", **form)
-    until(lambda: station.client.get(path).json()["frames"].get("indexed") == 2)
-    page.reload()
-    expect(page.locator(".place-notice")).to_contain_text("surface of 1 frame is not built")
-    page.get_by_role("button", name="Build it now").click()
-    expect(page.locator("#place-surface")).to_be_visible(timeout=60_000)
-    expect(page.locator(".place-notice")).to_be_hidden()
-    expect(page.locator("section", has=page.locator("#place-surface"))).to_contain_text("1 frame, ")
-
-    blind = open_page()
-    blind.add_init_script(
-        """const get = HTMLCanvasElement.prototype.getContext;
-        HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
-          return kind === "webgl2" ? null : get.call(this, kind, ...rest); };"""
-    )
-    blind.goto(f"{station.home}#/maps/building/place?parent=room-0")
-    settle(blind)
-    shown = blind.get_by_role("img", name="The place in room-0, seen from above")
-    assert shown.evaluate("one => one.ready") is True
-    plan = built["parent"]["plan"]
-    assert shown.evaluate("one => [one.width, one.height]") == [plan["width"], plan["height"]]
-    expect(blind.locator(".paths-run")).to_have_count(2)
+    # back in time: cart is not lost yet, and spot stands where it was before
+    slider = page.locator("#place-time")
+    for _ in range(3):
+        slider.press("ArrowLeft")
+    expect(page.locator(".place-when")).to_contain_text("query 2 of 5")
+    until(lambda: stands("robot", "spot", first))
+    expect(page.locator(".paths-label[data-kind=lost]")).to_have_count(0)
 
 
 def test_detail_by_value(run):
@@ -404,14 +166,9 @@ def test_detail_by_value(run):
         {"level": 1, "cell_m": 4, "tile_m": 256, "cells": 55},
     ]
 
-    def tile(column: int, row: int, cells: int) -> dict[str, Any]:
-        return {
-            "column": column,
-            "row": row,
-            "floor": 0,
-            "cells": cells,
-            "digest": f"{column} {row}",
-        }
+    def tile(column, row, cells):
+        named = {"column": column, "row": row, "floor": 0, "cells": cells}
+        return {**named, "digest": f"{column} {row}"}
 
     fine = [
         tile(0, 0, 100), tile(2, 2, 900), tile(3, 3, 100), tile(-1, 0, 50), tile(4, 0, 500)

@@ -1,15 +1,11 @@
 """Tests of the page of sessions against the API: list, renaming, tags, merging and deletion."""
 
-from __future__ import annotations
-
 import json
-from typing import Any
 
 import pytest
 
 from tests.dashboard.conftest import expect
 
-PROXIED = {"X-Forwarded-For": "192.0.2.7"}
 #: Session and robot of each of six frames.
 TAKEN = [("monday", "ann")] * 2 + [("monday", None)] + [("tuesday/2", "ann")] * 2 + [(None, None)]
 
@@ -30,7 +26,7 @@ def runs(station):
     return path
 
 
-def listed(station: Any, path: str) -> dict[tuple[str | None, str | None], tuple[int, list[str]]]:
+def listed(station, path):
     """Frames and tags by session and robot, as the API has them."""
     found = station.client.get(f"{path}/sessions").json()["items"]
     return {
@@ -58,7 +54,6 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(station, runs, pa
     expect(rows.first.get_by_role("button")).to_have_count(0)
     assert axe(page) == []
     dialog = page.get_by_role("dialog")
-
     page.get_by_role("button", name="Tag session tuesday/2").click()
     field = dialog.get_by_role("textbox", name="Tags")
     expect(field).to_be_focused()
@@ -70,12 +65,6 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(station, runs, pa
     page.keyboard.press("Enter")
     expect(dialog).to_have_count(0)
     assert listed(station, runs)["tuesday/2", "ann"] == (2, ["dock", "wet"])
-    page.get_by_role("button", name="Tag session tuesday/2").click()
-    field.fill("wet")
-    page.get_by_role("button", name="Save tags").click()
-    expect(dialog).to_have_count(0)
-    assert listed(station, runs)["tuesday/2", "ann"] == (2, ["wet"])
-
     page.get_by_role("button", name="Rename session tuesday/2").click()
     dialog.get_by_role("textbox", name="Name").fill("tuesday")
     page.get_by_role("button", name="Rename", exact=True).click()
@@ -89,13 +78,6 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(station, runs, pa
     page.keyboard.press("Enter")
     expect(rows).to_have_count(3)
     assert listed(station, runs)["monday", "ann"] == (4, ["dock", "wet"])
-
-    # without a robot all frames of the session are meant, and that is said
-    other = rows.filter(has_text="monday").filter(has_not_text="ann")
-    other.get_by_role("button", name="Delete").click()
-    expect(dialog).to_contain_text("its 5 frames")
-    expect(dialog).to_contain_text("those of ann in this session are meant as well")
-    page.keyboard.press("Escape")
     rows.filter(has_text="ann").get_by_role("button", name="Delete").click()
     expect(dialog).to_contain_text("its 4 frames")
     expect(dialog).not_to_contain_text("cannot be chosen alone")
@@ -108,25 +90,6 @@ def test_sessions_are_listed_renamed_tagged_joined_and_deleted(station, runs, pa
     assert set(listed(station, runs)) == {(None, None), ("monday", None)}
     assert axe(page) == []
     expect(page.get_by_role("button", name="Undo the deletion of 4 frames")).to_be_visible()
-    message = page.locator(".toast", has_text="Deleted")
-    expect(message).to_have_count(1)
     page.get_by_role("button", name="Undo the deletion of 4 frames").click()
     expect(rows).to_have_count(3)
-    expect(message).to_have_count(0)  # it would offer what is done
     assert listed(station, runs)["monday", "ann"] == (4, ["dock", "wet"])
-    # what others do is seen
-    told = station.client.delete(f"{runs}/sessions", params={"session": "monday"}).json()
-    assert (told["frames"], told["deletion"]["frames"]) == (5, 5)
-    expect(rows).to_have_count(1)
-
-
-def test_who_may_only_read_changes_nothing(station, open_page, settle):
-    reader = station.key("sessions-reader", {"building": "read"})
-    page = open_page(extra_http_headers=PROXIED)
-    page.add_init_script(f"sessionStorage.setItem('sceneprint.key', '{reader}')")
-    page.goto(f"{station.home}#/maps/building/sessions")
-    settle(page)
-    expect(page.locator("tbody tr")).to_have_count(4)
-    expect(page.get_by_role("main").get_by_role("button")).to_have_count(0)
-    page.set_viewport_size({"width": 390, "height": 900})
-    assert page.evaluate("() => document.documentElement.scrollWidth") <= 390

@@ -1,11 +1,6 @@
 """Tests of the shell: size of the first page, themes, keys, focus and a restarted service."""
 
-from __future__ import annotations
-
-import os
 import re
-import signal
-from typing import Any
 
 import pytest
 
@@ -16,10 +11,10 @@ BUDGET = 40_000
 
 
 def test_the_first_page_is_small_and_asks_for_nothing_long(station, page, settle, axe):
-    code: dict[str, int] = {}
-    asked: list[str] = []
+    code = {}
+    asked = []
 
-    def note(answer: Any) -> None:
+    def note(answer):
         path = answer.url.removeprefix(station.url).partition("?")[0]
         if path.startswith("/dashboard"):
             assert answer.headers["content-encoding"] == "gzip"
@@ -43,26 +38,6 @@ def test_the_first_page_is_small_and_asks_for_nothing_long(station, page, settle
         "/", "/v1/keys/me", "/v1/maps", "/v1/jobs", "/v1/queries", "/v1/events", "plan"
     }  # fmt: skip
     assert axe(page) == []
-
-
-def test_a_theme_is_kept(station, page, settle):
-    page.emulate_media(color_scheme="light")
-    page.goto(station.home)
-    settle(page)
-    colour = "() => getComputedStyle(document.documentElement).backgroundColor"
-    light = page.evaluate(colour)
-    page.get_by_role("button", name="Theme: Dark").click()
-    dark = page.evaluate(colour)
-    assert dark != light
-    expect(page.get_by_role("button", name="Theme: Dark")).to_have_attribute("aria-pressed", "true")
-    expect(page.get_by_role("button", name="Theme: Dark")).to_be_focused()
-    page.reload()
-    settle(page)
-    assert page.evaluate(colour) == dark
-    page.get_by_role("button", name="Theme: System").click()
-    assert page.evaluate(colour) == light
-    page.emulate_media(color_scheme="dark")
-    assert page.evaluate(colour) == dark
 
 
 @pytest.mark.thorough
@@ -135,33 +110,6 @@ def test_addresses_focus_and_keyboard(station, page, settle):
     page.keyboard.press("Escape")
     expect(page.get_by_role("dialog")).to_have_count(0)
     expect(button).to_be_focused()
-    button.dblclick()  # one dialog, and it is of this page
-    settle(page)
-    expect(page.get_by_role("dialog")).to_have_count(1)
-    page.go_back()
-    expect(page.get_by_role("heading", name="Page not found")).to_be_visible()
-    expect(page.get_by_role("dialog")).to_have_count(0)
-    # steps upwards in an address lead to nothing else of the API
-    page.goto(f"{station.home}#/maps/building/frames/..")
-    settle(page)
-    expect(page.get_by_role("main")).to_contain_text("There is no page at this address.")
-
-
-@pytest.mark.thorough
-def test_a_page_looks_the_same_wherever_one_comes_from(station, page, settle):
-    look = """() => { const one = getComputedStyle(document.querySelector(".gallery .tile"));
-      return [one.padding, one.gap, one.borderRadius]; }"""
-    page.goto(f"{station.home}#/maps/building")
-    settle(page)
-    alone = page.evaluate(look)
-    for area in ("Operations", "Maps"):  # operations have tiles, too
-        page.get_by_role("link", name=area, exact=True).click()
-        settle(page)
-    page.locator("main a[href='#/maps/building/place']").first.click()
-    settle(page)
-    page.get_by_role("link", name="Frames", exact=True).click()
-    settle(page)
-    assert page.evaluate(look) == alone
 
 
 @pytest.mark.thorough
@@ -187,14 +135,6 @@ def test_a_service_without_maps_goes_and_comes_back(serve, free_port, page, sett
         page.goto(alone.home + "#/operations")
         settle(page)
         health = page.locator(".health .badge").first
-        expect(health).to_have_text("ready")
-        os.kill(alone.process, signal.SIGSTOP)  # it takes connections, and answers none
-        try:
-            expect(page.locator("#banner")).to_contain_text("does not answer")
-            expect(health).to_have_text("not answering")
-        finally:
-            os.kill(alone.process, signal.SIGCONT)
-        expect(page.locator("#banner")).to_be_hidden(timeout=60_000)
         expect(health).to_have_text("ready")
         page.goto(alone.home + "#/")
         settle(page)
