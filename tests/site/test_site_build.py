@@ -4,26 +4,17 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
-import threading
-from functools import partial
 from html.parser import HTMLParser
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from tools.site.reference import generated_pages
-
 pytestmark = pytest.mark.thorough  # builds the site, which takes longest of all
 
 ROOT = Path(__file__).resolve().parents[2]
-#: What axe finds in the theme's own markup (two landmarks of one name, tables that scroll and that
-#: Chromium focuses without being told), and in tables whose columns need no titles.
-KNOWN = {"landmark-unique", "scrollable-region-focusable", "empty-table-header"}
 
 
 @pytest.fixture(scope="module")
@@ -67,21 +58,6 @@ def read(site):
     return {path: PageReader(path.read_text()) for path in site.rglob("*.html")}
 
 
-def test_every_page_is_there(site, read):
-    pages = {path.relative_to(site).as_posix() for path in read}
-    docs = ROOT / "docs"
-    written = {
-        path.relative_to(docs).with_suffix(".html").as_posix() for path in docs.rglob("*.md")
-    }
-    written -= {"README.html"}
-    generated = {one.path.replace(".md", ".html") for one in generated_pages()}
-    outside = {
-        "CHANGELOG.html", "CONTRIBUTING.html", "examples/index.html",
-        "examples/robot_loop.py.html", "ros2/sceneprint_ros/index.html",
-    }  # fmt: skip
-    assert written | generated | outside | {"index.html", "404.html"} <= pages
-
-
 def test_no_link_and_no_anchor_is_dead(site, read):
     dead = []
     checked = 0
@@ -110,59 +86,3 @@ def test_nothing_is_loaded_from_another_host(site, read):
     styles = "".join(path.read_text() for path in site.rglob("*.css"))
     found = re.findall(r"url\(([^)]*)\)|@import\s+([^;]+)", styles)
     assert {one for pair in found for one in pair if "//" in one and "data:" not in one} == set()
-
-
-class _QuietHandler(SimpleHTTPRequestHandler):
-    def log_message(self, *_):
-        """Say nothing."""
-
-
-@pytest.fixture(scope="module")
-def address(site):
-    """Where the site is served."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_QuietHandler, directory=str(site)))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}"
-    server.shutdown()
-    thread.join()
-    server.server_close()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    names = ("chromium", "chromium-browser", "google-chrome")
-    chromium = next((path for name in names if (path := shutil.which(name))), None)
-    if chromium is None:
-        pytest.skip("needs Chromium: apt install chromium")
-    with sync_playwright() as playwright:
-        one = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        yield one
-        one.close()
-
-
-@pytest.mark.parametrize(("scheme", "width"), [("light", 1280), ("dark", 1280), ("light", 390)])
-def test_pages_are_read_and_searched_in_a_browser(address, browser, scheme, width):
-    from axe_playwright_python.sync_playwright import Axe
-
-    asked = []
-    page = browser.new_page(
-        color_scheme=scheme, viewport={"width": width, "height": 900}
-    )  # fmt: skip
-    page.on("request", lambda request: asked.append(request.url))
-    for path in ("index.html", "architecture.html", "reference/http/jobs.html"):
-        page.goto(f"{address}/{path}")
-        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), path
-        found = Axe().run(page).response["violations"]
-        ours = [one for one in found if one["id"] not in KNOWN]
-        assert [(one["id"], one["nodes"][0]["html"]) for one in ours] == [], path
-    page.locator("label[for=__search]:visible, input.md-search__input:visible").first.click()
-    page.keyboard.type("ambiguous")
-    results = page.locator(".md-search-result__item")
-    results.first.wait_for()
-    titles = results.locator("h1").all_inner_texts()
-    page.close()
-    assert "Trust: what an answer promises" in titles
-    assert {urlsplit(url).netloc for url in asked if url[:5] != "data:"} == {address[7:]}
