@@ -334,13 +334,7 @@ def walled(starter, folder_stack):
 
 @dataclass
 class House:
-    """A service without workers, with its engine and keys; this process runs its jobs.
-
-    Parameters
-    ----------
-    client, portal, engine : access to the service, which runs in its own thread
-    secrets : secrets of the keys
-    """
+    """A service in its own thread, without workers; this process runs its jobs."""
 
     client: httpx.AsyncClient
     portal: BlockingPortal

@@ -1,7 +1,5 @@
 """Tests that every operation that changes data writes to the audit log."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile
@@ -92,7 +90,6 @@ def test_each_change_has_its_lines(recorder, small_shots, until):
     done = do("delete_frames", ["frame.deleted"], hall, json={"frame_ids": ["mine"]}).json()
     deletion = {**hall, "deletion_id": done["deletion"]["deletion_id"]}
     do("restore_deletion", ["frame.restored"], deletion)
-
     query = client.post("/v1/maps/hall/queries", json={"frame_id": taken[0]}).json()["query_id"]
     answer = {"query_id": query}
     do("keep_answer", ["answer.kept"], answer, json={})
@@ -101,7 +98,6 @@ def test_each_change_has_its_lines(recorder, small_shots, until):
     fused = do("reconstruct", ["job.queued"], {"query_id": query}, json={})
     do("delete_reconstruction", ["job.removed"], job_of(fused))
     do("delete_queries", ["queries.removed"], {}, params={"map": "hall"})
-
     for kind, body in (
         ("association", {"sessions": ["s0", "s1"]}), ("coverage", {}),
         ("difference", {"before": "s0", "after": "s1"}),
@@ -113,7 +109,6 @@ def test_each_change_has_its_lines(recorder, small_shots, until):
         do(f"delete_{kind}", ["job.removed"], begun)
     do("delete_surface", ["surface.removed"], hall)
     do("begin_surface", ["surface.requested"], hall)
-
     key = {"key_name": "robot"}
     do("create_key", ["key.created"], {}, json={"name": "robot", "grants": {"hall": "read"}})
     do("rotate_key", ["key.rotated"], key)

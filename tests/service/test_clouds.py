@@ -92,37 +92,6 @@ def test_what_is_told_of_a_cloud(served, hall, clouds):
         == ("cloud", other["viewpoint"])  # fmt: skip
 
 
-def pointcloud2(ros, points, *, little=True):
-    """As a node of ROS 2 would send it, serialised by rosbags: fields in another order."""
-    rows = np.zeros(len(points), [("z", "<f4"), ("ring", "<u2"), ("x", "<f4"), ("y", "<f4")])
-    for axis, name in enumerate("xyz"):
-        rows[name] = points[:, axis]
-    writer = ros.messages()
-    writer.points(0.0, rows)
-    kind = "sensor_msgs/msg/PointCloud2"
-    return bytes(writer.types.serialize_cdr(writer.last(), kind, little_endian=little))
-
-
-def test_a_pointcloud2_is_the_cloud_of_its_points(served, hall, shots, clouds, ros):
-    path, ids = hall
-    http, kind = served.client, {"Content-Type": "application/x-ros-pointcloud2"}
-    sent = {"content": pointcloud2(ros, clouds[1]), "headers": {**kind, **WAIT}}
-    meta = {"pose": {"parent_frame": "room", "matrix": shots[1].pose}}
-    same = http.post(f"{path}/frames", **sent, params={"meta": json.dumps(meta)})
-    assert (same.status_code, same.json()["frame_id"]) == (200, ids[1])
-    asked = {"content": pointcloud2(ros, clouds[1], little=False), "headers": kind}
-    there = found(http.post(f"{path}/queries", **asked, params={"k": 1}))
-    assert (there["kind"], there["matches"][0]["frame_id"]) == ("cloud", ids[1])
-
-    moved = pointcloud2(ros, clouds[0][::2])
-    new = http.post(f"{path}/frames", **form(moved, robot="r"))
-    assert new.status_code in (201, 202)
-    upload = http.get(f"{path}/frames/{new.json()['frame_id']}/upload")
-    assert (upload.content, upload.headers["content-type"]) == (moved, kind["Content-Type"])
-    assert upload.headers["content-disposition"].endswith('.cdr"')
-    assert http.delete(f"{path}/frames/{new.json()['frame_id']}").status_code == 204
-
-
 def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
     path, ids = hall
     http = served.client
@@ -148,18 +117,6 @@ def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
     assert (told["viewpoint"], told["base_frame"], told["kind"]) == (None, None, "cloud")
     for one in (elsewhere, fused):
         assert http.delete(f"{path}/frames/{one.json()['frame_id']}").status_code == 204
-
-
-def test_a_viewpoint_is_content_and_a_base_can_be_edited(served, hall, refused):
-    path, ids = hall
-    http, frame = served.client, f"{path}/frames/{ids[2]}"
-    refused(http.patch(frame, json={"viewpoint": None}), 422, "invalid-request", "viewpoint")
-    matrix = np.diag([-1.0, -1.0, 1.0, 1.0]).tolist()
-    told = http.patch(frame, json={"T_base_sensor": {"base_frame": "spot", "matrix": matrix}})
-    assert told.json()["base_frame"] == "spot"
-    told = http.patch(frame, json={"T_base_sensor": None})
-    assert told.json()["base_frame"] == "cloud"
-    assert [told.json()["T_base_sensor"]["translation"][x] for x in "xyz"] == [*VIEWPOINT]
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """Tests of the dashboard's files over HTTP; tests/dashboard tests them in a browser."""
 
 import gzip
-import re
 
 import pytest
 
@@ -78,51 +77,8 @@ def test_no_other_path_leads_to_a_file(served, path):
     assert "default-src 'none'" in got.headers["content-security-policy"]
 
 
-def test_only_what_a_browser_needs_is_found(tmp_path):
-    (tmp_path / "a").mkdir()
-    for name in ("a/page.js", "a/.js", "notes.txt", "page.js~", "style.css"):
-        (tmp_path / name).write_text("x")
-    assert sorted(dashboard.files_in(tmp_path)) == ["a/page.js", "style.css"]
-
-
-def test_nothing_is_taken(served):
-    for path in ("/", "/dashboard", "/dashboard/main.js"):
-        got = served.client.post(path, content=b"x")
-        assert got.status_code == 405
-        assert got.json()["type"] == "/problems/method-not-allowed"
-
-
-def test_no_file_asks_for_what_the_policy_forbids():
-    forbidden = (
-        "innerHTML",
-        "outerHTML",
-        "insertAdjacentHTML",
-        "document.write",
-        "eval(",
-        "new Function",
-    )
-    for name in names():
-        text = (dashboard.PAGES / name).read_text()
-        found = [one for one in forbidden if one in text]
-        assert found == [], name
-        assert "http://" not in text.replace("http://www.w3.org/", ""), name
-        assert "https://" not in text, name
-
-
 def test_it_is_for_whom_the_service_is_for(served, refused):
     # a page of others that lets its name lead here gets nothing; a proxy's visitor needs no key yet
     told = served.client.get("/dashboard", headers={**HTML, "Host": "evil.example"})
     refused(told, 421, "misdirected")
     assert served.client.get("/dashboard", headers={"X-Forwarded-For": "192.0.2.7"}).is_success
-
-
-@pytest.mark.parametrize("name", ["style.css", "paths/paths.css"])
-def test_dark_is_the_same_whether_chosen_or_the_systems(name):
-    """The colours stand twice, since canvases read them as they are written."""
-    text = (dashboard.PAGES / name).read_text()
-    systems, chosen = (
-        re.search(rf"{start} {{([^}}]*)}}", text)
-        for start in (r':root:not\(\[data-theme="light"\]\)', r':root\[data-theme="dark"\]')
-    )
-    assert systems[1] == chosen[1]
-    assert len(re.findall(r"--[\w-]+: #", systems[1])) >= 8

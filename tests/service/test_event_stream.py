@@ -5,7 +5,6 @@ import asyncio
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import Busy
 from sceneprint.store import open_store
 from sceneprint.store.events import EventFilter, record_event, remove_events
 from service import event_stream as feeds
@@ -77,24 +76,6 @@ def test_streams_far_behind_and_near_are_told_all_once(database, monkeypatch):
     asyncio.run(run())
 
 
-def test_from_now_on_means_from_when_it_was_asked(database):
-    write(database, "hall")
-
-    async def run():
-        feed = Feed(database, most=1, retained=1000)
-        feed.join()
-        stream = feed.batches(EventFilter(), None, always)
-        assert await anext(stream) == ([], 1)
-        write(database, "hall", "shop")
-        assert await gather(stream, 2) == [2, 3]
-        feed.leave()
-        feed.join()  # a new poller for who comes after the last one left
-        assert await gather(feed.batches(EventFilter(), 1, always), 2) == [2, 3]
-        feed.leave()
-
-    asyncio.run(run())
-
-
 def test_what_is_gone_is_said_to_be(database):
     """And what is left of it is told."""
     write(database, *("hall" for _ in range(12)))
@@ -111,76 +92,5 @@ def test_what_is_gone_is_said_to_be(database):
             if place < 12:
                 assert await gather(stream, 10) == [2, *range(4, 13)]
         assert await anext(feed.batches(EventFilter(), 3, always)) == ([], 3)
-
-    asyncio.run(run())
-
-
-def test_silence_is_broken_and_a_key_that_opens_nothing_ends_it(database, monkeypatch):
-    monkeypatch.setattr(feeds, "ALIVE_S", 0.05)
-    write(database, "hall")
-    asked = []
-
-    def twice():
-        asked.append(1)
-        return len(asked) < 3
-
-    async def run():
-        feed = Feed(database, most=1, retained=9)
-        return [batch async for batch in feed.batches(EventFilter(), None, twice)]
-
-    assert asyncio.run(run()) == [([], 1)] * 3
-    assert len(asked) == 3
-
-
-def test_events_of_others_are_no_reason_to_go_on(database, monkeypatch):
-    """Neither to keep silent, nor to keep a stream whose key opens nothing any more."""
-    monkeypatch.setattr(feeds, "ALIVE_S", 0.2)
-    asked = []
-
-    def twice():
-        asked.append(1)
-        return len(asked) < 3
-
-    async def run(wanted):
-        feed, found = Feed(database, most=1, retained=1000), []
-        asked.clear()
-
-        async def busy():
-            while True:
-                write(database, "hall")
-                await asyncio.sleep(0.02)
-
-        others = asyncio.create_task(busy())
-        async with asyncio.timeout(PATIENCE_S):
-            found = [batch async for batch in feed.batches(wanted, None, twice)]
-        others.cancel()
-        return found
-
-    write(database, "shop")
-    for shop in (EventFilter(frozenset(("shop",))), EventFilter(frozenset(("shop",)), ("map.",))):
-        assert asyncio.run(run(shop)) == [([], 1)] * 3  # nor are they seen in what is told
-    told = [one for batch in asyncio.run(run(EventFilter())) for one in ids(batch)]
-    assert told == list(range(told[0], told[-1] + 1))
-
-
-def test_there_are_so_many_places_and_all_end_together(database):
-    async def run():
-        feed = Feed(database, most=2, retained=9)
-        for _ in range(2):
-            feed.join()
-        with pytest.raises(Busy, match="limit of open event streams"):
-            feed.join()
-        streams = [feed.batches(EventFilter(), None, always) for _ in range(2)]
-        waiting = []
-        for stream in streams:
-            await anext(stream)
-            waiting.append(asyncio.ensure_future(anext(stream, None)))
-        await asyncio.sleep(0.05)
-        feed.close()
-        assert await asyncio.wait_for(asyncio.gather(*waiting), PATIENCE_S) == [None, None]
-        feed.leave()
-        with pytest.raises(Busy):  # a service that stops takes none
-            feed.join()
-        feed.leave()
 
     asyncio.run(run())

@@ -98,17 +98,11 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
     ("asked", "headers"),
     [
         ({"kind": "frame%"}, {}),
-        ({"kind": "x" * 33}, {}),
-        ({"kind": ["a"] * 21}, {}),
-        ({"after": "-1"}, {}),
-        ({"after": "17"}, {}),  # ids were numbers once
         ({"after": "0" * 32}, {}),
         ({"cursor": "x"}, {}),
-        ({"cursor": "0"}, {}),
         ({"limit": 1001}, {}),
         ({"order": "random"}, {}),
         ({}, {"Last-Event-ID": "1e3"}),
-        ({}, {"Last-Event-ID": "17"}),
     ],
 )
 def test_what_cannot_be_asked_is_refused_before_a_stream_begins(served, refused, asked, headers):

@@ -40,7 +40,7 @@ def test_names_are_sent_in_every_way_and_searched(served, make_map, small_shots)
     ("meta", "field"),
     [
         ({"name": "../a"}, "name"), ({"name": "/a"}, "name"), ({"name": "a" * 256}, "name"),
-        ({"name": ""}, "name"), ({"name": "a\tb"}, "name"), ({"sequence": -1}, "sequence"),
+        ({"sequence": -1}, "sequence"),
         ({"sequence": 2**53}, "sequence"), ({"sequence": 0.5}, "sequence"),
     ],
 )  # fmt: skip

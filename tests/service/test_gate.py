@@ -53,18 +53,3 @@ def test_who_hangs_up_while_it_waits_leaves_no_turn_behind():
             await second
 
     asyncio.run(test())
-
-
-def test_as_many_have_a_place_as_may():
-    async def test():
-        gate = Gate(1, 1, longest_s=1)
-        async with gate.place(), gate.place():
-            with pytest.raises(Busy, match="queue of uploads and queries is full"):
-                async with gate.place():
-                    pass
-        async with gate.place():
-            pass
-        async with Gate(1, 0, longest_s=1).place():  # none may wait, and one is worked on
-            pass
-
-    asyncio.run(test())

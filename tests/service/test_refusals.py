@@ -92,42 +92,18 @@ def test_a_camera_that_is_none_is_refused(served, hall, small_shots, refused, fi
     assert fields == ([f"intrinsics.{field}"] if kind == "invalid-request" else [])
 
 
-@pytest.mark.parametrize(
-    ("options", "field"),
-    [
-        ({"k": "x"}, "k"), ({"exact": "maybe"}, "exact"), ({"stages": "retrieve,fly"}, "stages.1"),
-        ({"stages": ""}, "stages.0"), ({"colour": "1"}, "colour"), ({"frame_id": "1"}, "frame_id"),
-    ],
-)  # fmt: skip
-def test_a_question_that_cannot_be_asked_is_refused(
-    served, hall, small_shots, refused, options, field
-):
-    form = small_shots[0].form()
-    form["data"] |= options
-    problem = refused(served.client.post(f"{hall}/queries", **form), 422, "invalid-request")
-    assert [one["field"] for one in problem["errors"]] == [field]
-
-
 #: content of a query that is no form -> status, type, text
 BODIES = {
     b"": (400, "malformed-body", "The body is empty."), b"{": (400, "malformed-body", "not JSON"),
-    b"[]": (400, "malformed-body", "not a JSON object"),
-    b'{"frame_id": "\xff"}': (400, "malformed-body", "not JSON"),
     b'{"frame_id": "\\ud800"}': (400, "malformed-body", "not JSON"),
     b"[" * 5000: (400, "malformed-body", "not JSON"),
-    b'{"k": ' + b"9" * 5000 + b"}": (400, "malformed-body", "not JSON"),
     b" " * (1 << 18) + b" ": (413, "too-large", "the limit of 262144 bytes"),
     b"{}": (422, "invalid-request", "has no frame"),
-    b'{"frame_id": 7}': (422, "invalid-request", "has no frame"),
     b'{"frame_id": "a", "k": 0}': (422, "invalid-request", "k: "),
-    b'{"frame_id": "a", "k": NaN}': (422, "invalid-request", "k: "),
-    b'{"frame_id": "a", "k": 1e999}': (422, "invalid-request", "k: "),
     b'{"frame_id": "a", "stages": "retrieve"}': (404, "unknown-frame", ""),
     b'{"frame_id": "a", "stages": "fly, retrieve"}': (
         422, "invalid-request", "stages.0: Input should be 'retrieve', 'diversify' or 'validate'."),
     b'{"frame_id": "a", "stages": "validate"}': (422, "invalid-request", "stages: "),
-    b'{"frame_id": "a", "stages": 7}': (422, "invalid-request", "stages: must be a list of stages"),
-    b'{"frame_id": "a", "stages": null}': (422, "invalid-request", "or a text with stages"),
     b'{"frame_id": "a", "fly": 1}': (422, "invalid-request", "fly: "),
     b'{"frame_id": "../a\\u0000"}': (404, "unknown-frame", ""),
 }  # fmt: skip
@@ -145,14 +121,10 @@ def test_json_that_asks_nothing_is_refused(served, hall, refused, number):
     ("content", "headers", "status", "kind"),
     [
         (b"{", JSON, 400, "malformed-body"), (b'{"name": "\xff"}', JSON, 400, "malformed-body"),
-        (b"[" * 100_000, JSON, 400, "malformed-body"), (b"[]", JSON, 422, "invalid-request"),
-        (b"{}", JSON, 422, "invalid-request"), (b'{"name": 7}', JSON, 422, "invalid-request"),
-        (b'{"name": "a", "fly": 1}', JSON, 422, "invalid-request"),
         (b'{"name": "a", "title": "\\ud800"}', JSON, 400, "malformed-body"),
         (b"", JSON, 400, "malformed-body"), (b" " * (1 << 18) + b" ", JSON, 413, "too-large"),
         (b'{"name": "a", "model": "big"}', JSON, 422, "invalid-request"),
         (b'{"name": "a"}', {}, 415, "unsupported-type"), (b"", {}, 415, "unsupported-type"),
-        (b'{"name": "a"}', {"content-type": "text/plain"}, 415, "unsupported-type"),
     ],
 )  # fmt: skip
 def test_a_map_that_cannot_be_is_refused(served, refused, content, headers, status, kind):
@@ -166,23 +138,17 @@ def test_a_map_that_cannot_be_is_refused(served, refused, content, headers, stat
         ("GET", "/v1/maps/nowhere/frames", 404, "unknown-map", None),
         ("GET", "/v1/maps/refusals/frames/nobody", 404, "unknown-frame", None),
         ("DELETE", "/v1/maps/refusals/frames/nobody", 404, "unknown-frame", None),
-        ("DELETE", "/v1/maps/nowhere", 404, "unknown-map", None),
         ("GET", "/v1/jobs/nothing", 404, "unknown-job", None),
         ("GET", "/v1/maps/%2e%2e", 404, "unknown-map", None),
         ("GET", "/v1/maps/%2e%2e%2fx", 404, "not-found", None),
         ("GET", "/v1/maps/%00", 404, "unknown-map", None),
-        ("GET", "/v1/maps/%ff", 404, "unknown-map", None),
         ("GET", "/v1/maps/" + "a" * 5000, 404, "unknown-map", None),
         ("GET", "/", 404, "not-found", None), ("GET", "/v2/maps", 404, "not-found", None),
-        ("GET", "/v1", 404, "not-found", None), ("GET", "/v1/../etc", 404, "not-found", None),
         ("GET", "/v1/maps/", 404, "not-found", None),
         ("PUT", "/v1/maps", 405, "method-not-allowed", "GET, POST"),
         ("POST", "/v1/maps/refusals", 405, "method-not-allowed", "DELETE, GET, PATCH"),
-        ("GET", "/v1/maps/refusals/queries", 405, "method-not-allowed", "POST"),
         ("BREW", "/healthz", 405, "method-not-allowed", "GET"),
         ("PUT", "/v1/keys/me", 405, "method-not-allowed", "GET"),  # not those of a key's name
-        ("OPTIONS", "/v1/maps/hall/frames/batch", 405, "method-not-allowed", "POST"),
-        ("PUT", "/v1/jobs/retry", 405, "method-not-allowed", "POST"),
     ],
 )  # fmt: skip
 def test_what_is_not_there_is_said_so(served, hall, refused, method, path, status, kind, allow):
@@ -192,48 +158,12 @@ def test_what_is_not_there_is_said_so(served, hall, refused, method, path, statu
     assert len(problem["detail"]) < 5300
 
 
-def test_an_empty_body_is_called_empty(served, hall, refused):
-    camera = "?fx=1&fy=1&cx=1&cy=1"
-    image = {"content-type": "image/png"}
-    told = "The body is empty. Send the file itself"
-    for route in ("frames", "queries"):
-        for path in (f"{hall}/{route}", f"{hall}/{route}{camera}"):
-            refused(served.client.post(path, headers=image), 422, "unreadable-frame", told)
-    refused(served.client.post(f"{hall}/frames"), 400, "malformed-body", told)
-    refused(served.client.post("/v1/maps", headers=JSON), 400, "malformed-body", "body is empty")
-
-
-@pytest.mark.parametrize(
-    ("request_of", "place", "rule"),
-    [
-        ({"url": "/v1/maps", "json": {"name": "My Hall"}}, "name", "1 to 63 lower-case letters"),
-        (
-            {"url": "/v1/keys", "json": {"name": "k", "grants": {"My Hall": "read"}}},
-            "grants.My Hall.[key]", "the name of a map, or * for all",
-        ),
-        (
-            {"url": "/v1/maps/refusals/frames?format=kitti&session=%01", "content": b"x",
-             "headers": {"content-type": "image/png"}},
-            "session", "characters of one line",
-        ),
-    ],
-)  # fmt: skip
-def test_a_name_that_breaks_its_rule_gets_the_rule(served, hall, refused, request_of, place, rule):
-    problem = refused(served.client.post(**request_of), 422, "invalid-request", f"must be {rule}")
-    assert problem["errors"][0]["field"] == place
-    assert "^" not in problem["detail"]
-
-
 @pytest.mark.parametrize(
     ("given", "field", "text"),
     [
         ('{"robot"', "filter", "not JSON"),
-        ("[1]", "filter", ""),
-        ('{"robots": "r1"}', "filter.robots", ""),
         ('{"robot": []}', "filter.robot", "at least 1"),
-        ('{"robot": "a\\nb"}', "filter.robot.0", ""),
         ('{"not_within_s": 0}', "filter.not_within_s", "greater than 0"),
-        ('{"not_within_s": NaN}', "filter.not_within_s", "finite"),
         ('{"not_within_s": 1e999}', "filter.not_within_s", "finite"),
         ('{"captured_after": "2026-11-16T09:30:00"}', "filter.captured_after", "timezone"),
         ('{"captured_after": "2026-11-16T09:30:00Z", "captured_before": "2026-11-16T09:29:59Z"}',
@@ -246,7 +176,6 @@ def test_a_name_that_breaks_its_rule_gets_the_rule(served, hall, refused, reques
          '{"x": 1, "y": 1, "z": 1}}}', "filter.region.min.z", "finite"),
         ('{"region": {"min": {"x": 0, "y": 1, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}}',
          "filter.region.parent_frame", "required"),
-        ("[" * 5000, "filter", "not JSON"),
     ],
 )  # fmt: skip
 def test_a_filter_that_makes_no_sense_is_named(

@@ -1,9 +1,6 @@
 """Tests of requests while the application loads."""
 
 import asyncio
-import os
-import subprocess
-import sys
 import threading
 
 import httpx
@@ -90,21 +87,6 @@ def test_an_application_that_cannot_be_made_ends_the_service(tmp_path):
 
     asyncio.run(_lived(front, test))
     assert str(front.error) == "the disk is gone"
-
-
-def test_a_service_that_cannot_be_loaded_ends_with_the_error(tmp_path):
-    """It listens by then, and stops itself by the signal that an operator would send."""
-    code = (
-        "import sys; sys.modules['service.app'] = None; "
-        "from service.__main__ import main; sys.exit(main())"
-    )
-    settings = {"SCENEPRINT_DATA_DIR": f"{tmp_path}", "SCENEPRINT_PORT": "0"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | settings, capture_output=True, text=True,
-        timeout=PATIENCE_S,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert "ModuleNotFoundError: import of service.app halted" in done.stderr
 
 
 def test_while_kernels_are_compiled_readyz_says_so_and_who_needs_them_waits(
