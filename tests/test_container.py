@@ -371,8 +371,8 @@ def image(tmp_path_factory):
 @pytest.mark.thorough
 def test_what_is_installed_is_the_lock_and_no_more(image):
     code = (
-        "import json; from importlib.metadata import distributions as d;"
-        "print(json.dumps({x.name.lower().replace('_', '-'): x.version for x in d()}))"
+        "import json, re; from importlib.metadata import distributions as d;"
+        "print(json.dumps({re.sub('[-_.]+', '-', x.name.lower()): x.version for x in d()}))"
     )
     told = subprocess.run(
         image.command(["python", "-c", code]), env=image.env, capture_output=True, text=True,

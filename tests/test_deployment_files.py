@@ -188,6 +188,17 @@ def test_systemd_takes_the_units(path, tmp_path):
 
 
 @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
+def test_units_confine_what_they_run(path):
+    lines = set(path.read_text().splitlines())
+    assert lines >= {
+        "SystemCallFilter=@system-service", "SystemCallFilter=~@privileged", "ProtectClock=yes",
+        "ProtectKernelLogs=yes", "ProtectHostname=yes", "ProtectProc=invisible",
+        "RestrictRealtime=yes", "NoNewPrivileges=yes", "CapabilityBoundingSet=", "UMask=0077",
+    }  # fmt: skip
+    assert {"MemoryMax", "TasksMax"} <= {line.partition("=")[0] for line in lines}
+
+
+@pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
 def test_units_let_decoders_lock_themselves_in(path):
     """What they call for it is in no group of systemd 252."""
     filters = re.findall(r"(?m)^SystemCallFilter=([^~].*)$", path.read_text())

@@ -3,6 +3,7 @@
 import os
 import re
 import subprocess
+import sys
 import tomllib
 from itertools import chain
 from pathlib import Path
@@ -135,3 +136,23 @@ def test_a_python_that_cannot_do_it_is_named(machine, python, message):
     assert message in done.stderr
     assert not (machine / "new").exists()
     assert calls == []
+
+
+@pytest.mark.thorough
+def test_type_checkers_find_the_client(tmp_path):
+    """As of a user's script in the environment of `make demo`."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from sceneprint_client import Client\n\n\n"
+        "def status(client: Client) -> int:\n"
+        '    return client.query("hall", "frame.png")\n'
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--config-file=", "--cache-dir=cache", script],
+        cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [
+        'script.py:5: error: Incompatible return value type (got "Answer", expected "int")'
+        "  [return-value]",
+        "Found 1 error in 1 file (checked 1 source file)",
+    ], done.stderr

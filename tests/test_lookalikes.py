@@ -1,7 +1,7 @@
 """Tests that ambiguous pairs of frames are not accepted, on whole seeded images."""
 
 from collections import Counter
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -174,3 +174,17 @@ def test_frames_that_overlap_by_half_are_accepted(model, data_root):
     right = sum(n for what, n in counted.items() if what.endswith("right"))
     assert right >= 39
     assert not_believed(counted) == 1.0
+
+
+@pytest.mark.thorough
+def test_frames_of_other_rooms_are_not_accepted(model, data_root):
+    rooms = []
+    for name in ("7scenes/redkitchen", "tum/fr1_rpy", "sun3d/studyroom2"):
+        frames = [frame for one in find_sequences(data_root / name) for frame in one.frames]
+        chosen = frames[:: len(frames) // 7][:7]
+        rooms.append([geometry(frame.read_depth(), model) for frame in chosen])
+    pairs = [pair for two in combinations(rooms, 2) for pair in product(*two)]
+    counted = Counter(outcome(a, b, None, i) for i, (a, b) in enumerate(pairs))
+    assert counted.total() == 147
+    assert not_believed(counted) == 1.0
+    assert counted["rejected"] >= 142
