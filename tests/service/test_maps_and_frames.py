@@ -5,6 +5,8 @@ from datetime import datetime
 import numpy as np
 import pytest
 
+from benchmarks.waiting import until
+
 
 def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
     first = served.client.post("/v1/maps", json={"name": "hall", "title": "The hall"})
@@ -105,6 +107,8 @@ def test_a_list_of_maps_is_the_maps_one_by_one(served, small_shots):
         assert sent.json()["state"] == "indexed", sent.text
     asked = served.client.post("/v1/maps/queried/queries", **small_shots[91].form())
     assert asked.status_code == 200
+    # the query log is written after the answer
+    until(lambda: served.client.get("/v1/maps/queried").json()["recent_queries"])
     listed = {one["name"]: one for one in served.client.get("/v1/maps").json()["items"]}
     for name, queries in (("counted", {}), ("queried", {asked.json()["status"]: 1})):
         one = listed[name]
