@@ -8,6 +8,7 @@ import pytest
 from sceneprint.atomic_files import make_folder, public_mode
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_folder
+from sceneprint.cli.doctor import machine
 from sceneprint_client.api import NewMap, Query
 from tests.whole_engine import Engine
 
@@ -64,3 +65,16 @@ def test_a_folder_that_is_there_keeps_its_permissions(no_umask, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError):
         make_folder(tmp_path / "file")
+
+
+@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
+def test_doctor_names_the_command_for_an_older_folder(tmp_path, settings):
+    folder = tmp_path / "of 0.2"
+    folder.mkdir()
+    folder.chmod(0o755)
+    found = {check.subject: check for check in machine(settings(folder))}
+    assert found["permissions"].verdict == "note"
+    assert "755" in found["permissions"].text
+    assert f"chmod -R o-rwx '{folder}'" in found["permissions"].text
+    folder.chmod(0o700)
+    assert "permissions" not in {check.subject for check in machine(settings(folder))}

@@ -6,6 +6,7 @@ import os
 import pty
 import shutil
 import sqlite3
+import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
@@ -194,6 +195,49 @@ def test_two_at_once(place, tmp_path):
     restore_to_folder(place, tmp_path / "new", progress=come)
     assert "another process is restoring to this folder" in str(inner[0])
     assert names_in(tmp_path / "new") == ["blobs", "sceneprint.db"]
+
+
+#: Restores to a mount with `lost+found`, and to one that is too small.
+MOUNTED = """
+import os, subprocess, sys
+from pathlib import Path
+from sceneprint.bundle.backup import take_backup
+from sceneprint.bundle.restoration import restore_to_folder
+from sceneprint.errors import BundleError, StoreFull
+from sceneprint.settings import Settings
+
+place, folder = sys.argv[1], Path(sys.argv[2])
+volume, small = folder / "volume", folder / "small"
+for mount, size in ((volume, "64m"), (small, "100k")):
+    mount.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "none", mount], check=True)
+(volume / "lost+found").mkdir()
+restore_to_folder(place, volume)
+print(sorted(os.listdir(volume)))
+for attempt in (
+    lambda: restore_to_folder(place, small),
+    lambda: take_backup(Settings(data_dir=volume, database_url=None), str(small / "place")),
+):
+    try:
+        attempt()
+    except (BundleError, StoreFull) as error:
+        print(error)
+"""
+
+
+@file_only
+def test_a_mount_is_filled_and_never_moved(place, tmp_path):
+    if subprocess.run(["unshare", "-rm", "true"], capture_output=True).returncode != 0:
+        pytest.skip("this machine lets nobody mount anything")
+    done = subprocess.run(
+        ["unshare", "-rm", sys.executable, "-c", MOUNTED, place, str(tmp_path)],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    first, second, third = done.stdout.splitlines()
+    assert first == "['blobs', 'lost+found', 'sceneprint.db']"
+    assert "small: the bundle needs" in second
+    assert "The store is full" in third
 
 
 # servers

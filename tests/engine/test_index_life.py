@@ -10,6 +10,7 @@ import pytest
 from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import AppendBuffer
 from sceneprint.errors import UnusableStore
+from sceneprint.index.index_manifest import scrub
 from sceneprint.index.index_version import newest
 from sceneprint.models import read_model
 from sceneprint.store.signatures import SignatureChange
@@ -85,6 +86,22 @@ def test_a_tail_in_a_file_is_as_one_in_memory(tmp_path, monkeypatch, in_memory):
     np.testing.assert_array_equal(late.tail().signatures, rows[200:])
     np.testing.assert_array_equal(late.tail().keys, np.arange(200, 300))
     assert list(tmp_path.glob("index/*")) == []  # nothing to be left behind
+
+
+def test_what_is_out_of_reach_for_a_moment_is_not_removed(data, make_engine, monkeypatch):
+    assert make_engine(data, unindexed_frames=1).publish_due() == 1
+    (folder,) = data.glob("index/hall-*")
+    before = sorted(path.name for path in folder.iterdir())
+    real = Path.open
+
+    def no_descriptor(path, *arguments, **options):
+        if path.suffix == ".faiss":
+            raise OSError(24, "Too many open files")
+        return real(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", no_descriptor)
+    assert [one for one in scrub(folder) if one is not None] == []
+    assert sorted(path.name for path in folder.iterdir()) == before
 
 
 def test_a_tail_that_finds_no_room_is_as_it_was(tmp_path, monkeypatch):

@@ -180,6 +180,22 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(stor
     assert now_is(store, dead) == held  # which is not queued again under its worker
 
 
+def test_a_job_renewed_while_it_is_buried_keeps_running(store, until):
+    held = claimed(store, "w", -1.0)
+    turned(store, held, attempts=queue.MAXIMUM_ATTEMPTS)
+
+    def bury():
+        with store.database.write() as connection:
+            return queue.dead_letter(connection)
+
+    with uncommitted(store) as (connection, commit):
+        queue.renew(connection, held, 60.0)
+        done = beside(store, until, bury)
+        commit()
+    assert done.result(PATIENCE_S) == []
+    assert now_is(store, held).state == JobState.RUNNING
+
+
 def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store):
     held = claimed(store, "first")
     turned(store, held, worker="second")  # the same token: the standby lacked the first claim

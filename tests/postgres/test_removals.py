@@ -263,6 +263,43 @@ def test_an_upload_that_waited_in_vain_has_its_blob_when_it_is_sent_again(
     assert engine.store.blobs.get(digest) == small[0].png
 
 
+def test_a_second_upload_waits_for_a_removal_too(
+    engine, small, held, removal, until, waiting, monkeypatch
+):
+    """The first upload may die before it has stored its blob again."""
+    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
+    digest = engine.store.blobs.put(small[0].png)
+    removing = removal(digest)
+    with monkeypatch.context() as patch:
+        patch.setattr("sceneprint.store.blobs.object_store.REMOVAL_S", 0.1)
+        with pytest.raises(StoreLocked):
+            alone(engine, small)
+    second = background(lambda: alone(engine, small))
+    until(lambda: waiting(engine.store) == 1 or second.done())
+    held.release()
+    removing.result()
+    _, is_new = second.result()
+    assert not is_new
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_a_blob_that_is_being_removed_stays_doomed(
+    engine, small, held, removal, until, waiting, monkeypatch
+):
+    """A second removal does not clear its row, although a frame refers to the blob by then."""
+    monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
+    digest = engine.store.blobs.put(small[0].png)
+    removing = removal(digest)
+    adding = background(lambda: alone(engine, small))  # committed, and waits
+    until(lambda: waiting(engine.store) == 1 or adding.done())
+    collect_blobs(engine.store, [digest])
+    assert doomed_in(engine) == [digest]
+    held.release()
+    removing.result()
+    adding.result()
+    assert engine.store.blobs.get(digest) == small[0].png
+
+
 def test_a_server_that_fell_tells_of_the_removal_that_was_under_way(tmp_path, bucket):
     server = Server(tmp_path / "server")
     server.start()
@@ -377,6 +414,17 @@ def test_who_lost_its_turn_while_it_removes_files_is_waited_for(
             removing.result()
         adding.result()
         assert engine.store.blobs.get(digest) == small[0].png
+
+
+def test_what_is_doomed_again_meanwhile_is_not_settled(engine, held, removal):
+    """An upload may have stored the blob again, and died after its frame was deleted."""
+    first, second = (engine.store.blobs.put(one) for one in (b"of another frame", b"of a third"))
+    removing = removal(first, second)
+    with engine.store.database.write() as connection:
+        doom(connection, [first])
+    held.release()
+    removing.result()
+    assert doomed_in(engine) == [first]
 
 
 def test_one_removal_waits_for_another(engine, held, removal, until, waiting, monkeypatch):
