@@ -1,9 +1,16 @@
 """Exact scenes: planes in a pinhole camera, and sets of patches."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sceneprint.types import Intrinsics, Patches, Surface
+from sceneprint.geometry.rigid import transform_points
+from sceneprint.pipeline import geometry_of
+from sceneprint.signing import see
+from sceneprint.types import DepthFrame, Intrinsics, Patches, Surface
+from sceneprint_lab.synth import KINECT, take, trajectory
+from sceneprint_lab.synth.dataset import room_and_rng
 
 #: Camera with the field of view of a Kinect and a quarter of the pixels.
 CAMERA = Intrinsics(80, 60, 73.0, 73.0, 39.5, 29.5)
@@ -61,15 +68,45 @@ def lifted(camera, q, normals):
     )
 
 
+def rigid(rng, metres, degrees=None):
+    """Return a random transform (4, 4); without `degrees` all rotations are equally likely."""
+    if degrees is None:
+        turn = Rotation.random(rng=rng)
+    else:
+        turn = Rotation.from_rotvec(rng.normal(0, np.radians(degrees), 3))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = turn.as_matrix(), rng.normal(0, metres, 3)
+    return T
+
+
+def patches_of(means, normals, areas=None):
+    """Return patches of 20 samples each, by default of area 1."""
+    n = len(means)
+    return Patches(
+        np.array(means, float).reshape(n, 3), np.array(normals, float).reshape(n, 3),
+        np.ones(n) if areas is None else areas, np.full(n, 20, np.int32), np.ones(n),
+    )  # fmt: skip
+
+
+def carried(patches, T):
+    """Return patches in the coordinates to which T takes theirs."""
+    means = transform_points(T, patches.means)
+    return replace(patches, means=means, normals=patches.normals @ T[:3, :3].T)
+
+
+def furnished(model, number, stop=60):
+    """Return (pose, geometry) of views of a furnished room, a fifth of its path apart."""
+    room, rng = room_and_rng(11, number)
+    poses = trajectory(room, 61, rng)[12:stop:12]
+    frames = [DepthFrame(take(room, T, KINECT, rng), KINECT) for T in poses]
+    views = [geometry_of(see(frame, model.parameters), model) for frame in frames]
+    return list(zip(poses, views, strict=True))
+
+
 def random_patches(rng, n, extent=2.0):
     normals = rng.normal(size=(n, 3))
-    return Patches(
-        rng.uniform(-extent, extent, (n, 3)),
-        normals / np.linalg.norm(normals, axis=1, keepdims=True),
-        rng.uniform(0.01, 0.1, n),
-        np.full(n, 20, np.int32),
-        np.ones(n),
-    )
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return patches_of(rng.uniform(-extent, extent, (n, 3)), normals, rng.uniform(0.01, 0.1, n))
 
 
 def room(rng, n=110):
@@ -89,15 +126,4 @@ def room(rng, n=110):
         normal[axis] += outwards * (2 * side - 1)
         means.append(low + point * extent)
         normals.append(normal / np.linalg.norm(normal))
-    sizes = np.full(n, 20, np.int32)
-    return Patches(np.array(means), np.array(normals), np.ones(n), sizes, np.ones(n))
-
-
-def moved(patches, rotation, translation):
-    return Patches(
-        rotation.apply(patches.means) + translation,
-        rotation.apply(patches.normals),
-        patches.areas,
-        patches.sizes,
-        patches.coherences,
-    )
+    return patches_of(means, normals)

@@ -15,12 +15,11 @@ from sceneprint.geometry.validation.acceptance import (
     objection,
     sparse_evidence_suffices,
 )
-from sceneprint.types import Geometry, Intrinsics, Patches, Surface
+from sceneprint.types import Geometry, Intrinsics, Surface
 from sceneprint_lab.training import preset_parameters
+from tests.geometry.scenes import patches_of
 
-NO_PATCHES = Patches(
-    np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int32), np.zeros(0)
-)
+NO_PATCHES = patches_of([], [])
 NO_WEIGHTS = np.zeros(0, np.float32)
 P = AcceptanceParameters()
 GOOD = Evidence(0.01, 0.01, 0.6, 0.5, 0.01, 1e-3)
@@ -118,10 +117,7 @@ SPARSE = Evidence(0.01, 0.01, 0.15, 0.2, 0.004, 1e-3, planes=8.0, worst_violatio
         ({"residual_rad": math.radians(5.1)}, {"residual_rad": math.radians(4.9)}),
         # overlap less five times the violations: .119 - .02 and .121 - .02
         ({"overlap": 0.119}, {"overlap": 0.121}),
-        (
-            {"plane_overlap": 0.099, "violations": 0.0},
-            {"plane_overlap": 0.101, "violations": 0.0},
-        ),
+        ({"plane_overlap": 0.099, "violations": 0.0}, {"plane_overlap": 0.101, "violations": 0.0}),
         # plane overlap less three times the violations: .13 - .0303 and .13 - .0297
         (
             {"plane_overlap": 0.13, "violations": 0.0101, "overlap": 0.2},

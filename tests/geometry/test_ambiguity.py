@@ -20,12 +20,7 @@ from sceneprint.geometry.validation.acceptance import (
     symmetries,
 )
 from sceneprint.models import read_model
-from sceneprint.pipeline import geometry_of
-from sceneprint.signing import see
-from sceneprint.types import DepthFrame, Patches
-from sceneprint_lab.synth import KINECT, take
-from sceneprint_lab.synth.dataset import room_and_rng
-from sceneprint_lab.synth.trajectories import trajectory
+from tests.geometry.scenes import furnished, patches_of
 
 P = AmbiguityParameters()
 
@@ -39,11 +34,7 @@ def on_planes(*planes):
         means.append(offset * np.array(normal) + rng.uniform(-2, 2, (n, 2)) @ across)
         normals.append(np.tile(normal, (n, 1)))
         areas.append(np.full(n, area))
-    count = sum(n for _, _, n, _ in planes)
-    return Patches(
-        np.concatenate(means), np.concatenate(normals).astype(float), np.concatenate(areas),
-        np.ones(count, np.int32), np.ones(count),
-    )  # fmt: skip
+    return patches_of(np.concatenate(means), np.concatenate(normals), np.concatenate(areas))
 
 
 #: A floor 1.4 m below a camera, a wall 3 m ahead, and little of a wall 2 m to the right.
@@ -134,23 +125,20 @@ def test_far_from_equals_the_difference():
 
 def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too():
     model, overlap_p = read_model("depth"), OverlapParameters()
-    room, rng = room_and_rng(11, 0)
-    poses = trajectory(room, 61, rng)[12:36:12]
-    frames = [DepthFrame(take(room, T, KINECT, rng), KINECT) for T in poses]
-    made = [geometry_of(see(frame, model.parameters), model) for frame in frames]
-    views = [plane_view(one, P.planes) for one in made]
+    poses, seen = zip(*furnished(model, 0, 36), strict=True)
+    views = [plane_view(one, P.planes) for one in seen]
     T = inverse(poses[1]) @ poses[0]
     # slid by 0.3 m each way along each axis: they agree with what lies along it, and violate
     shifts = np.tile(np.eye(4), (6, 1, 1))
     shifts[:, :3, 3] = 0.3 * np.concatenate([np.eye(3), -np.eye(3)])
     voted = shifts @ T
-    seen = plane_agreement(*views, voted, overlap_p)
-    assert (seen.violations > P.refuted).any()
+    agreed = plane_agreement(*views, voted, overlap_p)
+    assert (agreed.violations > P.refuted).any()
     none = np.empty((0, 4, 4))
     told = [
         best_alternative(*views, T, violations, voted, none, P, overlap_p)[0]
         for violations in (0.0, 1.0)
     ]
     # of a transform that violates everything no rival is refuted: the one that agrees most counts
-    assert told[1] >= seen.share.max()
-    assert told[0] < seen.share.max()
+    assert told[1] >= agreed.share.max()
+    assert told[0] < agreed.share.max()

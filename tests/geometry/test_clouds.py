@@ -1,13 +1,12 @@
 """Tests of the selection of points of a cloud, and of rotated axes."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.surface.cloud import CloudParameters, principal_axes, select_in_range
 from sceneprint.types import Cloud
+from tests.geometry import cloud_scenes
 
 P = CloudParameters(minimum_points=3)
 
@@ -24,7 +23,7 @@ def test_points_out_of_range_are_left_out():
     ("factor", "says"),
     [(1000.0, "if the coordinates are millimetres, set 1000 units per metre"), (0.01, "units")],
 )
-def test_out_of_range_names_the_range_and_what_to_do(cloud_scenes, factor, says):
+def test_out_of_range_names_the_range_and_what_to_do(factor, says):
     cloud = cloud_scenes.room(500)
     with pytest.raises(UselessFrame, match=r"0 of its 500 .* 0\.3 to 10 m.* median") as caught:
         select_in_range(Cloud(cloud.points * np.float32(factor), name="scan"), P)
@@ -38,7 +37,7 @@ def test_too_few_points_are_none_of_the_range():
         select_in_range(Cloud(np.ones((10, 3), np.float32)), CloudParameters())
 
 
-def test_axes_are_eigenvectors_signed_by_skew(cloud_scenes):
+def test_axes_are_eigenvectors_signed_by_skew():
     points = cloud_scenes.room(5000).points
     axes = principal_axes(points)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
@@ -48,15 +47,3 @@ def test_axes_are_eigenvectors_signed_by_skew(cloud_scenes):
     assert np.abs(off).max() < 1e-3 * moments.max()
     assert (np.diff(np.diag(moments)) < 0).all()
     assert ((points @ axes[:2].T) ** 3).sum(axis=0).min() > 0
-
-
-def test_no_extent_has_the_given_axes():
-    np.testing.assert_array_equal(principal_axes(np.zeros((4, 3), np.float32)), np.eye(3))
-
-
-def test_defaults_never_change():
-    """Models without these numbers in their files were made with them."""
-    assert replace(CloudParameters()) == CloudParameters(
-        0.3, 10.0, 64, 1 / 146, 0.02, 5.2, 8.2, 1200, 600, 76800, 0.03, 3, 0.05, 0.006, 0.006,
-        9, 0.3, 0.12, 1 / 146, 3, 6, 0.95,
-    )  # fmt: skip

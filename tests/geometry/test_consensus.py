@@ -8,21 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.registration import alignment as module
 from sceneprint.geometry.registration.alignment import ConsensusParameters, consensus
-from sceneprint.geometry.rigid import transform_points
+from tests.geometry import scenes
+from tests.geometry.scenes import carried, rigid
 
 P = ConsensusParameters()
-
-
-def motion(rng):
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.random(rng=rng).as_matrix(), rng.normal(0, 3, 3)
-    return T
-
-
-def carried(patches, T):
-    return replace(
-        patches, means=transform_points(T, patches.means), normals=patches.normals @ T[:3, :3].T
-    )
 
 
 def with_outliers(rng, n, share):
@@ -64,15 +53,11 @@ def graph_oracle(a, b, pairs):
     return fits & near
 
 
-def test_by_hand(validation_goldens):
-    validation_goldens.check_consensus(module)
-
-
 @pytest.mark.parametrize("n", [5, 64, 130])
-def test_graph_equals_the_oracle(scenes, n):
+def test_graph_equals_the_oracle(n):
     rng = np.random.default_rng(n)
     a = scenes.room(rng, n)
-    noisy = carried(a, motion(rng))
+    noisy = carried(a, rigid(rng, 3))
     noisy = replace(noisy, means=noisy.means + rng.normal(0, 0.05, (n, 3)))
     pairs = with_outliers(rng, n, 0.5)
     _, matrix = graph(a, noisy, pairs)
@@ -80,29 +65,6 @@ def test_graph_equals_the_oracle(scenes, n):
     assert not matrix.diagonal().any()
     np.testing.assert_array_equal(matrix, graph_oracle(a, noisy, pairs))
     assert n < 10 or 0.05 < matrix.mean() < 0.9
-
-
-@pytest.mark.parametrize("n", [3, 63, 64, 65, 200])
-def test_common_neighbours_equal_the_product_of_the_matrix(n):
-    rng = np.random.default_rng(n)
-    matrix = rng.random((n, n)) < 0.7
-    matrix = np.triu(matrix, 1) | np.triu(matrix, 1).T
-    bits = np.zeros((n, (n + 63) // 64 * 64), np.uint8)
-    bits[:, :n] = matrix
-    packed = np.packbits(bits, axis=1, bitorder="little").view(np.uint64)
-    common = np.zeros((n, n), np.int32)
-    module._count_common(packed, common)
-    np.testing.assert_array_equal(common, np.where(matrix, matrix.astype(int) @ matrix, 0))
-
-
-@pytest.mark.parametrize("most", [1, 16, 40])
-def test_largest_are_in_the_order_of_a_stable_sort(most):
-    rng = np.random.default_rng(most)
-    for _ in range(50):
-        row = rng.integers(0, 12, 40).astype(np.int32)
-        order = np.empty(most, np.int32)
-        module._write_largest(row, order)
-        np.testing.assert_array_equal(order, np.argsort(-row, kind="stable")[:most])
 
 
 def test_fit_equals_scipys():
@@ -127,20 +89,20 @@ def test_fit_equals_scipys():
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
-def test_the_motion_is_found_among_outliers(scenes, share):
+def test_the_motion_is_found_among_outliers(share):
     rng = np.random.default_rng(int(10 * share))
     for _ in range(3):
         a = scenes.random_patches(rng, 150)
-        T = motion(rng)
+        T = rigid(rng, 3)
         b, pairs = carried(a, T), with_outliers(rng, 150, share)
         found = consensus(a, b, pairs, P)
         assert 1 <= len(found) <= P.n_seeds
         np.testing.assert_allclose(found[0], T, atol=1e-6)
 
 
-def test_too_few_correspondences(scenes):
+def test_too_few_correspondences():
     a = scenes.random_patches(np.random.default_rng(6), 20)
-    T = motion(np.random.default_rng(7))
+    T = rigid(np.random.default_rng(7), 3)
     pairs = with_outliers(np.random.default_rng(8), 20, 0.0)
     for n in (0, 1, 2):
         assert consensus(a, carried(a, T), pairs[:n], P).shape == (0, 4, 4)

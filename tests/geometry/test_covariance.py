@@ -19,13 +19,7 @@ from sceneprint.geometry.registration.icp import (
     transform_covariance,
 )
 from sceneprint.geometry.rigid import average_poses, inverse
-
-
-def posed(rng):
-    T = np.eye(4)
-    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    T[:3, 3] = rng.normal(size=3)
-    return T
+from tests.geometry.scenes import rigid
 
 
 def with_error(T, error):
@@ -43,7 +37,7 @@ def some_covariance(rng, scale=1.0):
 
 def test_an_error_is_what_was_put_there():
     rng = np.random.default_rng(1)
-    T = posed(rng)
+    T = rigid(rng, 1)
     for size in (0.0, 1e-12, 1e-6, 1e-2, 1.0):
         error = size * rng.normal(size=6)
         np.testing.assert_allclose(
@@ -53,7 +47,7 @@ def test_an_error_is_what_was_put_there():
 
 def test_transport_against_monte_carlo():
     rng = np.random.default_rng(2)
-    T, before, after = posed(rng), posed(rng), posed(rng)
+    T, before, after = rigid(rng, 1), rigid(rng, 1), rigid(rng, 1)
     S = some_covariance(rng, 2e-3)
     errors = rng.multivariate_normal(np.zeros(6), S, 8_000)
     cases = (
@@ -78,7 +72,7 @@ def left_twist(T, true):
 @pytest.mark.parametrize("lost", [None, 0, 1])
 def test_a_pairs_covariance_from_the_definition(lost):
     rng = np.random.default_rng(4)
-    T, p = posed(rng), CovarianceParameters()
+    T, p = rigid(rng, 1), CovarianceParameters()
     refined = [Refinement(T, some_covariance(rng) + np.eye(6), 500, s) for s in (3e-5, 1e-5)]
     information, noise = np.zeros((6, 6)), []
     step = 1e-6

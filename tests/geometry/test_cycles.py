@@ -1,26 +1,18 @@
 """Tests of cycles of edges against a simple search, and of wrong edges."""
 
-import math
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.rigid import inverse, inverses, pose_difference
 from sceneprint.geometry.session_join import CycleParameters, LoopEdges, judge_edges, robot_path
-
-
-def moved_by(rng, metres, degrees):
-    T = np.eye(4)
-    turn = Rotation.from_rotvec(rng.normal(0, math.radians(degrees), 3))
-    T[:3, :3], T[:3, 3] = turn.as_matrix(), rng.normal(0, metres, 3)
-    return T
+from tests.geometry.scenes import rigid
 
 
 def walk(rng, n, metres=0.05, degrees=2.0):
-    poses = [moved_by(rng, 1.0, 40.0)]
+    poses = [rigid(rng, 1.0, 40.0)]
     for _ in range(n - 1):
-        poses.append(poses[-1] @ moved_by(rng, metres, degrees))
+        poses.append(poses[-1] @ rigid(rng, metres, degrees))
     return np.array(poses)
 
 
@@ -33,7 +25,7 @@ def edges_between(rng, here, there, n, metres, degrees):
     source = np.sort(rng.integers(0, len(here), n))
     target = np.clip(source + rng.integers(-3, 4, n), 0, len(there) - 1)
     pairs = zip(source, target, strict=True)
-    true = [inverse(there[j]) @ here[i] @ moved_by(rng, metres, degrees) for i, j in pairs]
+    true = [inverse(there[j]) @ here[i] @ rigid(rng, metres, degrees) for i, j in pairs]
     weights = rng.choice([0.5, 1.0], n)
     return LoopEdges(source, target, np.array(true), weights)
 
@@ -193,13 +185,6 @@ def test_nothing_checks_where_there_are_no_poses_or_odometry_is_broken():
     assert found.accepted.all()
     found = judge_edges(edges, a_run(poses, [0, 0, 1, 1]), a_run(poses))
     assert found.loops.tolist() == [1, 1, 1, 1]
-
-
-def test_no_edges():
-    run = a_run(np.tile(np.eye(4), (2, 1, 1)))
-    none = np.empty(0, np.int64)
-    found = judge_edges(LoopEdges(none, none, np.empty((0, 4, 4)), np.empty(0)), run, run)
-    assert len(found.accepted) == len(found.loops) == len(found.closed) == 0
 
 
 def test_the_reach_is_shortened_rather_than_memory_taken():

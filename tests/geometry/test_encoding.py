@@ -3,9 +3,7 @@
 import math
 
 import numpy as np
-import pytest
 
-from sceneprint.geometry.signature import fisher_vector as module
 from sceneprint.geometry.signature.fisher_vector import (
     fisher_vector,
     normalise,
@@ -21,9 +19,7 @@ from sceneprint.geometry.signature.pair_features import LEADING, PairCounts, pac
 def random_mixture(rng, n, spread=1.0):
     weights = rng.uniform(0.2, 1, n)
     return Mixture(
-        weights / weights.sum(),
-        rng.normal(0, spread, (n, 12)),
-        rng.uniform(0.3, 2, (n, 12)),
+        weights / weights.sum(), rng.normal(0, spread, (n, 12)), rng.uniform(0.3, 2, (n, 12))
     )
 
 
@@ -105,42 +101,6 @@ def test_statistics_of_counts_equal_those_of_the_pairs():
     for a, b in ((found.zeroth, exact.zeroth), (found.first, exact.first)):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found.second, exact.second, rtol=1e-5, atol=1e-5)
-
-
-def naive_sums(counts, table, n):
-    """Bin after bin, share after share, as the definition has it."""
-    sums = np.zeros((n, 32))
-    for b in np.flatnonzero(counts):
-        f = table.features[b].astype(float)
-        for k in range(LEADING):
-            share = table.posteriors[b, k]
-            if share == 0:
-                break
-            weight = float(counts[b] * share)  # rounded to single precision
-            row = np.concatenate([f, f * f, [1.0], np.zeros(7)])
-            sums[table.components[b, k]] += weight * row
-    return sums
-
-
-@pytest.mark.parametrize("filled", [0, 1, 16, 17, 400])
-def test_sums_over_the_table_are_the_same_to_the_bit(filled):
-    # fewer bins than are asked for ahead, and more; compiled, and without a compiler
-    rng, n = np.random.default_rng(filled), 5
-    shares = rng.uniform(0.01, 1, (400, LEADING)).astype(np.float32)
-    shares[np.arange(LEADING) > rng.integers(0, LEADING, 400)[:, None]] = 0  # one at least
-    table = pack_table(
-        rng.normal(size=(400, 12)).astype(np.float32),
-        shares,
-        rng.integers(0, n, (400, LEADING)).astype(np.int16),
-    )
-    counts = np.zeros(400, np.float32)
-    counts[rng.choice(400, filled, replace=False)] = rng.uniform(0.01, 99, filled)
-    expected = naive_sums(counts, table, n)
-    assert bool(expected.any()) == (filled > 0)
-    for accumulate in (module._accumulate, module._accumulate.function):
-        sums = np.zeros((n, 32))
-        accumulate(counts, table.packed, table.packed.view(np.int16), sums)
-        assert sums.tobytes() == expected.tobytes()
 
 
 def test_quantise_by_hand():

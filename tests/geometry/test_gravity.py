@@ -33,9 +33,9 @@ from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame
-from sceneprint_lab.synth import KINECT, symmetric_box, take, trajectory
-from sceneprint_lab.synth.dataset import room_and_rng
+from sceneprint_lab.synth import KINECT, symmetric_box, take
 from sceneprint_lab.synth.mesh import box
+from tests.geometry.scenes import furnished
 
 Z = np.array([0.0, 0.0, 1.0])  #: up in the world of synthetic rooms
 P = GravityParameters()
@@ -61,14 +61,7 @@ def model():
 @pytest.fixture(scope="module")
 def rooms(model):
     """Four views of each of two furnished rooms, a fifth of the path apart."""
-    made = []
-    for number in (0, 2):
-        room, rng = room_and_rng(11, number)
-        poses = trajectory(room, 61, rng)[12:60:12]
-        frames = [DepthFrame(take(room, T, KINECT, rng), KINECT) for T in poses]
-        seen = [geometry_of(see(frame, model.parameters), model) for frame in frames]
-        made.append(list(zip(poses, seen, strict=True)))
-    return made
+    return [furnished(model, number) for number in (0, 2)]
 
 
 @cache

@@ -1,7 +1,6 @@
 """Tests of the consensus of associations: known transforms, outliers and rejection."""
 
 import math
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -9,16 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.geometry.session_join import JoiningParameters, association_votes, join_sessions
-
-
-def rigid(rng, metres, degrees=None):
-    T = np.eye(4)
-    if degrees is None:
-        turn = Rotation.random(rng=rng)
-    else:
-        turn = Rotation.from_rotvec(rng.normal(0, math.radians(degrees), 3))
-    T[:3, :3], T[:3, 3] = turn.as_matrix(), rng.normal(0, metres, 3)
-    return T
+from tests.geometry.scenes import rigid
 
 
 def seen(rng, T_a_b, right, wrong, metres=0.01, degrees=0.4):
@@ -64,31 +54,6 @@ def place_of(point):
     T = np.eye(4)
     T[:3, 3] = point
     return T
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_support_is_that_of_an_exhaustive_search(seed):
-    """The largest set of votes that agree pairwise, of all sets there are."""
-    rng = np.random.default_rng(100 + seed)
-    true = rigid(rng, 5.0)
-    votes = seen(rng, true, 6, 5, 0.01, 0.3)
-    p = JoiningParameters()
-
-    def agree(i, j):
-        a, b = votes.transforms[i], votes.transforms[j]
-        places = [place_of(votes.places[k]) for k in (i, j)]
-        near = all(pose_difference(a @ T, b @ T)[0] <= p.agree_m for T in places)
-        return near and pose_difference(a, b)[1] <= p.agree_rad
-
-    n = len(votes.transforms)
-    pairs = {(i, j) for i, j in combinations(range(n), 2) if agree(i, j)}
-    best = max(
-        (set(group) for size in range(1, n + 1) for group in combinations(range(n), size)
-         if all(pair in pairs for pair in combinations(group, 2))),
-        key=len,
-    )  # fmt: skip
-    assert set(np.flatnonzero(join_sessions(votes).agree)) == best
-    assert len(best) == 6
 
 
 def test_two_answers_with_as_many_votes_are_none():

@@ -1,7 +1,6 @@
 """Tests that compiled kernels are reused only for the code they were compiled from."""
 
 import os
-import pickle
 import subprocess
 import sys
 
@@ -9,7 +8,6 @@ import pytest
 
 from sceneprint.geometry.kernel import TARGET_FEATURES
 from sceneprint.geometry.kernel_cache import runs_on
-from sceneprint.geometry.signature.pair_features import _count
 
 INNER = """
 from sceneprint.geometry.kernel import kernel
@@ -107,7 +105,3 @@ def test_kernels_import_numba_when_they_are_called():
     code = "import sys, sceneprint.pipeline; print({'numba', 'llvmlite'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "set()\n"
-
-
-def test_a_kernel_is_pickled_by_its_name():
-    assert pickle.loads(pickle.dumps(_count)) is _count

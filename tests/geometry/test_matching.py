@@ -58,9 +58,3 @@ def test_fewer_patches_than_wanted():
     none = np.empty((0, 8), np.uint8)
     assert correspondences(none, target, rng, MatchingParameters()).shape == (0, 2)
     assert correspondences(source, none, rng, MatchingParameters()).shape == (0, 2)
-
-
-def test_descriptors_of_two_lengths():
-    a, b = np.zeros((3, 8), np.uint8), np.zeros((3, 9), np.uint8)
-    with pytest.raises(ValueError, match="lengths, 8 and 9 bytes"):
-        correspondences(a, b, np.random.default_rng(0), MatchingParameters())

@@ -7,14 +7,11 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from sceneprint.errors import TrainingError
 from sceneprint.geometry.signature.mixture import (
     Mixture,
     MixtureParameters,
     em_step,
-    fit_mixture,
     log_densities,
-    moments,
     posteriors,
 )
 
@@ -74,16 +71,6 @@ def test_rows_sum_to_one_however_far():
     assert pi[-1].max() == 1.0  # far out, the widest component takes all
 
 
-def test_a_feature_of_weight_two_counts_twice():
-    rng = np.random.default_rng(3)
-    mixture, f = random_mixture(rng, 4), rng.normal(size=(9, 12))
-    weights = rng.integers(0, 3, 9)
-    weighted = moments(f, mixture, weights.astype(float), block=4)
-    repeated = moments(np.repeat(f, weights, axis=0), mixture)
-    for a, b in zip(weighted, repeated, strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
-
-
 def test_em_step_equals_scikit_learn():
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.mixture import GaussianMixture
@@ -119,11 +106,3 @@ def test_prior_and_floors_by_hand():
     # the other saw nothing: it keeps the prior, and the least weight before normalisation
     assert step.variances[1, 0] == pytest.approx(0.5)
     np.testing.assert_allclose(step.weights, [1 / 1.01, 0.01 / 1.01])
-
-
-def test_too_few_features():
-    features = np.random.default_rng(7).normal(size=(30, 12))
-    with pytest.raises(TrainingError, match="29 training pairs are too few for 3 components"):
-        list(fit_mixture(features[:29], parameters(3), seed=0))
-    fit = list(fit_mixture(features, parameters(3, floor=1e-3, iterations=1), seed=0))
-    assert [len(mixture) for mixture in fit] == [3, 3]

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.surface.depth_image import (
-    NormalParameters,
-    fit_surface,
-)
+from sceneprint.geometry.surface.depth_image import NormalParameters, fit_surface
 from sceneprint.types import Intrinsics
+from tests.geometry import scenes
 
 PARAMETERS = NormalParameters(
     radius_px=3,
@@ -38,7 +36,7 @@ def on_plane(u, v, camera, normal, point):
 
 @pytest.mark.parametrize(("tilt", "about"), [(0, 0), (50, 130)])
 @pytest.mark.parametrize("block", [(2, 3, 30, 25), (5, 5, 155, 115)])
-def test_areas_sum_to_the_rectangle(scenes, tilt, about, block):
+def test_areas_sum_to_the_rectangle(tilt, about, block):
     normal, point = tilted(tilt, about), np.array([0.0, 0.0, 2.0])
     seen = fit(scenes.plane(KINECT, normal, point), KINECT)
     x0, y0, x1, y1 = block
@@ -52,7 +50,7 @@ def test_areas_sum_to_the_rectangle(scenes, tilt, about, block):
     assert seen.areas[y0:y1, x0:x1].sum(dtype=float) == pytest.approx(area, rel=2e-3)
 
 
-def test_grazing_surfaces_are_not_valid(scenes):
+def test_grazing_surfaces_are_not_valid():
     # a floor 0.5 m below; gates wide open, so that only the angle of incidence rejects
     floor = np.array([0.0, -1.0, 0.0])
     q = scenes.plane(KINECT, floor, np.array([0.0, 0.5, 0.0]))

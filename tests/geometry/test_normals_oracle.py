@@ -53,7 +53,7 @@ def naive(q, y, x, p):
     return ray / at, normal
 
 
-def test_equals_least_squares_pixel_by_pixel(scenes):
+def test_equals_least_squares_pixel_by_pixel():
     rng = np.random.default_rng(5)
     y, x = np.mgrid[: CAMERA.height, : CAMERA.width]
     q = 0.5 + 0.08 * np.sin(x / 6 + 0.3) + 0.06 * np.cos(y / 5) + rng.normal(0, 8e-4, x.shape)

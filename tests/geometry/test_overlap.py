@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from sceneprint import types
 from sceneprint.geometry.registration import overlap as module
 from sceneprint.geometry.registration.overlap import (
     OverlapParameters,
@@ -10,12 +9,12 @@ from sceneprint.geometry.registration.overlap import (
     sample_points,
 )
 from sceneprint.geometry.surface import camera
+from tests.geometry import scenes, validation_goldens
 
 P = OverlapParameters()
 
 
-def test_by_hand(validation_goldens):
-    validation_goldens.check_cameras(types)
+def test_by_hand():
     validation_goldens.check_projecting(camera)
     validation_goldens.check_targets(module)
     validation_goldens.check_agreement(module)
@@ -23,7 +22,7 @@ def test_by_hand(validation_goldens):
     validation_goldens.check_sampling(module)
 
 
-def test_nothing_to_compare(scenes):
+def test_nothing_to_compare():
     corner, _ = scenes.corner()
     none = overlap_counts(np.empty((0, 6), np.float32), corner, np.eye(4), P)
     assert (none.points, none.inliers, none.violations) == (0, 0, 0)

@@ -14,7 +14,7 @@ from sceneprint.geometry.registration.patch_descriptors import (
     fit_compression,
     patch_descriptors,
 )
-from sceneprint.types import Patches
+from tests.geometry import scenes
 
 P = PatchDescriptorParameters()
 
@@ -50,39 +50,16 @@ def oracle(patches, p):
     return np.array(rows)
 
 
-def test_sizes():
-    assert P.dimension == (4 * 5 + 5 * 7 + 6 * 8) * 9
-    none = Patches(
-        np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0, np.int32), np.empty(0)
-    )
-    found = patch_descriptors(none, P)
-    assert (found.shape, found.dtype) == ((0, P.dimension), np.float32)
-
-
-def test_equals_the_oracle(scenes):
+def test_equals_the_oracle():
     rng = np.random.default_rng(0)
     for patches in (scenes.random_patches(rng, 40, 0.8), scenes.room(rng, 60)):
         np.testing.assert_allclose(patch_descriptors(patches, P), oracle(patches, P), atol=2e-6)
 
 
-def test_other_parameters_equal_the_oracle(scenes):
+def test_other_parameters_equal_the_oracle():
     p = PatchDescriptorParameters(0.5, 3, 2, 0.9, 1, 4, 1.1, 2, 1)
     patches = scenes.random_patches(np.random.default_rng(1), 40, 0.8)
     np.testing.assert_allclose(patch_descriptors(patches, p), oracle(patches, p), atol=2e-6)
-
-
-def random_compression(rng, d, bins):
-    axes = np.linalg.qr(rng.normal(size=(bins, d)))[0].T
-    return Compression(np.full(bins, 0.01, np.float32), axes.astype(np.float32))
-
-
-def test_compression_of_nothing_is_128():
-    by = random_compression(np.random.default_rng(5), 16, 30)
-    mean = np.repeat(by.mean[None], 2, axis=0)
-    stored = compress(mean, by)
-    assert (stored.shape, stored.dtype) == ((2, 16), np.uint8)
-    # what rounding leaves of it is not blown up
-    assert np.abs(stored.astype(int) - 128).max() <= 2
 
 
 def test_compression_by_hand():
@@ -114,11 +91,3 @@ def test_principal_components_equal_those_of_the_svd():
     np.testing.assert_allclose(np.abs((by.matrix * vt[:5]).sum(axis=1)), 1.0, atol=1e-5)
     # of the two signs the one that makes the largest entry positive
     assert (by.matrix[np.arange(5), np.abs(by.matrix).argmax(axis=1)] > 0).all()
-
-
-def test_components_that_cannot_be_learnt():
-    rows = np.ones((13, 12), np.float32)
-    for count, dimension in ((12, 3), (13, 0), (13, 13), (0, 1)):
-        with pytest.raises(ValueError, match=f"determine {dimension} components"):
-            fit_compression(rows[:count], dimension)
-    assert fit_compression(rows, 12).matrix.shape == (12, 12)

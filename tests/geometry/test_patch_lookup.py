@@ -3,7 +3,7 @@
 import numpy as np
 
 from sceneprint.geometry.validation.inspection import patches_at
-from sceneprint.types import Patches
+from tests.geometry.scenes import patches_of
 
 
 def unit(rows):
@@ -15,7 +15,7 @@ def test_it_is_the_nearest_that_fits():
     n, m = 40, 200
     areas = rng.uniform(0.01, 0.05, n)
     means, normals = rng.uniform(-1, 1, (n, 3)), unit(rng.normal(size=(n, 3)))
-    patches = Patches(means, normals, areas, np.ones(n, np.int32), np.ones(n))
+    patches = patches_of(means, normals, areas)
     at = np.hstack([rng.uniform(-1, 1, (m, 3)), unit(rng.normal(size=(m, 3)))]).astype(np.float32)
     found = patches_at(at, patches)
     for row, one in zip(at.astype(float), found.tolist(), strict=True):
@@ -30,6 +30,4 @@ def test_it_is_the_nearest_that_fits():
 
 
 def test_no_patches_hold_no_points():
-    none = np.zeros((0, 3))
-    patches = Patches(none, none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
-    assert patches_at(np.ones((3, 6), np.float32), patches).tolist() == [-1, -1, -1]
+    assert patches_at(np.ones((3, 6), np.float32), patches_of([], [])).tolist() == [-1, -1, -1]

@@ -82,27 +82,6 @@ def test_a_plane_seen_through_a_lens_comes_back(camera):
     np.testing.assert_allclose(z[::6, ::6], z_taken[::6, ::6], rtol=2e-6)
 
 
-def test_ray_to_axis_by_hand():
-    # directions (-3/4, 0, 1), (0, 0, 1), (3/4, 0, 1) have lengths 5/4, 1, 5/4
-    camera = Intrinsics(3, 1, 4.0, 4.0, 1.0, 0.0)
-    wide = Intrinsics(3, 1, 4.0 / 3.0, 4.0, 1.0, 0.0)
-    np.testing.assert_allclose(
-        ray_to_axis(np.array([[5.0, 5.0, 0.0]], np.float32), wide), [[4.0, 5.0, 0.0]], rtol=1e-6
-    )
-    np.testing.assert_allclose(
-        ray_to_axis(np.full((1, 3), 17**0.5, np.float32), camera), [[4, 17**0.5, 4]], rtol=1e-6
-    )
-
-
-def test_no_distortion_changes_nothing():
-    image = np.arange(12, dtype=np.float32).reshape(3, 4)
-    for k in ((), (0.0,) * 4, (0.0,) * 5):
-        result = undistort(image, Intrinsics(4, 3, 5.0, 5.0, 2.0, 1.0, k))
-        np.testing.assert_array_equal(result, image)
-        result[:] = 9.0  # a copy: the input is the caller's
-    assert image.max() == 11.0
-
-
 @pytest.mark.parametrize("k1", [-0.8, -3.0])
 def test_a_fold_has_rays_only_before_it(k1):
     """The picture of r ends at r = 1/sqrt(-3 k1), at 2/3 of it; beyond there is no ray."""
@@ -168,9 +147,3 @@ def test_blocks_fit_together():
         x, y = seen((u - 512.0) / 900.0, (v - 300.0) / 900.0, camera.distortion)
         row, column = math.floor(y * 900 + 300.5), math.floor(x * 900 + 512.5)
         assert result[v, u] == image[row, column] % 65521
-
-
-@pytest.mark.parametrize("function", [undistort, ray_to_axis])
-def test_a_wrong_size_is_the_callers_mistake(function):
-    with pytest.raises(ValueError, match=r"shape \(48, 48\)"):
-        function(np.ones((48, 48), np.float32), CAMERA)

@@ -9,6 +9,7 @@ from sceneprint.geometry.registration import icp as module
 from sceneprint.geometry.registration.icp import COARSE, FINE, refine
 from sceneprint.geometry.registration.overlap import sample_points
 from sceneprint.geometry.rigid import pose_difference
+from tests.geometry import scenes, validation_goldens
 
 
 def off(rng, metres, degrees):
@@ -20,12 +21,12 @@ def off(rng, metres, degrees):
     return T
 
 
-def test_by_hand(validation_goldens):
+def test_by_hand():
     validation_goldens.check_registration(module)
     validation_goldens.check_registration_of_clouds(module)
 
 
-def test_an_exact_corner_is_found_exactly(scenes):
+def test_an_exact_corner_is_found_exactly():
     rng = np.random.default_rng(1)
     corner, _ = scenes.corner()
     source = sample_points(corner, 2)
@@ -41,7 +42,7 @@ def test_an_exact_corner_is_found_exactly(scenes):
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
 
 
-def test_what_does_not_overlap_is_not_refined(scenes):
+def test_what_does_not_overlap_is_not_refined():
     corner, _ = scenes.corner()
     source = sample_points(corner, 2)
     far, behind = np.eye(4), np.diag([-1.0, 1, -1, 1])

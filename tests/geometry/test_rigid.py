@@ -16,13 +16,7 @@ from sceneprint.geometry.rigid import (
     solve_positive,
     transform_points,
 )
-
-
-def transform(rng, metres=3.0):
-    T = np.eye(4)
-    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
-    T[:3, 3] = rng.normal(0, metres, 3)
-    return T
+from tests.geometry.scenes import rigid
 
 
 def fitted(a, b, weights=None):
@@ -41,7 +35,7 @@ def assert_rotation(R):
 def test_inverse_equals_numpys():
     rng = np.random.default_rng(0)
     for _ in range(50):
-        T = transform(rng)
+        T = rigid(rng, 3)
         np.testing.assert_allclose(inverse(T), np.linalg.inv(T), atol=1e-12)
         np.testing.assert_array_equal(inverse(inverse(T))[:3, :3], T[:3, :3])
         x = rng.normal(size=(4, 3))
@@ -50,10 +44,7 @@ def test_inverse_equals_numpys():
         )
 
 
-@pytest.mark.parametrize(
-    "angle",
-    [0.0, 1e-9, 0.01, 1.0, 3.0, math.pi - 1e-9, math.pi],
-)
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.01, 1.0, 3.0, math.pi - 1e-9, math.pi])
 def test_rotation_angle_where_acos_fails(angle):
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -73,7 +64,7 @@ def test_difference_by_hand_and_without_a_favourite():
     assert pose_difference(b, a) == pytest.approx((metres, radians), abs=1e-12)
     assert pose_difference(b, b) == (0.0, pytest.approx(0.0, abs=1e-15))
     # the same motion of the target frame afterwards changes neither
-    T = transform(np.random.default_rng(2))
+    T = rigid(np.random.default_rng(2), 3)
     assert pose_difference(T @ a, T @ b) == pytest.approx((metres, radians), abs=1e-12)
 
 

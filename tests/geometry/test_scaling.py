@@ -10,6 +10,7 @@ from sceneprint.models import ModelParameters
 from sceneprint.models.model import POWERS, scale_lengths
 from sceneprint.pipeline import prepare, validate
 from sceneprint.types import Cloud
+from tests.geometry import cloud_scenes
 
 #: Numbers that no scale changes; a new one belongs here or in POWERS.
 BARE = {
@@ -90,7 +91,7 @@ def test_scaled_by_hand():
     assert scale_lengths(p, 0.25) == ModelParameters()
 
 
-def test_a_larger_world_signs_and_validates_the_same(cloud_scenes, small_signer):
+def test_a_larger_world_signs_and_validates_the_same(small_signer):
     """A power of two changes no digit of a float: so the bytes are the same."""
     model = small_signer.model
     small = replace(model.parameters, cloud=CloudParameters(voxel_angle=0.02, image_angle=0.02))

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from sceneprint.geometry.signature import segmentation as module
 from sceneprint.geometry.signature.segmentation import (
     SegmentationParameters,
-    compact_labels,
     extract_patches,
     segment,
 )
+from tests.geometry import scenes
 
 
 def parameters(n_patches=120, minimum_size=0.15, minimum_pixels=4):
@@ -22,13 +21,13 @@ def parameters(n_patches=120, minimum_size=0.15, minimum_pixels=4):
     )
 
 
-def wall(scenes, distance=2.0):
+def wall(distance=2.0):
     towards = np.array([0.0, 0.0, -1.0])
     q = scenes.plane(scenes.CAMERA, towards, np.array([0.0, 0.0, distance]))
     return scenes.lifted(scenes.CAMERA, q, np.broadcast_to(towards, (*q.shape, 3)))
 
 
-def test_no_patch_mixes_two_planes(scenes):
+def test_no_patch_mixes_two_planes():
     seen, plane_of = scenes.corner()
     assert [int((plane_of == k).sum()) > 300 for k in range(3)] == [True] * 3
     labels = segment(seen, parameters())
@@ -40,7 +39,7 @@ def test_no_patch_mixes_two_planes(scenes):
         assert len(set(plane_of[labels == k])) == 1
 
 
-def test_every_pixel_is_in_a_patch_or_in_a_dropped_one(scenes):
+def test_every_pixel_is_in_a_patch_or_in_a_dropped_one():
     seen, _ = scenes.corner()
     seen.valid[20:30, 15:40] = False
     every = segment(seen, parameters(minimum_size=0.0, minimum_pixels=1))
@@ -57,8 +56,8 @@ def test_every_pixel_is_in_a_patch_or_in_a_dropped_one(scenes):
     np.testing.assert_array_equal(few >= 0, seen.valid & (sizes[every] >= 15))
 
 
-def test_labels_have_no_gaps_and_follow_the_image(scenes):
-    seen = wall(scenes)
+def test_labels_have_no_gaps_and_follow_the_image():
+    seen = wall()
     labels = segment(seen, parameters(n_patches=48))
     assert labels.dtype == np.int32
     # 48 cells of 10 x 10 pixels: 6 rows of 8, left to right and top to bottom
@@ -72,7 +71,7 @@ def test_labels_have_no_gaps_and_follow_the_image(scenes):
     np.testing.assert_array_equal(np.unique(labels), np.arange(-1, labels.max() + 1))
 
 
-def test_patches_respect_depth_edges(scenes):
+def test_patches_respect_depth_edges():
     # one wall half a metre before the other, with the same normal: only position tells them apart
     towards = np.array([0.0, 0.0, -1.0])
     q = np.full((60, 80), 1 / 2.0)
@@ -82,17 +81,7 @@ def test_patches_respect_depth_edges(scenes):
     assert not set(labels[:, :37].ravel()) & set(labels[:, 37:].ravel())
 
 
-def test_kept_by_hand():
-    labels = np.array([[0, 1, -1, 2], [3, 3, 1, 0]], np.int32)
-    result = compact_labels(labels, np.array([True, False, True, True]))
-    assert result.tolist() == [[0, -1, -1, 1], [2, 2, -1, 0]]
-    assert result.dtype == np.int32
-    assert compact_labels(labels, np.zeros(4, bool)).tolist() == [[-1] * 4] * 2
-    assert compact_labels(labels, np.ones(4, bool)).tolist() == labels.tolist()
-    assert labels.tolist() == [[0, 1, -1, 2], [3, 3, 1, 0]]
-
-
-def test_patches_of_equals_the_loop(scenes):
+def test_patches_of_equals_the_loop():
     rng = np.random.default_rng(1)
     seen, _ = scenes.corner()
     labels = rng.integers(-1, 7, seen.valid.shape).astype(np.int32)
@@ -111,48 +100,3 @@ def test_patches_of_equals_the_loop(scenes):
         np.testing.assert_allclose(patches.normals[k], normal / np.linalg.norm(normal), atol=1e-6)
         assert patches.areas[k] == pytest.approx(area, rel=1e-6)
         assert patches.sizes[k] == size
-
-
-def test_nothing_seen_gives_no_patch(scenes):
-    seen = wall(scenes)
-    seen.valid[:] = False
-    labels = segment(seen, parameters())
-    assert (labels == -1).all()
-    assert len(extract_patches(seen, labels)) == 0
-
-
-def naive_assignment(pixels, centres, spacing, weight, columns):
-    """The nearest of nine centres of each pixel, one after the other, the first of equals."""
-    _, height, width = pixels.shape
-    rows = len(centres) // columns
-    labels = np.full((height, width), -1, np.int32)
-    for y, x in np.ndindex(height, width):
-        px, py, pz, nx, ny, nz = pixels[:, y, x]
-        nearest = np.float32(np.inf)
-        for n in range(9):
-            row = min(int(y / spacing), rows - 1) + n // 3 - 1
-            column = min(int(x / spacing), columns - 1) + n % 3 - 1
-            if not (0 <= row < rows and 0 <= column < columns):
-                continue
-            cx, cy, cz, mx, my, mz, scale = centres[row * columns + column]
-            dx, dy, dz = px - cx, py - cy, pz - cz
-            cosine = nx * mx + ny * my + nz * mz
-            found = (dx * dx + dy * dy + dz * dz) * scale + weight * (np.float32(1) - cosine)
-            if scale > 0 and found < nearest:
-                labels[y, x], nearest = row * columns + column, found
-    return labels
-
-
-@pytest.mark.parametrize(("height", "width", "spacing"), [(31, 23, 4.3), (9, 40, 9.0), (20, 20, 1)])
-def test_pixels_get_the_nearest_of_nine_centres(height, width, spacing):
-    rng = np.random.default_rng(height)
-    rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
-    pixels = rng.normal(size=(6, height, width)).astype(np.float32)
-    centres = rng.normal(size=(rows * columns, 7)).astype(np.float32)
-    centres[:, 6] = rng.uniform(0.5, 2, len(centres)) * (rng.random(len(centres)) < 0.8)
-    valid = rng.random((height, width)) < 0.9
-    labels, weight = np.zeros((height, width), np.int32), np.float32(6)
-    module._assign(pixels, valid, centres, spacing, weight, columns, labels)
-    expected = naive_assignment(pixels, centres, spacing, weight, columns)
-    np.testing.assert_array_equal(labels, np.where(valid, expected, -1))
-    assert len(np.unique(labels)) > 0.4 * len(centres)

@@ -19,6 +19,7 @@ from sceneprint.geometry.registration.overlap import OverlapParameters
 from sceneprint.geometry.rigid import transform_points
 from sceneprint.types import Intrinsics
 from sceneprint_client.surface_encoding import NO_SESSION
+from tests.geometry import scenes
 
 P = OverlapParameters()
 CAMERA = Intrinsics(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -28,7 +29,7 @@ WALL_M, BOX_M = 3.0, 2.0
 BOX = (slice(40, 80), slice(60, 100))
 
 
-def view(scenes, *, box):
+def view(*, box):
     """A wall that faces the camera, with the front of a box before it, or without."""
     q = np.full((CAMERA.height, CAMERA.width), 1.0 / WALL_M)
     if box:
@@ -66,8 +67,8 @@ def judged(cells, other, sensors):
     return cell_states(counts, len(sensors)), positions[:, 2] - 30.0
 
 
-def test_a_box_that_was_added_is_new_and_the_wall_behind_it_is_not_gone(scenes):
-    empty, full = view(scenes, box=False), view(scenes, box=True)
+def test_a_box_that_was_added_is_new_and_the_wall_behind_it_is_not_gone():
+    empty, full = view(box=False), view(box=True)
     sensors = poses(3)
     states, depths = judged(cells_of(full, sensors), empty, sensors)
     of_box = depths < 2.5
@@ -81,8 +82,8 @@ def test_a_box_that_was_added_is_new_and_the_wall_behind_it_is_not_gone(scenes):
     assert (wall == SAME).sum() > 1000
 
 
-def test_one_frame_of_several_is_not_enough_and_one_that_agrees_decides(scenes):
-    empty, full = view(scenes, box=False), view(scenes, box=True)
+def test_one_frame_of_several_is_not_enough_and_one_that_agrees_decides():
+    empty, full = view(box=False), view(box=True)
     (sensor,) = poses(1)
     cells = cells_of(full, [sensor])
     positions = cell_positions(cells, CELL_M)

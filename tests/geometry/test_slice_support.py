@@ -7,11 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.registration.plan_search import (
-    PlanParameters,
-    ScanPlan,
-    slice_correlation,
-)
+from sceneprint.geometry.registration.plan_search import PlanParameters, ScanPlan, slice_correlation
 from sceneprint.geometry.registration.slice_support import (
     refine_by_points,
     refine_by_slices,

@@ -7,13 +7,9 @@ import pytest
 
 from sceneprint.errors import UselessFrame
 from sceneprint.geometry.surface.cloud import CloudParameters
-from sceneprint.geometry.surface.range_image import _lift_surface as lift_surface
-from sceneprint.geometry.surface.range_image import (
-    directions,
-    pole_of,
-    range_image,
-)
+from sceneprint.geometry.surface.range_image import directions, pole_of, range_image
 from sceneprint.types import Cloud, Sphere
+from tests.geometry import cloud_scenes
 
 P = CloudParameters(image_angle=0.02)
 
@@ -24,7 +20,7 @@ def camera_of(cloud, p=P):
     return camera
 
 
-def test_planes_are_exact(cloud_scenes):
+def test_planes_are_exact():
     surface = range_image(cloud_scenes.room(60_000), P)
     assert surface.valid.mean() > 0.93
     points, normals = surface.points[surface.valid], surface.normals[surface.valid]
@@ -43,7 +39,7 @@ def test_planes_are_exact(cloud_scenes):
 
 
 @pytest.mark.parametrize("pole", [0, 1, 2])
-def test_pixels_are_where_the_camera_says(cloud_scenes, pole):
+def test_pixels_are_where_the_camera_says(pole):
     rays = cloud_scenes.directions(20_000)
     rays = rays[np.abs(rays[:, pole]) < 0.5]  # the pole is where nothing is
     surface = range_image(Cloud(cloud_scenes.in_room(rays)[0].astype(np.float32)), P)
@@ -61,7 +57,7 @@ def test_pixels_are_where_the_camera_says(cloud_scenes, pole):
     np.testing.assert_allclose(directions(camera)[y, x], at, atol=1e-5)
 
 
-def test_cropped_to_what_is_seen(cloud_scenes):
+def test_cropped_to_what_is_seen():
     full = camera_of(cloud_scenes.room(60_000))
     assert full.is_closed
     assert full.width == 315
@@ -81,7 +77,7 @@ def test_cropped_to_what_is_seen(cloud_scenes):
     assert camera_of(Cloud(back)).width == pytest.approx(cone.width, abs=1)
 
 
-def test_pixels_grow_until_there_are_few_enough(cloud_scenes):
+def test_pixels_grow_until_there_are_few_enough():
     camera = camera_of(cloud_scenes.room(5000), replace(P, maximum_pixels=900))
     assert camera.width * camera.height <= 900
     assert camera.step > 0.04
@@ -132,35 +128,6 @@ def test_points_in_one_direction_show_no_surface():
     ray = np.linspace(1, 9, 5000)[:, None] * np.array([1.0, 0.1, 0.1])
     with pytest.raises(UselessFrame, match="1 pixels"):
         range_image(Cloud(ray.astype(np.float32)), P)
-
-
-def test_rays_meet_planes_as_numpy_has_it():
-    """To the bit, with pixels that show nothing, are grazed, or lie out of range."""
-    rng, p = np.random.default_rng(3), replace(P, minimum_range=0.5, maximum_range=8.0)
-    camera = Sphere(40, 20, 0.05, -1.0, 0.5, 2)
-    rays = directions(camera)
-    planes = rays * rng.uniform(0.04, 6, (20, 40, 1)) + rng.normal(0, 0.5, (20, 40, 3))
-    planes[rng.random((20, 40)) < 0.2] = 0
-    found = lift_surface(planes, rays, camera, p)
-    inverse, length = (planes * rays).sum(axis=2), np.linalg.norm(planes, axis=2)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        cosine, r = inverse / length, 1 / inverse
-    faces = cosine >= p.minimum_cosine
-    valid = faces & (inverse * 8.0 * 2 > 1) & (inverse * 0.5 < 2)
-    assert not faces.all()
-    assert not (valid == faces).all()
-    assert valid.mean() > 0.3
-    np.testing.assert_array_equal(found.valid, valid)
-    flat = np.cos(camera.top - camera.step * np.arange(20))[:, None] * np.ones(40)
-    areas = camera.step**2 * flat[valid] / inverse[valid] ** 2 / cosine[valid]
-    for ours, expected in (
-        (found.points, rays[valid] / inverse[valid][:, None]),
-        (found.normals, -planes[valid] / length[valid][:, None]),
-        (found.areas, areas),
-    ):
-        assert ours[valid].tobytes() == expected.astype(np.float32).tobytes()
-        assert not ours[~valid].any()
-    assert 0.25 < r[valid].min() < r[valid].max() <= 16
 
 
 @pytest.mark.parametrize(("spread", "pole"), [((3, 3, 1), 2), ((1, 3, 3), 0), ((3, 1, 3), 1)])

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sceneprint.geometry.registration.overlap import first_per_cube, sample_points, thin_points
+from sceneprint.geometry.registration.overlap import first_per_cube
 from sceneprint.geometry.surface.range_image import SPREAD_POINTS
 from sceneprint.geometry.validation.validation import refine_transform
 from sceneprint.models import read_model
@@ -77,14 +77,6 @@ def test_a_scan_that_sees_a_part_keeps_its_image_alone(lidar):
     part = geometry(hall((1.0, 0.5, 1.5), half=1.0), lidar).surface
     assert part.spread is None
     assert part.fitted is part
-
-
-def test_as_many_are_counted_as_of_a_depth_image(surface):
-    n = surface.spread.points.shape[1]
-    assert len(sample_points(surface, 5)) == pytest.approx(n / round(25 * n / 19_200), abs=1)
-    assert len(sample_points(surface, 2)) == pytest.approx(n / 2, abs=1)
-    assert len(sample_points(surface, 1)) == int(surface.valid.sum())
-    assert len(thin_points(surface.spread, 100, 1.0).points[0]) <= 100
 
 
 def test_refinement_works_on_the_points(lidar):

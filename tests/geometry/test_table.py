@@ -20,6 +20,7 @@ from sceneprint.geometry.signature.pair_features import (
     project,
     properties,
 )
+from tests.geometry import scenes
 
 LAYOUT = TableLayout(distance_bins=36, angle_bins=25, dihedral_bins=36, distance_exponent=1.3)
 SMALL = TableLayout(distance_bins=7, angle_bins=5, dihedral_bins=8, distance_exponent=1.0)
@@ -54,7 +55,7 @@ def shape(layout):
 
 @pytest.mark.parametrize("layout", [LAYOUT, SMALL])
 @pytest.mark.parametrize("seed", range(2))
-def test_counts_equal_those_of_the_invariants(scenes, layout, seed):
+def test_counts_equal_those_of_the_invariants(layout, seed):
     rng = np.random.default_rng(seed)
     patches = scenes.room(rng) if seed % 2 else scenes.random_patches(rng, 130)
     pairs = neighbour_pairs(patches, P)
@@ -79,18 +80,7 @@ def test_centres_by_hand():
     )
 
 
-def index(counts):
-    return set(np.flatnonzero(counts).tolist())
-
-
-def test_bins_finer_than_the_look_up_are_refused():
-    # 4096 cells of hints over the radius: 5000 bins would put two edges into one of them
-    fine = TableLayout(distance_bins=5000, angle_bins=1, dihedral_bins=4, distance_exponent=1.0)
-    with pytest.raises(ValueError, match="narrower than the cells"):
-        count_pairs(np.zeros((2, 3)), np.ones((2, 3)), np.ones(2), fine, P)
-
-
-def test_few_patches_have_no_pairs(scenes):
+def test_few_patches_have_no_pairs():
     patches = scenes.random_patches(np.random.default_rng(0), 2)
     for n in (0, 1):
         few = count_pairs(patches.means[:n], patches.normals[:n], np.ones(n), SMALL, P)
@@ -100,7 +90,7 @@ def test_few_patches_have_no_pairs(scenes):
         assert count_pairs(means, patches.normals, np.ones(2), SMALL, P).n_pairs == 0
 
 
-def test_a_pair_weighs_the_product_of_its_patches(scenes):
+def test_a_pair_weighs_the_product_of_its_patches():
     patches = scenes.random_patches(np.random.default_rng(4), 12)
     weights = np.random.default_rng(5).uniform(0.1, 3, 12)
     found = count_pairs(patches.means, patches.normals, weights, SMALL, P)

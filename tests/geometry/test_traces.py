@@ -22,7 +22,9 @@ from sceneprint.geometry.validation.inspection import (
     residuals,
     trace,
 )
-from sceneprint.types import Geometry, Patches
+from sceneprint.types import Geometry
+from tests.geometry import scenes
+from tests.geometry.scenes import patches_of
 
 P = OverlapParameters(stride=3)
 
@@ -33,7 +35,7 @@ def shifted(x=0.0, z=0.0):
     return T
 
 
-def wall(scenes, z):
+def wall(z):
     ahead = np.array([0.0, 0.0, -1.0])
     q = scenes.plane(scenes.CAMERA, ahead, np.array([0.0, 0.0, z]))
     return scenes.lifted(scenes.CAMERA, q, np.broadcast_to(ahead, (*q.shape, 3)))
@@ -41,10 +43,7 @@ def wall(scenes, z):
 
 def patches(*rows):
     """One for each x, y, z and, if its normal is not -z, the normal."""
-    means = np.array([row[:3] for row in rows], float)
-    normals = np.array([row[3:] or (0.0, 0.0, -1.0) for row in rows], float)
-    n = len(rows)
-    return Patches(means, normals, np.ones(n), np.ones(n, np.int32), np.ones(n))
+    return patches_of([row[:3] for row in rows], [row[3:] or (0, 0, -1) for row in rows])
 
 
 def framed(surface, of):
@@ -52,7 +51,7 @@ def framed(surface, of):
 
 
 @pytest.mark.parametrize("T", [shifted(), shifted(0.04, 0.03), shifted(0.3, -0.3), shifted(z=9.0)])
-def test_every_point_is_judged_as_it_is_counted(scenes, T):
+def test_every_point_is_judged_as_it_is_counted(T):
     seen, _ = scenes.corner()
     points = sample_points(seen, P.stride)
     counts, verdicts = overlap_counts(points, seen, T, P), point_verdicts(points, seen, T, P)
@@ -64,8 +63,8 @@ def test_every_point_is_judged_as_it_is_counted(scenes, T):
 
 
 @pytest.mark.parametrize("tolerance", [0.05, 0.12])
-def test_residuals_by_hand(scenes, tolerance):
-    seen, p = wall(scenes, 2.0), OverlapParameters(stride=3, surface_tolerance=tolerance)
+def test_residuals_by_hand(tolerance):
+    seen, p = wall(2.0), OverlapParameters(stride=3, surface_tolerance=tolerance)
     points = sample_points(seen, 3)
     ahead = int(np.hypot(points[:, 0], points[:, 1]).argmin())
     # half a step off a whole one, as a share of the tolerance, and where nothing agrees
@@ -76,7 +75,7 @@ def test_residuals_by_hand(scenes, tolerance):
         assert residuals(points, seen, shifted(z=z), p)[ahead] == byte, z
 
 
-def test_patches_coincide_with_each_others_nearest(scenes):
+def test_patches_coincide_with_each_others_nearest():
     T = shifted(1.0)
     query = patches(
         (0, 0, 2), (1, 0, 2), (1.05, 0, 2), (2, 0, 2), (3, 0, 2), (4, 0, 2, 0.6, 0.0, -0.8)
@@ -84,7 +83,7 @@ def test_patches_coincide_with_each_others_nearest(scenes):
     match = patches(
         (5.1, 0, 2), (4.2, 0, 2), (3, 0, 2, 1.0, 0.0, 0.0), (2.04, 0, 2), (1.03, 0.04, 2)
     )
-    surface = wall(scenes, 2.0)
+    surface = wall(2.0)
     found = trace(framed(surface, query), framed(surface, match), T, P)
     # (1.05: at 2.05, nearer than 1's 2.0) (2: its normal differs) (3: 0.2 m off)
     # (4: at 5.0 with cos 0.8)
@@ -96,8 +95,8 @@ def test_patches_coincide_with_each_others_nearest(scenes):
     assert (nothing.pairs.shape, nothing.distances.shape) == ((0, 2), (0,))
 
 
-def test_overlays_are_coloured(scenes):
-    near, far = wall(scenes, 1.5), wall(scenes, 2.0)
+def test_overlays_are_coloured():
+    near, far = wall(1.5), wall(2.0)
     n = int(near.valid.sum())
     points, normals, colours = overlay(near, far, shifted(z=0.5))
     assert points[:n, 2] == pytest.approx(2.0)

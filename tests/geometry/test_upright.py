@@ -7,10 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from sceneprint.geometry.surface.upright import (
-    estimate_units,
-    estimate_up,
-)
+from sceneprint.geometry.surface.upright import estimate_units, estimate_up
 from sceneprint_lab.synth.dataset import room_and_rng, synthesise_survey
 
 Z = np.array([0.0, 0.0, 1.0])

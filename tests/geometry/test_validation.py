@@ -27,8 +27,8 @@ from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Patches, Surface
-from sceneprint_lab.synth import KINECT, symmetric_box, take, trajectory
-from sceneprint_lab.synth.dataset import room_and_rng
+from sceneprint_lab.synth import KINECT, symmetric_box, take
+from tests.geometry.scenes import furnished
 
 
 @pytest.fixture(scope="module")
@@ -43,12 +43,7 @@ def geometry(model, depth):
 @pytest.fixture(scope="module")
 def rooms(model):
     """Four views of each of three furnished rooms, as the demo takes them."""
-    made = []
-    for number in (0, 2, 3):
-        room, rng = room_and_rng(11, number)
-        poses = trajectory(room, 61, rng)[12:60:12]
-        made.append([(T, geometry(model, take(room, T, KINECT, rng))) for T in poses])
-    return made
+    return [furnished(model, number) for number in (0, 2, 3)]
 
 
 @pytest.fixture(scope="module")

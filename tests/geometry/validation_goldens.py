@@ -1,12 +1,12 @@
 """Manual results of validation on small scenes; each check takes the module under test."""
 
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
-from sceneprint.types import Intrinsics, Patches, Sphere, Surface, camera_of
+from sceneprint.types import Intrinsics, Sphere, Surface, camera_of
 
 #: Pixels are a degree wide; the ray of pixel (20, 15) is the optical axis.
 CAMERA = Intrinsics(41, 31, 57.0, 57.0, 20.0, 15.0)
@@ -77,21 +77,6 @@ def quarter(axis, shift=(0.0, 0.0, 0.0)):
     T[b, a], T[a, b] = 1.0, -1.0
     T[:3, 3] = shift
     return T
-
-
-def check_cameras(module):
-    """As kernels take them: kind, nearest, and five numbers of that kind."""
-    # a copy of the module has classes of its own
-    pinhole, ball = module.Intrinsics(9, 7, 10.0, 20.0, 1.0, 2.0), module.Sphere(*astuple(BALL))
-    assert module.camera_of(pinhole, 0.1).tolist() == [0, 0.1, 10, 20, 1, 2, 0]
-    for pole in range(3):
-        found = module.camera_of(replace(ball, pole=pole), 0.2)
-        assert found.tolist() == [1, 0.2, TEN, ball.left, ball.top, pole, 36]
-    # of an image that is no full turn the last column has no neighbour on the right
-    assert module.camera_of(replace(ball, width=34), 0.2)[6] == 0
-    assert module.camera_of(None, 0.3).tolist() == [2, 0.3, 0, 0, 0, 0, 0]
-    for camera, kind in ((pinhole, 0), (ball, 1), (None, 2)):
-        assert module.kind_of(camera) == kind
 
 
 def check_projecting(module):
@@ -533,81 +518,3 @@ def check_registration_of_clouds(module):
     assert once(source, target, 0) is None
     source[0, 1] = 0.38
     assert once(source, target, 0) is not None
-
-
-def patches(means, normals):
-    n = len(means)
-    return Patches(means, normals, np.ones(n), np.ones(n, np.int32), np.ones(n))
-
-
-def check_consensus(module):
-    # a quarter turn about z and a shift; three correspondences are needed
-    source = patches(
-        np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [5, 5, 5]]), np.eye(3)[[0, 1, 2, 0]]
-    )
-    T = quarter(2, (1.0, 2.0, 3.0))
-    q, m = source.means @ T[:3, :3].T + T[:3, 3], source.normals @ T[:3, :3].T
-    found = np.zeros((4, 4))
-    weights, room = np.array([1.0, 2.0, 3.0, 0.0]), np.empty(4, np.int32)
-
-    def columns(*arrays):
-        return [np.ascontiguousarray(one.T) for one in arrays]
-
-    of_source = columns(source.means, source.normals)
-    few = np.array([1.0, 0, 0, 1])
-    assert not module._fit_transform(*of_source, *columns(q, m), few, 0.05, room, found)
-    # what it explains: off by 0, 6 cm, 16 cm, and by 0 but facing elsewhere; (1 - .16)^2
-    off = q.copy()
-    off[1, 0] += 0.06
-    off[2, 2] += 0.16
-    off[3] = source.means[3] @ T[:3, :3].T + T[:3, 3]
-    m[3] = 0.0, 0.0, 1.0
-    module._weigh_inliers(*of_source, *columns(off, m), T, 0.15, 0.85, weights)
-    np.testing.assert_allclose(weights, [1, 0.84**2, 0, 0], atol=1e-9)
-
-
-def check_averaging(module):
-    def at(x, y=0.0, degrees=0.0):
-        T = np.eye(4)
-        a = math.radians(degrees)
-        T[0, 0] = T[1, 1] = math.cos(a)
-        T[1, 0], T[0, 1] = math.sin(a), -math.sin(a)
-        T[0, 3], T[1, 3] = x, y
-        return T
-
-    # four votes around a square of 8 cm and 4 degrees, and two far off
-    votes = [
-        at(9.0),
-        at(0, 0, -2),
-        at(0.08, 0, 2),
-        at(0, 0.08, -2),
-        at(0.08, 0.08, 2),
-        at(0, 0, 40),
-    ]
-    found = module.average_poses(np.array(votes))
-    np.testing.assert_allclose(found.T, at(0.04, 0.04), atol=1e-12)
-    assert (found.support, found.votes) == (4, 6)
-    # each of the four is 4 cm off in x and in y, and 2 degrees
-    np.testing.assert_allclose(found.spread_m, 0.04 * math.sqrt(2), atol=1e-12)
-    np.testing.assert_allclose(found.spread_rad, math.radians(2), atol=1e-12)
-    # the default tolerances: 15 cm and 10 degrees, either is enough to disagree
-    for other, support in (
-        (at(0.149), 2), (at(0.151), 1), (at(0, 0, 9.9), 2), (at(0, 0, 10.1), 1),
-        (at(0.14, 0, 9), 2),
-    ):  # fmt: skip
-        assert module.average_poses(np.array([at(0), other])).support == support
-    # nobody agrees: the earlier
-    found = module.average_poses(np.array([at(1), at(2), at(3)]))
-    np.testing.assert_array_equal(found.T, at(1))
-    assert (found.spread_m, found.support, found.votes) == (0.0, 1, 3)
-    # two against two: the two that are nearer to each other, though they come later
-    found = module.average_poses(np.array([at(1), at(1.1), at(2), at(2.04)]))
-    np.testing.assert_allclose(found.T, at(2.02), atol=1e-12)
-    # more against fewer, though these are nearer; the mean is not the medoid
-    found = module.average_poses(np.array([at(5), at(5.01), at(0), at(0.12), at(0.06), at(0.06)]))
-    np.testing.assert_allclose(found.T, at(0.06), atol=1e-12)
-    np.testing.assert_allclose(found.spread_m, math.sqrt(0.0072 / 4), atol=1e-12)
-    # the medoid has two beside it, which do not agree with each other
-    found = module.average_poses(np.array([at(-0.1), at(0.0), at(0.13)]))
-    np.testing.assert_allclose(found.T, at(0.01), atol=1e-12)
-    assert found.support == 3
