@@ -70,27 +70,17 @@ def test_none_is_found(tmp_path, monkeypatch):
 
 BAD = {
     "no JSON": ("{'width': 640}", "not JSON"),
-    "a list": ("[1, 2]", "not a JSON object"),
     "deep": ("[" * 60_000, "not JSON"),
-    "no fields": ("{}", "width, height, fx, fy, cx, cy is missing"),
     "missing": (GOOD | {"cy": None}, "cy is None, not a number"),
     "unknown": (GOOD | {"distorsion": []}, "distorsion' is not a field"),
     "bool": (GOOD | {"fx": True}, "fx is True, not a number"),
-    "text": (GOOD | {"fy": "525"}, "fy is '525'"),
     "broken size": (GOOD | {"height": 480.5}, "height is 480.5, not a whole"),
-    "zero size": (GOOD | {"height": 0}, "640 x 0 is invalid"),
     "huge size": (GOOD | {"width": 10**9}, "exceeds the limit"),
     "zero focal length": (GOOD | {"fx": 0}, "focal length fx"),
     "not a number": (json.dumps(GOOD).replace("319.5", "NaN"), "principal point"),
-    "beyond floats": (GOOD | {"fx": 10**400}, "fx is 1000000000"),
     "beyond Python": (json.dumps(GOOD).replace("640", "9" * 5000), "not JSON"),
     "zero scale": (GOOD | {"depth_scale": 0}, "depth scale 0.0"),
-    "no scale": (json.dumps(GOOD)[:-1] + ', "depth_scale": NaN}', "depth scale nan"),
     "three coefficients": (GOOD | {"distortion": [1, 2, 3]}, "3 distortion coefficients"),
-    "infinite coefficients": (
-        json.dumps(GOOD)[:-1] + ', "distortion": [0, 0, 0, Infinity]}', "not all finite",
-    ),
-    "half along the ray": (GOOD | {"depth_along_ray": 1}, "is not a boolean"),
 }  # fmt: skip
 
 

@@ -1,6 +1,5 @@
 """Tests of the decoder of whole maps: equal arrays, isolation, limits and false headers."""
 
-import io
 import json
 import os
 import struct
@@ -12,6 +11,7 @@ import trimesh
 from sceneprint.decoders.pool import DecoderProcess
 from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
 from sceneprint.errors import DecoderFailure, UnreadableCloud
+from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.surface_file.reading import SurfaceOptions, read_surface
 
 STATED = SurfaceOptions(units_per_metre=2.0, up="-y")
@@ -23,10 +23,8 @@ def ball(form):
 
 
 def rows(n=5000):
-    file = io.BytesIO()
     points = np.random.default_rng(2).uniform((-8, -6, 0), (8, 6, 3), (n, 3))
-    np.save(file, points + np.array([500_000.0, 4_000_000.0, 100.0]))
-    return file.getvalue()
+    return encode_npy(points + np.array([500_000.0, 4_000_000.0, 100.0]))
 
 
 def assert_equal(here, there):

@@ -181,21 +181,6 @@ def test_images_of_absurd_sizes(container, tmp_path, ros, depth):
 
 
 @pytest.mark.parametrize(
-    "more",
-    [
-        {"point_step": 0}, {"point_step": 11}, {"point_step": 2**32 - 1}, {"width": 2**32 - 1},
-        {"width": 2**31, "point_step": 2**31}, {"row_step": 3}, {"row_step": 1},
-    ],
-)  # fmt: skip
-def test_points_of_absurd_sizes(more, tmp_path, ros):
-    rows = np.ones(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-    path = ros.write(tmp_path, lambda writer: writer.points(0.0, rows, **({"height": 2} | more)))
-    (sequence,) = find_sequences(path)
-    with pytest.raises(UnreadableCloud):
-        sequence.frames[0].read()
-
-
-@pytest.mark.parametrize(
     ("data", "message"),
     [
         (b"", "PNG or RVL"), (b"\x00" * 12, "PNG or RVL"),

@@ -79,16 +79,6 @@ def described(lines, body=b"\0" * 120):
 
 
 LIES = {
-    "no vertices": (described("element face 0\nproperty float x\n"), "0 elements called vertex"),
-    "no z": (
-        described("element vertex 10\nproperty float x\nproperty float y\n"),
-        "exactly one property z",
-    ),
-    "a list of z": (
-        described("element vertex 10\nproperty float x\nproperty float y\n"
-                  "property list uchar float z\n"),
-        "exactly one property",
-    ),
     "fifty million": (described(f"element vertex 50000000\n{XYZ}"), "declares 50000000 points"),
     "more than there are": (described(f"element vertex 11\n{XYZ}"), "at least 132 bytes, but 120"),
     "doubles for floats": (
@@ -107,17 +97,6 @@ LIES = {
                   b"\0" * 120 + b"\xff\xff\xff\xff" + b"\0" * 9),
         "row 1 of 1, whose lists",
     ),
-    "a list of fewer than none": (
-        described(f"element vertex 10\n{XYZ}element face 1\nproperty list char int a\n",
-                  b"\0" * 120 + b"\xff" + b"\0" * 255 * 4),  # as many as an unsigned length tells
-        "row 1 of 1, whose lists",
-    ),
-    "an unknown type": (described("element vertex 10\nproperty quad x\n"), "property 'quad x'"),
-    "no format": (
-        b"ply\nelement vertex 10\n" + XYZ.encode() + b"end_header\n",
-        "not state the format",
-    ),
-    "no end": (BINARY.encode() + b"comment " * 20_000, "no end_header"),
     "many properties": (
         described("element vertex 10\n" + "property int a\n" * 1001), "more than 1000 properties",
     ),
@@ -134,21 +113,13 @@ def test_lies(case):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ("1 2 3\n" * 9, "bytes follow"),
         ("1.00 2.00 3.00\n" * 9, "Row 10 of 10.*file ends before"),
         ("1.0 2.0 3.0\n" * 9 + "1.0 2.0\n", "Row 10 of 10.*fewer values"),
         ("1.0 2.0 3.0 4.0\n" * 10, "Row 1 of 10.*more values"),
         ("1.0 2.0 3.0\n" * 4 + "1.0 x 3.0\n" * 6, "Row 5 of 10.*not a number"),
-        ("1.0 2.0 3.0\n" * 4 + "1.0 2.0 3.0\0\n" * 6, "Row 5 of 10.*not a number"),
     ],
 )
 def test_rows_that_are_none(rows, message):
     header = f"ply\nformat ascii 1.0\nelement vertex 10\n{XYZ}end_header\n"
     with pytest.raises(UnreadableCloud, match=message):
         decode_cloud((header + rows).encode())
-
-
-def test_errors_are_printable():
-    data = f"{BINARY}element vertex\x1b[31m 9\n{XYZ}element vertex 0\n{XYZ}end_header\n".encode()
-    with pytest.raises(UnreadableCloud, match=r"9 rows of 'vertex\\x1b\[31m', at least 108 bytes"):
-        decode_cloud(data)

@@ -1,7 +1,6 @@
 """Tests of whole maps from other programs, and of damaged and hostile files."""
 
 import base64
-import io
 import json
 import struct
 
@@ -11,6 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sceneprint.errors import UnreadableCloud, UselessFrame
+from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.surface_file.raw_surface import gather
 from sceneprint.formats.surface_file.reading import SurfaceOptions, read_surface
 
@@ -83,9 +83,7 @@ def test_scans_by_libe57_are_one_cloud(tmp_path):
 def test_rows_of_numpy_and_what_is_missing():
     points = path()
     points[5] = np.nan
-    file = io.BytesIO()
-    np.save(file, points)
-    read = read_surface(file.getvalue(), "map.npy", STATED)
+    read = read_surface(encode_npy(points), "map.npy", STATED)
     assert (read.units, read.up_from) == ("stated", "stated")
     np.testing.assert_allclose(read.surface.points, np.delete(points, 5, axis=0), atol=MILLIMETRE)
     assert read.notes == ("1 missing points were skipped.",)
@@ -279,8 +277,6 @@ def test_millimetres_are_recognised():
 
 def files():
     mesh, cloud = steps(), trimesh.PointCloud(path(100))
-    buffer = io.BytesIO()
-    np.save(buffer, path(100))
     pcd = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 100\nHEIGHT 1\n"
     return {
         "a.pcd": pcd + b"POINTS 100\nDATA binary\n" + path(100).astype("<f4").tobytes(),
@@ -288,7 +284,7 @@ def files():
         "mesh.ply": exported(mesh, "ply"),
         "ascii.ply": ply(mesh.faces.tolist(), "ascii", np.asarray(mesh.vertices)),
         "a.las": las_with(34735, keys((1024, 1))),
-        "a.npy": buffer.getvalue(),
+        "a.npy": encode_npy(path(100)),
         "a.obj": exported(mesh, "obj"),
         "a.stl": exported(mesh, "stl"),
         "ascii.stl": exported(mesh, "stl_ascii"),
@@ -339,8 +335,6 @@ def changed_gltf(change):
         ),
         (lambda t: t["accessors"][0].pop("bufferView"), "without a buffer view"),
         (lambda t: t["accessors"][0].update(count=10**15), "cannot be read"),
-        (lambda t: t.update(accessors=7), "no list of objects as its accessors"),
-        (lambda t: t.update(scenes=[{"nodes": []}], scene=0), "neither triangles nor points"),
     ],
 )
 def test_gltf_that_needs_more_than_its_bytes(change, message):
@@ -361,8 +355,6 @@ def test_a_part_that_is_placed_too_often_is_refused_unbuilt():
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
-        ("a.txt", b"hello world", "none of PCD"),
-        ("a.obj", b"no geometry\n", "neither triangles nor points"),
         ("a.pcd", b"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 4000000000\n"
                   b"HEIGHT 1\nPOINTS 4000000000\nDATA binary\n", "the limit is 60000000. Down"),
         ("a.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n"
@@ -380,11 +372,10 @@ def test_headers_that_announce_what_is_not_there(name, data, message):
 
 @pytest.mark.parametrize("far", [3e4, 1e20, 1e300])
 def test_a_place_of_more_than_twenty_kilometres_is_refused(far):
-    file, points = io.BytesIO(), path(100)
+    points = path(100)
     points[50, 1] = far
-    np.save(file, points)
     with pytest.raises(UnreadableCloud, match="isolated distant points"):
-        read_surface(file.getvalue(), "a.npy", STATED)
+        read_surface(encode_npy(points), "a.npy", STATED)
 
 
 # Thinning while reading.
