@@ -121,6 +121,15 @@ class Server:
             self.process.stdout.close()
 
 
+class Clock:
+    """A clock that tests set."""
+
+    now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
 @pytest.fixture(scope="session")
 def certificate(tmp_path_factory):
     """A self-signed certificate of this machine, and its key."""

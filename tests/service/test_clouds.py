@@ -1,11 +1,11 @@
 """Tests of point clouds over HTTP: upload, query, download, and errors."""
 
-import io
 import json
 
 import numpy as np
 import pytest
 
+from sceneprint.formats.depth_file import encode_npy
 from sceneprint.formats.export import write_ply
 
 WAIT = {"Prefer": "wait=200"}
@@ -32,12 +32,6 @@ def pcd(points, viewpoint):
         f"VIEWPOINT {place} 1 0 0 0\nPOINTS {len(points)}\nDATA binary\n"
     )
     return head.encode() + (points + viewpoint).astype("<f8").tobytes()
-
-
-def npy(array):
-    out = io.BytesIO()
-    np.save(out, array)
-    return out.getvalue()
 
 
 def form(data, **meta):
@@ -70,13 +64,6 @@ def hall(served, make_map, shots, small_shots, clouds):
     return path, ids
 
 
-def found(answer, status="found"):
-    assert answer.status_code == 200, answer.text
-    told = answer.json()
-    assert told["status"] == status, told["reason"]
-    return told
-
-
 def test_what_is_told_of_a_cloud(served, hall, clouds):
     path, ids = hall
     image, ply, other = (served.client.get(f"{path}/frames/{one}").json() for one in ids)
@@ -101,12 +88,12 @@ def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
 
     other = form(pcd(clouds[2], VIEWPOINT))
     assert (post(other).status_code, post(other).json()["frame_id"]) == (200, ids[2])
-    repacked = npy(clouds[2] + VIEWPOINT)
+    repacked = encode_npy(clouds[2] + VIEWPOINT)
     same = form(repacked, viewpoint=dict(zip("xyz", VIEWPOINT, strict=True)))
     assert (post(same).status_code, post(same).json()["frame_id"]) == (200, ids[2])
     robot = form(repacked, robot="r", viewpoint=dict(zip("xyz", VIEWPOINT, strict=True)))
     refused(post(robot), 409, "frame-conflict", "different robot")
-    millimetres = raw(npy(1000.0 * (clouds[2] + VIEWPOINT)), viewpoint="2,-1,0.5")
+    millimetres = raw(encode_npy(1000.0 * (clouds[2] + VIEWPOINT)), viewpoint="2,-1,0.5")
     millimetres["params"]["units_per_metre"] = 1000
     refused(post(millimetres), 409, "frame-conflict", "different units_per_metre")
     elsewhere = post(raw(repacked, viewpoint="2,-1,0.4"))  # another viewpoint, another frame
@@ -132,9 +119,10 @@ BAD = {
     "KITTI unsaid": (TEN.astype("<f4").tobytes(), {}, 422, "unreadable-frame", "format=kitti"),
     "a PNG said to be points": (b"\x89PNG\r\n\x1a\n", {"format": "ply"}, 422,
                                 "unreadable-cloud", ""),
-    "NaN": (npy(np.full((20, 3), np.nan)), {}, 422, "useless-frame", "0 of 20 points are valid"),
-    "far": (npy(TEN * 1e6), {}, 422, "unreadable-cloud", "units_per_metre"),
-    "viewpoint": (npy(TEN), {"viewpoint": "1,2"}, 422, "invalid-request", "`viewpoint`"),
+    "NaN": (encode_npy(np.full((20, 3), np.nan)), {}, 422, "useless-frame",
+            "0 of 20 points are valid"),
+    "far": (encode_npy(TEN * 1e6), {}, 422, "unreadable-cloud", "units_per_metre"),
+    "viewpoint": (encode_npy(TEN), {"viewpoint": "1,2"}, 422, "invalid-request", "`viewpoint`"),
     "a camera": (write_ply(TEN), {"fx": 1, "fy": 1, "cx": 0, "cy": 0, "width": 5, "height": 2},
                  422, "invalid-request", "`intrinsics`"),
     "along rays": (write_ply(TEN), {"depth_along_ray": True}, 422, "invalid-request",

@@ -42,19 +42,6 @@ def test_a_database_that_vanishes_is_told_of_and_comes_back(
     assert shaken.log("worker died") == []
 
 
-def test_a_disk_that_takes_no_blobs_takes_no_frames(shaken, small_shots, refused):
-    blobs, away = shaken.folder / "blobs", shaken.folder / "away"
-    blobs.rename(away)
-    blobs.write_text("a file where the folder was")
-    before = shaken.client.get("/readyz").json()["frames"]
-    answer = shaken.client.post("/v1/maps/hall/frames", **small_shots[3].form())
-    refused(answer, 503, "unusable-store", "nothing was stored")
-    assert shaken.client.get("/readyz").json()["frames"] == before
-    blobs.unlink()
-    away.rename(blobs)
-    shaken.index("/v1/maps/hall", small_shots[3])
-
-
 def test_what_nobody_thought_of_is_told_by_its_id_alone(shaken, refused, truth):
     with truth(shaken.folder) as connection:
         connection.exec_driver_sql("UPDATE maps SET model_id = model_id, created_at = 1e30")

@@ -27,30 +27,10 @@ def pending(server):
     return dict(server.client.get("/readyz").json()["jobs"])
 
 
-def members(server):
-    return [server.process.pid, *server.workers]
-
-
-class Limited:
-    """A service whose processes may write no large file; no privilege is needed for that."""
-
-    def __init__(self, server):
-        self.server, self.folder = server, server.folder
-
-    def _limit(self, size):
-        for pid in members(self.server):
-            resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
-
-    def fill(self):
-        self._limit(NARROW)
-
-    def free(self):
-        self._limit(resource.RLIM_INFINITY)
-
-
-@pytest.fixture
-def narrow(begin, tmp_path):
-    return Limited(begin(folder=tmp_path / "data", job_lease_s=3))
+def limit_files(server, size):
+    """Limit the files of the service's processes; no privilege is needed for that."""
+    for pid in (server.process.pid, *server.workers):
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
 def tree(folder):
@@ -60,9 +40,9 @@ def tree(folder):
 @pytest.mark.thorough
 @pytest.mark.sqlite_only("the disk of uploads is that of the database")
 def test_a_full_disk_takes_nothing_and_costs_nothing(
-    narrow, make_map, shots, small_shots, refused, until, tmp_path
+    begin, make_map, shots, small_shots, refused, until, tmp_path
 ):
-    server = narrow.server
+    server = begin(folder=tmp_path / "data", job_lease_s=3)
     path = make_map(server, "hall")
     first = server.index(path, shots[0])
     (worker,) = server.workers
@@ -70,13 +50,13 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
     waiting = server.client.post(f"{path}/frames", **shots[1].form())
     assert waiting.status_code == 202
     before = server.client.get("/readyz").json()
-    narrow.fill()
-    blobs = tree(narrow.folder / "blobs")
+    limit_files(server, NARROW)
+    blobs = tree(server.folder / "blobs")
     for shot in (shots[2], small_shots[0]):  # too large for a blob; for the database alone
         answer = server.client.post(f"{path}/frames", **shot.form())
         refused(answer, 503, "unusable-store", "nothing was stored")
         assert answer.headers["retry-after"] == "1"
-    assert tree(narrow.folder / "blobs") == blobs  # no blob without a row, no part
+    assert tree(server.folder / "blobs") == blobs  # no blob without a row, no part
     assert server.client.get("/readyz").json() == before
     found = server.client.post(f"{path}/queries", json={"frame_id": first})
     assert found.status_code == 200
@@ -87,14 +67,14 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
     assert server.client.get("/healthz").status_code == 200
     job = server.client.get(f"/v1/jobs/{waiting.json()['job_id']}").json()
     assert job["state"] in ("queued", "running")
-    assert tree(narrow.folder / "blobs") == blobs
-    narrow.free()
+    assert tree(server.folder / "blobs") == blobs
+    limit_files(server, resource.RLIM_INFINITY)
     until(lambda: pending(server) == {"succeeded": 2})  # of itself
     assert server.workers == [worker]
     server.index(path, shots[2])
     copy = tmp_path / "copy.db"  # SQLite would look for the path in our own namespace
     for end in ("", "-wal"):
-        shutil.copy(narrow.folder / f"sceneprint.db{end}", f"{copy}{end}")
+        shutil.copy(server.folder / f"sceneprint.db{end}", f"{copy}{end}")
     with closing(sqlite3.connect(copy)) as database:
         assert database.execute("SELECT max(failures) FROM jobs").fetchone() == (0,)
         assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)

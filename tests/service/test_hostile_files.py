@@ -46,10 +46,6 @@ def folder(stored, tmp_path):
     return Path(shutil.copytree(stored, tmp_path / "data"))
 
 
-def found(answer):
-    return [(match["frame_id"], match["distance"]) for match in answer["matches"]]
-
-
 def nearest(server, frame_id):
     answer = server.client.post(f"{HALL}/queries", json={"frame_id": frame_id, **NEAREST})
     assert answer.status_code == 200, answer.text

@@ -6,7 +6,6 @@ import tarfile
 import zipfile
 from functools import partial
 
-import numpy as np
 import pytest
 
 
@@ -53,53 +52,30 @@ def test_an_archive_has_a_limit_of_its_own(open_house, tmp_path, small_shots, re
     limits = {"max_upload_bytes": 20_000, "max_import_bytes": 60_000}
     with open_house(tmp_path, None, {"boss": {"*": "admin"}}, **limits) as house:
         house.ask("boss", "POST", "/v1/maps", json={"name": "yard"})
-        post = partial(house.ask, "boss", "POST")
-        check_limits(post, zipped(small_shots[:3]), refused)
+        post, small = partial(house.ask, "boss", "POST"), zipped(small_shots[:3])
+        imports = "/v1/maps/yard/imports"
+        assert 20_000 < len(small) < 60_000
+        assert post(imports, **sent(small)).status_code == 202
+        large = small + bytes(60_000)
+        refused(post(imports, **sent(large)), 413, "too-large", "60000")
+
+        async def chunks():  # their length is not sent
+            yield large[:30_000]
+            yield large[30_000:]
+
+        refused(post(imports, **{**sent(large), "content": chunks()}), 413, "too-large", "60000")
+        refused(post("/v1/maps/yard/frames", **sent(small)), 413, "too-large", "20000")
+        packed = io.BytesIO()
+        with tarfile.open(fileobj=packed, mode="w:xz") as archive:
+            info = tarfile.TarInfo("a.npy")
+            info.size = 400_000
+            archive.addfile(info, io.BytesIO(bytes(info.size)))
+        bomb = sent(packed.getvalue(), "application/x-xz")
+        refused(post(imports, **bomb), 422, "unreadable-archive", "240000")
 
 
-def check_limits(post, small, refused):
-    imports = "/v1/maps/yard/imports"
-    assert 20_000 < len(small) < 60_000
-    assert post(imports, **sent(small)).status_code == 202
-    large = small + bytes(60_000)
-    refused(post(imports, **sent(large)), 413, "too-large", "60000")
-
-    async def chunks():  # their length is not sent
-        yield large[:30_000]
-        yield large[30_000:]
-
-    refused(post(imports, **{**sent(large), "content": chunks()}), 413, "too-large", "60000")
-    refused(post("/v1/maps/yard/frames", **sent(small)), 413, "too-large", "20000")
-    made = io.BytesIO()
-    with tarfile.open(fileobj=made, mode="w:xz") as archive:
-        info = tarfile.TarInfo("a.npy")
-        info.size = 400_000
-        archive.addfile(info, io.BytesIO(bytes(info.size)))
-    bomb = sent(made.getvalue(), "application/x-xz")
-    refused(post(imports, **bomb), 422, "unreadable-archive", "240000")
-
-
-def test_recordings_are_sent_with_their_options(served, make_map, refused, ros, tmp_path, until):
-    path = make_map(served, "bags")
-
-    def fill(writer):
-        for name in ("/a", "/b"):
-            writer.image(0, np.full((60, 80), 2000), topic=f"{name}/image_raw")
-            writer.camera_info(0, f"{name}/camera_info")
-
-    bag = ros.write(tmp_path, fill, "ros1").read_bytes()
-    said = {"as": "recording", "name": "run.bag"}
-    kind = "application/octet-stream"
-
-    def imported(**more):
-        answer = served.client.post(f"{path}/imports", **sent(bag, kind, **said, **more))
-        assert answer.status_code == 202
-        place = answer.headers["Location"]
-        until(lambda: served.client.get(place).json()["finished_at"])
-        return served.client.get(place).json()
-
-    done = imported(topic="/b/image_raw", keyframe_s="0", depth_scale="500")
-    assert (done["kind"], done["result"]["summary"]["depth"]["median"]) == ("import-bag", 4.0)
-    post = partial(served.client.post, f"{path}/imports")
-    refused(post(**sent(b"x" * 600, kind, **said)), 422, "unreadable-archive", "run.bag")
-    refused(post(**sent(bag, kind, topic="/b")), 422, "invalid-request", "topic")
+def test_recordings_that_are_none_are_refused(served, yard, refused):
+    post, kind = partial(served.client.post, f"{yard}/imports"), "application/octet-stream"
+    named = {"as": "recording", "name": "run.bag"}
+    refused(post(**sent(b"x" * 600, kind, **named)), 422, "unreadable-archive", "run.bag")
+    refused(post(**sent(b"x", kind, topic="/b")), 422, "invalid-request", "topic")

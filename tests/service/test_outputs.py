@@ -91,21 +91,6 @@ def test_pictures_and_uploads_are_files(served, shown, small_shots):
     assert (part.status_code, part.content) == (206, small_shots[0].png[100:])
 
 
-@pytest.mark.parametrize(
-    ("query", "field"),
-    [
-        ("cloud.ply?frame=world", "frame"),
-        ("preview.png?view=colour", "view"),
-        ("preview.png?width=1281", "width"),
-    ],
-)
-def test_what_cannot_be_made_is_refused(served, shown, refused, query, field):
-    path, ids = shown
-    answer = served.client.get(f"{path}/frames/{ids[0]}/{query}")
-    problem = refused(answer, 422, "invalid-request")
-    assert [one["field"] for one in problem["errors"]] == [field]
-
-
 def test_an_edit_does_not_overwrite_another(served, shown, refused):
     path, ids = shown
     url = f"{path}/frames/{ids[2]}"

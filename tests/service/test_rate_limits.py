@@ -7,14 +7,7 @@ from starlette.requests import Request
 
 from sceneprint_client.api import Frame, Page
 from service.limits import TokenBucket, network_of, request_cost
-
-
-class Clock:
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
+from tests.service.conftest import Clock
 
 
 def test_a_rested_caller_may_ask_at_once_and_then_at_the_rate():

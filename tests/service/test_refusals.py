@@ -1,11 +1,11 @@
 """Tests of rejected requests and their problem documents, as a table."""
 
-import io
 import json
 
 import numpy as np
 import pytest
-from PIL import Image
+
+from sceneprint.formats.depth_file import encode_npy, encode_png
 
 JSON = {"content-type": "application/json"}
 
@@ -15,25 +15,13 @@ def hall(served, make_map):
     return make_map(served, "refusals")
 
 
-def png(image):
-    out = io.BytesIO()
-    image.save(out, "PNG")
-    return out.getvalue()
-
-
-def npy(array):
-    out = io.BytesIO()
-    np.save(out, array)
-    return out.getvalue()
-
-
-ZERO = png(Image.fromarray(np.zeros((120, 160), np.uint16)))
+ZERO = encode_png(np.zeros((120, 160), np.uint16))
 
 #: bytes of the file -> type of the problem, text that the detail holds
 FILES = {
     "empty": (b"", "unreadable-frame", "empty"),
     "missing": (ZERO, "useless-frame", "All 19200 samples are missing"),
-    "other size": (npy(np.ones((120, 159), np.float32)), "invalid-intrinsics", "159 x 120"),
+    "other size": (encode_npy(np.ones((120, 159), np.float32)), "invalid-intrinsics", "159 x 120"),
 }
 
 

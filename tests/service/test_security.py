@@ -59,13 +59,6 @@ def test_a_key_that_is_sent_counts_where_none_is_required(served, make_map, refu
     assert served.client.get(hall).status_code == 200
 
 
-@pytest.mark.parametrize("path", ["/healthz", "/readyz"])
-def test_a_balancer_may_ask_for_the_head_alone(served, path):
-    answer = served.client.head(path)
-    assert (answer.status_code, answer.content) == (200, b"")
-    assert int(answer.headers["content-length"]) > 0
-
-
 def test_the_page_of_the_api_loads_its_own_files_alone(served):
     page = served.client.get("/docs")
     assert page.status_code == 200

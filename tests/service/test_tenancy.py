@@ -84,8 +84,3 @@ def test_retention_is_tried_set_and_told(house, small_shots):
     assert house.ask("tenant", "GET", path).json()["retention_days"] is None
     assert house.ask("robot", "PATCH", path, json={"retention_days": 1}).status_code == 403
     assert house.ask("tenant", "PATCH", path, json={"retention_days": 1e-9}).json()["overdue"] == 1
-    house.engine.publish_due()
-    told = house.ask("tenant", "GET", path).json()
-    assert (told["frames"], told["used_bytes"], told["overdue"]) == ({"deleted": 1}, 0, 0)
-    [event] = house.ask("robot", "GET", "/v1/events?kind=frame.deleted").json()["items"]
-    assert event["data"] == {"reason": "retention"}

@@ -29,15 +29,8 @@ from service.limits import (
 )  # fmt: skip
 from service.metrics import MOST_TENANTS, Metrics
 from service.middleware import RequestMiddleware
+from tests.service.conftest import Clock
 from tests.whole_engine import Engine
-
-
-class Clock:
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,11 @@
 """Tests of uploads under an id, as bodies, with idempotency keys, priorities and in batches."""
 
-import io
 import json
 
 import numpy as np
 import pytest
+
+from sceneprint.formats.depth_file import encode_npy
 
 BASE = {"translation": {"x": 0.1, "y": 0.0, "z": 0.4}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
 
@@ -30,9 +31,7 @@ def test_depth_that_does_not_look_like_it_is_taken_when_trusted(
     """It is signed from the store as well, where nobody says it again."""
     http, shot = served.client, small_shots[0]
     noise = (2000 * np.random.default_rng(3).gamma(60, 1 / 60, (120, 160))).astype(np.uint16)
-    out = io.BytesIO()
-    np.save(out, noise)
-    form = {"files": {"frame": ("frame.npy", out.getvalue())}}
+    form = {"files": {"frame": ("frame.npy", encode_npy(noise))}}
     problem = refused(http.post(f"{hall}/frames", **shot.form() | form), 422, "unreadable-frame")
     assert "--trust-depth, or `trust_depth` in the metadata" in problem["detail"]
     added = http.post(f"{hall}/frames", **shot.form(trust_depth=True) | form).json()
@@ -55,17 +54,18 @@ def test_an_id_that_is_none_is_refused(served, hall, small_shots, refused, name)
 
 def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_shots):
     http, shot = served.client, small_shots[2]
-    said = {"session": "raw", "robot": "r2", "tags": "a,b", "captured_at": "2026-01-02T03:04:05Z"}
-    pose, base = "1,2,3,0,0,0,1", "0.1,0,0.4,0,0,0,1"
-    raw = http.put(
-        f"{hall}/frames/raw",
-        **query(shot, **said, pose=pose, base=base, parent_frame="hall", up="0.6,-0.8,0"),
-    )
+    said = {
+        "session": "raw", "robot": "r2", "tags": "a,b", "captured_at": "2026-01-02T03:04:05Z",
+        "name": "depth/2.png", "sequence": "2", "pose": "1,2,3,0,0,0,1",
+        "base": "0.1,0,0.4,0,0,0,1", "parent_frame": "hall", "up": "0.6,-0.8,0",
+    }  # fmt: skip
+    raw = http.put(f"{hall}/frames/raw", **query(shot, **said))
     assert raw.status_code == 202
     form = shot.form(
         session="raw", robot="r2", tags=["a", "b"], captured_at="2026-01-02T03:04:05Z",
         pose={"translation": {"x": 1, "y": 2, "z": 3}, "rotation": BASE["rotation"],
               "parent_frame": "hall"}, T_base_sensor=BASE, up=[0.6, -0.8, 0],
+        name="depth/2.png", sequence=2,
     )  # fmt: skip
     again = http.put(f"{hall}/frames/raw", **form)
     assert (again.status_code, again.json()["frame_id"]) == (200, "raw")
