@@ -32,5 +32,12 @@ def write_rooms(root, frames, views=3):
 
 
 @pytest.fixture(scope="session")
+def whole_rooms(room_views, tmp_path_factory):
+    """The rooms with all samples: the third frames have no accepted match."""
+    frames = [frame for i in range(2) for frame in room_views(21, i, 3).frames]
+    return write_rooms(tmp_path_factory.mktemp("whole"), frames)
+
+
+@pytest.fixture(scope="session")
 def rooms(room_frames, tmp_path_factory):
     return write_rooms(tmp_path_factory.mktemp("rooms"), room_frames)

@@ -1,6 +1,5 @@
 """Tests of `sceneprint demo`, which removes its data however it ends."""
 
-import json
 import os
 import re
 import signal
@@ -15,15 +14,9 @@ import pytest
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.cli.options import ended_by_signals
 from sceneprint.errors import DatasetError
+from sceneprint.formats.dataset import Camera, write_intrinsics
+from sceneprint.types import Intrinsics
 from sceneprint_lab.cli.demo import choose_frames
-from tests.cli_service.conftest import write_rooms
-
-
-@pytest.fixture(scope="module")
-def rooms(room_views, tmp_path_factory):
-    """The rooms with all samples: their third frames have no accepted match."""
-    frames = [frame for i in range(2) for frame in room_views(21, i, 3).frames]
-    return write_rooms(tmp_path_factory.mktemp("whole"), frames)
 
 
 @pytest.fixture
@@ -64,11 +57,13 @@ def leaves_nothing(temporary):
     assert list(temporary.iterdir()) == []
 
 
-def test_demo_goes_the_whole_way_and_leaves_nothing(run_command, tmp_path, rooms, monkeypatch):
+def test_demo_goes_the_whole_way_and_leaves_nothing(
+    run_command, tmp_path, whole_rooms, monkeypatch
+):
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
     monkeypatch.setattr(tempfile, "tempdir", None)  # so that TMPDIR is read again
-    arguments = ("--dataset", rooms, "--workers", 1, "--out", tmp_path / "out")
+    arguments = ("--dataset", whole_rooms, "--workers", 1, "--out", tmp_path / "out")
     out = run_command("demo", *arguments).stdout
     service, uploaded, sent, queries, head, *lines = out.splitlines()
     assert re.match(r"service: http://127\.0\.0\.1:\d+, empty data folder, 1 worker", service)
@@ -84,22 +79,14 @@ def test_demo_goes_the_whole_way_and_leaves_nothing(run_command, tmp_path, rooms
 
 
 @pytest.mark.thorough
-def test_demo_that_is_stopped_leaves_nothing(demo, tmp_path, rooms):
-    process = demo("--dataset", rooms)
+def test_demo_that_is_stopped_leaves_nothing(demo, tmp_path, whole_rooms):
+    process = demo("--dataset", whole_rooms)
     assert process.stdout.readline().startswith("service: ")
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGTERM)  # as `make` does: it passes on what the terminal has sent
     _, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, err) == (130, "sceneprint demo: stopped\n")
     leaves_nothing(tmp_path / "tmp")
-
-
-def test_demo_needs_frames_for_the_map_and_to_look_up(run_command, rooms):
-    one = rooms / "room-0/seq-01/frame-000000.depth.png"
-    err = run_command("demo", "--dataset", one, expect=2).stderr
-    assert len(err.splitlines()) == 1
-    assert "(found: 1)" in err
-    assert "(found: 0)" in err
 
 
 def test_signals_that_are_ignored_stay_so_and_others_are_given_back():
@@ -121,31 +108,16 @@ def test_signals_that_are_ignored_stay_so_and_others_are_given_back():
 # Selection of frames.
 
 
-@pytest.fixture
-def scene(tmp_path):
-    scene = tmp_path / "scene"
-    scene.mkdir()
-    camera = {"width": 2, "height": 2, "fx": 1, "fy": 1, "cx": 0, "cy": 0}
-    (scene / "intrinsics.json").write_text(json.dumps(camera))
-    return scene
-
-
 def sequence(folder, frames):
     folder.mkdir(parents=True)
     for i in range(frames):
         (folder / f"frame-{i:06d}.depth.png").write_bytes(b"never read")
 
 
-def test_without_split_files_the_first_60_percent_are_the_map_and_5_are_left_out(scene):
-    sequence(scene / "seq-01", 100)
-    choice = choose_frames(scene)
-    database, queries = ([int(one.reference.name[-6:]) for one in some]
-                         for some in (choice.database, choice.queries))  # fmt: skip
-    assert (database, queries) == (list(range(60)), list(range(65, 100)))
-    assert {(one.parent, one.session) for one in choice.queries} == {("scene", "seq-01")}
-
-
-def test_split_files_decide_where_they_are(scene):
+def test_split_files_decide_where_they_are(tmp_path):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    write_intrinsics(scene, Camera(Intrinsics(2, 2, 1.0, 1.0, 0.0, 0.0)))
     sequence(scene / "seq-01", 3)
     sequence(scene / "seq-02", 2)
     (scene / "TrainSplit.txt").write_text("sequence2\n")

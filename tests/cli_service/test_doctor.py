@@ -2,7 +2,6 @@
 
 import re
 import sqlite3
-from pathlib import Path
 
 import pytest
 from pydantic import SecretStr
@@ -10,12 +9,8 @@ from pydantic import SecretStr
 from benchmarks.waiting import until
 from sceneprint import __version__
 from sceneprint.cli import doctor
-from sceneprint.cli.checks import (
-    queue_check,
-    service_checks,
-    worker_check,
-)
-from sceneprint.cli.doctor import database, object_stores
+from sceneprint.cli.checks import queue_check, service_checks, worker_check
+from sceneprint.cli.doctor import object_stores
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.settings import Settings
 from sceneprint_client import Client
@@ -128,6 +123,8 @@ def test_databases_of_other_versions(tmp_path):
         ("sqlite://", "WRONG", "is an in-memory database"),
         ("postgresql://me:p@ss:hidden@host/db", "WRONG", "the port is not a number"),
         ("nonsense", "WRONG", "not an SQLAlchemy URL"),
+        ("postgresql://me:hidden@127.0.0.1:1/maps", "WRONG", "postgresql://me@127.0.0.1:1/maps: "),
+        ("mysql://me:hidden@host/maps", "WRONG", "'mysql' is not a supported database"),
     ],
 )
 def test_addresses_of_databases(sceneprint, tmp_path, monkeypatch, url, verdict, said):
@@ -171,20 +168,6 @@ def test_workers_that_are_missing(waiting):
 
 
 # Servers and object stores.
-
-
-@pytest.mark.parametrize(
-    ("url", "said"),
-    [
-        ("postgresql://me:hidden@127.0.0.1:1/maps", "postgresql://me@127.0.0.1:1/maps: "),
-        ("mysql://me:hidden@host/maps", "'mysql' is not a supported database"),
-    ],
-)
-def test_a_server_that_cannot_be_asked(url, said):
-    found = database(Settings(data_dir=Path("/nowhere"), database_url=SecretStr(url)))
-    assert (found.verdict, found.subject) == ("WRONG", "database")
-    assert said in found.text
-    assert "hidden" not in found.text
 
 
 def test_object_stores(bucket, tmp_path, monkeypatch):

@@ -63,19 +63,11 @@ def test_a_key_gets_a_new_secret_while_the_old_one_works(keys, tmp_path):
 
 
 def test_a_key_may_do_what_it_was_made_for(keys, tmp_path):
-    given = ("--scope", "write", "--map", "hall", "--map", "yard", "--expires", "30d")
-    keys("--create", "robot", *given)
-    keys("--create", "screen", "--scope", "read")
-    before = datetime.now(UTC)
-    robot, screen = listed(keys)
-    assert screen == "screen  read of all"
-    told, until = robot.split(", until ")
-    assert told == "robot  write of hall, write of yard"
-    left = datetime.fromisoformat(until) - before
-    assert timedelta(days=30) - timedelta(seconds=60) < left <= timedelta(days=30)
+    keys("--create", "robot", "--scope", "write", "--map", "hall", "--map", "yard")
     with Engine(Settings(data_dir=tmp_path, database_url=None)) as engine:
-        engine.create_key("late", expires_at=before - timedelta(days=1))
-    (late,) = [line for line in listed(keys) if "late" in line]
+        engine.create_key("late", expires_at=datetime.now(UTC) - timedelta(days=1))
+    late, robot = listed(keys)
+    assert robot == "robot  write of hall, write of yard"
     assert ", expired " in late
 
 

@@ -61,17 +61,10 @@ def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch):
 
 
 def test_a_misspelt_setting_is_refused_and_variables_of_others_are_not(monkeypatch):
-    for other in (
-        "SCENEPRINT_DATABASE_URL_FILE",
-        "SCENEPRINT_KEY",
-        "SCENEPRINT_URL",
-        "SCENEPRINT_X",
-    ):
-        monkeypatch.setenv(other, "1")
+    for other in ("DATABASE_URL_FILE", "KEY", "URL", "X"):
+        monkeypatch.setenv(f"SCENEPRINT_{other}", "1")
     settings_of(argparse.Namespace())
-    for name, meant in (
-        ("QUEUD_REQUESTS", "QUEUED_REQUESTS"), ("PRT", "PORT"),
-    ):  # fmt: skip
+    for name, meant in (("QUEUD_REQUESTS", "QUEUED_REQUESTS"), ("PRT", "PORT")):
         with monkeypatch.context() as changed:
             changed.setenv(f"SCENEPRINT_{name}", "1")
             text = f"SCENEPRINT_{name} is not a setting. Did you mean SCENEPRINT_{meant}?"

@@ -61,19 +61,18 @@ def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_pat
 
 
 @pytest.fixture
-def run_example(rooms, tmp_path, monkeypatch, capsys):
-    def example(url, *more):
+def example(rooms, tmp_path, monkeypatch, capsys):
+    def run(url, *more):
         given = [rooms, "offline-example", "--spool", tmp_path / "spool", "--url", url, *more]
         monkeypatch.setattr(sys, "argv", ["offline_robot.py", *map(str, given)])
         capsys.readouterr()
         runpy.run_path(str(ROOT / "examples" / "offline_robot.py"), run_name="__main__")
         return capsys.readouterr().out.splitlines()
 
-    return example
+    return run
 
 
-def test_the_example_goes_on_while_it_is_offline(service_url, run_example):
-    example = run_example
+def test_the_example_goes_on_while_it_is_offline(service_url, example):
     told = example("http://127.0.0.1:9")
     assert told[0].startswith("offline, 6 frames wait: http://127.0.0.1:9 cannot be reached")
     assert told[1] == "0 uploaded, 6 wait, 0 thinned"

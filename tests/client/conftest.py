@@ -12,10 +12,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from sceneprint.formats.dataset import (
-    find_sequences,
-    write_depth_png,
-)
+from sceneprint.formats.dataset import find_sequences, write_depth_png
 from sceneprint_client import Client, http
 from sceneprint_client.api import FrameMeta, JobState, Localization
 from sceneprint_client.poses import quaternion_of

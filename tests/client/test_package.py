@@ -1,16 +1,11 @@
 """Tests of the client's package: its imports, its shared code with the service, and its wheel."""
 
-import json
 import math
-import os
-import shutil
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 from typing import get_args
-
-import pytest
 
 import sceneprint_client
 from sceneprint.geometry.retrieval.ranking import DiversityParameters, Metric
@@ -69,77 +64,3 @@ def test_the_distributions_have_one_version():
     assert {one.partition(">")[0] for one in client["dependencies"]} == {
         "httpx", "numpy", "pydantic",
     }  # fmt: skip
-
-
-def oldest_python():
-    """A Python 3.10 that starts (a shim of pyenv may not), or the Python of the tests."""
-    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
-    for found in (shutil.which("python3.10"), *pyenv.glob("versions/3.10.*/bin/python3.10")):
-        if (
-            found
-            and not subprocess.run([found, "-c", ""], capture_output=True, check=False).returncode
-        ):
-            return str(found)
-    return sys.executable
-
-
-#: Maps a place from files, loses its way in it, and is told what it does wrong.
-ROBOT = """
-import json, sys
-from sceneprint_client import Client, errors
-from sceneprint_client.api import JobState
-url, asked, *mapped = sys.argv[1:]
-told = {"python": sys.version_info[:2], "state": [str(JobState.QUEUED), f"{JobState.QUEUED}"]}
-with Client(url) as client:
-    client.create_map("wheel", model="depth")
-    told["healthy"] = client.healthy()
-    told["uploads"] = [client.upload("wheel", path, wait_s=60).state for path in mapped]
-    answer = client.localize("wheel", asked)
-    told["status"] = answer.status
-    translation = answer.pose.translation
-    told["at"] = [translation.x, translation.y, translation.z]
-    try:
-        client.frame("wheel", "nobody")
-    except errors.UnknownFrame as error:
-        told["frame"] = str(error)
-    client.delete_map("wheel")
-try:
-    Client.embedded("nowhere")
-except errors.MissingDependency as error:
-    told["embedded"] = str(error)
-from sceneprint_client import meta_of
-told["loaded"] = sorted({"sceneprint", "numba", "scipy"} & set(sys.modules))
-print(json.dumps(told))
-"""
-
-
-@pytest.mark.thorough
-def test_the_wheel_localises_alone(tmp_path, service_url, references):
-    """In an empty environment, of the oldest Python that there is, against a service over HTTP."""
-    source = tmp_path / "source"
-    shutil.copytree(ROOT / "client", source, ignore=shutil.ignore_patterns("*.egg-info", "build"))
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    built = [*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path)]
-    subprocess.run([*built, str(source)], check=True)
-    [wheel] = tmp_path.glob("sceneprint_client-*-py3-none-any.whl")
-    python, oldest = tmp_path / "env" / "bin" / "python", oldest_python()
-    subprocess.run([oldest, "-m", "venv", str(tmp_path / "env")], check=True)
-    installed = [str(python), "-m", "pip", "--quiet", "--disable-pip-version-check", "install"]
-    subprocess.run([*installed, str(wheel)], check=True)
-    mapped = references[:3]
-    asked = mapped[1]
-    done = subprocess.run(
-        [str(python), "-I", "-c", ROBOT, service_url, asked.path, *(one.path for one in mapped)],
-        capture_output=True, text=True, cwd=tmp_path, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert told["python"] == [3, 10] or oldest == sys.executable
-    assert told["state"] == ["queued", "queued"]
-    assert told["healthy"]
-    assert told["uploads"] == ["indexed"] * len(mapped)
-    assert told["status"] == "found"
-    assert math.dist(told["at"], asked.pose[:3, 3]) < 0.10
-    assert told["frame"].startswith("There is no frame 'nobody'")
-    assert told["embedded"].endswith("In a clone, run: pip install .")
-    assert told["loaded"] == []

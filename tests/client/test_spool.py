@@ -1,6 +1,5 @@
 """Tests of the spool of an offline robot, which never loses or duplicates frames after a kill."""
 
-import io
 import json
 import os
 import random
@@ -16,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks.waiting import PATIENCE_S
+from sceneprint.formats.depth_file import encode_png
 from sceneprint_client import Client, Spool, meta_of
 from sceneprint_client.api import CameraIntrinsics, FrameMeta
 from sceneprint_client.api.base import GivenPose
@@ -30,7 +29,7 @@ from sceneprint_client.errors import (
     UnreadableFrame,
     UnusableStore,
 )
-from sceneprint_client.spool import SpoolPlace, pose_matrix, separation
+from sceneprint_client.spool import SpoolPlace, separation
 
 START = datetime(2026, 11, 26, 9, 0, tzinfo=UTC)
 CAMERA = CameraIntrinsics(width=16, height=12, fx=14, fy=14, cx=7.5, cy=5.5)
@@ -67,12 +66,6 @@ def broken(number, known):
     return f"none, {number}".encode().ljust(150_000), known
 
 
-def png_of(image):
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
 def names(path):
     with closing(sqlite3.connect(path)) as database, database:
         rows = database.execute("SELECT meta FROM frames WHERE reason IS NULL ORDER BY id")
@@ -80,7 +73,7 @@ def names(path):
 
 
 def test_what_its_robot_can_still_mend_is_not_kept(tmp_path):
-    png = png_of(depth(1))
+    png = encode_png(depth(1))
     with Spool(tmp_path / "spool") as spool:
         with pytest.raises(UnreadableFrame, match="The frame is empty"):
             spool.add(b"", meta())
@@ -102,23 +95,6 @@ def test_a_metre_thirty_degrees_and_a_minute_weigh_the_same():
     assert separation(SpoolPlace(0, here), SpoolPlace(90)) == pytest.approx(1.5)
     back = np.diag([-1.0, -1.0, 1.0, 1.0])
     assert separation(SpoolPlace(0, here), SpoolPlace(0, back)) == pytest.approx(6.0)
-
-
-def test_a_pose_is_read_in_both_forms():
-    given = GivenPose.model_validate(
-        {
-            "translation": {"x": 1, "y": 2, "z": 3},
-            "rotation": {"x": 0, "y": 0, "z": 2, "w": 2},  # 90 degrees about z
-        }
-    )
-    expected = [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
-    found = pose_matrix(given)
-    assert found is not None
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-    same = pose_matrix(GivenPose(matrix=[[float(one) for one in row] for row in expected]))
-    np.testing.assert_array_equal(same, expected)
-    nowhere = {"translation": {"x": 1, "y": 2, "z": 3}, "rotation": dict.fromkeys("xyzw", 0)}
-    assert pose_matrix(GivenPose.model_validate(nowhere)) is None
 
 
 def test_a_full_spool_gives_up_the_frame_nearest_to_its_neighbours(tmp_path):

@@ -9,8 +9,6 @@ from PIL import Image
 
 from sceneprint.errors import InvalidRequest, NotFound, UnknownMap
 from sceneprint_client.api import JobState
-from sceneprint_client.api.surface import SurfaceTile
-from sceneprint_client.errors import Refused
 from sceneprint_client.surface_encoding import decode_tile
 
 MAP, PLAIN = "produced", "poseless"
@@ -61,15 +59,11 @@ def test_what_a_surface_refuses(fused):
             call("nowhere")
     with pytest.raises(InvalidRequest):
         fused.begin_surface(PLAIN)
-    assert (fused.surface(PLAIN).state, fused.surface(PLAIN).frames_left) == ("none", 0)
     for name in ("../x", "0" * 32):
         with pytest.raises(NotFound):
             fused.surface_tile(MAP, name)
     with pytest.raises(InvalidRequest, match="Specify either `at` or `box`"):
         list(fused.surface_frames(MAP))
-    tile = SurfaceTile(column=0, row=0, floor=0, cells=2, bytes=16, digest="x")
-    with pytest.raises(Refused, match="15 bytes do not hold 2 cells"):
-        decode_tile(bytes(15), tile, 1.0)
 
 
 def test_a_tile_is_kept_for_ever_and_a_plan_asked_for_again(fused, service_url):

@@ -13,27 +13,21 @@ from sceneprint_client.surface_encoding import decode_points
 CORNERS = np.array([[x, y, z] for x in (-1.5, 2.25) for y in (0.0, 8.0) for z in (0.125, 0.5)])
 
 
-def test_corners_are_exact_and_all_others_within_half_a_step():
+def test_points_are_read_as_they_were_encoded():
     rng = np.random.default_rng(1)
     points = np.concatenate([CORNERS, rng.uniform(CORNERS.min(0), CORNERS.max(0), (200, 3))])
-    told = decode_points(encode_points(points, total=900))
-    np.testing.assert_array_equal(told.points[: len(CORNERS)], CORNERS)
+    plain = decode_points(encode_points(points, total=900))
+    np.testing.assert_array_equal(plain.points[: len(CORNERS)], CORNERS)
     half = np.ptp(CORNERS, axis=0) / 65535 / 2
-    assert (abs(told.points - points) <= half * (1 + 1e-9)).all()
-    assert (told.total, told.tolerance_m) == (900, 0.0)
-    assert told.normals is told.patches is told.residuals is None
-
-
-def test_what_is_told_of_points():
+    assert (abs(plain.points - points) <= half * (1 + 1e-9)).all()
+    assert (plain.total, plain.tolerance_m) == (900, 0.0)
+    assert plain.normals is plain.patches is plain.residuals is None
     normals = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0.6, 0.8]])
-    patches = np.array([4, -1, 0], np.int32)
-    residuals = np.array([1, 250, 254], np.uint8)
-    told = decode_points(encode_points(np.eye(3), normals, patches, residuals, scale=0.25))
-    np.testing.assert_array_equal(told.normals[:2], normals[:2])
-    np.testing.assert_allclose(told.normals[2], normals[2], atol=0.5 / 127)
-    assert told.patches.tolist() == [4, -1, 0]
-    assert told.residuals.tolist() == [1, 250, 254]
-    assert told.tolerance_m == 0.25
+    patches, residuals = np.array([4, -1, 0], np.int32), np.array([1, 250, 254], np.uint8)
+    whole = decode_points(encode_points(np.eye(3), normals, patches, residuals, scale=0.25))
+    np.testing.assert_allclose(whole.normals, normals, atol=0.5 / 127)
+    assert (whole.patches.tolist(), whole.tolerance_m) == ([4, -1, 0], 0.25)
+    assert whole.residuals.tolist() == [1, 250, 254]
     assert len(decode_points(encode_points(np.zeros((0, 3)))).points) == 0
 
 

@@ -230,22 +230,6 @@ def test_the_prior_does_not_confirm_itself_for_ever():
     assert (state.status, state.age) == ("tracking", 0)
 
 
-def test_after_a_lift_that_it_is_told_of_equal_floors_are_ambiguous():
-    core = tracking()
-    assert core.reset("in a lift").reason == "in a lift"
-    for i in range(1, 6):
-        state = step(core, i, i, several(at(10, 20 + i, 0, 90), at(10, 20 + i, 3, 90)))
-        assert (state.status, state.T_map_odom) == ("ambiguous", None)
-    assert step(core, 6, 6, found(at(10, 26, 3, 90))).status == "tracking"
-
-
-def test_a_corridor_of_equal_doors_is_never_decided_by_alternatives():
-    core = TrackerCore()
-    for i in range(30):
-        doors = [at(10, 20 + i + 2 * n, 0, 90) for n in range(-2, 3)]
-        assert step(core, i, i, several(*doors)).status == "ambiguous"
-
-
 def test_no_answer_is_neither_for_nor_against():
     core = tracking()
     state = step(core, 1, 1, Observation("unanswered", reason="no answer: away"))
