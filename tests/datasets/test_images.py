@@ -98,43 +98,25 @@ def test_what_is_no_file(tmp_path, monkeypatch):
         decode_png(b"\0" * 1001)
 
 
-@pytest.mark.parametrize("scale", [0, -1, float("nan"), float("inf"), -0.0])
-@pytest.mark.parametrize("samples", [SAMPLES, METRES])
-def test_bad_scale(scale, samples):
-    with pytest.raises(InvalidIntrinsics, match=r"depth scale .* positive"):
-        make_frame(samples, CAMERA, depth_scale=scale)
-
-
 @pytest.mark.parametrize(
-    "samples",
+    ("samples", "scale", "error", "message"),
     [
-        np.zeros((3, 4), np.uint16),
-        np.full((3, 4), 65535, np.uint16),
-        np.full((3, 4), np.nan),
-        np.full((3, 4), -np.inf, np.float32),
-        np.full((3, 4), -2.0),
+        (SAMPLES, 0, InvalidIntrinsics, r"depth scale .* positive"),
+        (SAMPLES, float("nan"), InvalidIntrinsics, r"depth scale .* positive"),
+        (METRES, float("inf"), InvalidIntrinsics, r"depth scale .* positive"),
+        (np.full((3, 4), 65535, np.uint16), 1000, UselessFrame, "f: All 12 samples are missing"),
+        (np.full((3, 4), np.nan), 1000, UselessFrame, "f: All 12 samples are missing"),
+        (np.full((3, 4), -2.0), 1000, UselessFrame, "f: All 12 samples are missing"),
+        (np.ones((3, 4, 1), np.float32), 1000, UnreadableFrame, "two dimensions"),
+        (np.ones((0, 4), np.float32), 1000, UnreadableFrame, "two dimensions"),
+        (np.ones((3, 4), np.int16), 1000, UnreadableFrame, "Convert them"),
+        (np.ones((3, 4), object), 1000, UnreadableFrame, "Convert them"),
+        (SAMPLES.T, 1000, InvalidIntrinsics, "3 x 4 pixels, but the intrinsics are for 4 x 3"),
     ],
 )
-def test_nothing_seen(samples):
-    with pytest.raises(UselessFrame, match="f: All 12 samples are missing"):
-        make_frame(samples, CAMERA, name="f")
-
-
-@pytest.mark.parametrize("shape", [(12,), (3, 4, 1), (0, 4), ()])
-def test_bad_shape(shape):
-    with pytest.raises(UnreadableFrame, match="two dimensions"):
-        make_frame(np.ones(shape, np.float32), CAMERA)
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int32, np.uint32, bool, complex, object])
-def test_bad_type(dtype):
-    with pytest.raises(UnreadableFrame, match="Convert them"):
-        make_frame(np.ones((3, 4), dtype), CAMERA)
-
-
-def test_intrinsics_of_another_image():
-    with pytest.raises(InvalidIntrinsics, match="3 x 4 pixels, but the intrinsics are for 4 x 3"):
-        make_frame(SAMPLES.T, CAMERA)
+def test_arrays_that_are_no_depth(samples, scale, error, message):
+    with pytest.raises(error, match=message):
+        make_frame(samples, CAMERA, depth_scale=scale, name="f")
 
 
 @pytest.mark.parametrize("scale", [1000.0, 5000.0, 1e-34, 3.7])

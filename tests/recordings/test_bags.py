@@ -12,6 +12,7 @@ from sceneprint.formats.recording.outline import bag_outline
 from sceneprint.formats.recording.selection import RecordingOptions
 from sceneprint.types import DepthFrame
 from sceneprint_client.frame_files import meta_of
+from tests.scans.conftest import rows_of
 
 ALL = RecordingOptions(keyframe_m=0)
 
@@ -113,9 +114,7 @@ def test_points_have_the_pose_of_their_sensor(container, tmp_path, ros, walk):
         "names": ["ring", "z", "intensity", "x", "y"], "offsets": [0, 2, 6, 10, 17],
         "formats": ["<u2", "<f4", "<f4", "<f4", "<f4"], "itemsize": 23,
     }  # fmt: skip
-    rows = np.zeros(len(xyz), np.dtype(form))
-    for axis, name in enumerate("xyz"):
-        rows[name] = xyz[:, axis]
+    rows = rows_of(xyz, np.dtype(form))
 
     def fill(writer):
         writer.transforms(0.0, {("base_link", "lidar"): ros.camera}, "/tf_static")

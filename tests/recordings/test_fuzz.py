@@ -13,6 +13,7 @@ from sceneprint.errors import DatasetError, SceneprintError, UnreadableCloud, Un
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.outline import bag_outline
 from sceneprint.formats.recording.selection import RecordingOptions
+from tests.scans.conftest import rows_of
 
 DEPTH, POINTS = "/camera/depth/image_raw", "/points"
 
@@ -53,9 +54,7 @@ def check(error):
 def small(tmp_path_factory, ros, walk):
     """A bag of everything in each container, small enough to be cut at many places."""
     rng = np.random.default_rng(0)
-    rows = np.zeros(30, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
-    for name in "xyz":
-        rows[name] = rng.uniform(1, 5, 30)
+    rows = rows_of(rng.uniform(1, 5, (30, 3)), [(name, "<f4") for name in "xyz"])
 
     def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
@@ -102,19 +101,12 @@ def test_whole_bags_are_read(kind, small):
 
 @pytest.mark.parametrize("times", DAMAGED)
 @pytest.mark.parametrize("kind", ALL_KINDS)
-def test_bags_that_were_cut_off(kind, times, small, tmp_path):
-    whole = content_of(small[kind])
-    places = {0, 1, 7, 8, 9, 13, 40, len(whole) - 1, len(whole) - 8, len(whole) - 37}
-    places |= set(np.random.default_rng(1).integers(0, len(whole), times - 10).tolist())
-    for number, place in enumerate(sorted(places)):
-        read_all(damaged(small[kind], tmp_path, whole[:place], number))
-
-
-@pytest.mark.parametrize("times", DAMAGED)
-@pytest.mark.parametrize("kind", ALL_KINDS)
-def test_bags_with_other_bytes(kind, times, small, tmp_path):
+def test_bags_that_were_cut_off_or_have_other_bytes(kind, times, small, tmp_path):
     whole, rng = content_of(small[kind]), np.random.default_rng(2)
-    for number in range(times):
+    places = {0, 1, 7, 8, 9, 13, 40, len(whole) - 1, len(whole) - 8, len(whole) - 37}
+    places |= set(rng.integers(0, len(whole), times - 10).tolist())
+    contents = [whole[:place] for place in sorted(places)]
+    for _ in range(times):
         content = bytearray(whole)
         for _ in range(int(rng.integers(1, 4))):
             at = int(rng.integers(0, len(content) - 8))
@@ -124,7 +116,9 @@ def test_bags_with_other_bytes(kind, times, small, tmp_path):
             )  # fmt: skip
             new = kinds[int(rng.integers(0, len(kinds)))]
             content[at : at + len(new)] = new
-        read_all(damaged(small[kind], tmp_path, bytes(content), number))
+        contents.append(bytes(content))
+    for number, content in enumerate(contents):
+        read_all(damaged(small[kind], tmp_path, content, number))
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from sceneprint.errors import DatasetError, UnreadableCloud
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.selection import RecordingOptions
+from tests.scans.conftest import rows_of
 
 JOINED = RecordingOptions(join_m=2.05, keyframe_m=0.5)
 #: Interval of scans, of which each takes the whole interval, and of odometry, seconds.
@@ -54,9 +55,7 @@ def write_walls(writer, kind):
             writer.livox(t, points, seconds, package=kind)
             continue
         names = ["x", "y", "z", *([] if kind == "untimed" else [kind])]
-        rows = np.zeros(20, [(name, "<u4" if name == "t" else "<f4") for name in names])
-        for axis, name in enumerate("xyz"):
-            rows[name] = points[:, axis]
+        rows = rows_of(points, [(name, "<u4" if name == "t" else "<f4") for name in names])
         if kind != "untimed":
             rows[kind] = np.round(seconds * (1e9 if kind == "t" else 1), 9)
         writer.points(t, rows, "/livox/lidar", frame="livox_frame")
@@ -104,9 +103,7 @@ def test_registered_scans_are_joined_as_they_are(tmp_path, ros):
         for number in range(30):
             t = SCAN_S * number
             writer.transforms(t, {("camera_init", "body"): pose(t)})
-            rows = np.zeros(20, [(name, "<f4") for name in ("x", "y", "z", "time")])
-            for axis, name in enumerate("xyz"):
-                rows[name] = wall(number)[:, axis]
+            rows = rows_of(wall(number), [(name, "<f4") for name in ("x", "y", "z", "time")])
             rows["time"] = np.linspace(0.0, 0.0999, 20)
             writer.points(t, rows, "/cloud_registered", frame="camera_init")
 

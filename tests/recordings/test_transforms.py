@@ -9,6 +9,7 @@ import pytest
 from sceneprint.errors import DatasetError
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.formats.recording.selection import RecordingOptions
+from tests.scans.conftest import rows_of
 
 ALL = RecordingOptions(keyframe_m=0, keyframe_s=0)
 IMAGE = np.full((60, 80), 2000, np.uint16)
@@ -220,9 +221,8 @@ def registered(ros, writer, *, frame, tf, leaf=""):
         if tf:
             writer.transforms(float(i), {(frame, "body"): T})
         T_world_lidar = T @ ros.transform(0.1, 0, 0.4)
-        rows = np.zeros(len(SEEN), [("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
-        for axis, name in enumerate("xyz"):
-            rows[name] = (SEEN @ T_world_lidar[:3, :3].T + T_world_lidar[:3, 3])[:, axis]
+        points = SEEN @ T_world_lidar[:3, :3].T + T_world_lidar[:3, 3]
+        rows = rows_of(points, [(name, "<f8") for name in "xyz"])
         writer.points(float(i), rows, "/cloud_registered", frame=frame)
 
 

@@ -6,6 +6,7 @@ import pytest
 from sceneprint.errors import UnreadableCloud
 from sceneprint_client.files import read_livox_scan
 from sceneprint_client.ros_messages import cloud_points, timed_points
+from tests.scans.conftest import rows_of
 
 SECONDS = np.linspace(0.0, 0.099, 12)
 XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
@@ -22,9 +23,7 @@ XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     ],
 )
 def test_times_of_drivers(name, kind, unit, epoch, points, ros):
-    rows = np.zeros(len(points), [*XYZ, ("ring", "<u2"), (name, kind)])
-    for axis, axis_name in enumerate("xyz"):
-        rows[axis_name] = points[:, axis] + 10
+    rows = rows_of(points + 10, [*XYZ, ("ring", "<u2"), (name, kind)])
     rows[name] = np.round((SECONDS + epoch * (ros.start + 1.5)) * unit, 6)
     rows["x"][3] = np.nan
     writer = ros.messages()
