@@ -8,7 +8,6 @@ from sceneprint.geometry.signature.fisher_vector import (
     fisher_vector,
     normalise,
     quantise,
-    signature,
     statistics_of_counts,
     statistics_of_features,
 )
@@ -60,12 +59,6 @@ def test_normalised_by_hand():
         normalise(np.array([4.0, -9.0, 0.0, 36.0])), [2 / 7, -3 / 7, 0, 6 / 7], rtol=1e-12
     )
     assert normalise(np.zeros(5)).tolist() == [0.0] * 5
-
-
-def test_signature_is_its_levels_end_to_end():
-    fine, coarse = np.array([4.0, -9.0, 0.0, 36.0]), np.array([0.0, -0.25, 0.0, 0.0])
-    expected = [2 / 7, -3 / 7, 0, 6 / 7, 0, -1, 0, 0]
-    np.testing.assert_allclose(signature([fine, coarse]), expected, rtol=1e-12)
 
 
 def table_of(features, mixture):

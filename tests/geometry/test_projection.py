@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sceneprint.geometry.signature.pair_features import Projection, fit_projection, project
+from sceneprint.geometry.signature.pair_features import fit_projection, project
 
 RNG_SEED = 11
 
@@ -12,18 +12,6 @@ def correlated(n=3000):
     rng = np.random.default_rng(RNG_SEED)
     mixing = rng.normal(size=(13, 13))
     return rng.normal(size=(n, 13)) @ mixing * np.logspace(-2, 2, 13) + rng.normal(size=13) * 10
-
-
-def test_project_by_hand():
-    matrix = np.zeros((12, 13))
-    matrix[0, 0], matrix[0, 12], matrix[3, 1] = 2.0, -1.0, 0.5
-    projection = Projection(np.arange(13.0), matrix)
-    # f' - mean = 1 everywhere, then 3 everywhere
-    f = project(np.array([np.arange(13.0) + 1, np.arange(13.0) + 3]), projection)
-    assert f.shape == (2, 12)
-    assert f[:, 0].tolist() == [1.0, 3.0]
-    assert f[:, 3].tolist() == [0.5, 1.5]
-    assert not np.delete(f, [0, 3], axis=1).any()
 
 
 def test_pca_equals_an_eigendecomposition():

@@ -14,7 +14,6 @@ from sceneprint.geometry.retrieval.ranking import (
     rank,
     ranking_size,
     scan,
-    similarity,
 )
 
 METRICS = ("l1", "l2")
@@ -109,11 +108,6 @@ def test_ranking_equals_a_full_sort(values, size):
     assert found.similarities.tolist() == [max(1 - d / 4, 0.0) for d in found.distances.tolist()]
     assert len(found) == min(size, len(values))
     assert (found.indices.dtype, found.distances.dtype) == (np.intp, np.int64)
-
-
-def test_similarity_by_hand():
-    found = similarity(np.array([0, 50, 200, 300]), 200.0)
-    assert found.tolist() == [1.0, 0.75, 0.0, 0.0]
 
 
 def test_size_of_a_ranking():

@@ -80,16 +80,6 @@ def test_centres_by_hand():
     )
 
 
-def test_few_patches_have_no_pairs():
-    patches = scenes.random_patches(np.random.default_rng(0), 2)
-    for n in (0, 1):
-        few = count_pairs(patches.means[:n], patches.normals[:n], np.ones(n), SMALL, P)
-        assert (few.n_pairs, few.total, few.weights.sum()) == (0, 0, 0)
-    # in the same place, or out of reach
-    for means in (np.zeros((2, 3)), np.array([[0, 0, 0], [3, 0, 0]], float)):
-        assert count_pairs(means, patches.normals, np.ones(2), SMALL, P).n_pairs == 0
-
-
 def test_a_pair_weighs_the_product_of_its_patches():
     patches = scenes.random_patches(np.random.default_rng(4), 12)
     weights = np.random.default_rng(5).uniform(0.1, 3, 12)
