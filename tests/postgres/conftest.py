@@ -1,7 +1,5 @@
 """Fixtures of the PostgreSQL tests: stores, and waits for conditions."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import pytest

@@ -13,6 +13,7 @@ from sceneprint.store import queue
 from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.tables import jobs
 from sceneprint_client.api import JobState
+from tests.store.conftest import Hand
 
 BLOCKED = text(
     "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database() "
@@ -31,20 +32,9 @@ def store(server_store):
     return server_store
 
 
-def claim(store, worker="w", lease_s=60.0):
-    with store.database.write(turn=False) as connection:
-        return queue.claim(connection, worker, lease_s)
-
-
-def claimed(store, worker="w", lease_s=60.0):
-    held = claim(store, worker, lease_s)
-    assert held is not None
-    return held
-
-
-def now_is(store, job):
-    with store.database.read() as connection:
-        return queue.find_job(connection, job.id)
+@pytest.fixture
+def hand(store):
+    return Hand(store)
 
 
 def turned(store, job, **values):
@@ -75,19 +65,19 @@ def beside(store, until, what):
     return begun
 
 
-def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(store):
+def test_a_claim_waits_for_no_turn_and_passes_over_what_another_has_in_hand(store, hand):
     with store.database.write(), uncommitted(store) as (connection, commit):
         first = queue.claim(connection, "a", 60.0)
-        second, third = claimed(store, "b"), claimed(store, "c")
-        assert claim(store, "d") is None
+        second, third = hand.taken("b"), hand.taken("c")
+        assert hand.take("d") is None
         commit()
     assert first is not None
     assert [held.number for held in (first, second, third)] == [1, 2, 3]
-    assert [now_is(store, held).worker for held in (first, second, third)] == ["a", "b", "c"]
+    assert [hand.row(held).worker for held in (first, second, third)] == ["a", "b", "c"]
 
 
-def test_what_fell_silent_is_locked_only_by_who_takes_it(store):
-    silent = claimed(store, "dead", -1.0)
+def test_what_fell_silent_is_locked_only_by_who_takes_it(store, hand):
+    silent = hand.taken("dead", -1.0)
     with store.database.write(turn=False) as connection:
         held = queue.claim(connection, "a", 60.0)
         assert held.number == 2  # what was not tried yet goes first
@@ -95,12 +85,12 @@ def test_what_fell_silent_is_locked_only_by_who_takes_it(store):
             other.execute(text("SET LOCAL lock_timeout = 1"))
             queue.renew(other, silent, 60.0)  # nobody has it locked
     turned(store, silent, leased_until=0.0)
-    third, again = claimed(store, "b"), claimed(store, "c")
+    third, again = hand.taken("b"), hand.taken("c")
     assert (third.number, again.number, again.token) == (3, 1, 2)
 
 
 @pytest.mark.parametrize("first", ["claim", "cancel"])
-def test_a_claim_beside_a_cancellation(store, until, first):
+def test_a_claim_beside_a_cancellation(store, hand, until, first):
     with store.database.read() as connection:
         job = queue.find_job(connection, _id_of(connection, 1))
 
@@ -120,8 +110,8 @@ def test_a_claim_beside_a_cancellation(store, until, first):
     else:
         with store.database.write() as connection:
             queue.cancel(connection, job)
-            assert claimed(store).number == 2  # passed over, though not committed
-    assert now_is(store, job).state == JobState.CANCELLED
+            assert hand.taken().number == 2  # passed over, though not committed
+    assert hand.row(job).state == JobState.CANCELLED
 
 
 def _id_of(connection, number):
@@ -130,10 +120,9 @@ def _id_of(connection, number):
 
 
 @pytest.mark.parametrize("what", ["finish", "check_held", "renew"])
-def test_an_end_that_comes_late_and_a_claim_take_effect_once(store, until, what):
-    """The lease is over, and both find the job: the second waits, and finds that it lost it."""
-    late = claimed(store, "late", -1.0)
-    claimed(store, "b"), claimed(store, "c")
+def test_an_end_that_comes_late_and_a_claim_take_effect_once(store, hand, until, what):
+    late = hand.taken("late", -1.0)
+    hand.taken("b"), hand.taken("c")
 
     def end(connection):
         if what == "finish":
@@ -145,7 +134,7 @@ def test_an_end_that_comes_late_and_a_claim_take_effect_once(store, until, what)
 
     with store.database.write() as connection:  # the end is first
         end(connection)
-        assert claim(store, "next") is None
+        assert hand.take("next") is None
     turned(store, late, state=JobState.RUNNING, leased_until=0.0)
 
     def ends():
@@ -158,13 +147,13 @@ def test_an_end_that_comes_late_and_a_claim_take_effect_once(store, until, what)
         commit()
     with pytest.raises(LostLease):
         done.result(PATIENCE_S)
-    assert now_is(store, late).worker == "next"
-    assert now_is(store, late) == held
+    assert hand.row(late).worker == "next"
+    assert hand.row(late) == held
 
 
-def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(store, until):
-    dead = claimed(store, "dead", -1.0)
-    claimed(store, "b"), claimed(store, "c")
+def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(store, hand, until):
+    dead = hand.taken("dead", -1.0)
+    hand.taken("b"), hand.taken("c")
 
     def tell():
         with store.database.write() as connection:
@@ -177,11 +166,11 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(stor
         done = beside(store, until, tell)
         commit()
     assert done.result(PATIENCE_S) is None
-    assert now_is(store, dead) == held  # which is not queued again under its worker
+    assert hand.row(dead) == held  # which is not queued again under its worker
 
 
-def test_a_job_renewed_while_it_is_buried_keeps_running(store, until):
-    held = claimed(store, "w", -1.0)
+def test_a_job_renewed_while_it_is_buried_keeps_running(store, hand, until):
+    held = hand.taken("w", -1.0)
     turned(store, held, attempts=queue.MAXIMUM_ATTEMPTS)
 
     def bury():
@@ -193,31 +182,31 @@ def test_a_job_renewed_while_it_is_buried_keeps_running(store, until):
         done = beside(store, until, bury)
         commit()
     assert done.result(PATIENCE_S) == []
-    assert now_is(store, held).state == JobState.RUNNING
+    assert hand.row(held).state == JobState.RUNNING
 
 
-def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store):
-    held = claimed(store, "first")
+def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store, hand):
+    held = hand.taken("first")
     turned(store, held, worker="second")  # the same token: the standby lacked the first claim
     with pytest.raises(LostLease), store.database.write() as connection:
         queue.finish(connection, held, JobState.SUCCEEDED)
 
 
 @pytest.mark.parametrize("hours", [-5, 5])
-def test_the_clock_of_a_host_decides_nothing(store, monkeypatch, hours):
+def test_the_clock_of_a_host_decides_nothing(store, hand, monkeypatch, hours):
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() + 3600 * hours)
-    held = claimed(store, "w", 60.0)
+    held = hand.taken("w", 60.0)
     assert held.started_at == pytest.approx(real(), abs=30)
     assert held.leased_until == pytest.approx(real() + 60, abs=30)
-    claimed(store), claimed(store)
-    assert claim(store) is None  # no lease is over
+    hand.taken(), hand.taken()
+    assert hand.take() is None  # no lease is over
     with store.database.read() as connection:
         assert not queue.has_due(connection)
         assert 0 < (queue.due_in_s(connection) or 0) <= 60
         assert queue.read_clock(connection) == pytest.approx(real(), abs=30)
     with store.database.write() as connection:
         queue.release_job(connection, held)
-    assert claimed(store).number == held.number  # at once
+    assert hand.taken().number == held.number  # at once
     with store.database.write() as connection:
         assert queue.dead_letter(connection) == []

@@ -27,7 +27,6 @@ MAPS = 3
 
 
 def told(store):
-    """All events that a reader finds."""
     return next_events(store.database, EventFilter(), 0, 10_000).events
 
 

@@ -10,7 +10,6 @@ from sqlalchemy.exc import IntegrityError
 from sceneprint.engine.ingest import write_groups
 from sceneprint.engine.ingest.write_groups import NewFrames
 from sceneprint.errors import StoreLocked
-from sceneprint.process import of_request
 from sceneprint.store import open_database
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map
@@ -26,7 +25,6 @@ def new(row, content, **given):
 
 
 def receive(database, *given, wait_s=10.0):
-    """Whether each was taken."""
     with database.write_maps({one.row.number for one in given}, wait_s) as connection:
         ids = receive_frames(connection, given)
     return [one.frame_id in ids for one in given]
@@ -39,7 +37,6 @@ def counted(database):
 
 
 def content_of(database):
-    """Map, content and job of each frame in the order of their numbers."""
     with database.read() as connection:
         asked = (
             select(frames.c.map_number, frames.c.content_id, jobs.c.id)
@@ -104,7 +101,6 @@ def test_a_map_without_room_for_all_takes_none_and_others_take_theirs(
 
 
 def test_what_was_done_under_its_key_is_not_done_again(server_store, rows):
-    """And the answers of the others are remembered."""
     database, (a, b, _) = server_store.database, rows
     requests = [IdempotentRequest("robot", key, "0" * 64) for key in ("old", "new")]
 
@@ -122,18 +118,6 @@ def test_what_was_done_under_its_key_is_not_done_again(server_store, rows):
     with pytest.raises(IntegrityError, match="pk_idempotency"):
         receive(database, new(a, 8, result=kept(both)), new(b, 8, result=kept(both)))
     assert counted(database) == [("a", 2, 6), ("b", 1, 3), ("c", 0, 0)]
-
-
-def test_each_is_of_the_request_that_it_came_with(server_store, rows):
-    given = list[NewFrame]()
-    for name in ("one", "two"):
-        with of_request(name):
-            given.append(new(rows[0], len(given)))
-    with of_request("who writes"):
-        receive(server_store.database, *given)
-    with server_store.database.read() as connection:
-        data = connection.execute(select(jobs.c.data).order_by(jobs.c.number)).scalars()
-        assert [one["request_id"] for one in data] == ["one", "two"]
 
 
 @contextmanager
@@ -184,19 +168,12 @@ def together(group, given, until):
     return found
 
 
-def test_frames_of_many_threads_are_one_transaction(server_store, rows, until, monkeypatch):
-    database, sizes = server_store.database, list[int]()
-
-    def noted(connection, given):
-        sizes.append(len(given))
-        return receive_frames(connection, given)
-
-    monkeypatch.setattr(write_groups, "receive_frames", noted)
-    monkeypatch.setattr(write_groups, "MOST_TOGETHER", 5)
+def test_frames_of_many_threads_are_taken_once(server_store, rows, until, monkeypatch):
+    database = server_store.database
+    monkeypatch.setattr(write_groups, "MOST_TOGETHER", 5)  # two transactions
     given = [new(rows[i % 3], i // 2) for i in range(8)] + [new(rows[0], 0)]
     found = together(NewFrames(database), given, until)
-    assert (sorted(sizes), sum(found)) == ([4, 5], 8)
-    assert sum(one[1] for one in counted(database)) == 8
+    assert sum(found) == sum(one[1] for one in counted(database)) == 8
     with database.read() as connection:
         assert set(connection.execute(select(frames.c.id)).scalars()) == {
             one.frame_id for one, taken in zip(given, found, strict=True) if taken

@@ -1,31 +1,26 @@
 """Tests of a recovery to the moment before an accidental deletion."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil
 import subprocess
 import time
-from collections import Counter
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
 from benchmarks.postgres import OPTIONS, Server, binaries, nobody_prefix
 from benchmarks.waiting import PATIENCE_S
-from sceneprint.errors import UnknownFrame
-from sceneprint.maintenance.fsck.check import fsck
-from sceneprint.settings import Settings
-from sceneprint_client.api import JobState, NewMap, Query
-from tests.whole_engine import Engine
+from sceneprint.store import open_database
+from sceneprint.store.deletion import remove_map
+from sceneprint.store.maps import add_map, find_map, list_maps, store_model
 
 SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "deployment" / "recover.sh"
-#: Of the server's command line, which the copy in its folder does not have.
-OPTIONS_TOLD = f"-c max_connections={OPTIONS['max_connections']} -c unix_socket_directories="
+MODEL = "ab" * 32
+#: Options of the server's command line, which the copy in its folder does not have.
+COMMAND_LINE = f"-c max_connections={OPTIONS['max_connections']} -c unix_socket_directories="
 
 
 def recover(*arguments, options=""):
@@ -54,8 +49,8 @@ def place(tmp_path_factory):
 def archiving(page, archive):
     """The settings of a page's section, for another folder."""
     section = page.read_text().partition("### Point-in-time recovery")[2]
-    told = re.findall(r"^(archive_\w+) = '?(.*?)'?$", section, re.MULTILINE)
-    return {name: value.replace("/backup/log", str(archive)) for name, value in told}
+    settings = re.findall(r"^(archive_\w+) = '?(.*?)'?$", section, re.MULTILINE)
+    return {name: value.replace("/backup/log", str(archive)) for name, value in settings}
 
 
 @pytest.fixture
@@ -68,68 +63,12 @@ def primary(place):
     server.kill()
 
 
-def settings_of(url, data):
-    given = {"database_url": url, "data_dir": data, "undo_window_s": 0, "unindexed_frames": 1}
-    return Settings.model_validate(given)
-
-
-def add(engine, frame, name="hall"):
-    added, _ = engine.add_frame(name, *frame)
-    work = engine.claim("w")
-    assert engine.run(work) == JobState.SUCCEEDED
-    return added.frame_id
-
-
-def found(engine, frame, name="hall"):
-    asked = Query(k=9, candidates=9, keep=False, stages=["retrieve"])
-    return [one.frame_id for one in engine.queries.upload([name], *frame, asked).matches]
-
-
-def kinds(url, data):
-    """What fsck finds, notes as well."""
-    return Counter(one.kind for one in fsck(settings_of(url, data)))
-
-
-class Drill(NamedTuple):
-    """What was there at the moment: frames of two maps; and what came after it."""
-
-    moment: str
-    hall: list[str]
-    yard: list[str]
-    late: list[str]
-
-
-def mistake(primary, place, data, small, until):
-    """A map is deleted and begun again, and another goes on: published indexes know all that."""
-    with Engine(settings_of(primary.create("fleet"), data)) as engine:
-        for name in ("hall", "yard"):
-            engine.create_map(NewMap(name=name, model="depth"))
-        hall = [add(engine, small[0])]
-        primary._run(
-            "pg_basebackup", "--pgdata", str(place / "base"), "--host=127.0.0.1",
-            f"--port={primary.port}", "--username=postgres", "--checkpoint=fast",
-        )  # fmt: skip
-        hall += [add(engine, frame) for frame in small[1:3]]
-        yard = [add(engine, frame, "yard") for frame in small[5:7]]
-        shutil.copytree(data / "blobs", data.parent / "versions")
-        (known,) = primary.execute("SELECT clock_timestamp()")
-        moment = datetime.fromisoformat(str(known[0])).astimezone(UTC)
-        time.sleep(0.05)  # a commit of that very moment would be before it
-        engine.delete_map("hall")
-        engine.create_map(NewMap(name="hall", model="depth"))
-        late = [add(engine, small[3])] + [add(engine, one, "yard") for one in small[7:9]]
-        assert engine.publish_due() == 1  # of the yard
-    (last,) = primary.execute("SELECT pg_walfile_name(pg_switch_wal())")
-    until((place / "archive" / str(last[0])).is_file)
-    return Drill(moment.isoformat(" "), hall, yard, late)
-
-
 @contextmanager
 def recovered(place, data, moment):
     """A server that the script made."""
     new = Server(data.with_suffix(".unused"))  # of which the port is taken, and nothing else
     done = recover(
-        place / "base", place / "archive", data, moment, new.port, options=OPTIONS_TOLD
+        place / "base", place / "archive", data, moment, new.port, options=COMMAND_LINE
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     said = done.stdout.splitlines()
@@ -143,38 +82,36 @@ def recovered(place, data, moment):
 
 
 @pytest.mark.thorough
-def test_a_map_that_was_deleted_by_mistake_is_brought_back(primary, place, tmp_path, small, until):
-    data, versions = tmp_path / "data", tmp_path / "versions"
-    drill = mistake(primary, place, data, small, until)
-    with recovered(place, place / "recovered", drill.moment) as server:
-        url = server.url("fleet")
-        # what the deletion removed is named
-        assert kinds(url, data) == {"missing-upload": 3, "missing-artifact": 3}
-        with Engine(settings_of(url, data)) as engine:
-            assert sorted(found(engine, small[2])) == sorted(drill.hall)
-        shutil.copytree(versions, data / "blobs", dirs_exist_ok=True)
-        assert kinds(url, data) == {}
-        _check_recovered(settings_of(url, data), small, drill)
-        assert kinds(url, data) == {}
+def test_a_map_that_was_deleted_by_mistake_is_brought_back(primary, place, tmp_path, until):
+    with closing(open_database(primary.create("fleet"))) as database:
 
+        def add(name):
+            with database.write() as connection:
+                add_map(connection, name, None, MODEL)
 
-def _check_recovered(settings, small, drill):
-    with Engine(settings) as engine:
-        assert engine.store.database.history == "00000002"
-        assert engine.get_map("hall").frames == {"indexed": 3}
-        assert engine.get_map("yard").frames == {"indexed": 2}
-        for one in drill.late:
-            with pytest.raises(UnknownFrame):
-                engine.get_frame("hall" if one == drill.late[0] else "yard", one)
-        assert sorted(found(engine, small[2])) == sorted(drill.hall)
-        assert found(engine, small[2])[0] == drill.hall[2]
-        # the yard goes on with the keys and the revisions that the lost frames had
-        yard = [*drill.yard, *(add(engine, one, "yard") for one in small[9:11])]
-        assert sorted(found(engine, small[7], "yard")) == sorted(yard)
-        assert engine.publish_due() == 2
-    with Engine(settings) as engine:  # which begins with the new indexes
-        assert found(engine, small[10], "yard")[0] == yard[-1]
-        assert sorted(found(engine, small[10], "yard")) == sorted(yard)
+        with database.write() as connection:
+            store_model(connection, MODEL, "toy", b"a model")
+        add("hall")
+        primary._run(
+            "pg_basebackup", "--pgdata", str(place / "base"), "--host=127.0.0.1",
+            f"--port={primary.port}", "--username=postgres", "--checkpoint=fast",
+        )  # fmt: skip
+        add("yard")
+        ((now,),) = primary.execute("SELECT clock_timestamp()")
+        moment = datetime.fromisoformat(str(now)).astimezone(UTC).isoformat(" ")
+        time.sleep(0.05)  # a commit of that very moment would be before it
+        with database.write() as connection:
+            remove_map(connection, find_map(connection, "hall"))
+        add("late")
+    ((last,),) = primary.execute("SELECT pg_walfile_name(pg_switch_wal())")
+    until((place / "archive" / str(last)).is_file)
+    with (
+        recovered(place, place / "recovered", moment) as server,
+        closing(open_database(server.url("fleet"))) as database,
+    ):
+        assert database.history == "00000002"
+        with database.write() as connection:  # it is promoted
+            assert [row.name for row in list_maps(connection)] == ["hall", "yard"]
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,11 @@
 """Tests of the removal of blobs, which blocks no writer and keeps acknowledged data."""
 
-from __future__ import annotations
-
 import hashlib
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, suppress
+from socketserver import BaseRequestHandler, ThreadingTCPServer
 
 import pytest
 from sqlalchemy import select, text, update
@@ -35,51 +34,37 @@ SESSIONS = (
 )
 
 
-class HeldDeletes:
-    """A port of an object server that holds requests to delete, until they are let through."""
+class HeldDeletes(ThreadingTCPServer):
+    """A proxy of an object server that holds requests to delete until `release` or `drop`."""
 
-    def __init__(self, port):
-        self._to, self._is_dropped = port, False
-        self.arrived, self._passes = threading.Event(), threading.Event()
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._listener.getsockname()[1]
-        self._open: list[socket.socket] = []
-        self._threads = [threading.Thread(target=self._accept, daemon=True)]
-        self._threads[0].start()
+    daemon_threads = True
+
+    def __init__(self, target):
+        super().__init__(("127.0.0.1", 0), _Relay)
+        self.target, self.port, self.is_dropped = target, self.server_address[1], False
+        self.arrived, self.passes = threading.Event(), threading.Event()
+        threading.Thread(target=self.serve_forever, args=(0.02,), daemon=True).start()
 
     def release(self):
-        """Let them through, and those that come."""
-        self._passes.set()
+        self.passes.set()
 
     def drop(self):
-        """Break their connections, and those of who comes."""
-        self._is_dropped = True
-        self._passes.set()
+        """Break the connections of held requests, and of later ones."""
+        self.is_dropped = True
+        self.passes.set()
 
     def close(self):
-        """End it."""
         self.drop()
-        for one in (self._listener, *self._open):
-            with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join(PATIENCE_S)
-        self._listener.close()
+        self.shutdown()
+        self.server_close()
 
-    def _accept(self):
-        with suppress(OSError):
-            while True:
-                near, _ = self._listener.accept()
-                thread = threading.Thread(target=self._hand_on, args=(near,), daemon=True)
-                self._open.append(near)
-                self._threads.append(thread)
-                thread.start()
 
-    def _hand_on(self, near):
-        with near, socket.create_connection(("127.0.0.1", self._to)) as far:
-            back = threading.Thread(target=self._pump, args=(far, near), daemon=True)
+class _Relay(BaseRequestHandler):
+    def handle(self):
+        with socket.create_connection(("127.0.0.1", self.server.target)) as far:
+            back = threading.Thread(target=self._pump, args=(far, self.request), daemon=True)
             back.start()
-            self._pump(near, far, holds=True)
+            self._pump(self.request, far, holds=True)
             back.join()
 
     def _pump(self, source, to, *, holds=False):
@@ -87,9 +72,9 @@ class HeldDeletes:
             while data := source.recv(1 << 16):
                 method, _, rest = data.partition(b"\r\n")[0].partition(b" ")
                 if holds and (method == b"DELETE" or (method == b"POST" and b"?delete" in rest)):
-                    self.arrived.set()
-                    self._passes.wait()
-                    if self._is_dropped:
+                    self.server.arrived.set()
+                    self.server.passes.wait()
+                    if self.server.is_dropped:
                         break
                 to.sendall(data)
         for one in (source, to):
@@ -154,7 +139,6 @@ def doomed_in(engine):
 
 
 def end_sessions(engine, which):
-    """Cut the one process off that has an advisory lock of that kind."""
     with engine.store.database.read() as connection:
         ended = connection.execute(text(f"{SESSIONS} AND {which}")).scalar_one()
     assert ended == 1
@@ -286,7 +270,6 @@ def test_a_second_upload_waits_for_a_removal_too(
 def test_a_blob_that_is_being_removed_stays_doomed(
     engine, small, held, removal, until, waiting, monkeypatch
 ):
-    """A second removal does not clear its row, although a frame refers to the blob by then."""
     monkeypatch.setattr("sceneprint.engine.upkeep.garbage_collection._PATIENCE_S", 0.1)
     digest = engine.store.blobs.put(small[0].png)
     removing = removal(digest)

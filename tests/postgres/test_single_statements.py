@@ -133,7 +133,6 @@ def test_a_frame_of_a_joined_parent_frame_is_indexed_in_the_root(server_store, p
 
 @pytest.mark.parametrize("fused", [False, True])
 def test_a_frame_is_indexed_as_by_its_parts(server_store, pair, fused):
-    """Also one that is signed anew, whose surface has to be fused anew."""
     held = []
     for row in pair:
         received(server_store, row, at_once=True)

@@ -1,25 +1,21 @@
 """Tests of transactions of one statement: one round trip, in order, and atomic."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 
 import pytest
-from sqlalchemy import event, func, insert, literal_column, select, text, update
+from sqlalchemy import func, literal_column, select, text, update
 
 from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.ingest.write_groups import NewFrames
-from sceneprint.engine.jobs import signature_job
-from sceneprint.engine.upkeep.garbage_collection import collect_blobs
 from sceneprint.errors import IdempotencyConflict, LostLease, NewerSchema
 from sceneprint.settings import Settings
 from sceneprint.store import open_database
 from sceneprint.store.keys import IdempotentRequest
 from sceneprint.store.maps import add_map, store_model
 from sceneprint.store.postgres import connection as postgres
-from sceneprint.store.tables import idempotency, maps, pending_events, signatures
-from sceneprint_client.api import JobState, NewMap
+from sceneprint.store.tables import maps
+from sceneprint_client.api import NewMap
 from tests.whole_engine import Engine
 
 MODEL = "ab" * 32
@@ -136,22 +132,6 @@ def test_what_fails_leaves_nothing(server_store, row):
     assert named(server_store) == "after"
 
 
-def test_it_has_one_statement(server_store, row):
-    rows = [{"at": 0.0, "kind": "late", "map": "hall", "data": {}}] * 2
-    database, many = server_store.database, insert(pending_events)
-    with (
-        pytest.raises(ValueError, match="one set of parameters"),
-        database.write(map_number=row.number, single=True) as connection,
-    ):
-        connection.execute(many, rows)
-    with database.write(map_number=row.number, single=True) as connection:
-        connection.execute(many, rows[0])
-        with pytest.raises(ValueError, match="second"):
-            connection.execute(many, rows[0])
-    with database.read() as connection:
-        assert connection.execute(select(func.count()).select_from(pending_events)).scalar() == 1
-
-
 def test_a_connection_that_was_ended_a_moment_ago_is_not_used(server_store, row):
     database = server_store.database
     with database.read() as connection:
@@ -173,48 +153,6 @@ def engine(postgres_url, tmp_path):
         yield opened
 
 
-def test_an_upload_that_a_deletion_removed_before_its_commit_is_put_again(
-    engine, small, monkeypatch
-):
-    once = NewFrames.receive
-
-    def run(group, frame):
-        monkeypatch.undo()
-        collect_blobs(engine.store, list(engine.store.blobs.digests()))
-        found = once(group, frame)
-        assert list(engine.store.blobs.digests()) == []
-        return found
-
-    monkeypatch.setattr(NewFrames, "receive", run)
-    added, new = engine.add_frame("hall", *small[0])
-    assert new
-    work = engine.claim("w")
-    assert work.job.id == added.job_id
-    assert engine.run(work) == JobState.SUCCEEDED
-    assert engine.get_map("hall").frames == {"indexed": 1}
-
-
-def test_an_artifact_that_a_deletion_removed_before_its_commit_is_put_again(
-    engine, small, monkeypatch
-):
-    engine.add_frame("hall", *small[0])
-    work = engine.claim("w")
-    (upload,) = engine.store.blobs.digests()
-    index = signature_job.index_claimed_frame
-
-    def late(*given, **how):
-        monkeypatch.undo()
-        collect_blobs(engine.store, [one for one in engine.store.blobs.digests() if one != upload])
-        assert list(engine.store.blobs.digests()) == [upload]
-        return index(*given, **how)
-
-    monkeypatch.setattr(signature_job, "index_claimed_frame", late)
-    assert engine.run(work) == JobState.SUCCEEDED
-    with engine.store.database.read() as connection:
-        artifact = connection.execute(select(signatures.c.geometry)).scalar_one()
-    assert engine.store.geometries.read(artifact).patches
-
-
 def once_of(what):
     return IdempotentRequest("robot", "a key", what * 64)
 
@@ -223,31 +161,7 @@ def add(engine, frame, once, map_name="hall"):
     return engine.uploads.add(map_name, Upload(*frame), once)
 
 
-def test_what_a_request_came_to_is_remembered_with_its_frame(engine, small):
-    said = list[str]()
-    event.listen(
-        engine.store.database._engine, "before_cursor_execute",
-        lambda connection, _cursor, statement, *_: said.append(statement)
-        if {"sceneprint_write", "sceneprint_single"} & connection.get_execution_options().keys()
-        else None,
-    )  # fmt: skip
-    first, replayed = add(engine, small[0], once_of("a"))
-    assert (first.new, replayed, len(said)) == (True, False, 1)
-    again, replayed = add(engine, small[0], once_of("a"))
-    assert replayed
-    assert (again.new, again.added) == (True, first.added)
-    with pytest.raises(IdempotencyConflict):
-        add(engine, small[1], once_of("b"))
-    with engine.store.database.write() as connection:  # a day later it is forgotten
-        connection.execute(update(idempotency).values(created_at=0.0))
-    other, replayed = add(engine, small[1], once_of("b"))
-    assert (other.new, replayed) == (True, False)
-    assert add(engine, small[1], once_of("b"))[1]
-    assert engine.get_map("hall").frames == {"received": 2}
-
-
 def test_a_request_whose_key_is_used_meanwhile_takes_nothing(engine, small, monkeypatch):
-    """By another request, for another map, whose turn is another."""
     engine.create_map(NewMap(name="other"))
     run = NewFrames.receive
 

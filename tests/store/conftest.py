@@ -160,7 +160,7 @@ class Hand:
         self.database = store.database
 
     def take(self, worker="w", lease_s=60.0):
-        with self.database.write() as connection:
+        with self.database.write(turn=False) as connection:  # as workers do
             return queue.claim(connection, worker, lease_s)
 
     def taken(self, worker="w", lease_s=60.0):

@@ -1,12 +1,8 @@
 """Tests of blobs: round trips and errors."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -22,35 +18,6 @@ from sceneprint.store.blobs.object_store import ObjectBlobs
 
 DIGEST = hashlib.sha256(b"depth").hexdigest()
 KEY = f"blobs/{DIGEST[:2]}/{DIGEST}"
-
-NARROW = """
-import resource, sys
-from pathlib import Path
-from sceneprint.errors import UnusableStore
-from sceneprint.store import FolderBlobs
-from sceneprint.store.blobs.folder import FileLocks
-from sceneprint.store.blobs.object_store import ObjectBlobs
-from sceneprint.store.blobs.object_client import open_objects
-
-resource.setrlimit(resource.RLIMIT_FSIZE, (65536, 65536))
-blobs = FolderBlobs(Path(sys.argv[1]))
-small = blobs.put(b"s" * 65536)
-for size in (65537, 5_000_000):
-    try:
-        blobs.put(b"x" * size)
-        print("put")
-    except UnusableStore as error:
-        print(error)
-print(blobs.get(small) == b"s" * 65536)
-fleet = ObjectBlobs(open_objects("memory:///"), FileLocks(Path(sys.argv[1])), lambda: "me")
-try:
-    with fleet.incoming() as blob:  # waits in a temporary file
-        for _ in range(20):
-            blob.write(b"x" * 5000)
-        blob.keep()
-except UnusableStore as error:
-    print(error)
-"""
 
 
 @dataclass
@@ -197,31 +164,6 @@ def test_who_needs_blobs_keeps_others_from_removing_them(kept):
         assert (allowed, also) == (True, False)
     with kept.blobs.removing() as allowed:
         assert allowed
-
-
-def test_a_full_disk_leaves_nothing_and_hurts_nothing(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", NARROW, str(tmp_path / "blobs")],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    told = done.stdout.splitlines()
-    assert len(told) == 4
-    for line in (*told[:2], told[3]):
-        assert "A blob cannot be written (File too large)" in line
-    assert told[2] == "True"
-    kept = hashlib.sha256(b"s" * 65536).hexdigest()
-    assert files(tmp_path) == [f"blobs/{kept[:2]}/{kept}"]
-
-
-def test_a_file_where_a_folder_should_be_is_said(tmp_path):
-    place = tmp_path / "blobs" / DIGEST[:2]
-    blobs = FolderBlobs(tmp_path / "blobs")
-    place.write_bytes(b"")  # a file where the folder should be
-    with pytest.raises(UnusableStore, match="Check the folder and its permissions"):
-        blobs.put(b"depth")
-    with pytest.raises(UnusableStore, match=r"The folder cannot be created \(Not a directory\)"):
-        FolderBlobs(place / "below")
 
 
 def test_a_blob_may_be_put_and_removed_at_once(blobs, tmp_path):

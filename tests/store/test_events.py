@@ -1,8 +1,6 @@
 """Tests of the order and the removal of events."""
 
 import itertools
-import re
-from pathlib import Path
 
 from sqlalchemy import insert, select, update
 
@@ -11,9 +9,7 @@ from sceneprint.store.events import EventFilter, list_events, newest_selected, r
 from sceneprint.store.maps import add_map, find_map, store_model
 from sceneprint.store.store_counts import count_events
 from sceneprint.store.tables import events
-from sceneprint_client.api.admin import KINDS
 
-ROOT = Path(__file__).resolve().parents[2]
 KEPT = ("frame.received", "frame.indexed", "map.created", "key.created")
 
 #: Each process commits events one by one, some transactions of several and some given up.
@@ -112,19 +108,6 @@ def test_events_are_counted_by_interval(store):
                     naive[place] = naive.get(place, 0) + 1
             recent = {key: n for key, n in counted.items() if key[0] < 1e6}  # not of the maps
             assert recent == naive
-
-
-def test_every_kind_that_is_told_is_declared():
-    told = set()
-    pattern = re.compile(r"\brecord_(?:job_)?event\(\s*connection,\s*\"([\w.]+)\"")
-    declared_event = re.compile(r"\bevent=\"([\w.]+)\"")
-    for folder in ("sceneprint", "service", "worker"):
-        for path in (ROOT / folder).rglob("*.py"):
-            text = path.read_text()
-            told |= set(pattern.findall(text)) | set(declared_event.findall(text))
-    assert {"frame.indexed", "map.created", "key.revoked"} <= told
-    assert told <= set(KINDS)
-    assert all(re.fullmatch(r"[a-z_]+\.[a-z_]+", kind) and len(kind) <= 32 for kind in KINDS)
 
 
 def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):

@@ -5,11 +5,12 @@ from sqlalchemy import select, update
 from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import UnknownFrame, UnknownMap
-from sceneprint.store import frame_queries, queue
 from sceneprint.store import frames as stored
 from sceneprint.store import maps as stored_maps
+from sceneprint.store import queue
 from sceneprint.store import signatures as signed
 from sceneprint.store.deletion import remove_map
+from sceneprint.store.frame_queries import list_frames
 from sceneprint.store.tables import events, signatures
 from sceneprint_client.api import FrameState
 from sceneprint_client.api.listing import FrameListing
@@ -89,14 +90,11 @@ def test_changes_come_in_order_whatever_the_block(store, hall, received, indexed
     delete(store, hall, frames[2])
     wanted = [
         signed.SignatureChange(
-            frames[i].number,
-            frames[i].id,
-            revision,
-            bytes([frames[i].number, 2, 3]) if there else None,
-            deleted=not there,
+            frames[i].number, frames[i].id, revision,
+            bytes([frames[i].number, 2, 3]) if there else None, deleted=not there,
         )
         for i, revision, there in [(3, 1, 1), (4, 3, 1), (1, 4, 1), (0, 5, 0), (2, 6, 0)]
-    ]
+    ]  # fmt: skip
     assert changes(store, hall, 0) == [wanted]
     assert changes(store, hall, 0, 2) == [wanted[:2], wanted[2:4], wanted[4:]]
     assert changes(store, hall, 0, 5) == [wanted]
@@ -137,19 +135,14 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(store, hall, received, in
     artifact = f"{frame.number:064d}"
     assert delete(store, hall, frame) == ["11" * 32, artifact]
     with store.database.read() as connection:
-        now, gone = (
-            stored_maps.find_frame(connection, hall, frame.id),
-            FrameListing(state=FrameState.DELETED),
-        )
+        now = stored_maps.find_frame(connection, hall, frame.id)
+        listings = (FrameListing(), FrameListing(state=FrameState.DELETED))
         assert (now.state, now.content_id, now.revision) == (FrameState.DELETED, None, 2)
         assert stored_maps.frames_of_content(connection, hall.number, "a") == []
-        assert frame_queries.list_frames(connection, hall.number, None, 9, FrameListing()) == [
-            other
-        ]
-        assert frame_queries.list_frames(connection, hall.number, None, 9, gone) == [now]
-        assert stored_maps.frames_of(connection, [frame.number, other.number]) == {
-            other.number: other
-        }
+        found = [list_frames(connection, hall.number, None, 9, one) for one in listings]
+        assert found == [[other], [now]]
+        numbers = [frame.number, other.number]
+        assert stored_maps.frames_of(connection, numbers) == {other.number: other}
         assert signed.stored_vector(connection, frame.number, hall.model_id) is None
         assert stored_maps.geometry_blobs(connection, [frame.number], hall.model_id) == {}
         assert stored.refers_to(connection, "11" * 32)  # the other frame does
@@ -177,18 +170,14 @@ def test_a_removed_map_takes_all_of_its_own_and_nothing_of_others(store, hall, r
     assert sorted(blobs) == sorted(["11" * 32, f"{mine.number:064d}"])
     with store.database.read() as connection:
         assert [row.name for row in stored_maps.list_maps(connection)] == ["other"]
-        assert stored_maps.frames_of(connection, [mine.number, theirs.number]).keys() == {
-            theirs.number
-        }
-        assert queue.signing_jobs(connection, [mine.number, theirs.number]) == {
-            theirs.number: kept.id
-        }
+        numbers = [mine.number, theirs.number]
+        assert list(stored_maps.frames_of(connection, numbers)) == [theirs.number]
+        assert queue.signing_jobs(connection, numbers) == {theirs.number: kept.id}
         assert job.number != kept.number
         assert stored.refers_to(connection, "11" * 32)
         assert signed.stored_vector(connection, mine.number, hall.model_id) is None
-        assert signed.stored_vector(connection, theirs.number, hall.model_id) == bytes(
-            [theirs.number, 2, 3]
-        )
+        vector = signed.stored_vector(connection, theirs.number, hall.model_id)
+        assert vector == bytes([theirs.number, 2, 3])
         assert [e.kind for e in connection.execute(select(events).order_by(events.c.number))] == [
             "map.created", "map.created", "map.deleted",
         ]  # fmt: skip

@@ -91,16 +91,6 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(store, hand, queued, turn
         queue.finish(connection, held, JobState.SUCCEEDED)
 
 
-def test_what_was_tried_goes_behind_what_was_not(hand, queued, turned):
-    """A machine that dies again and again does not use up the tries of the oldest job."""
-    first, second = queued("a"), queued("b")
-    assert hand.taken().number == first.number
-    turned(first, leased_until=time.time() - 1)
-    assert hand.taken().number == second.number
-    turned(second, leased_until=time.time() - 1)
-    assert hand.taken().number == first.number
-
-
 def test_silence_is_not_counted_as_breaking_down(hand, queued, turned):
     """A machine restarted eight times must not cost a frame that then breaks down once."""
     job = queued("a")

@@ -2,39 +2,14 @@
 
 import io
 import os
-import signal
 import socket
-import subprocess
-import sys
 
 import pytest
 
 from benchmarks.s3 import ObjectServer
 from sceneprint.errors import StoreAway, UnusableStore
 from sceneprint.store.blobs import object_client
-from sceneprint.store.blobs import object_client as module
 from sceneprint.store.blobs.object_client import PART, check_objects, open_objects
-
-HALF_WAY = """
-import sys, time
-from sceneprint.store.blobs.object_client import open_objects
-from sceneprint.store.blobs.object_client import PART
-
-class Slow:
-    place = 0
-    def tell(self): return self.place
-    def seek(self, offset, whence=0):
-        self.place = 8 * PART if whence == 2 else offset
-        return self.place
-    def read(self, size=-1):
-        if self.place >= 3 * PART:
-            print("half way", flush=True)
-            time.sleep(600)
-        self.place += size
-        return b"x" * size
-
-open_objects(sys.argv[1]).put_file("large", Slow())
-"""
 
 
 @pytest.mark.parametrize(
@@ -95,23 +70,12 @@ def test_a_bucket_that_is_not_there_is_no_missing_blob(bucket):
             call()
 
 
-def test_who_is_killed_half_way_leaves_nothing_to_be_read(bucket):
-    with subprocess.Popen(
-        [sys.executable, "-c", HALF_WAY, bucket], stdout=subprocess.PIPE, text=True
-    ) as child:
-        assert child.stdout.readline() == "half way\n"
-        child.send_signal(signal.SIGKILL)
-    objects = open_objects(bucket)
-    assert objects.head("large") is None
-    assert list(objects.list("")) == []
-
-
 @pytest.fixture
 def brittle(monkeypatch):
     """A server of this test alone, and little patience with it."""
     monkeypatch.setattr(object_client, "TRIED_S", 1)
     monkeypatch.setattr(object_client, "SMALL_S", 1)
-    monkeypatch.setattr(module, "AWAY_S", 0.2)
+    monkeypatch.setattr(object_client, "AWAY_S", 0.2)
     with ObjectServer() as server:
         for name, value in server.env.items():
             monkeypatch.setenv(name, value)
@@ -137,10 +101,10 @@ def test_a_server_that_falls_acknowledges_nothing(brittle, monkeypatch):
     brittle.bucket("fragile")
     until = objects._away[0]
     assert until > 0
-    while module.time.monotonic() < until:
+    while object_client.time.monotonic() < until:
         with pytest.raises(StoreAway):  # at once
             objects.get("a")
-        module.time.sleep(0.02)  # leaves the processor to others
+        object_client.time.sleep(0.02)  # leaves the processor to others
     assert objects.put("a", b"x")
     assert [one.key for one in objects.list("")] == ["a"]
 

@@ -87,12 +87,6 @@ def test_what_is_left_of_maps_that_are_gone_is_bounded_together(filled):
         assert set(gone) - set(numbers_of(connection, "shop")) == set(rest[:-10])
 
 
-def test_nothing_goes_of_nothing(store):
-    with store.database.read() as connection:
-        assert surplus_events(connection, 10, (), 99) == []
-        assert removal_floor(connection, EventFilter(), 10, 0) == 0
-
-
 def test_of_a_map_that_is_gone_nothing_is_missed_after_its_last_event(filled):
     hall = EventFilter(frozenset(("hall",)))
     with filled.database.write() as connection:

@@ -11,16 +11,14 @@ from sqlalchemy import insert, select, text
 from sqlalchemy.exc import DBAPIError
 
 from sceneprint import errors
-from sceneprint.errors import StoreAway, StoreLocked, UnusableStore
+from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import database, open_database, open_store
 from sceneprint.store.database import database_exists, known_revisions, reach_database
 from sceneprint.store.events import record_event
-from sceneprint.store.keys import create_key, list_keys
-from sceneprint.store.maps import add_frame, add_map, find_map, frames_of, list_maps, store_model
+from sceneprint.store.maps import add_map, frames_of, list_maps, store_model
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.read_only import inspect_database
 from sceneprint.store.tables import events, maps, metadata
-from tests.store.frame_rows import frame_values
 
 
 @pytest.fixture
@@ -162,27 +160,6 @@ def test_more_readers_than_connections_are_told_so(postgres_url, monkeypatch):
     few.close()
 
 
-def test_a_connection_of_its_own_commits_each_statement(served):
-    own = served.driver_connection()
-    own.execute("INSERT INTO events (at, kind, data) VALUES (1, 'own', '{}')")
-    with served.read() as connection:
-        assert connection.execute(select(events.c.kind)).scalars().all() == ["own"]
-    with pytest.raises(StoreAway, match="service tries again"), served.explained():
-        own.execute("SELECT pg_terminate_backend(pg_backend_pid())")
-    assert own.closed
-
-
-def test_texts_are_in_the_order_of_their_code_points(store):
-    names = ["b", "B", "a", "_", "-", "ä", "Z", "z", "é", "10", "9", "\U0001f600", "\uffee"]
-    with store.database.write() as connection:
-        for name in names:
-            create_key(connection, name, {"*": "read"})
-        told = [key.name for key in list_keys(connection)]
-        assert told == sorted(names)
-        after = told[4]
-        assert [key.name for key in list_keys(connection, after, 3)] == sorted(names)[5:8]
-
-
 def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store):
     with store.database.write() as connection:
         store_model(connection, "m", "n" * 200, b"x")
@@ -197,18 +174,6 @@ def test_more_numbers_are_asked_for_than_one_statement_takes(store, hall, receiv
     with store.database.read() as connection:
         found = frames_of(connection, range(70_000))
     assert sorted(found) == made
-
-
-def test_numbers_may_have_64_bits(store, hall):
-    with store.database.write() as connection:
-        connection.execute(
-            insert(maps).values(
-                number=2**40, name="far", model_id=hall.model_id, revision=2**41, created_at=1.0
-            )
-        )
-        frame = add_frame(connection, 2**40, frame_values("a", bytes=2**40))
-        assert (frame.map_number, frame.bytes) == (2**40, 2**40)
-        assert find_map(connection, "far").revision == 2**41
 
 
 def test_what_was_stored_is_json(store, hall):
@@ -261,35 +226,6 @@ def test_a_mistake_of_ours_stays_one(served):
             connection.exec_driver_sql(wrong)
 
 
-def test_a_statement_without_end_is_ended(served):
-    def sleep(connection):
-        connection.exec_driver_sql("SET LOCAL statement_timeout = 50")
-        connection.exec_driver_sql("SELECT pg_sleep(600)")
-
-    with pytest.raises(errors.UnusableStore, match="took too long"), served.read() as connection:
-        sleep(connection)
-    with served.read() as connection:
-        assert connection.execute(select(maps)).all() == []
-
-
-def test_connections_that_were_ended_are_made_anew(served, postgres):
-    def fall(connection):
-        mine = connection.execute(text("SELECT pg_backend_pid()")).scalar_one()
-        postgres.execute(f"SELECT pg_terminate_backend({mine}, 60000)")
-        connection.execute(select(maps))
-
-    with pytest.raises(errors.StoreAway), served.write() as connection:
-        fall(connection)
-    with served.read() as first, served.read() as second:
-        pids = [
-            one.execute(text("SELECT pg_backend_pid()")).scalar_one() for one in (first, second)
-        ]
-    for pid in pids:  # while nobody uses them: whoever comes next learns nothing of it
-        postgres.execute(f"SELECT pg_terminate_backend({pid}, 60000)")
-    with served.write() as first, served.read() as second:
-        assert first.execute(select(maps)).all() == second.execute(select(maps)).all() == []
-
-
 @pytest.mark.parametrize(
     ("given", "kind", "said"),
     [
@@ -323,23 +259,6 @@ def test_what_cannot_be_reached_is_said_without_the_password(
 def _looked_at(url):
     with inspect_database(url):
         pass
-
-
-def test_a_table_that_is_changed_elsewhere_costs_one_try(served, postgres, postgres_url):
-    """Connections have prepared for it what they asked of it again and again."""
-    name, asked = postgres_url.rpartition("/")[2], text("SELECT a FROM changing")
-    postgres.execute("CREATE TABLE changing (a int)", name)
-    for _ in range(8):
-        with served.write(turn=False) as one, served.write(turn=False) as other:
-            assert [one.execute(asked).all(), other.execute(asked).all()] == [[], []]
-    postgres.execute("ALTER TABLE changing ALTER a TYPE bigint", name)
-    with (
-        pytest.raises(errors.StoreLocked, match="The tables were changed meanwhile"),
-        served.write(turn=False) as one,
-    ):
-        one.execute(asked)
-    with served.write(turn=False) as one, served.write(turn=False) as other:
-        assert [one.execute(asked).all(), other.execute(asked).all()] == [[], []]
 
 
 def test_a_database_of_another_encoding_is_refused(postgres):

@@ -5,11 +5,10 @@ from contextlib import ExitStack
 
 import pytest
 from sqlalchemy import insert, select, update
-from sqlalchemy.exc import IntegrityError
 
 from sceneprint.errors import StoreFull
 from sceneprint.store.maps import find_map, next_revision
-from sceneprint.store.tables import events, frames, maps
+from sceneprint.store.tables import events, maps
 
 #: One process writes in four threads without a pause; the other counts the commits of the first
 #: that it has to wait for.
@@ -57,14 +56,6 @@ def test_every_connection_of_the_pool_is_configured(store):
             assert found == {
                 "journal_mode": "wal", "synchronous": 2, "foreign_keys": 1, "busy_timeout": 10_000,
             }  # fmt: skip
-
-
-def test_a_row_that_refers_to_nothing_is_refused(store, hall, received):
-    frame = received("a")
-    with pytest.raises(IntegrityError), store.database.write() as connection:
-        connection.execute(
-            update(frames).where(frames.c.number == frame.number).values(map_number=hall.number + 1)
-        )
 
 
 @pytest.mark.parametrize("kind", [ValueError, KeyboardInterrupt])

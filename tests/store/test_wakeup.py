@@ -99,14 +99,6 @@ def test_more_rings_than_a_fifo_holds_end_one_wait(bells):
         assert not listener.wait(0)
 
 
-def test_who_listens_no_more_leaves_nothing(bells, tmp_path):
-    with bells.listen():
-        (fifo,) = fifos(tmp_path)
-        assert fifo.is_fifo()
-        assert fifo.stat().st_mode & 0o777 == 0o600
-    assert fifos(tmp_path) == []
-
-
 def test_what_the_dead_left_is_removed_when_it_is_old(bells, tmp_path):
     with bells.listen() as listener:
         (own,) = fifos(tmp_path)
@@ -121,6 +113,8 @@ def test_what_the_dead_left_is_removed_when_it_is_old(bells, tmp_path):
         assert sorted(fifos(tmp_path)) == sorted([own, new, file])  # somebody reads its own
         assert file.read_bytes() == b"other"
         assert listener.wait(FOREVER)
+        assert own.stat().st_mode & 0o777 == 0o600
+    assert not own.exists()  # nobody listens
 
 
 def test_a_listener_shows_that_it_lives_and_mends_its_fifo(bells, tmp_path, monkeypatch):

@@ -110,19 +110,6 @@ def test_a_full_disk_is_told_to_all(database):
     assert (count(database, "a"), count(database, "full")) == (0, 0)
 
 
-def test_ctrl_c_ends_its_own_writer_alone(database):
-    group, tries = Grouping(database), [0]
-
-    def stop(_):
-        tries[0] += 1
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        group.run(stop)
-    assert group.run(noting("a", 1)) == 1
-    assert (tries, count(database, "a")) == ([1], 1)
-
-
 def test_ctrl_c_in_a_second_try_forgets_nobody(database):
     """It ends the thread that writes for all: those that it has not written go on themselves."""
     errors = [ValueError, KeyboardInterrupt]
