@@ -4,33 +4,30 @@ hadolint and the Compose schema check the files, our own rules check further pro
 steps of the image are run in a folder that represents its file system.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import shlex
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass
 from fnmatch import fnmatch
-from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import NamedTuple
 
 import httpx
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from benchmarks.waiting import PATIENCE_S
+from benchmarks.waiting import PATIENCE_S, free_port
 from sceneprint.process import SECRETS
 from sceneprint.settings import Settings
+from sceneprint_client import Client
+from sceneprint_client.api import FrameMeta
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCKERFILE = (ROOT / "Dockerfile").read_text()
@@ -43,22 +40,13 @@ KNOWN_SETTINGS = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields
 # Reading a Dockerfile
 
 
-@dataclass(frozen=True)
-class Step:
-    """One instruction: which stage it is in (from 0), its name, flags, and the rest of it."""
+class Step(NamedTuple):
+    """An instruction: its stage (from 0), name, flags, and the rest of it."""
 
     stage: int
     name: str
     flags: tuple[str, ...]
     rest: str
-
-    def words(self):
-        """The rest as the exec form has it; a ValueError where it is in shell form."""
-        try:
-            found = json.loads(self.rest)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{self.name} is not in exec form: {self.rest}") from error
-        return cast(list[str], found)
 
 
 def steps_of(text):
@@ -76,22 +64,18 @@ def steps_of(text):
 
 
 def final(steps):
-    """Steps of the stage that becomes the image."""
     return [step for step in steps if step.stage == steps[-1].stage]
 
 
 def only(steps, name):
-    """The one step of that name in the image's stage."""
-    found = [step for step in final(steps) if step.name == name]
-    if len(found) != 1:
-        raise ValueError(f"{len(found)} {name} in the last stage")
-    return found[0]
+    """Return the rest of the one step of that name in the image's stage."""
+    (step,) = [step for step in final(steps) if step.name == name]
+    return step.rest
 
 
-def health_check(steps):
-    """Command of the image's health check."""
-    step = only(steps, "HEALTHCHECK")
-    return Step(step.stage, "HEALTHCHECK", (), step.rest.removeprefix("CMD ")).words()
+def words(steps, name):
+    """Return the words of a step in exec form."""
+    return json.loads(only(steps, name).removeprefix("CMD "))
 
 
 def environment(steps):
@@ -103,20 +87,20 @@ def environment(steps):
 # Lint
 
 
-def tool(name):
-    """A tool beside this Python; it comes with the dev extra."""
-    path = shutil.which(name, path=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}")
-    if path is None:
-        pytest.fail(f"{name} is not installed: it belongs to the dev extra, run `make test`")
-    return path
-
-
-def test_hadolint_has_nothing_against_the_dockerfile():
+@pytest.mark.parametrize(
+    ("file", "command"),
+    [
+        ("Dockerfile", ["hadolint", "--no-color"]),
+        ("docker-compose.yml", ["check-jsonschema", "--builtin-schema", "vendor.compose-spec"]),
+    ],
+)
+def test_linters_accept_the_files(file, command):
+    """The linters are installed beside this Python, with the extra `dev`."""
+    program = Path(sys.executable).parent / command[0]
     done = subprocess.run(
-        [tool("hadolint"), "--no-color", "-"], input=DOCKERFILE, capture_output=True, text=True,
-        timeout=PATIENCE_S,
-    )  # fmt: skip
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+        [program, *command[1:], ROOT / file], capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    assert (done.returncode, done.stderr) == (0, ""), done.stdout
 
 
 def test_the_image_runs_as_a_user_on_slim_bases_with_settings_that_are_read():
@@ -131,23 +115,21 @@ def test_the_image_runs_as_a_user_on_slim_bases_with_settings_that_are_read():
         "PATH", "PYTHONUNBUFFERED", "PYTHONDONTWRITEBYTECODE",
         "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_CACHE_DIR",
     }  # fmt: skip
-    assert only(steps, "EXPOSE").rest == env["SCENEPRINT_PORT"]
-    assert json.loads(only(steps, "VOLUME").rest) == [env["SCENEPRINT_DATA_DIR"]]
-    assert f'version="{PROJECT["version"]}"' in only(steps, "LABEL").rest
+    assert only(steps, "EXPOSE") == env["SCENEPRINT_PORT"]
+    assert words(steps, "VOLUME") == [env["SCENEPRINT_DATA_DIR"]]
+    assert f'version="{PROJECT["version"]}"' in only(steps, "LABEL")
 
 
 # What is sent to the builder
 
 
-def is_ignored(path, patterns=IGNORE):
-    """Whether .dockerignore keeps a file from the builder; the last pattern that fits decides."""
-    ignored = False
-    parts = path.split("/")
-    for line in patterns.splitlines():
+def is_ignored(path):
+    """Return whether .dockerignore excludes a file; the last pattern that fits decides."""
+    ignored, parts = False, path.split("/")
+    for line in IGNORE.splitlines():
         if line.strip() and not line.startswith("#"):
             pattern = line.removeprefix("!").removeprefix("**/")
-            at_any_depth = line.startswith("**/")
-            heads = parts if at_any_depth else parts[:1]
+            heads = parts if line.startswith("**/") else parts[:1]
             if any(fnmatch(head, pattern) for head in heads):
                 ignored = not line.startswith("!")
     return ignored
@@ -158,30 +140,24 @@ def test_the_builder_gets_no_secret():
 
 
 def context_files():
-    """What the builder is sent of a fresh checkout: no file that git does not know or would add."""
-    paths = sorted(path for path in tracked_files() if path and (ROOT / path).is_file())
+    """Return the files that the builder gets: those that git knows or would add."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    paths = sorted(path for path in listed.stdout.split("\0") if path and (ROOT / path).is_file())
     return [path for path in paths if not is_ignored(path)]
 
 
 # docker-compose.yml
 
 
-def composed(text=COMPOSE):
-    """The composition, with its merge keys and anchors followed."""
-    return cast(dict[str, Any], YAML(typ="safe", pure=True).load(text))
+def composed():
+    """Return the composition with its merge keys and anchors resolved."""
+    return YAML(typ="safe", pure=True).load(COMPOSE)
 
 
 def defaults(value):
     """What Compose makes of ${NAME:-default} where NAME is not set."""
     return re.sub(r"\$\{\w+:-([^}]*)\}", r"\1", value)
-
-
-@cache
-def tracked_files():
-    """Files that git knows or would add."""
-    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
-    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    return frozenset(listed.stdout.split("\0"))
 
 
 #: Of libraries that ours are built on: who they are to PostgreSQL and to the object store.
@@ -210,15 +186,6 @@ def test_a_part_of_the_composition_is_confined_and_told_what_is_read(name):
         own = {key.removeprefix("SCENEPRINT_").lower(): value for key, value in given.items()
                if key in KNOWN_SETTINGS}  # fmt: skip
         Settings(**own)
-
-
-def test_the_composition_is_as_the_specification_has_it():
-    done = subprocess.run(
-        [tool("check-jsonschema"), "--builtin-schema", "vendor.compose-spec",
-         str(ROOT / "docker-compose.yml")],
-        capture_output=True, text=True, timeout=PATIENCE_S,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout
 
 
 def test_the_two_parts_have_room_for_what_they_run():
@@ -263,15 +230,14 @@ FOLDERS = ("/opt/sceneprint", "/var/cache/sceneprint", "/data", "/src")
 OF_ROOT = ("apt-get", "groupadd", "useradd", "chown")
 
 
-@dataclass
 class Image:
-    """What the steps of a Dockerfile have made, under a folder."""
+    """The file system and the environment of an image, below a folder."""
 
-    root: Path
-    env: dict[str, str]
+    def __init__(self, root):
+        self.root, self.env = root, {}
 
     def here(self, text):
-        """The text with the image's folders where they are now."""
+        """Return a text with the current paths of the image's folders."""
         return re.sub(rf"(?<![\w.])({'|'.join(FOLDERS)})(?![\w-])", rf"{self.root}\1", text)
 
     def command(self, words):
@@ -332,9 +298,8 @@ def copy_step(image, step, files, cwd):
 
 
 def built(folder):
-    """Run every step of the Dockerfile, in their order."""
     steps, files = steps_of(DOCKERFILE), context_files()
-    image = Image(folder / "root", {})
+    image = Image(folder / "root")
     image.root.mkdir()
     cwd = image.root
     for step in steps:
@@ -368,25 +333,6 @@ def image(tmp_path_factory):
     return made
 
 
-@pytest.mark.thorough
-def test_what_is_installed_is_the_lock_and_no_more(image):
-    code = (
-        "import json, re; from importlib.metadata import distributions as d;"
-        "print(json.dumps({re.sub('[-_.]+', '-', x.name.lower()): x.version for x in d()}))"
-    )
-    told = subprocess.run(
-        image.command(["python", "-c", code]), env=image.env, capture_output=True, text=True,
-        check=True, cwd=image.root,
-    )  # fmt: skip
-    there = json.loads(told.stdout)
-    assert there.pop("sceneprint") == there.pop("sceneprint-client") == PROJECT["version"]
-    lock = set(re.findall(r"^([\w.-]+)==([\w.]+)", (ROOT / "requirements.lock").read_text(), re.M))
-    assert set(there.items()) <= {(name.lower(), version) for name, version in lock}
-    wanted = {re.split(r"[<>=;\[ ]", line)[0] for line in PROJECT["dependencies"]}
-    assert wanted - set(there) == {"open3d", "sceneprint-client"}
-    assert {"pip", "setuptools", "pytest", "mypy", "ruff", "dash"} & set(there) == set()
-
-
 @pytest.fixture
 def start(image, tmp_path):
     """Starts a part of the composition; whatever still runs at the end is killed."""
@@ -395,11 +341,11 @@ def start(image, tmp_path):
 
     def begin(name, env):
         part = composed()["services"][name]
-        words = only(steps, "ENTRYPOINT").words() + part.get("command", only(steps, "CMD").words())
+        command = words(steps, "ENTRYPOINT") + part.get("command", words(steps, "CMD"))
         log = tmp_path / f"{name}.log"
         with log.open("wb") as out:
             process = subprocess.Popen(
-                image.command(words), env={**image.env, **part["environment"], **env},
+                image.command(command), env={**image.env, **part["environment"], **env},
                 cwd=image.root, stdout=out, stderr=out, start_new_session=True,
             )  # fmt: skip
         started.append(process)
@@ -413,7 +359,6 @@ def start(image, tmp_path):
 
 
 def machine_code(image):
-    """Files of compiled kernels."""
     return {path.name for path in Path(image.env["NUMBA_CACHE_DIR"]).rglob("*.nbc")}
 
 
@@ -422,57 +367,44 @@ def test_service_and_worker_run_as_composed(image, start, room_frames, tmp_path)
     steps, parts = steps_of(DOCKERFILE), composed()["services"]
     compiled = machine_code(image)
     assert len(compiled) > 20
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = {"SCENEPRINT_PORT": str(free.getsockname()[1])}
+    port = {"SCENEPRINT_PORT": str(free_port())}
 
-    def exits(words):
+    def exits(command):
         env = {**image.env, **port}
-        return subprocess.run(image.command(words), env=env, timeout=PATIENCE_S, cwd=image.root,
+        return subprocess.run(image.command(command), env=env, timeout=PATIENCE_S, cwd=image.root,
                               capture_output=True).returncode  # fmt: skip
 
-    assert exits(health_check(steps)) == 1  # nobody is there
+    assert exits(words(steps, "HEALTHCHECK")) == 1  # nobody is there
     service, service_log = start("service", port)
     until = time.monotonic() + PATIENCE_S
-    while exits(health_check(steps)) != 0:
+    while exits(words(steps, "HEALTHCHECK")) != 0:
         assert service.poll() is None, service_log.read_text()
         assert time.monotonic() < until, service_log.read_text()
         time.sleep(0.3)
 
-    url = f"http://127.0.0.1:{port['SCENEPRINT_PORT']}/v1"
-    assert httpx.get(f"{url}/maps").status_code == 401
+    url = f"http://127.0.0.1:{port['SCENEPRINT_PORT']}"
+    assert httpx.get(f"{url}/v1/maps").status_code == 401
     documented = set(re.findall(r"docker compose exec service (.+?) NAME", DOCKERFILE + COMPOSE))
     assert documented == {"sceneprint keys --create"}
     made = subprocess.run(
         image.command([*documented.pop().split(), "robot"]), env=image.env, text=True,
         capture_output=True, check=True, cwd=image.root,
     )  # fmt: skip
-    headers = {"Authorization": f"Bearer {made.stdout.strip()}"}
-    with httpx.Client(base_url=url, headers=headers, timeout=PATIENCE_S) as client:
-        assert client.post("/maps", json={"name": "hall"}).status_code == 201
+    with Client(url, made.stdout.strip(), timeout_s=PATIENCE_S) as client:
+        client.create_map("hall")
         worker, worker_log = start("worker", port)
-        frame = room_frames[0]
-        lens, data = frame.intrinsics, tmp_path / "frame.npy"
-        np.save(data, frame.depth)
+        lens, path = room_frames[0].intrinsics, tmp_path / "frame.npy"
+        np.save(path, room_frames[0].depth)
         camera = {name: getattr(lens, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-        added = client.post(
-            "/maps/hall/frames",
-            files={"frame": ("frame.npy", data.read_bytes())},
-            data={"meta": json.dumps({"intrinsics": camera})},
-            headers={"Prefer": "wait=200"},
-        )
-        assert (added.status_code, added.json()["state"]) == (201, "indexed"), added.text
-        found = client.post(
-            "/maps/hall/queries",
-            files={"frame": ("frame.npy", data.read_bytes())},
-            data={"meta": json.dumps({"intrinsics": camera})},
-        )
-        assert (found.status_code, found.json()["status"]) == (200, "found"), found.text
+        meta = FrameMeta.model_validate({"intrinsics": camera})
+        client.wait([client.upload("hall", path, meta).job_id], timeout_s=PATIENCE_S)
+        assert client.query("hall", path, meta).status == "found"
     assert exits(parts["worker"]["healthcheck"]["test"][1:]) == 0
 
     assert parts["service"]["stop_grace_period"] == "30s"
     for process, log in ((worker, worker_log), (service, service_log)):
-        process.send_signal(signal.Signals[only(steps, "STOPSIGNAL").rest])
+        process.send_signal(signal.Signals[only(steps, "STOPSIGNAL")])
         assert process.wait(30) == 0, log.read_text()
-    assert exits(health_check(steps)) == 1
+    assert exits(words(steps, "HEALTHCHECK")) == 1
     # nothing was left to compile: no first frame waits for what the build could have done
     assert machine_code(image) == compiled

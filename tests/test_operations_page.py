@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint import errors
 from service.metrics import METRICS
-from service.problem_types import problem_type
-from tools.pages import problem_rows, written_pages
+from tools.pages import written_pages
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 FOLDER = DOCS.parent / "deploy/helm/sceneprint/dashboards"
@@ -50,16 +48,6 @@ def test_tables_of_pages_are_those_of_the_code(path):
     assert path.read_text() == written_pages()[path], "run: make goldens"
 
 
-def test_every_public_error_is_in_one_row_with_its_status():
-    table = [row for row in problem_rows() if not row[0].startswith("5")]
-    listed = {one.strip("`"): row[0] for row in table for one in row[1].split(", ")}
-    kinds = [getattr(errors, name) for name in errors.__all__ if name[:1].isupper()]
-    for kind in kinds:
-        status = problem_type(kind).status
-        name = errors.kebab_case(kind.__name__)
-        assert status >= 500 or listed[name] == str(status)
-
-
 def test_alerts_query_existing_metrics():
     page = (DOCS / "operations.md").read_text()
     alerts = [
@@ -81,20 +69,3 @@ def test_dashboards_ask_for_what_there_is():
         check(expression)
         named |= {re.sub(r"_(bucket|sum|count)$", "", name) for name, _ in queried(expression)}
     assert named == set(families())  # all is shown somewhere
-
-
-@pytest.mark.parametrize("name", DASHBOARDS)
-def test_a_dashboard_can_be_imported_and_provisioned(name):
-    """The data source is a variable: Grafana asks for inputs only where a person imports."""
-    dashboard = DASHBOARDS[name]
-    assert not dashboard.keys() & {"id", "__inputs"}  # of another Grafana: it would overwrite
-    source, *variables = dashboard["templating"]["list"]
-    assert (source["type"], source["query"]) == ("datasource", "prometheus")
-    wanted = {"type": "prometheus", "uid": f"${{{source['name']}}}"}
-    for variable in variables:
-        assert variable["datasource"] == wanted
-        check(variable["query"]["query"])
-    for panel in dashboard["panels"]:
-        assert panel["datasource"] == wanted
-        assert all(target["datasource"] == wanted for target in panel["targets"])
-    assert len({panel["id"] for panel in dashboard["panels"]}) == len(dashboard["panels"])

@@ -5,12 +5,13 @@ The output of the former must match the page; SCENEPRINT_UPDATE_GOLDEN=1 updates
 
 import os
 import re
-import socket
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from benchmarks.waiting import free_port
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE, WHOLE_MAPS = ROOT / "docs/from_bag_to_pose.md", ROOT / "docs/whole_maps.md"
@@ -44,9 +45,7 @@ def shape(lines):
 @pytest.fixture
 def said(tmp_path):
     """Runs a command as the page's reader does; with a number of lines it is left running."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     (tmp_path / "here").mkdir()
     (tmp_path / "here" / "examples").symlink_to(ROOT / "examples")
     environment = {

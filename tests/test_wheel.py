@@ -1,6 +1,5 @@
 """Tests of a wheel with compiled kernels, which need no compilation after installation."""
 
-import json
 import os
 import platform
 import subprocess
@@ -35,35 +34,6 @@ print(sum(sum(one._cache_misses.values()) for one in ours),
       sum(sum(one._cache_hits.values()) for one in ours))
 """
 
-#: Uploads a frame and asks for it, in this process; says what was compiled and found.
-USE = """
-import gc, json, sys
-from pathlib import Path
-import numpy as np
-from sceneprint import Client
-from sceneprint_client.api import FrameMeta
-import sceneprint
-from sceneprint.engine.signers import _corner
-corner = _corner()
-lens = {n: getattr(corner.intrinsics, n) for n in ("width", "height", "fx", "fy", "cx", "cy")}
-meta = FrameMeta.model_validate({"intrinsics": lens})
-path = Path(sys.argv[1]) / "frame.npy"
-np.save(path, corner.depth)
-with Client.embedded(Path(sys.argv[1]) / "data") as client:
-    client.create_map("hall")
-    added = client.upload("hall", path, meta)
-    client.wait([added.job_id])
-    answer = client.query("hall", path, meta)
-from numba.core.dispatcher import Dispatcher
-ours = [one for one in gc.get_objects() if isinstance(one, Dispatcher)
-        and one.py_func.__module__.startswith("sceneprint.")]
-print(json.dumps({
-    "compiled": [one.py_func.__name__ for one in ours if sum(one._cache_misses.values())],
-    "loaded": sum(sum(one._cache_hits.values()) for one in ours),
-    "from": sceneprint.__file__,
-    "matches": [one.frame_id for one in answer.matches], "frame": added.frame_id,
-}))
-"""
 
 #: The bytes of a signature and of an artifact.
 BYTES = """
@@ -118,7 +88,6 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory):
-    """Its files, in a folder that nobody may write to but root."""
     folder = tmp_path_factory.mktemp("installed")
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(folder)
@@ -163,14 +132,6 @@ def test_a_first_use_of_clouds_compiles_nothing(installed, tmp_path):
     assert compiled == 0
     assert loaded > 25
     assert [*(tmp_path / "numba").rglob("*.nb?")] == []
-
-
-def test_a_first_upload_and_query_compile_nothing(installed, tmp_path):
-    told = json.loads(run(USE, installed, tmp_path))
-    assert Path(told["from"]).is_relative_to(installed)
-    assert told["matches"] == [told["frame"]]
-    assert told["compiled"] == []
-    assert told["loaded"] > 25
 
 
 def test_signatures_are_those_of_code_for_this_processor(installed, tmp_path):
