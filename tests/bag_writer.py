@@ -1,7 +1,5 @@
 """Builders of ROS messages, and of bags in every container, with a camera mounted on a base."""
 
-from __future__ import annotations
-
 import io
 import struct
 from contextlib import contextmanager

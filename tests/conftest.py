@@ -1,7 +1,5 @@
 """Fixtures and hooks that several folders of tests share."""
 
-from __future__ import annotations
-
 import fcntl
 import gc
 import os
@@ -289,14 +287,12 @@ def postgres(tmp_path_factory):
         shutil.rmtree(server.folder, ignore_errors=True)  # the folder is large
 
 
-@pytest.fixture(scope="session")
-def _clean(postgres):
-    """Clean databases to reuse, since cleaning is twenty times as fast as creating."""
-    return []
+#: Clean databases to reuse, since cleaning is twenty times as fast as creating.
+_clean = []
 
 
 @pytest.fixture
-def postgres_url(postgres, _clean):
+def postgres_url(postgres):
     """URL of an empty database with the schema of this version."""
     if _clean:
         name = _clean.pop()

@@ -1,7 +1,5 @@
 """Tests of commands as processes: output, files and exit codes."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -9,7 +7,6 @@ import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -22,15 +19,9 @@ from sceneprint.models import save_model
 from sceneprint.pipeline import sign
 from sceneprint.types import Cloud
 from sceneprint_lab.synth import synthesise_survey
+from tests.conftest import Said
 
 CAMERA = {"width": 160, "height": 120, "fx": 146, "fy": 146, "cx": 80, "cy": 60}
-
-
-class Said(NamedTuple):
-    """What a command printed."""
-
-    stdout: str
-    stderr: str
 
 
 def run(*arguments, expect=0):

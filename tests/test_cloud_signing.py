@@ -1,23 +1,14 @@
 """Tests of signatures of clouds: near those of depth images, and invariant to rotation."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sceneprint.errors import UselessFrame
-from sceneprint.formats.dataset import find_sequences
-from sceneprint.geometry.rigid import rotation_angle
-from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
-from sceneprint.geometry.surface.voxels import Voxels
-from sceneprint.pipeline import distance, geometry_of, open_signer, prepare, see, sign
+from sceneprint.pipeline import distance, prepare, sign
 from sceneprint.types import Cloud
-
-FAR_M = 0.5
-FAR_RAD = np.radians(30.0)
 
 
 def cloud_of(frame, seed, R=None, *, has_viewpoint=True):
@@ -39,14 +30,6 @@ def any_rotation(seed):
     if np.linalg.det(q) < 0:
         q[:, 0] *= -1
     return np.asarray(q, float)
-
-
-def are_far(frames):
-    """(N, N), by pose."""
-    poses = np.stack([frame.pose for frame in frames if frame.pose is not None])
-    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=2) > FAR_M
-    turned = [[rotation_angle(a[:3, :3].T @ b[:3, :3]) > FAR_RAD for b in poses] for a in poses]
-    return apart | np.array(turned)
 
 
 def wall():
@@ -126,33 +109,3 @@ def test_a_cloud_is_near_its_own_depth_image(small_signer, room_frames):
         assert int(np.argmin(d)) == i
         turned_ = sign(cloud_of(frame, i, any_rotation(i)), small_signer)
         assert distance(cloud, turned_) < 0.5 * sorted(d)[1]
-
-
-def test_an_artifact_has_the_range_image(small_signer, room_frames):
-    p = small_signer.model.parameters
-    seen = see(cloud_of(room_frames[0], 0), p)
-    assert isinstance(seen, Voxels)
-    made = geometry_of(seen, small_signer.model)
-    assert made.surface.valid.shape[0] > 50
-    coarser = replace(p, cloud=CloudParameters(image_angle=2 / 146))
-    small = geometry_of(seen, replace(small_signer.model, parameters=coarser))
-    assert small.surface.valid.size == pytest.approx(made.surface.valid.size / 4, rel=0.05)
-
-
-def test_real_clouds_are_near_their_depth_images_and_may_turn(data_root):
-    """A few frames of what docs/evaluation.md tells of clouds."""
-    references = find_sequences(data_root / "7scenes" / "redkitchen")[0].frames
-    signer = open_signer("paper")
-    room = [one.read_depth() for one in references[::200]]
-    far = are_far(room)
-    assert far.sum() > 8
-    depth = [sign(frame, signer) for frame in room]
-    clouds = [sign(cloud_of(frame, i), signer) for i, frame in enumerate(room)]
-    apart = np.array([[distance(a, b) for b in depth] for a in clouds], float)
-    nearest_other = np.where(far, apart, np.inf)
-    assert (np.diag(apart) < nearest_other.min(axis=1)).all()
-    assert (np.diag(apart) < nearest_other.min(axis=0)).all()
-    assert (np.diag(apart) / nearest_other.min(axis=1)).mean() < 0.7
-    for i, frame in enumerate(room):
-        turned = sign(cloud_of(frame, i + 1, any_rotation(i)), signer)
-        assert distance(turned, clouds[i]) < 0.1 * nearest_other[i].min()

@@ -1,14 +1,13 @@
 """Tests of fused views of a room: position and area of the surface."""
 
-import subprocess
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from sceneprint.errors import InvalidRequest, UselessFrame
-from sceneprint.fusion import FusionParameters, fuse, prepare_view
+from sceneprint.errors import InvalidRequest, MissingDependency, UselessFrame
+from sceneprint.fusion import FusionParameters, fuse, open3d, prepare_view
 from sceneprint.geometry.surface.coverage import (
     TriangleMesh,
     added_areas,
@@ -24,7 +23,6 @@ CAMERA = Intrinsics(160, 120, 80.0, 80.0, 79.5, 59.5)  # sees 90 by 74 degrees
 
 
 def view(yaw, at=(0, 0, 0), pitch=0.0):
-    """What a camera in the room sees of its walls, floor and ceiling."""
     c, s = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
     e, f = np.cos(np.radians(pitch)), np.sin(np.radians(pitch))
     T = np.eye(4)
@@ -42,11 +40,6 @@ def view(yaw, at=(0, 0, 0), pitch=0.0):
 def around(with_open3d):
     """All walls of the room, the floor and the ceiling, seen from six sides."""
     return [*(view(yaw) for yaw in (0, 90, 180, 270)), view(0, pitch=90), view(0, pitch=-90)]
-
-
-@pytest.fixture(scope="module")
-def room(around):
-    return fuse(around, FusionParameters(voxel_m=0.026))
 
 
 def test_the_surface_lies_on_the_walls_and_has_their_area(around):
@@ -101,20 +94,6 @@ def test_a_thinned_view_keeps_its_rays(around):
         assert (y - k.cy) / k.fy == pytest.approx((2 * y - whole.cy) / whole.fy, abs=1e-12)
 
 
-def test_what_each_view_adds(around, room):
-    mesh, voxel = room
-    views = [around[0], around[0], around[2], *around[1:2], *around[3:]]
-    first = first_views(mesh, views, 2 * voxel)
-    added = added_areas(mesh, first, len(views))
-    assert added.sum() == pytest.approx(mesh.areas().sum())
-    assert added[1] == 0  # a duplicate adds nothing
-    assert added[0] == pytest.approx(added[2], rel=0.05)  # the room is alike before and behind
-    # the wall ahead is 4 m wide and 2.5 m high: 45 degrees to each side see 3 m, 37 up see 1.125
-    ahead = np.abs(mesh.points[mesh.triangles][..., 2].mean(axis=1) - ROOM[2]) < 0.02
-    seen = first[mesh.triangles].min(axis=1) == 0
-    assert mesh.areas()[ahead & seen].sum() == pytest.approx(3.0 * 2.25, rel=0.08)
-
-
 def test_first_seen_by_hand():
     """One square of two triangles, the first seen by the second view alone."""
     points = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1.0]])
@@ -151,25 +130,7 @@ def test_the_observed_volume_is_that_of_the_view_cone(around):
     assert observed_volume([])[0] == 0.0
 
 
-def test_without_open3d_the_message_names_the_packages():
-    """A system library is missing: all else of the package works."""
-    code = """
-import sys
-class Without:
-    def find_spec(self, name, path=None, target=None):
-        if name == "open3d":
-            raise ImportError("libX11.so.6: cannot open shared object file")
-sys.meta_path.insert(0, Without())
-import sceneprint.cli, sceneprint_client.client, sceneprint.fusion, service.app, worker.loop
-from sceneprint.fusion import open3d
-from sceneprint.errors import MissingDependency
-try:
-    open3d("A reconstruction")
-except MissingDependency as error:
-    print(error)
-"""
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
-    assert "libX11.so.6" in ran.stdout
-    assert "apt-get install libgl1 libegl1 libx11-6 libusb-1.0-0 libgomp1" in ran.stdout
-    assert ran.stdout.count("\n") == 1
+def test_without_open3d_the_message_names_the_packages(monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)  # as if a system library were missing
+    with pytest.raises(MissingDependency, match="apt-get install libgl1 libegl1 libx11-6 libusb"):
+        open3d("A reconstruction")

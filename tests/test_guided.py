@@ -24,7 +24,6 @@ def walk(room_views):
 
 
 def asked_of(walk, rows, poses):
-    """The first frame asked of others, whose poses are as given."""
     geometries, _ = walk
     n = len(rows)
     ranking = Ranking(np.array(rows, np.intp), np.zeros(n, np.int64), np.zeros(n))

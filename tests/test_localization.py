@@ -38,10 +38,10 @@ from sceneprint.pipeline import PairMatch, open_signer, prepare
 from sceneprint.places import LocalizationParameters, PosePrior, QueryFrame
 from sceneprint.types import DepthFrame, Geometry, Intrinsics, Patches, Surface
 from sceneprint_lab.synth import KINECT, render, symmetric_box
+from tests.test_lookalikes import looking
 
 
 def outcome(status="accepted", strength="strong", T=None):
-    """What `validate` might have said."""
     T = np.eye(4) if T is None else T
     return PairValidation(
         status,
@@ -58,7 +58,6 @@ def shifted(x, y=0.0):
 
 
 def about_up(degrees):
-    """A turn about z."""
     T, a = np.eye(4), math.radians(degrees)
     T[:2, :2] = [[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]
     return T
@@ -89,11 +88,7 @@ def seen_at(x, rows, strength="strong"):
 
 
 def by_pairs(blank, matches):
-    """What the matches alone decide."""
     return localize([QueryFrame(blank, matches)], ROWS)
-
-
-# Votes by hand
 
 
 def test_the_pose_of_a_match_leads_to_that_of_the_query(blank):
@@ -205,9 +200,6 @@ def test_five_votes_are_averaged(blank):
     assert found.average.T[0, 3] == pytest.approx(0.02)
 
 
-# Properties
-
-
 def test_a_copy_of_a_view_is_no_second_vote(blank):
     """Whatever is uploaded twice, ambiguous never becomes found."""
     rows = [*ROWS, *(T @ shifted(0.01) for T in ROWS)]  # each viewpoint again, a centimetre off
@@ -218,9 +210,6 @@ def test_a_copy_of_a_view_is_no_second_vote(blank):
         assert (found.status, {one.support for one in found.alternatives}) == ("ambiguous", {1})
     other = localize([QueryFrame(blank, [*both, *seen_at(0.0, [2])])], rows)
     assert other.status == "found"
-
-
-# The map's frames
 
 
 @pytest.fixture(scope="module")
@@ -239,21 +228,20 @@ def box_views(signer):
 def looking_at_the_box(degrees):
     """A camera two metres from the origin, a metre up, its optical axis through the box."""
     eye = about_up(degrees)[:3, :3] @ np.array([2.0, 0.0, 1.0])
-    z = np.array([0.0, 0.0, 0.3]) - eye
-    z /= np.linalg.norm(z)
-    x = np.cross(z, (0.0, 0.0, 1.0))
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    T[:3, 3] = eye
-    return T
+    return looking(eye, np.array([0.0, 0.0, 0.3]))
 
 
-def test_a_room_bears_out_the_true_pose_alone(signer, room_views):
-    p, overlap_p = MapParameters(), OverlapParameters()
+@pytest.fixture(scope="module")
+def path(signer, room_views):
+    """Geometries and poses of three frames along a path; the map has the last two."""
     frames = room_views(21, 0, 4, along_path=True).frames[:3]
     geometries = [prepare(frame, signer)[1] for frame in frames]
-    poses = np.stack([frame.pose for frame in frames if frame.pose is not None])
+    return geometries, np.stack([frame.pose for frame in frames])
+
+
+def test_a_room_bears_out_the_true_pose_alone(path):
+    p, overlap_p = MapParameters(), OverlapParameters()
+    geometries, poses = path
     views = MapViews(poses[1:3], geometries[1:3].__getitem__, p, overlap_p)
     query = map_frame(geometries[0], np.eye(4), p, overlap_p)
     here = score_pose([query], poses[0], views, p, overlap_p)
@@ -276,13 +264,11 @@ def test_a_room_bears_out_the_true_pose_alone(signer, room_views):
     np.testing.assert_allclose(drawn.T, poses[0] @ inverse(before), atol=0.02)
 
 
-def test_frames_of_another_room_contradict_the_map(room_views, signer):
+def test_frames_of_another_room_contradict_the_map(path, room_views, signer):
     p, overlap_p = MapParameters(), OverlapParameters()
-    frames = room_views(21, 0, 4, along_path=True).frames[:3]
-    (other, *_) = room_views(21, 2, 4, along_path=True).frames
-    here, *seen = (prepare(frame, signer)[1] for frame in frames)
-    wrong, T = prepare(other, signer)[1], frames[0].pose
-    views = MapViews(np.stack([frame.pose for frame in frames[1:]]), seen.__getitem__, p, overlap_p)
+    (here, *seen), (T, *poses) = path
+    wrong = prepare(room_views(21, 2, 4, along_path=True).frames[0], signer)[1]
+    views = MapViews(np.stack(poses), seen.__getitem__, p, overlap_p)
 
     def contradiction(*posed):
         return median_contradiction(posed, views, p, overlap_p)
@@ -461,7 +447,6 @@ def test_frames_that_look_the_same_way_are_asked_first():
 
 
 def test_evidence_by_hand():
-    """Two strong votes and a weak one for a place of three frames; another has a vote as well."""
     matches = [
         *seen_at(0.0, [0, 1]), *seen_at(0.0, [2], "weak"), suggested_at(0.0, 3),
         replace(seen_at(APART, [4], "weak")[0], similarity=0.9),  # of another place
@@ -494,25 +479,23 @@ def test_evidence_by_hand():
 )
 def test_a_pose_is_found_where_its_confidence_is_enough(rival, confidence, status):
     matches = [*seen_at(0.0, [0, 1]), *(suggested_at(APART, row) for row in (5, 6))]
-    found = judged(matches, [picture((40, SAME))], [picture((rival, SAME))])
+    places = [picture((40, SAME))], [picture((rival, SAME))]
+    found = judged(matches, *places)
     assert found.status == status
     assert found.confidence == pytest.approx(confidence, abs=1e-4)
     assert found.evidence.rival == pytest.approx(rival / 40)
     if status == "found":
         assert (found.verified_by, at_place(0, found)) == ("matches", True)
         strict = replace(BY_HAND, confidence=0.995)
-        assert judged(
-            matches, [picture((40, SAME))], [picture((rival, SAME))], p=strict
-        ).status == ("ambiguous")
+        assert judged(matches, *places, p=strict).status == "ambiguous"
     else:
         assert found.reason.startswith("another pose explains the frame equally well")
         lenient = replace(BY_HAND, confidence=0.95)
-        again = judged(matches, [picture((40, SAME))], [picture((rival, SAME))], p=lenient)
+        again = judged(matches, *places, p=lenient)
         assert again.status == ("found" if rival == 24 else "ambiguous")
 
 
 def test_a_confidence_that_equals_the_limit_suffices():
-    """For a pose that is found, with and without a prior, and for an alternative."""
     matches = [*seen_at(0.0, [0, 1]), *(suggested_at(APART, row) for row in (5, 6))]
     places = [picture((40, SAME))], [picture((24, SAME))]
     for prior in (None, near_place(0)):
@@ -526,7 +509,6 @@ def test_a_confidence_that_equals_the_limit_suffices():
 
 
 def test_alternatives_are_told_with_their_confidences_the_best_first():
-    """Equal places share what is left; what is not worth a look is not told."""
     matches = [suggested_at(APART * k, row) for k in range(3) for row in (2 * k, 2 * k + 1)]
     places = [[picture((count, SAME))] for count in (36, 36, 12)]
     found = judged(matches, *places)
@@ -539,7 +521,6 @@ def test_alternatives_are_told_with_their_confidences_the_best_first():
 
 
 def test_few_planes_and_violations_lower_a_confidence():
-    """By the penalties: 3 of 6 planes; 1 of 5 %, on either side."""
     votes = seen_at(0.0, [0, 1])
     for there, logit, why in (
         (picture((6, SAME)), 3.0, "only 6 distinct planes agree"),
@@ -574,7 +555,6 @@ def test_a_pose_that_one_view_alone_suggests_is_not_sure():
     ],
 )
 def test_violations_that_the_map_shows_of_itself_are_borne(same, missing, unlike, excess):
-    """Its two frames see the same, but for so many tiles that the query does not show."""
     query = picture((same + missing, SAME))
     frames = [
         picture((same, SAME), (missing, FARTHER), (unlike, away)) for away in (SAME, FARTHER)
@@ -599,12 +579,10 @@ def test_most_of_the_frames_that_agree_decide_what_a_map_is_made_of(rendered, st
     assert found.evidence.excess == pytest.approx(0.1)
 
 
-def test_a_pose_that_refines_to_another_is_no_rival(signer, room_views):
+def test_a_pose_that_refines_to_another_is_no_rival(path):
     """Beyond the distance between places, but in the basin of the right pose."""
     p, overlap_p = MapParameters(same_m=0.02, place_m=0.05), OverlapParameters()
-    frames = room_views(21, 0, 4, along_path=True).frames[:3]
-    geometries = [prepare(frame, signer)[1] for frame in frames]
-    poses = np.stack([frame.pose for frame in frames if frame.pose is not None])
+    geometries, poses = path
     views = MapViews(poses[1:3], geometries[1:3].__getitem__, p, overlap_p)
     query = map_frame(geometries[0], np.eye(4), p, overlap_p)
     near = poses[0].copy()
@@ -629,9 +607,6 @@ def test_weak_matches_suffice_where_nothing_is_known_of_free_space(blank):
     unsure = [suggested_at(0.0, row, "ambiguous") for row in range(3)]
     none = localize([QueryFrame(lost, unsure)], ROWS)
     assert (none.status, none.reason) == ("ambiguous", "no match is accepted")
-
-
-# The map alone
 
 
 def test_the_map_alone_may_decide_where_no_match_votes():
@@ -667,7 +642,6 @@ def test_the_first_poses_of_all_candidates_come_before_their_second():
 
 
 def test_a_place_that_the_map_does_not_show_loses_to_any_rival():
-    """Whether its pose was scored on all frames, or was not hopeful."""
     matches = [*seen_at(0.0, [0, 1]), *seen_at(APART, [2])]
     for hopeful, excess in ((0.0, 0.0), (0.2, 1.0)):
         p = replace(BY_HAND, map=replace(BY_HAND.map, hopeful=hopeful))
@@ -689,16 +663,12 @@ def test_a_pose_against_which_up_speaks_is_not_suggested():
 
 
 def test_where_no_match_is_accepted_the_pose_is_that_of_the_map():
-    """What an ambiguous match says is but the first to be looked at."""
     aside = inverse(ROWS[0])
     aside[2, 3] = 0.2
     unsure = match(0, outcome("ambiguous", T=aside))
     found = judged([unsure, suggested_at(0.0, 1)], [WHOLE] * 8)
     assert (found.status, found.verified_by) == ("found", "map")
     assert at_place(0, found)
-
-
-# Priors
 
 
 @pytest.mark.parametrize(
@@ -803,10 +773,8 @@ def test_a_prior_may_confirm_the_best_of_equal_poses_alone():
 
 def test_the_parent_frame_of_rejected_matches_is_that_of_most():
     tried = [suggested_at(0.0, row) for row in range(3)]
-    for parents, parent in (
-        (["there", "here", "here"], "here"),
-        (["there", "there", "here"], "there"),
-    ):
+    for middle in ("here", "there"):
+        parents, parent = ["there", middle, "here"], middle
         views_of = told_by([WHOLE] * 3, parent=parent)
         frames = [QueryFrame(WHOLE, tried)]
         found = localize(frames, ROWS[:3], parents, views_of, None, BY_HAND, FIXED)
@@ -814,7 +782,6 @@ def test_the_parent_frame_of_rejected_matches_is_that_of_most():
 
 
 def test_poses_about_a_prior_are_drawn_to_where_the_map_fits(box_views, signer):
-    """Also where no candidate suggests any."""
     poses, views = box_views
     T = looking_at_the_box(45.0)
     query = prepare(DepthFrame(render(symmetric_box(), T, KINECT), KINECT, "query", T), signer)[1]
@@ -837,11 +804,7 @@ def test_starts_lie_a_deviation_about_a_prior():
     np.testing.assert_allclose(starts[:, :3, 3] - T[:3, 3], by_hand, atol=1e-12)
 
 
-# Several frames
-
-
 def test_frames_of_a_sequence_vote_for_the_pose_of_the_last(blank):
-    """Each match places its own frame; odometry brings that to the last."""
     before = shifted(-1.0) @ about_up(20.0)  # T_query_sensor of the frame before
     truth = about_up(40.0) @ shifted(3.0)
     first = [match(i, outcome(T=inverse(ROWS[i]) @ truth @ before)) for i in (0, 1)]
@@ -962,9 +925,6 @@ def test_what_was_not_compared_is_ambiguous(blank):
     assert mark_unconfirmed(told) is told
 
 
-# All that may change an answer
-
-
 class Shelf:
     """Frames at ROWS, but row 5 a bit aside; what searches return is given, and calls are noted."""
 
@@ -999,7 +959,6 @@ def guided_at(x, row):
 
 
 def test_guided_matches_are_searched_where_no_pose_is_found(blank):
-    """Of the frame that has them; its other matches are known."""
     before = QueryFrame(blank, [suggested_at(0.0, 3)])
     frames = [
         before,
@@ -1023,7 +982,6 @@ def test_guided_matches_of_a_found_pose_are_not_searched(blank):
 
 
 def test_frames_elsewhere_are_compared_before_a_pose_is_found(blank):
-    """Those that the last frame has not tried vote for its pose, in its coordinates."""
     before = QueryFrame(
         blank, [match(5, outcome(T=inverse(ROWS[5]) @ shifted(-1.0)))], shifted(-1.0)
     )

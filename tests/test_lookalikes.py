@@ -5,7 +5,6 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from benchmarks.pairs import pairs_among
 from sceneprint.formats.dataset import find_sequences
@@ -13,9 +12,8 @@ from sceneprint.geometry.rigid import inverse, pose_difference
 from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
-from sceneprint.types import Cloud, DepthFrame
-from sceneprint_lab.synth import KINECT, corridor, symmetric_box, synthesise_survey, take
-from sceneprint_lab.synth.sensors import Spinning, scan
+from sceneprint.types import DepthFrame
+from sceneprint_lab.synth import KINECT, corridor, symmetric_box, take
 
 #: A transform this near the truth is right: then the pair was told apart after all.
 RIGHT_M = 0.2
@@ -69,21 +67,6 @@ def corridor_pairs(n, seed):
         yield frames[0], frames[1]
 
 
-def scan_pairs(room, pitch, n, seed):
-    """A corridor or a hall of equal bays, scanned from two places one to three pitches apart."""
-    rng = np.random.default_rng((seed, 2))
-    length, width = room.outline.max(axis=0)
-    for _ in range(n):
-        x = rng.uniform(6, length - 6 - 3 * pitch)
-        scans = []
-        for shift in (0.0, float(rng.integers(1, 4)) * pitch):
-            T = np.eye(4)
-            T[:3, :3] = Rotation.from_euler("z", rng.uniform(0, 2 * np.pi)).as_matrix()
-            T[:3, 3] = x + shift, rng.uniform(0.7, width - 0.7), 1.4
-            scans.append(Cloud(scan(room.caster, T, Spinning(), rng), pose=T))
-        yield scans[0], scans[1]
-
-
 def overlapping(recording, n, seed):
     """`n` pairs of every 20th frame of a recording that overlap by half, the smaller direction."""
     frames = [reference.read_depth() for reference in recording[::20]]
@@ -92,7 +75,6 @@ def overlapping(recording, n, seed):
 
 
 def geometry(frame, model):
-    """The geometry artifact of a frame."""
     return geometry_of(see(frame, model.parameters), model)
 
 
@@ -106,7 +88,6 @@ def outcome(query, match, truth, seed):
 
 
 def outcomes_of(pairs, model):
-    """Outcomes of pairs with known poses."""
     counted = Counter()
     for i, (a, b) in enumerate(pairs):
         truth = inverse(b.pose) @ a.pose
@@ -115,7 +96,6 @@ def outcomes_of(pairs, model):
 
 
 def not_believed(counted):
-    """Share of pairs that were not accepted with a wrong transform."""
     wrong = sum(n for what, n in counted.items() if what.endswith("wrong"))
     return 1.0 - wrong / counted.total()
 
@@ -131,41 +111,6 @@ def test_sides_of_a_box_and_doors_of_a_corridor_are_not_told_apart(pairs, unsure
     counted = outcomes_of(pairs(24, 31), model)
     assert not_believed(counted) >= 0.95
     assert counted["ambiguous"] >= unsure  # and not for want of a transform
-
-
-@pytest.fixture(scope="module")
-def scans_model():
-    return read_model("lidar")
-
-
-@pytest.mark.thorough  # tests/geometry/test_validation_clouds.py has a room of equal sides
-@pytest.mark.parametrize(
-    ("room", "pitch", "n", "least"),
-    [
-        ((60, 2.5, 2.2, 2.6), 2.5, 12, 1.0),
-        # half a turn maps an empty hall onto itself: what tells is no more than noise
-        ((10, 6.0, 14.0, 6.0), 6.0, 24, 0.95),  # measured: one of 24, and one of another seed
-    ],
-)
-def test_scans_of_equal_doors_and_bays_are_seldom_believed(room, pitch, n, least, scans_model):
-    counted = outcomes_of(scan_pairs(corridor(*room), pitch, n, 31), scans_model)
-    assert not_believed(counted) >= least
-    assert counted["ambiguous"] >= 6  # and not for want of a transform; of bays measured: 7
-
-
-@pytest.mark.thorough
-def test_scans_of_synthetic_storeys(scans_model):
-    """Corridors with rooms: of what is accepted at most one in fifty is wrong."""
-    counted = Counter()
-    for index in range(8):
-        survey = synthesise_survey(7200, index, 14, kind="storey")
-        frames = [(cloud.pose, geometry(cloud, scans_model)) for cloud in survey.clouds]
-        for (T_a, a), (T_b, b) in combinations(frames, 2):
-            counted[outcome(a, b, inverse(T_b) @ T_a, 0)] += 1
-    wrong = sum(n for what, n in counted.items() if what.endswith("wrong"))
-    right = sum(n for what, n in counted.items() if what.endswith("right"))
-    assert right >= 60
-    assert wrong <= 1
 
 
 def test_frames_that_overlap_by_half_are_accepted(model, data_root):

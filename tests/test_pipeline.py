@@ -1,7 +1,5 @@
 """Tests of the path from a frame to its stored signature."""
 
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -10,7 +8,6 @@ import pytest
 
 from sceneprint.errors import ModelMismatch, UselessFrame
 from sceneprint.geometry.signature.fisher_vector import quantise
-from sceneprint.models import save_model
 from sceneprint.pipeline import distance, sign
 from sceneprint.signing import describe, encode, float_signature, open_signer, table_statistics
 from sceneprint.types import DepthFrame, Intrinsics
@@ -41,29 +38,6 @@ def test_same_bytes_in_any_thread_and_order(small_signer, room_frames):
         threaded = [job.result().vector.tobytes() for job in jobs]
     assert threaded == alone[::-1] * 2
     assert len(set(alone)) == len(alone)
-
-
-def signed_elsewhere(frame, model, folder):
-    """The stored signature of a frame, made by a fresh process."""
-    save_model(model, folder / "model")
-    np.save(folder / "depth.npy", frame.depth)
-    code = (
-        "import sys, numpy as np, sceneprint as s\n"
-        "k = s.Intrinsics(640, 480, 585.0, 585.0, 320.0, 240.0)\n"
-        f"signer = s.open_signer({str(folder / 'model')!r}, cached=False)\n"
-        f"frame = s.DepthFrame(np.load({str(folder / 'depth.npy')!r}), k)\n"
-        "sys.stdout.buffer.write(s.sign(frame, signer).vector.tobytes())\n"
-    )
-    environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment)
-    assert done.returncode == 0, done.stderr.decode()
-    return np.frombuffer(done.stdout, np.uint8)
-
-
-def test_same_bytes_in_another_process(small_signer, room_frames, tmp_path):
-    assert room_frames[0].intrinsics == CAMERA
-    elsewhere = signed_elsewhere(room_frames[0], small_signer.model, tmp_path)
-    np.testing.assert_array_equal(elsewhere, sign(room_frames[0], small_signer).vector)
 
 
 def test_stages_add_up_to_sign(small_signer, room_frames):
@@ -114,7 +88,6 @@ def test_one_patch_has_no_pair(small_model):
 
 
 def test_any_depth_signs_or_says_why(small_signer):
-    """Shapes, cameras and values nobody planned for: a signature or a UselessFrame."""
     rng = np.random.default_rng(3)
     outcomes = {"signed": 0, "useless": 0}
     for _ in range(40):
@@ -132,13 +105,3 @@ def test_any_depth_signs_or_says_why(small_signer):
         except UselessFrame:
             outcomes["useless"] += 1
     assert min(outcomes.values()) >= 5
-
-
-def test_importing_loads_nothing_heavy():
-    code = (
-        "import sys, sceneprint\n"
-        "heavy = {'numpy', 'numba', 'sklearn', 'open3d', 'PIL', 'pydantic'}\n"
-        "sys.exit(', '.join(heavy & set(sys.modules)) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")

@@ -51,22 +51,6 @@ def test_points_are_read_back():
     assert [one["residual"] for one in told] == residuals.tolist()
 
 
-def test_what_is_not_told_says_so():
-    head, told = decoded(encode_points(np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 3.5]])))
-    assert (head["flags"], head["total"], head["scale"]) == (0, 2, 0)
-    assert head["extent"] == (0, 0, 0.5)  # flat in two directions
-    assert [one["at"] for one in told] == [[1, 2, 3], [1, 2, 3.5]]
-    assert {(one["patch"], one["residual"]) for one in told} == {(65535, 255)}
-    assert told[0]["normal"] == [0, 0, 0]
-    assert decoded(encode_points(np.zeros((0, 3)))) == (
-        {"flags": 0, "origin": (0, 0, 0), "extent": (0, 0, 0), "total": 0, "scale": 0}, [],
-    )  # fmt: skip
-    for flags, more in ((1, {"normals": np.eye(3)}), (2, {"patches": np.array([0, 70000, -1])})):
-        head, told = decoded(encode_points(np.eye(3), **more))
-        assert head["flags"] == flags
-    assert [one["patch"] for one in told] == [0, 65535, 65535]
-
-
 def test_far_from_its_origin_a_cloud_keeps_its_shape():
     points = 4e6 + np.array([[0.0, 0, 0], [1, 2, 0.25], [0.5, 1, 0.25]])
     _, told = decoded(encode_points(points))

@@ -21,7 +21,6 @@ from sceneprint.types import Intrinsics, Surface
 
 
 def surface(z, normals=None):
-    """Of these depths; 0 for none."""
     depth = np.array(z, np.float32)
     points = np.zeros((*depth.shape, 3), np.float32)
     points[..., 2] = depth
@@ -42,12 +41,6 @@ def test_depth_by_hand():
     assert (text["near_m"], text["far_m"]) == (f"{near:.4f}", f"{far:.4f}")
     two, _ = depth_view(surface([[1.0] * 50 + [2.0, 3.0] + [3.0] * 49]))
     assert two[0, 50].tolist() == [33, 145, 140]  # half way
-
-
-def test_nothing_seen_is_grey_throughout():
-    blank = surface([[0.0, 0.0]])
-    for colours, _ in (depth_view(blank), normals_view(blank), patches_view(np.full((2, 3), -1))):
-        assert (colours == UNKNOWN).all()
 
 
 def test_normals_by_hand():

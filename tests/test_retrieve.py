@@ -11,10 +11,9 @@ from sceneprint.geometry.registration.patch_descriptors import compress, patch_d
 from sceneprint.geometry.retrieval.ranking import Ranking
 from sceneprint.geometry.retrieval.ranking import diversify as select
 from sceneprint.geometry.signature.segmentation import extract_patches, segment
-from sceneprint.geometry.validation.validation import PairValidation, expected_error, rank_accepted
+from sceneprint.geometry.validation.validation import expected_error, rank_accepted
 from sceneprint.models import read_model
 from sceneprint.pipeline import (
-    PairMatch,
     Signature,
     associate,
     diversify,
@@ -28,30 +27,11 @@ from sceneprint.signing import see
 from sceneprint.types import DepthFrame, Geometry
 from sceneprint_lab.synth import KINECT, take, trajectory
 from sceneprint_lab.synth.dataset import room_and_rng
+from tests.test_localization import outcome, shifted
 
 
 def signature(*values, model_id="a" * 64):
     return Signature(np.array(values, np.uint8), model_id, (5,), (20,), "l1")
-
-
-def outcome(status="accepted", strength="strong", T=None):
-    """What `validate` might have said."""
-    return PairValidation(
-        status,
-        strength if status == "accepted" else None,
-        "as given", np.eye(4) if T is None else T, 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.0,
-        None, 0,
-    )  # fmt: skip
-
-
-def shifted(x):
-    T = np.eye(4)
-    T[0, 3] = x
-    return T
-
-
-def match(index, validation):
-    return PairMatch(index, 10, 0.5, validation)
 
 
 def ranked(model, *indices):
@@ -68,17 +48,10 @@ def model_a(small_model):
     return named
 
 
-# retrieve
-
-
 def test_retrieve_by_hand(model_a):
     query = signature(10, 10, 10)
-    database = [
-        signature(10, 10, 13),
-        signature(255, 0, 0),
-        signature(10, 9, 10),
-        signature(7, 10, 10),
-    ]
+    rows = ((10, 10, 13), (255, 0, 0), (10, 9, 10), (7, 10, 10))
+    database = [signature(*row) for row in rows]
     found = retrieve(query, database, model_a)
     assert found.indices.tolist() == [2, 0, 3, 1]
     assert found.distances.tolist() == [1, 3, 3, 265]
@@ -117,9 +90,6 @@ def test_signatures_of_two_models_are_not_compared(model_a):
         retrieve(mixed[1], mixed[1:], model_a)
 
 
-# diversify
-
-
 def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a):
     rng = np.random.default_rng(1)
     database = [signature(*rng.integers(0, 256, 30).tolist()) for _ in range(25)]
@@ -134,9 +104,6 @@ def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a):
     np.testing.assert_array_equal(chosen.gains, expected.gains)
     assert chosen.indices[0] == 0
     assert len(diversify(found, database).indices) == 10
-
-
-# prepare and geometry_of
 
 
 def test_prepare_is_sign_and_geometry_of_one_look(small_signer, room_frames):
@@ -159,11 +126,7 @@ def test_prepare_is_sign_and_geometry_of_one_look(small_signer, room_frames):
     assert 250 < len(patches) < 450  # 400 cells
 
 
-# validate, associate
-
-
 def never():
-    """An artifact that is not looked into."""
     return Geometry(None, None, None, "a" * 64)
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from sceneprint.geometry.signature.mixture import MixtureParameters
 from sceneprint.geometry.signature.pair_features import TableLayout
-from sceneprint.models import ModelParameters, read_model
+from sceneprint.models import read_model
 from sceneprint.pipeline import distance, open_signer, sign
 from sceneprint_lab.synth import Spinning, synthesise_survey
-from sceneprint_lab.training import TrainingParameters, preset_parameters, preset_scenes, train
+from sceneprint_lab.training import TrainingParameters, preset_parameters, train
 
 TRAINING = TrainingParameters(
     rooms=2, views=2, seed=3, pairs=3000, histograms=1500, descriptors=32, scenes="sites"
@@ -22,18 +22,6 @@ def trained():
     model_p, _ = preset_parameters("lidar")
     small = replace(model_p, table=TableLayout(8, 9, 8))
     return train("tiny", small, MixtureParameters(n_components=16, iterations=3), TRAINING)
-
-
-def test_scenes_and_lengths_are_the_presets_own():
-    assert [preset_scenes(name) for name in ("paper", "depth", "lidar")] == [
-        ("rooms", 6), ("rooms", 6), ("sites", 3),
-    ]  # fmt: skip
-    lidar, mixture = preset_parameters("lidar")
-    assert (mixture.n_components, lidar.hierarchy.n_levels) == (256, 4)
-    assert (lidar.properties.radius, lidar.weights.size_exponent) == (30.0, 0.0)
-    assert lidar.surroundings.far_radius == 8.0
-    assert (lidar.cloud.minimum_range, lidar.cloud.maximum_range) == (0.6, 60.0)
-    assert preset_parameters("paper")[0] == ModelParameters()
 
 
 def test_scans_of_one_part_of_a_hall_are_nearer_than_others(trained):

@@ -2,16 +2,16 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.turns import ACTIVE_S, PRESENT_S, ThreadTurns, TurnOrder
 
 
 class Clock:
-    """Seconds that pass when told to."""
+    """A clock that stands at `now`."""
 
-    def __init__(self):
-        self.now = 0.0
+    now = 0.0
 
     def __call__(self):
         return self.now
@@ -185,27 +185,19 @@ def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once():
 
 def test_many_threads_never_hold_more_than_there_are():
     turns, lock = ThreadTurns(3), threading.Lock()
-    held, most, done = 0, 0, 0
+    holders, counts = set[int](), list[int]()
 
-    def work(tenant):
-        def run():
-            nonlocal held, most, done
-            for _ in range(50):
-                assert turns.acquire(tenant, 60)
-                with lock:
-                    held += 1
-                    most = max(most, held)
-                with lock:
-                    held -= 1
-                    done += 1
-                turns.release(tenant)
+    def work(number):
+        for _ in range(50):
+            assert turns.acquire("abc"[number % 3], 60)
+            with lock:
+                holders.add(number)
+                counts.append(len(holders))
+            with lock:
+                holders.remove(number)
+            turns.release("abc"[number % 3])
 
-        return run
-
-    threads = [threading.Thread(target=work("abc"[number % 3])) for number in range(9)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert (held, done) == (0, 450)
-    assert 1 <= most <= 3
+    with ThreadPoolExecutor(9) as pool:
+        list(pool.map(work, range(9)))
+    assert (len(counts), holders) == (450, set())
+    assert max(counts) <= 3

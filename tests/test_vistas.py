@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sceneprint.pictures import vista_of
-from sceneprint.types import Intrinsics, Sphere, Surface
+from sceneprint.types import Sphere, Surface
 
 
 def surface(points, camera):
@@ -29,14 +29,6 @@ def around(pole):
     )  # fmt: skip
     ranges = np.arange(1.0, 13.0).reshape(3, 4, 1)
     return surface(np.roll(rays, pole - 2, axis=-1) * ranges, camera)
-
-
-def test_an_image_is_as_its_camera_saw_it():
-    seen = surface(np.dstack([np.zeros((2, 2, 2)), [[1.0, 2.0], [0.0, 4.0]]]),
-                   Intrinsics(2, 2, 1, 1, 0, 0))  # fmt: skip
-    vista = vista_of(seen)
-    assert vista.pixels.tolist() == [[0, 1], [-1, 3]]
-    assert (vista.distances.tolist(), vista.what) == ([1, 2, 0, 4], "depth")
 
 
 @pytest.mark.parametrize("pole", [0, 1, 2])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sceneprint.atomic_files import sync_folder, whole_file, write_durable, write_whole
+from sceneprint.atomic_files import whole_file, write_durable, write_whole
 
 
 @pytest.fixture
@@ -46,15 +46,6 @@ def test_a_durable_file_is_synced_before_its_name_and_the_name_after(tmp_path, c
         ("fsync", str(folder), b""),
         ("fsync", str(tmp_path), b""),
     ]
-
-
-def test_a_folder_is_synced_through_a_descriptor_that_is_closed(tmp_path, calls):
-    before = len(list(Path("/proc/self/fd").iterdir()))
-    sync_folder(tmp_path)
-    with pytest.raises(FileNotFoundError):
-        sync_folder(tmp_path / "none")
-    assert calls == [("fsync", str(tmp_path), b"")]
-    assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 
 @pytest.mark.parametrize("write", [write_whole, write_durable])

@@ -30,7 +30,7 @@ FOLDERS = (
 FILES = (
     "artifacts", "artifacts_clouds", "cloud_signing", "clouds", "fusion", "golden", "graphs",
     "guided", "localization", "lookalikes", "pipeline", "points", "quality", "retrieve",
-    "same_as_evaluate", "training", "training_lidar", "vistas",
+    "training", "training_lidar", "vistas",
 )  # fmt: skip
 #: Code that prints numpy's loops for this processor beyond those of the oldest x86-64.
 NUMPY_LOOPS = (

@@ -56,7 +56,6 @@ class CutDisk:
         self._ids = {real: at for real, at in self._ids.items() if real in named}
 
     def synced(self, descriptor):
-        """Record an fsync."""
         with self._lock:
             self.look()
             found = os.fstat(descriptor)

@@ -1,7 +1,5 @@
 """Run an operation with a fault at its first call, its second, and so on, and check each store."""
 
-from __future__ import annotations
-
 import os
 import select
 import shutil

@@ -49,7 +49,6 @@ class Injector:
         self.calls, self.failed, self._is_armed = 0, "", False
 
     def arm(self):
-        """Begin to count."""
         signal.signal(signal.SIGALRM, lambda *_: None)
         sys.addaudithook(self._audit)
         for name in ("write", "pwrite", "fsync", "fdatasync"):

@@ -1,7 +1,5 @@
 """The operations whose calls fail one after another, and the checks of a store afterwards."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile
@@ -65,7 +63,6 @@ class Store:
 
 
 def fill(store):
-    """Create a map with STORED signed frames."""
     with Engine(store.settings) as engine:
         engine.create_map(NewMap(name=MAP, model="depth"))
         for one in store.uploads[:STORED]:
@@ -186,7 +183,6 @@ OPERATIONS = {
 
 
 def small_uploads():
-    """Return small frames of a synthetic room."""
     with recordings(None, 1) as folder:
         shots = walks(folder, 1, STORED + 2)[0]
     return tuple(Upload(one.png, one.meta) for one in shots)

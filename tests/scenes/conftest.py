@@ -1,7 +1,5 @@
 """Fixtures of the viewer tests: a reader of scenes, a service with a map, and a command runner."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -84,7 +82,6 @@ class ListWriter:
         self.gone.append(gone)
 
     def contents(self, moment=-1):
-        """Return the contents of a moment by path."""
         return {"/".join(one.path): one.content for one in self.moments[moment].entities}
 
 
@@ -126,6 +123,5 @@ def sceneprint(service_url, client, run_command, monkeypatch):
 
 
 def moved(T, points):
-    """Return points transformed by a (4, 4) matrix."""
     T = np.asarray(T, float)
     return np.asarray(points, float) @ T[:3, :3].T + T[:3, 3]

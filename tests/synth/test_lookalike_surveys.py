@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sceneprint.formats.dataset import find_sequences
 from sceneprint_lab.synth import synthesise_lookalike_survey
 from sceneprint_lab.synth.large_scenes import symmetric_hall
 from sceneprint_lab.synth.lookalike_surveys import (
@@ -52,24 +51,3 @@ def test_a_scan_does_not_tell_equal_places_apart_and_tells_others():
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     assert distinct_fraction(Stop(hall, T), hall, half_turn @ T, SMALL) < 0.01
     assert distinct_fraction(Stop(hall, T), hall, np.diag([1.0, -1.0, -1.0, 1.0]) @ T, SMALL) > 0.1
-
-
-@pytest.mark.parametrize(
-    ("kind", "scenes"), [("bays", 1), pytest.param("absent", 2, marks=pytest.mark.thorough)]
-)
-def test_the_layout_is_read_back(kind, scenes, tmp_path, run_command):
-    out = tmp_path / "sites"
-    said, _ = run_command("synth", out, "--lookalikes", kind, "--sensor", "lidar", "--rooms", 1,
-                  "--views", 2, "--seed", SEED)  # fmt: skip
-    assert f"1 sites of 2 queries in {out}" in said
-    site = synthesise_lookalike_survey(kind, SEED, 0, queries=2)
-    found = find_sequences(out)
-    assert len({sequence.parent_frame for sequence in found}) == scenes
-    parts = {sequence.split: sequence for sequence in found}
-    assert set(parts) == {"train", "test"}
-    for part, clouds in (("train", site.map), ("test", site.queries)):
-        read = parts[part].frames
-        assert len(read) == len(clouds)
-        back = read[1].read()
-        np.testing.assert_allclose(back.points, clouds[1].points, atol=1e-5)
-        np.testing.assert_allclose(back.pose, clouds[1].pose, atol=1e-6)
