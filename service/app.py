@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import threading
 from collections.abc import AsyncIterator
@@ -151,6 +152,8 @@ def _warm(context: Context, stop: threading.Event) -> None:
         context.signers.warm()
     except SceneprintError as error:  # later requests retry
         log.info("store unreachable", extra={"error": str(error)})
+    gc.collect()
+    gc.freeze()  # otherwise, full collections would stop all threads for 50 ms to traverse code
 
 
 @asynccontextmanager
