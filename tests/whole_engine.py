@@ -2,6 +2,8 @@
 
 from contextlib import ExitStack
 
+from sqlalchemy import select, update
+
 from sceneprint.engine.admin import operations
 from sceneprint.engine.admin.operations import Audit, Events
 from sceneprint.engine.admin.statistics import Statistics
@@ -25,10 +27,10 @@ from sceneprint.engine.search.query import Queries
 from sceneprint.engine.upkeep.housekeeping import Housekeeping
 from sceneprint.engine.upkeep.purge import MemoryPurging
 from sceneprint.store import maps as stored_maps
+from sceneprint.store.events import number_events
 from sceneprint.store.keys import find_key
-from sceneprint_client.api import (
-    FrameName,
-)
+from sceneprint.store.tables import events, jobs
+from sceneprint_client.api import FrameName, Query
 from sceneprint_client.api.listing import FrameListing
 
 
@@ -118,8 +120,20 @@ class Engine:
     def get_frame(self, map_name, frame_id):
         return get_frame(self.store, map_name, frame_id)
 
+    def add(self, upload, map_name="hall", **more):
+        """Add an upload of the tests; returns what was accepted, and whether it is new."""
+        return self.add_frame(map_name, upload.data, upload.meta, **more)
+
+    def ids(self, map_name="hall"):
+        """Return the ids of the frames of a map in order of arrival."""
+        return [frame.frame_id for frame in self.list_frames(map_name).items]
+
     def delete_frame(self, map_name, frame_id):
         self.tombstones.delete_frame(map_name, frame_id)
+
+    def ask(self, upload, query=None, maps=("hall",), meta=None):
+        """Query maps with an upload of the tests."""
+        return self.queries.upload(list(maps), upload.data, meta or upload.meta, query or Query())
 
     def query_frame(self, map_name, frame_id, query, **more):
         frame = FrameName(map=map_name, frame_id=frame_id)
@@ -156,6 +170,23 @@ class Engine:
 
     def run(self, work, broke=None):
         return self.jobs.run(work, broke)
+
+    def work_off(self):
+        """Run all due jobs and return their states."""
+        states = []
+        while (work := self.claim("w")) is not None:
+            states.append(self.run(work))
+        return states
+
+    def make_due(self):
+        """Make all jobs due, by ending leases and delays."""
+        self.write(update(jobs).values(run_after=0.0))
+        self.write(update(jobs).where(jobs.c.leased_until.is_not(None)).values(leased_until=1.0))
+
+    def event_kinds(self):
+        """Return the kinds of all events in order."""
+        number_events(self.store.database)
+        return list(self.fetch(select(events.c.kind).order_by(events.c.number)).scalars())
 
     def put_back(self, work):
         self.jobs.put_back(work)

@@ -30,16 +30,21 @@ def settings():
     return settings_of
 
 
-@pytest.fixture(scope="session")
-def uploads(room_frames, small_image):
-    """24 small frames with poses, from four offsets of each of six views."""
-    found = []
-    for frame in room_frames:
+def small_uploads(room_frames, small_image):
+    """Return 24 small frames with poses and tags, from four offsets of each of six views."""
+    results = []
+    for number, frame in enumerate(room_frames):
         for place in range(4):
             data, camera = small_image(frame, *divmod(place, 2))
             pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
-            found.append(Upload(data, FrameMeta(intrinsics=camera, pose=pose)))
-    return found
+            tags = ["all", f"view-{number}"]
+            results.append(Upload(data, FrameMeta(intrinsics=camera, pose=pose, tags=tags)))
+    return results
+
+
+@pytest.fixture(scope="session")
+def uploads(room_frames, small_image):
+    return small_uploads(room_frames, small_image)
 
 
 @pytest.fixture(scope="session")
@@ -50,8 +55,7 @@ def master(uploads, tmp_path_factory):
         engine.create_map(NewMap(name="hall", model="depth"))
         for each in uploads[: SIGNED + 1]:
             engine.add_frame("hall", each.data, each.meta)
-        while (work := engine.claim("w")) is not None:
-            assert engine.run(work) == JobState.SUCCEEDED
+        assert set(engine.work_off()) == {JobState.SUCCEEDED}
         engine.delete_frame("hall", engine.list_frames("hall").items[SIGNED].frame_id)
         engine.add_frame("hall", uploads[SIGNED + 1].data, uploads[SIGNED + 1].meta)
         engine.store.blobs.put(b"nothing refers to this")
@@ -61,13 +65,11 @@ def master(uploads, tmp_path_factory):
 
 @pytest.fixture
 def data(master, tmp_path):
-    """A writable copy of `master`."""
     return Path(shutil.copytree(master, tmp_path / "data"))
 
 
 @pytest.fixture(scope="session")
 def place(master, tmp_path_factory):
-    """A read-only folder with a bundle of `master`."""
     folder = str(tmp_path_factory.mktemp("place") / "bundles")
     take_backup(settings_of(master), folder)
     return folder
@@ -91,21 +93,17 @@ def content():
 
 @pytest.fixture(scope="session")
 def rows():
-    """A function that queries a data folder's database."""
-
     def ask(folder, asked):
         with closing(sqlite3.connect(folder / "sceneprint.db", timeout=PATIENCE_S)) as database:
-            found = database.execute(asked).fetchall()
+            results = database.execute(asked).fetchall()
             database.commit()
-            return found
+            return results
 
     return ask
 
 
 @pytest.fixture(scope="session")
 def answers():
-    """A function that returns the answers of the map `hall`, without parts that always differ."""
-
     def of(settings, asked):
         free = {"query_id": "", "milliseconds": {}}
         with Engine(settings) as engine:
@@ -121,14 +119,13 @@ def answers():
 
 @pytest.fixture
 def sceneprint(run_command, monkeypatch):
-    """A function that runs a command in this process and checks its exit code."""
     monkeypatch.delenv("SCENEPRINT_DATABASE_URL", raising=False)
 
     def run(*arguments, expect=0):
-        said = run_command(*arguments, expect=expect)
+        output = run_command(*arguments, expect=expect)
         if expect == 2:
-            assert said.stdout == ""
-            assert said.stderr.count("\n") == 1
-        return said
+            assert output.stdout == ""
+            assert output.stderr.count("\n") == 1
+        return output
 
     return run

@@ -19,14 +19,11 @@ from sceneprint.settings import Settings
 
 @pytest.fixture
 def copy(place, tmp_path):
-    """A copy of the place, to be damaged."""
     return Path(shutil.copytree(place, tmp_path / "copy"))
 
 
 @pytest.fixture
 def refused(copy, tmp_path):
-    """Check that the copy is refused, and that no store comes of it."""
-
     def check(text, kind=DamagedBundle):
         for attempt in (
             lambda: verify_bundle(str(copy)),
@@ -75,7 +72,6 @@ def replace_part(folder, kind, change):
 
 
 def test_every_part_that_is_flipped_cut_missing_or_swapped_is_named(copy):
-    """One damage to each part, and each damage to two parts or more."""
     rng, parts = random.Random(8), sorted(copy.glob("parts/??/*"))
     assert len(parts) > 15
     for number, path in enumerate(parts):
@@ -183,7 +179,6 @@ def lines_of(folder, kind):
 
 @pytest.mark.parametrize("large", [restoration.LARGE, 20])
 def test_a_damaged_blob_is_named_as_it_is_restored(copy, tmp_path, monkeypatch, large):
-    """Blobs that are copied in parts as well as those that memory holds."""
     monkeypatch.setattr(restoration, "LARGE", large)
     digest = lines_of(copy, "blobs")[3][0]
     path = copy / "parts" / digest[:2] / digest
@@ -206,7 +201,6 @@ def test_rows_that_contradict_each_other_are_no_row_of_a_server(copy, postgres, 
 
 
 def test_a_part_of_gigabytes_takes_no_memory(copy, refused):
-    """Zeros that unpack to more than any part has."""
     data = zlib.compress(bytes(300 << 20), 1)
     digest = hashlib.sha256(data).hexdigest()
     path = copy / "parts" / digest[:2] / digest
@@ -214,13 +208,3 @@ def test_a_part_of_gigabytes_takes_no_memory(copy, refused):
     path.write_bytes(data)
     rewrite(copy, lambda one: one["parts"][0].update(digest=digest, bytes=len(data)))
     refused("too long or truncated")
-
-
-def test_places_without_a_bundle(tmp_path):
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(BundleError, match="holds no bundle"):
-        verify_bundle(str(tmp_path / "empty"))
-    with pytest.raises(BundleError, match="the folder does not exist"):
-        verify_bundle(str(tmp_path / "typo"))
-    with pytest.raises(BundleError, match="holds no bundle '2020'"):
-        verify_bundle(str(tmp_path / "empty"), "2020")

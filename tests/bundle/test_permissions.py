@@ -8,7 +8,6 @@ import pytest
 from sceneprint.atomic_files import make_folder, public_mode
 from sceneprint.bundle.backup import take_backup
 from sceneprint.bundle.restoration import restore_to_folder
-from sceneprint.cli.doctor import machine
 from sceneprint_client.api import NewMap, Query
 from tests.whole_engine import Engine
 
@@ -22,11 +21,11 @@ def no_umask():
 
 def public_paths(folder):
     """What in a folder anybody but its owner may read, write or enter; its own name is `.`."""
-    found = set[str]()
+    results = set[str]()
     for one in (folder, *folder.rglob("*")):
         with suppress(FileNotFoundError):  # an answer that is being written gets its name
-            found |= {str(one.relative_to(folder))} if one.stat().st_mode & 0o077 else set()
-    return found
+            results |= {str(one.relative_to(folder))} if one.stat().st_mode & 0o077 else set()
+    return results
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
@@ -36,8 +35,7 @@ def test_all_that_is_made_is_its_owners_alone(no_umask, tmp_path, uploads, setti
         engine.create_map(NewMap(name="hall", model="depth"))
         for each in uploads[:3]:
             engine.add_frame("hall", each.data, each.meta)
-        while (work := engine.claim("w")) is not None:
-            engine.run(work)
+        engine.work_off()
         engine.rebuild_index("hall")
         engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(keep=True))
         assert {path.name for path in data.iterdir()} >= {
@@ -65,16 +63,3 @@ def test_a_folder_that_is_there_keeps_its_permissions(no_umask, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(FileExistsError):
         make_folder(tmp_path / "file")
-
-
-@pytest.mark.sqlite_only("looks at the database as a file of the data folder")
-def test_doctor_names_the_command_for_an_older_folder(tmp_path, settings):
-    folder = tmp_path / "of 0.2"
-    folder.mkdir()
-    folder.chmod(0o755)
-    found = {check.subject: check for check in machine(settings(folder))}
-    assert found["permissions"].verdict == "note"
-    assert "755" in found["permissions"].text
-    assert f"chmod -R o-rwx '{folder}'" in found["permissions"].text
-    folder.chmod(0o700)
-    assert "permissions" not in {check.subject for check in machine(settings(folder))}

