@@ -95,8 +95,7 @@ def test_a_claim_beside_a_cancellation(store, hand, until, first):
         job = queue.find_job(connection, _id_of(connection, 1))
 
     def cancel():
-        with store.database.write() as connection:
-            queue.cancel(connection, job)
+        hand.do(queue.cancel, job)
 
     if first == "claim":
         with uncommitted(store) as (connection, commit):
@@ -105,8 +104,8 @@ def test_a_claim_beside_a_cancellation(store, hand, until, first):
             commit()
         assert done.result(PATIENCE_S) is None
         assert held is not None
-        with pytest.raises(LostLease), store.database.write() as connection:
-            queue.finish(connection, held, JobState.SUCCEEDED)
+        with pytest.raises(LostLease):
+            hand.do(queue.finish, held, JobState.SUCCEEDED)
     else:
         with store.database.write() as connection:
             queue.cancel(connection, job)
@@ -157,9 +156,8 @@ def test_a_death_that_is_told_while_another_takes_the_job_is_not_laid_to_it(stor
 
     def tell():
         with store.database.write() as connection:
-            return queue.fail_dead_worker(
-                connection, dead.id, dead.token, "died", "trace", counts=False
-            )
+            arguments = (connection, dead.id, dead.token, "died", "trace")
+            return queue.fail_dead_worker(*arguments, counts=False)
 
     with uncommitted(store) as (connection, commit):
         held = queue.claim(connection, "next", 60.0)
@@ -174,8 +172,7 @@ def test_a_job_renewed_while_it_is_buried_keeps_running(store, hand, until):
     turned(store, held, attempts=queue.MAXIMUM_ATTEMPTS)
 
     def bury():
-        with store.database.write() as connection:
-            return queue.dead_letter(connection)
+        return hand.do(queue.dead_letter)
 
     with uncommitted(store) as (connection, commit):
         queue.renew(connection, held, 60.0)
@@ -188,8 +185,8 @@ def test_a_job_renewed_while_it_is_buried_keeps_running(store, hand, until):
 def test_a_token_that_a_promoted_standby_gave_out_again_is_anothers(store, hand):
     held = hand.taken("first")
     turned(store, held, worker="second")  # the same token: the standby lacked the first claim
-    with pytest.raises(LostLease), store.database.write() as connection:
-        queue.finish(connection, held, JobState.SUCCEEDED)
+    with pytest.raises(LostLease):
+        hand.do(queue.finish, held, JobState.SUCCEEDED)
 
 
 @pytest.mark.parametrize("hours", [-5, 5])
@@ -205,8 +202,6 @@ def test_the_clock_of_a_host_decides_nothing(store, hand, monkeypatch, hours):
         assert not queue.has_due(connection)
         assert 0 < (queue.due_in_s(connection) or 0) <= 60
         assert queue.read_clock(connection) == pytest.approx(real(), abs=30)
-    with store.database.write() as connection:
-        queue.release_job(connection, held)
+    hand.do(queue.release_job, held)
     assert hand.taken().number == held.number  # at once
-    with store.database.write() as connection:
-        assert queue.dead_letter(connection) == []
+    assert hand.do(queue.dead_letter) == []

@@ -100,17 +100,13 @@ def test_a_turn_answers_the_last_question_and_leaves_the_usual_limits(server_sto
         assert tuple(connection.exec_driver_sql(limits).one()) == ("10s", "1min")
 
 
-_WAITING = text("SELECT count(*) FROM pg_locks WHERE locktype = 'transactionid' AND NOT granted")
-
-
-def waiting(store):
-    """Return whether a transaction waits for the end of another."""
-    with store.database.read() as connection:
-        return bool(connection.execute(_WAITING).scalar_one())
-
-
 def test_writers_of_two_maps_may_doom_the_same_blobs(server_store, postgres_url, tmp_path, until):
     blobs = [f"{number:064x}" for number in range(3)]
+    waits = text("SELECT 1 FROM pg_locks WHERE locktype = 'transactionid' AND NOT granted")
+
+    def waiting():
+        with server_store.database.read() as connection:
+            return connection.execute(waits).all()
 
     def doom_elsewhere():
         with (
@@ -122,7 +118,7 @@ def test_writers_of_two_maps_may_doom_the_same_blobs(server_store, postgres_url,
     with ThreadPoolExecutor(1) as pool, server_store.database.write(map_number=7) as connection:
         doom(connection, blobs[:2])
         writer = pool.submit(doom_elsewhere)
-        until(lambda: waiting(server_store))
+        until(waiting)
     writer.result()
     with server_store.database.read() as connection:
         assert doomed_blobs(connection, 9) == blobs

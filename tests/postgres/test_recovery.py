@@ -114,22 +114,17 @@ def test_a_map_that_was_deleted_by_mistake_is_brought_back(primary, place, tmp_p
             assert [row.name for row in list_maps(connection)] == ["hall", "yard"]
 
 
-@pytest.mark.parametrize(
-    ("at", "value", "said"),
-    [
-        (0, "none", "is no base backup"), (1, "none", "is no folder"),
-        (3, "2026' OR", "are refused"),
-    ],
-)  # fmt: skip
-def test_what_it_is_given_is_checked_first(place, at, value, said):
+def test_arguments_are_checked_first(place):
     (place / "base").mkdir()
     (place / "base" / "PG_VERSION").write_text("18")
-    given = [place / "base", place / "archive", place / "data", "2026-11-28 12:00+00"]
-    given[at] = value
-    done = recover(*given)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert said in done.stderr
-    assert done.stderr.count("\n") == 1
+    arguments = [place / "base", place / "archive", place / "data", "2026-11-28 12:00+00"]
+    for at, value, said in (
+        (0, "none", "is no base backup"), (1, "none", "is no folder"),
+        (3, "2026' OR", "are refused"),
+    ):  # fmt: skip
+        done = recover(*arguments[:at], value, *arguments[at + 1 :])
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+        assert said in done.stderr
     assert not (place / "data").exists()
 
 

@@ -153,26 +153,19 @@ def engine(postgres_url, tmp_path):
         yield opened
 
 
-def once_of(what):
-    return IdempotentRequest("robot", "a key", what * 64)
-
-
-def add(engine, frame, once, map_name="hall"):
-    return engine.uploads.add(map_name, Upload(*frame), once)
-
-
 def test_a_request_whose_key_is_used_meanwhile_takes_nothing(engine, small, monkeypatch):
     engine.create_map(NewMap(name="other"))
     run = NewFrames.receive
+    keyed = {mark: IdempotentRequest("robot", "a key", mark * 64) for mark in "ab"}
 
     def overtaken(group, frame):
         monkeypatch.undo()
-        add(engine, small[1], once_of("b"), "other")
+        engine.uploads.add("other", Upload(*small[1]), keyed["b"])
         return run(group, frame)
 
     monkeypatch.setattr(NewFrames, "receive", overtaken)
     with pytest.raises(IdempotencyConflict):
-        add(engine, small[0], once_of("a"))
+        engine.uploads.add("hall", Upload(*small[0]), keyed["a"])
     assert (engine.get_map("hall").frames, engine.get_map("other").frames) == ({}, {"received": 1})
     with engine.store.database.read() as connection:
         assert connection.execute(select(func.sum(maps.c.used_frames))).scalar() == 1

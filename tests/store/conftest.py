@@ -159,6 +159,11 @@ class Hand:
     def __init__(self, store):
         self.database = store.database
 
+    def do(self, call, *arguments):
+        """Call a function of the queue in a transaction of its own."""
+        with self.database.write() as connection:
+            return call(connection, *arguments)
+
     def take(self, worker="w", lease_s=60.0):
         with self.database.write(turn=False) as connection:  # as workers do
             return queue.claim(connection, worker, lease_s)
@@ -173,8 +178,7 @@ class Hand:
             return queue.find_job(connection, job.id)
 
     def fail(self, held, error="broke", trace="Trace"):
-        with self.database.write() as connection:
-            return queue.fail(connection, held, error, trace)
+        return self.do(queue.fail, held, error, trace)
 
     def due(self):
         with self.database.read() as connection:

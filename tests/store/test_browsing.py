@@ -278,12 +278,3 @@ def test_each_list_takes_the_index_that_is_meant_for_it(store, hall, plans):
             list_frames(connection, hall.number, beyond, 9, listing)
         assert any(way in step for step in told), (wanted, told)
         assert not any(step.startswith("SCAN") for step in told), (wanted, told)
-
-
-def test_sessions_are_counted_without_reading_a_row(store, hall, plans):
-    with store.database.read() as connection, plans(connection) as told:
-        list_runs(connection, hall.number, ("a", "b"), 9)
-        count_run(connection, hall.number, Run(session="s"))
-        stamps_of_run(connection, hall.number, Run(session="s", parent_frame="p"))
-    assert all(SEARCHED in step or step.startswith("USE TEMP B-TREE") for step in told), told
-    assert any("session=?" in step for step in told)

@@ -15,14 +15,13 @@ def test_what_is_finished_stays_so(store, hand, queued, state):
     job = queued("a")
     held = hand.taken()
     before = time.time()
-    with store.database.write() as connection:
-        queue.finish(connection, held, state, "why")
+    hand.do(queue.finish, held, state, "why")
     now = hand.row(job)
     assert (now.state, now.error, now.leased_until) == (state, "why", None)
     assert now.finished_at is not None
     assert before <= now.finished_at <= time.time()
-    with pytest.raises(LostLease), store.database.write() as connection:
-        queue.finish(connection, held, JobState.SUCCEEDED)
+    with pytest.raises(LostLease):
+        hand.do(queue.finish, held, JobState.SUCCEEDED)
     assert hand.row(job) == now
     assert not hand.due()
 
@@ -71,24 +70,21 @@ def test_a_job_whose_workers_all_fell_silent_is_buried(store, hand, queued, turn
     for attempt in range(1, 11):
         held = hand.taken()
         assert (held.number, held.attempts) == (silent.number, attempt)
-        with store.database.write() as connection:  # its last lease still runs
-            assert queue.dead_letter(connection) == []
+        assert hand.do(queue.dead_letter) == []  # its last lease still runs
         turned(silent, leased_until=time.time() - 1)
         if attempt < 10:
-            with store.database.write() as connection:  # another may try
-                assert queue.dead_letter(connection) == []
+            assert hand.do(queue.dead_letter) == []  # another may try
     lively = queued("b")
     assert hand.taken().number == lively.number  # and the other not an eleventh time
     assert hand.due()  # to be buried
-    with store.database.write() as connection:
-        (buried,) = queue.dead_letter(connection)
+    (buried,) = hand.do(queue.dead_letter)
     assert buried == hand.row(silent)
     assert (buried.state, buried.leased_until) == (JobState.DEAD, None)
     assert buried.error == "its worker stopped responding in the last of 10 attempts"
     assert buried.finished_at is not None
     assert not hand.due()
-    with pytest.raises(LostLease), store.database.write() as connection:
-        queue.finish(connection, held, JobState.SUCCEEDED)
+    with pytest.raises(LostLease):
+        hand.do(queue.finish, held, JobState.SUCCEEDED)
 
 
 def test_silence_is_not_counted_as_breaking_down(hand, queued, turned):
@@ -106,8 +102,7 @@ def test_silence_is_not_counted_as_breaking_down(hand, queued, turned):
 def test_cancelling_takes_a_job_from_whoever_has_it(store, hand, queued):
     running, waiting, over, other = (queued(name) for name in "abcd")
     held = hand.taken()
-    with store.database.write() as connection:
-        queue.cancel_jobs(connection, jobs.c.frame_number == waiting.frame_number)
+    hand.do(queue.cancel_jobs, jobs.c.frame_number == waiting.frame_number)
     assert hand.row(waiting).state == JobState.CANCELLED
     done = hand.taken()
     assert done.number == over.number  # not the cancelled one
@@ -116,8 +111,8 @@ def test_cancelling_takes_a_job_from_whoever_has_it(store, hand, queued):
         queue.cancel_jobs(connection, jobs.c.frame_number == over.frame_number)
         queue.cancel_jobs(connection, jobs.c.frame_number == running.frame_number)
     assert hand.row(over).state == JobState.SUCCEEDED
-    with pytest.raises(LostLease), store.database.write() as connection:
-        queue.finish(connection, held, JobState.SUCCEEDED)
+    with pytest.raises(LostLease):
+        hand.do(queue.finish, held, JobState.SUCCEEDED)
     now = hand.row(running)
     assert (now.state, now.leased_until) == (JobState.CANCELLED, None)
     assert now.finished_at is not None
@@ -129,8 +124,7 @@ def test_what_is_given_back_was_never_tried(store, hand, queued):
     for token in (1, 2, 3, 4, 5):  # as often as workers are stopped
         held = hand.taken()
         assert (held.token, held.attempts) == (token, 1)
-        with store.database.write() as connection:
-            queue.release_job(connection, held)
+        hand.do(queue.release_job, held)
         now = hand.row(job)
         assert (now.state, now.attempts, now.worker, now.leased_until) == (
             JobState.QUEUED, 0, None, None,

@@ -110,8 +110,7 @@ def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(store, ha
 
 def test_what_comes_late_leaves_nothing(store, hand, hall, received, turned):
     frame = received("a")
-    with store.database.write() as connection:
-        job = queue.enqueue(connection, "sign", frame.number)
+    job = hand.do(queue.enqueue, "sign", frame.number)
     made = StoredSignature(hall.model_id, b"\1\2\3", "cd" * 32, [4, 2], [12, 2])
     first = hand.taken("w")
     turned(job, leased_until=1.0)
@@ -136,8 +135,7 @@ def test_renewing_extends_the_lease_and_nothing_else(store, hand, queued, turned
     held = hand.taken("w", 10.0)
     turned(held, leased_until=time.time() - 1)  # late, but nobody else came
     before = time.time()
-    with store.database.write() as connection:
-        queue.renew(connection, held, 30.0)
+    hand.do(queue.renew, held, 30.0)
     now = hand.row(held)
     assert now.leased_until is not None
     assert before + 30.0 <= now.leased_until <= time.time() + 30.0
@@ -227,8 +225,7 @@ def test_deleted_jobs_give_no_turn_back(store, hand, hall):
     queue_jobs(store, hall, "b", 3)
     queue_jobs(store, hall, "a", 2)
     first = hand.taken()
-    with store.database.write() as connection:
-        queue.remove_job(connection, first)
+    hand.do(queue.remove_job, first)
     assert (first.tenant, hand.taken().tenant, hand.taken().tenant) == ("a", "b", "a")
 
 

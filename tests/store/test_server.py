@@ -53,15 +53,12 @@ def test_two_processes_may_open_an_empty_database_at_once(empty_url, race, opens
     with made.read() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, metadata) == []
-        narrow = connection.execute(
-            text(
-                "SELECT table_name, column_name FROM information_schema.columns WHERE table_schema "
-                "= 'public' AND table_name <> 'alembic_version' AND (data_type = 'integer' OR "
-                "(data_type IN ('text', 'character varying') AND collation_name IS DISTINCT FROM "
-                "'C'))"
-            )
-        ).all()
-        assert narrow == []
+        narrow = text(
+            "SELECT table_name, column_name FROM information_schema.columns WHERE table_schema = "
+            "'public' AND table_name <> 'alembic_version' AND (data_type = 'integer' OR (data_type "
+            "IN ('text', 'character varying') AND collation_name IS DISTINCT FROM 'C'))"
+        )
+        assert connection.execute(narrow).all() == []
         counted = connection.execute(text("SELECT DISTINCT data_type::text FROM pg_sequences"))
         assert counted.scalars().all() == ["bigint"]
     made.close()
