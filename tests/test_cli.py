@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 from sceneprint import cli
-from sceneprint.cli import main
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.models import save_model
 from sceneprint.pipeline import sign
@@ -264,7 +263,7 @@ def test_a_shell_completes_commands_and_options(words, completions):
 def test_sites_are_written_as_clouds_with_poses(tmp_path):
     out = tmp_path / "sites"
     arguments = ["--rooms", "1", "--views", "2", "--seed", "5", "--jobs", "1"]
-    assert main(["synth", str(out), "--sensor", "lidar", *arguments]) == 0
+    run("synth", out, "--sensor", "lidar", *arguments)
     made = synthesise_survey(5, 0, 2)
     (sequence,) = find_sequences(out)
     read = [reference.read() for reference in sequence.frames]

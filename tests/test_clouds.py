@@ -65,6 +65,6 @@ def test_a_surface_is_its_valid_pixels():
     surface = Surface(
         points, -points, valid, np.ones((2, 2), np.float32), Intrinsics(2, 2, 1, 1, 0, 0)
     )
-    found, normals = points_of(surface)
-    assert found.tolist() == [[0, 1, 2], [9, 10, 11]]
-    assert (normals == -found).all()
+    visible, normals = points_of(surface)
+    assert visible.tolist() == [[0, 1, 2], [9, 10, 11]]
+    assert (normals == -visible).all()

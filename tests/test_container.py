@@ -173,17 +173,17 @@ def test_a_part_of_the_composition_is_confined_and_told_what_is_read(name):
     assert set(part["deploy"]["resources"]["limits"]) == {"cpus", "memory", "pids"}
     for port in part.get("ports", []):
         assert re.fullmatch(r"127\.0\.0\.1:\d+:\d+", defaults(port))
-    given = part.get("environment", {})
-    for key, value in given.items():
+    variables = part.get("environment", {})
+    for key, value in variables.items():
         if key.endswith("_FILE"):
             assert value in [f"/run/secrets/{one}" for one in part["secrets"]], key
         elif re.search("PASSWORD|SECRET", key):  # without a default
             assert re.fullmatch(r"\$\{SCENEPRINT_\w+:-\}", value), key
     if part["image"].startswith("sceneprint:"):
-        ours = {one for one in given if one.removesuffix("_FILE") in SECRETS}
-        unknown = given.keys() - KNOWN_SETTINGS - ours
+        ours = {one for one in variables if one.removesuffix("_FILE") in SECRETS}
+        unknown = variables.keys() - KNOWN_SETTINGS - ours
         assert [one for one in unknown if not OF_LIBRARIES.fullmatch(one)] == []
-        own = {key.removeprefix("SCENEPRINT_").lower(): value for key, value in given.items()
+        own = {key.removeprefix("SCENEPRINT_").lower(): value for key, value in variables.items()
                if key in KNOWN_SETTINGS}  # fmt: skip
         Settings(**own)
 
@@ -261,8 +261,10 @@ def base_environment(folder):
     """A fresh Python, as the base image has one; and how pip finds its index on this machine."""
     done = subprocess.run([sys.executable, "-m", "venv", folder], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    kept = re.compile(r"HOME|LANG|TMPDIR|PIP_\w+|SSL_\w+|REQUESTS_\w+|\w+_proxy", re.IGNORECASE)
-    env = {name: value for name, value in os.environ.items() if kept.fullmatch(name)}
+    inherited = re.compile(
+        r"HOME|LANG|TMPDIR|PIP_\w+|SSL_\w+|REQUESTS_\w+|\w+_proxy", re.IGNORECASE
+    )
+    env = {name: value for name, value in os.environ.items() if inherited.fullmatch(name)}
     return {**env, "PATH": f"{folder}/bin:/usr/local/bin:/usr/bin:/bin"}
 
 

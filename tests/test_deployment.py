@@ -4,7 +4,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,8 +18,6 @@ from tests.whole_engine import Engine
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "deployment.md").read_text()
 #: Folders that commands of the product run from, and that of PostgreSQL's.
 PATH = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-
-Run = Callable[..., str]
 
 
 def blocks(title):
@@ -43,15 +40,15 @@ def primary(tmp_path_factory):
 def run(primary, bucket, tmp_path):
     """Run a block with the environment of a node, and of the database's administrator."""
 
-    def shell(block, **given):
-        told = {
+    def shell(block, **more):
+        variables = {
             **os.environ, "PATH": f"{binaries()}:{PATH}", "PGHOST": "127.0.0.1",
             "PGPORT": str(primary.port), "PGUSER": "postgres", "PGPASSWORD": "not a default",
-            "SCENEPRINT_BLOB_URL": bucket, "SCENEPRINT_DATA_DIR": str(tmp_path / "caches"), **given,
+            "SCENEPRINT_BLOB_URL": bucket, "SCENEPRINT_DATA_DIR": str(tmp_path / "caches"), **more,
         }  # fmt: skip
         done = subprocess.run(
             [*nobody_prefix(), "bash", "-euo", "pipefail", "-c", block],
-            env=told, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S,
+            env=variables, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S,
         )  # fmt: skip
         assert done.returncode == 0, f"{block}\n{done.stdout}\n{done.stderr}"
         return done.stdout
@@ -79,8 +76,8 @@ def test_commands_in_their_order(primary, run, tmp_path):
     (follow,) = blocks("A standby")
     standby = Server(tmp_path / "standby-server")  # only for the port that it would take
     standby_data = tmp_path / "standby"
-    told = {"STANDBY_DATA": str(standby_data), "STANDBY_PORT": str(standby.port)}
-    said = run(follow, PRIMARY_HOST="127.0.0.1", PRIMARY_PORT=str(primary.port), **told)
+    variables = {"STANDBY_DATA": str(standby_data), "STANDBY_PORT": str(standby.port)}
+    said = run(follow, PRIMARY_HOST="127.0.0.1", PRIMARY_PORT=str(primary.port), **variables)
     assert re.search(r"standby1 +\| streaming \| sync ", said)
     try:
         (node,) = blocks("Every node")
@@ -90,10 +87,10 @@ def test_commands_in_their_order(primary, run, tmp_path):
         assert len(re.findall(r"\bsp_[\w-]+", said)) == 2, said
         primary.kill()
         (promote,) = blocks("When the primary dies")
-        assert re.findall(r"^ (t|on|off)$", run(promote, **told), re.MULTILINE) == ["t", "off"]
+        assert re.findall(r"^ (t|on|off)$", run(promote, **variables), re.MULTILINE) == ["t", "off"]
         names = "SELECT name FROM keys ORDER BY name"
-        asked = f'psql --port {standby.port} --dbname sceneprint -Atc "{names}"'
-        assert run(asked).split() == ["operator", "robot-7"]
+        command = f'psql --port {standby.port} --dbname sceneprint -Atc "{names}"'
+        assert run(command).split() == ["operator", "robot-7"]
 
         (backup,) = blocks("Backup")
         run(backup.replace("/backup", str(tmp_path / "backup")), SCENEPRINT_DATABASE_URL=url)
@@ -106,8 +103,8 @@ def test_commands_in_their_order(primary, run, tmp_path):
 
 
 def test_what_root_does_is_at_least_a_shells():
-    found = re.findall(r"^```bash\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
-    assert found
-    for block in found:
+    scripts = re.findall(r"^```bash\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+    assert scripts
+    for block in scripts:
         done = subprocess.run(["bash", "-n", "-c", block], capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (0, "")

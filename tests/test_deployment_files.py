@@ -86,13 +86,13 @@ def test_units_let_decoders_lock_themselves_in(path):
 
 def settings_of(text):
     """NAME=value of a unit's `Environment=` lines, or of a file of the environment."""
-    found = []
+    assignments = []
     for line in text.splitlines():
         if line.startswith("Environment="):
-            found += line.removeprefix("Environment=").split()
+            assignments += line.removeprefix("Environment=").split()
         elif re.match(r"(# )?[A-Z_]+=", line):
-            found += shlex.split(line.removeprefix("# "))
-    return dict(one.split("=", 1) for one in found)
+            assignments += shlex.split(line.removeprefix("# "))
+    return dict(one.split("=", 1) for one in assignments)
 
 
 def test_units_and_environment_set_what_is_read():
@@ -101,15 +101,17 @@ def test_units_and_environment_set_what_is_read():
     read |= {
         f"AWS_{name}" for name in ("REGION", "ACCESS_KEY_ID", "SECRET_ACCESS_KEY", "ENDPOINT_URL")
     }
-    given = {}
+    variables = {}
     for path in (*UNITS, FOLDER / "sceneprint.env"):
-        given |= settings_of(path.read_text())
-    assert given.keys() - read == set()
-    own = {k.removeprefix("SCENEPRINT_").lower(): v for k, v in given.items() if k[:5] == "SCENE"}
-    told = Settings(**own)  # as the environment has them: texts
-    assert told.workers == 0
-    assert told.asks_for_keys
-    assert "change-me" not in told.database  # in no URL is a secret
+        variables |= settings_of(path.read_text())
+    assert variables.keys() - read == set()
+    own = {
+        k.removeprefix("SCENEPRINT_").lower(): v for k, v in variables.items() if k[:5] == "SCENE"
+    }
+    settings = Settings(**own)  # as the environment has them: texts
+    assert settings.workers == 0
+    assert settings.asks_for_keys
+    assert "change-me" not in settings.database  # in no URL is a secret
 
 
 def test_a_shell_reads_the_environment_as_systemd_does():

@@ -22,14 +22,14 @@ def locked(path):
     """Version and hashes of each package of a lock; each has a hash at least."""
     text = path.read_text()
     assert "://" not in text
-    known = {}
+    versions = {}
     if text.startswith("-r "):
         first, _, text = text.partition("\n")
-        known = locked(path.with_name(first.removeprefix("-r ")))
+        versions = locked(path.with_name(first.removeprefix("-r ")))
     hashed = r"((?:\\\n    --hash=sha256:[0-9a-f]{64} ?)+)"
     entries = re.findall(rf"^([\w.-]+)(?:\[.*\])?==(\S+).*?{hashed}$", text, re.M)
     assert len(entries) == len(re.findall(r"^\S", text, re.M))
-    return known | {name: f"{version} {hashes}" for name, version, hashes in entries}
+    return versions | {name: f"{version} {hashes}" for name, version, hashes in entries}
 
 
 def test_every_dependency_has_a_reason_and_is_locked():

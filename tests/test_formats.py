@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
-import pytest
 
 from sceneprint.decoders.child_process import array_samples, text_samples
 from sceneprint.formats.depth_file import decode_samples, encode_npy, encode_png, size_of
@@ -49,11 +48,3 @@ def test_every_depth_format_is_recognised_measured_and_read():
 def test_every_cloud_format_but_one_is_recognised():
     for data, name in (*array_samples(), *text_samples()):
         assert format_of(data) == (None if name == "kitti" else name)
-
-
-@pytest.mark.parametrize("kind", ["depth", "cloud"])
-def test_an_array_is_a_cloud_by_its_columns_and_type(kind):
-    array = np.ones((5, 3), "<f4" if kind == "cloud" else "<u2")
-    assert format_of(encode_npy(array)) == ("npy" if kind == "cloud" else None)
-    assert format_of(encode_npy(np.ones((5, 30), "<f4"))) is None
-    assert format_of(encode_npy(np.ones((5, 4), ">f8"))) == "npy"

@@ -67,9 +67,9 @@ def rendered(values, folder):
     returned, text, error = run_helm("template", "fleet", values=values, folder=folder)
     assert returned == 0, error
     objects = [one for one in yaml.safe_load_all(text) if one is not None]
-    found = {(one["kind"], one["metadata"]["name"]): one for one in objects}
-    assert len(found) == len(objects)
-    return found
+    by_name = {(one["kind"], one["metadata"]["name"]): one for one in objects}
+    assert len(by_name) == len(objects)
+    return by_name
 
 
 def environment(container):
@@ -128,7 +128,7 @@ def test_a_password_in_a_url_is_refused_and_not_repeated(url, tmp_path):
 
 
 def test_pods_run_our_commands_with_our_settings(tmp_path):
-    known = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields} | {"AWS_REGION"}
+    settable = {f"SCENEPRINT_{name.upper()}" for name in Settings.model_fields} | {"AWS_REGION"}
     objects = rendered(ALL, tmp_path)
     parts = {
         "serve": objects["Deployment", "fleet-api"],
@@ -140,9 +140,11 @@ def test_pods_run_our_commands_with_our_settings(tmp_path):
         (container,) = pod["containers"]
         assert container["args"] == [command]
         assert command in COMMANDS
-        given = environment(container)
-        assert given.keys() - known == set()
-        own = {k.removeprefix("SCENEPRINT_").lower(): v for k, v in given.items() if k[:3] == "SCE"}
+        variables = environment(container)
+        assert variables.keys() - settable == set()
+        own = {
+            k.removeprefix("SCENEPRINT_").lower(): v for k, v in variables.items() if k[:3] == "SCE"
+        }
         settings = Settings(**own)  # texts, as in the environment
         assert settings.database == REQUIRED["database"]["url"]
         assert container["image"] == f"sceneprint@sha256:{'a' * 64}"

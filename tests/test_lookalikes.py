@@ -13,7 +13,7 @@ from sceneprint.models import read_model
 from sceneprint.pipeline import geometry_of, validate
 from sceneprint.signing import see
 from sceneprint.types import DepthFrame
-from sceneprint_lab.synth import KINECT, corridor, symmetric_box, take
+from sceneprint_lab.synth import KINECT, symmetric_box, take
 
 #: A transform this near the truth is right: then the pair was told apart after all.
 RIGHT_M = 0.2
@@ -48,22 +48,6 @@ def box_pairs(n, seed):
             eye = np.array([d * np.cos(a), d * np.sin(a), h])
             middle = rng.normal(0, 0.05, 3) + np.array([0, 0, 0.3])
             frames.append(_taken(room, looking(eye, middle), rng))
-        yield frames[0], frames[1]
-
-
-def corridor_pairs(n, seed):
-    """A corridor from two places one or two doors apart, in any direction of view."""
-    rng, room = np.random.default_rng((seed, 1)), corridor(12, 2.0)
-    for _ in range(n):
-        eye = rng.uniform((6, 0.6, 1.0), (14, 1.2, 1.6))
-        yaw = rng.uniform(0, 2 * np.pi)
-        doors = float(rng.choice([-1, 1]) * rng.integers(1, 3) * 2.0)
-        frames = []
-        for shift in (0.0, doors):
-            at = eye + (shift, 0, 0) + (shift != 0) * rng.uniform(-0.1, 0.1, 3)
-            turned = yaw + (shift != 0) * rng.uniform(-0.1, 0.1)
-            ahead = np.array([np.cos(turned), np.sin(turned), -0.15])
-            frames.append(_taken(room, looking(at, at + ahead), rng))
         yield frames[0], frames[1]
 
 
@@ -106,11 +90,10 @@ def model():
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("pairs", "unsure"), [(box_pairs, 20), (corridor_pairs, 12)])
-def test_sides_of_a_box_and_doors_of_a_corridor_are_not_told_apart(pairs, unsure, model):
-    counted = outcomes_of(pairs(24, 31), model)
+def test_sides_of_a_box_are_not_distinguished(model):
+    counted = outcomes_of(box_pairs(24, 31), model)
     assert not_believed(counted) >= 0.95
-    assert counted["ambiguous"] >= unsure  # and not for want of a transform
+    assert counted["ambiguous"] >= 20  # and not for want of a transform
 
 
 def test_frames_that_overlap_by_half_are_accepted(model, data_root):

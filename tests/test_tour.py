@@ -24,13 +24,13 @@ def blocks(language):
 
 def named_blocks():
     """Blocks of commands, each with the heading it stands under."""
-    found, heading = [], ""
+    parsed, heading = [], ""
     for part in re.findall(r"^##+ [^\n]*$|^```sh\n.*?^```", TOUR, re.DOTALL | re.MULTILINE):
         if part.startswith("#"):
             heading = part.lstrip("# ")
         else:
-            found.append((heading, part.removeprefix("```sh\n").removesuffix("```")))
-    return found
+            parsed.append((heading, part.removeprefix("```sh\n").removesuffix("```")))
+    return parsed
 
 
 @pytest.fixture(scope="module")
@@ -67,13 +67,13 @@ def outputs(tmp_path_factory):
 
 def documents(output):
     """The JSON documents of an output, which curl prints one after the other."""
-    decoder, found = json.JSONDecoder(), []
+    decoder, parsed = json.JSONDecoder(), []
     position = output.find("{")
     while position >= 0:
         document, end = decoder.raw_decode(output, position)
-        found.append(document)
+        parsed.append(document)
         position = output.find("{", end)
-    return found
+    return parsed
 
 
 def one(outputs, heading, place=0):

@@ -25,7 +25,7 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 def transcripts(text):
     """Of each block its commands, each with the lines that it prints."""
-    found = []
+    parsed = []
     for block in BLOCK.findall(text):
         commands = []
         for line in block.splitlines():
@@ -33,8 +33,8 @@ def transcripts(text):
                 commands.append((line[2:], []))
             else:
                 commands[-1][1].append(line)
-        found.append(commands)
-    return found
+        parsed.append(commands)
+    return parsed
 
 
 def shape(lines):
@@ -87,11 +87,11 @@ def test_the_page_says_what_happens(said):
             if not command.startswith("pip "):  # it is installed, and nothing is downloaded here
                 block[place] = (command, said(command, 2 if " serve" in command else 0))
     if os.environ.get("SCENEPRINT_UPDATE_GOLDEN") == "1":
-        told = iter(
+        updated = iter(
             "".join(f"{line}\n" for command, lines in block for line in (f"$ {command}", *lines))
             for block in blocks
         )
-        text = BLOCK.sub(lambda _: next(told), text)
+        text = BLOCK.sub(lambda _: next(updated), text)
         PAGE.write_text(text, encoding="utf-8")
     for page, ran in zip(transcripts(text), blocks, strict=True):
         for (command, expected), (_, lines) in zip(page, ran, strict=True):

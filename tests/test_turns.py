@@ -3,18 +3,10 @@
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.turns import ACTIVE_S, PRESENT_S, ThreadTurns, TurnOrder
-
-
-class Clock:
-    """A clock that stands at `now`."""
-
-    now = 0.0
-
-    def __call__(self):
-        return self.now
 
 
 def queue(turns, tenants, order):
@@ -75,8 +67,8 @@ def test_after_the_end_there_are_no_turns():
 
 
 def test_beside_another_a_tenant_holds_so_many_and_alone_all():
-    clock = Clock()
-    order = TurnOrder(4, 1, clock)
+    clock = SimpleNamespace(now=0.0)
+    order = TurnOrder(4, 1, lambda: clock.now)
 
     def ask(*waiters):
         for one in waiters:
@@ -107,8 +99,8 @@ def test_who_asks_for_several_gets_them_beside_another_too_where_it_holds_none()
 
 
 def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns():
-    clock = Clock()
-    order = TurnOrder(4, 1, clock, rest=1.0)
+    clock = SimpleNamespace(now=0.0)
+    order = TurnOrder(4, 1, lambda: clock.now, rest=1.0)
     order.enter("b", "b1")
     order.enter("a", "a1")
     assert order.admit() == ["a1", "b1"]
@@ -131,8 +123,8 @@ def test_beside_an_active_tenant_one_rests_as_long_as_it_held_turns():
 
 
 def test_a_request_without_a_turn_makes_others_share_and_rest():
-    clock = Clock()
-    order = TurnOrder(4, 1, clock, rest=2.0)
+    clock = SimpleNamespace(now=0.0)
+    order = TurnOrder(4, 1, lambda: clock.now, rest=2.0)
     order.enter("a", "a1")
     order.enter("a", "a2")
     order.see("b")
@@ -143,8 +135,8 @@ def test_a_request_without_a_turn_makes_others_share_and_rest():
 
 
 def test_one_rests_for_its_latest_turn_and_a_second_at_most():
-    clock = Clock()
-    order = TurnOrder(4, 2, clock, rest=1.0)
+    clock = SimpleNamespace(now=0.0)
+    order = TurnOrder(4, 2, lambda: clock.now, rest=1.0)
     order.enter("a", "a1")
     order.admit()
     clock.now = 100.0
@@ -168,8 +160,8 @@ def test_one_rests_for_its_latest_turn_and_a_second_at_most():
 
 
 def test_a_rest_that_ends_after_the_look_is_looked_at_again_at_once():
-    clock = Clock()
-    order = TurnOrder(4, 1, clock, rest=1.0)
+    clock = SimpleNamespace(now=0.0)
+    order = TurnOrder(4, 1, lambda: clock.now, rest=1.0)
     order.enter("b", "b1")
     order.enter("a", "a1")
     order.admit()

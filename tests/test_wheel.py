@@ -82,8 +82,8 @@ def wheel(tmp_path_factory):
         command, cwd=folder / "source", env=env, capture_output=True, text=True, timeout=600
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    (found,) = (folder / "wheels").glob("sceneprint-*.whl")
-    return found
+    (built,) = (folder / "wheels").glob("sceneprint-*.whl")
+    return built
 
 
 @pytest.fixture(scope="module")
@@ -99,13 +99,13 @@ def installed(wheel, tmp_path_factory):
 
 def run(program, installed, folder, *arguments, **env):
     """What a program of an installation prints, with cache folders of its own."""
-    given = {
+    variables = {
         **os.environ, "PYTHONPATH": os.pathsep.join((str(installed), str(ROOT / "client"))),
         "NUMBA_CACHE_DIR": str(folder / "numba"), "SCENEPRINT_CACHE_DIR": str(folder / "tables"),
         **env,
     }  # fmt: skip
     done = subprocess.run(
-        [sys.executable, "-c", program, str(folder), *arguments], cwd=folder, env=given,
+        [sys.executable, "-c", program, str(folder), *arguments], cwd=folder, env=variables,
         capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

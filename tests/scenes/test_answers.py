@@ -64,8 +64,8 @@ def test_matches_lie_where_the_map_has_them(client, frame, answer):
         record = client.frame(match.map, match.frame_id)
         assert match.transform is not None
         np.testing.assert_array_equal(there[path].T_parent_child, record.pose.matrix)
-        told = client.frame_points(MAP, match.frame_id, limit=ONE.match).points
-        np.testing.assert_array_equal(there[f"{path}/points"].points, told)
+        sampled = client.frame_points(MAP, match.frame_id, limit=ONE.match).points
+        np.testing.assert_array_equal(there[f"{path}/points"].points, sampled)
         [vote] = there[f"{path}/vote"].strips  # from the match to where it puts the query
         at = moved(record.pose.matrix, vote)
         np.testing.assert_allclose(at[0], np.array(record.pose.matrix)[:3, 3], atol=1e-9)

@@ -53,8 +53,8 @@ def test_the_frames_of_a_map_are_shown(sceneprint, client, tmp_path):
     for one in frames:
         [move] = moves_of(rows, one.pose.child_frame)
         at = one.pose.translation
-        told = move.values["Transform3D:translation"]
-        np.testing.assert_allclose(told, [[at.x, at.y, at.z]], atol=1e-6)
+        position = move.values["Transform3D:translation"]
+        np.testing.assert_allclose(position, [[at.x, at.y, at.z]], atol=1e-6)
 
 
 @pytest.fixture

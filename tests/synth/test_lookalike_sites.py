@@ -1,4 +1,4 @@
-"""Tests of ambiguous sites: reproducibility and similarity."""
+"""Tests of ambiguous sites, as images and as scans: reproducibility and similarity."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,14 @@ import pytest
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.types import Intrinsics
 from sceneprint_lab.evaluation.protocol import overlaps, view_of
-from sceneprint_lab.synth import synthesise_lookalike
+from sceneprint_lab.synth import synthesise_lookalike, synthesise_lookalike_survey
+from sceneprint_lab.synth.large_scenes import symmetric_hall
+from sceneprint_lab.synth.lookalike_surveys import (
+    MAP_SCANS,
+    SURVEYED_KINDS,
+    Stop,
+    distinct_fraction,
+)
 from sceneprint_lab.synth.lookalikes import (
     APART,
     ELSEWHERE,
@@ -15,33 +22,59 @@ from sceneprint_lab.synth.lookalikes import (
     difference_share,
     equal_offices,
 )
-from sceneprint_lab.synth.trajectories import scattered_poses
+from sceneprint_lab.synth.sensors import Spinning
+from sceneprint_lab.synth.trajectories import scanner_pose, scattered_poses
 
 SEED = 5
-#: a Kinect's field of view in few samples
+#: A Kinect's field of view in few samples, and a scan that takes a millisecond.
 SMALL = Intrinsics(160, 120, 146.25, 146.25, 79.5, 59.5)
+FEW_RAYS = Spinning(rings=8, azimuth_step=0.05).perfect()
+#: Per kind of site, whether its map has the place of a query, and whether both share a frame.
+OF_IMAGES = {kind: (kind not in ELSEWHERE, kind not in APART) for kind in KINDS}
+OF_SCANS = {
+    kind: (kind not in ("unmapped", "absent"), kind != "absent") for kind in SURVEYED_KINDS
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", [*KINDS[:-1], pytest.param(KINDS[-1], marks=pytest.mark.thorough)])
-def test_a_site_depends_on_its_seed_and_number_alone(kind):
-    site, again, other = (
-        synthesise_lookalike(kind, seed, 1, queries=2, intrinsics=SMALL)
-        for seed in (SEED, SEED, SEED + 1)
-    )
-    assert site.name == f"{kind}-001"
-    assert (site.present, site.same_frame) == (kind not in ELSEWHERE, kind not in APART)
-    assert len(site.queries) == 2
-    assert len(site.map) >= 15
-    for one, same in zip(
-        (*site.map[:3], *site.queries), (*again.map[:3], *again.queries), strict=True
-    ):
-        np.testing.assert_array_equal(one.depth, same.depth)
+@pytest.mark.parametrize(
+    ("kind", "is_scanned"),
+    [
+        pytest.param(kind, is_scanned, marks=[pytest.mark.thorough] * (kind == "absent"))
+        for is_scanned, kinds in enumerate((OF_IMAGES, OF_SCANS))
+        for kind in kinds
+    ],
+)
+def test_a_site_depends_on_its_seed_and_number_alone(kind, is_scanned):
+    number = 2 if is_scanned else 1  # whose map lacks no scan
+
+    def synthesise(seed):
+        if is_scanned:
+            return synthesise_lookalike_survey(kind, seed, number, queries=2)
+        return synthesise_lookalike(kind, seed, number, queries=2, intrinsics=SMALL)
+
+    def samples(frame):
+        return frame.points if is_scanned else frame.depth
+
+    site, again, other = map(synthesise, (SEED, SEED, SEED + 1))
+    assert (site.name, len(site.queries)) == (f"{kind}-00{number}", 2)
+    assert (site.present, site.same_frame) == (OF_SCANS if is_scanned else OF_IMAGES)[kind]
+    assert len(site.map) == MAP_SCANS if is_scanned else len(site.map) >= 15
+    for one, same in zip((*site.map, *site.queries), (*again.map, *again.queries), strict=True):
+        np.testing.assert_array_equal(samples(one), samples(same))
         np.testing.assert_array_equal(one.pose, same.pose)
-    assert not np.array_equal(site.queries[0].depth, other.queries[0].depth)
+    assert min(np.count_nonzero(samples(one)) for one in site.queries) > 5000
+    assert not np.array_equal(site.queries[0].pose, other.queries[0].pose)
     names = [frame.name for frame in (*site.map, *site.queries)]
     assert len(set(names)) == len(names)
-    shown = [float(np.mean(frame.depth > 0)) for frame in site.queries]
-    assert min(shown) > 0.3
+
+
+def test_a_scan_does_not_tell_equal_places_apart_and_tells_others():
+    rng = np.random.default_rng(2)
+    hall = symmetric_hall(rng)
+    T = scanner_pose(3.0, 1.0, 1.2, 0.4, rng)
+    for signs, least, most in (((-1, -1, 1, 1), 0, 0.01), ((1, -1, -1, 1), 0.1, 1)):
+        share = distinct_fraction(Stop(hall, T), hall, np.diag(signs) @ T, FEW_RAYS)
+        assert least <= share < most
 
 
 def test_every_query_around_an_object_has_a_frame_beside_it_and_one_across():

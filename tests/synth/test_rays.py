@@ -1,12 +1,8 @@
-import sys
-
 import numpy as np
-import pytest
 
-from sceneprint.errors import MissingDependency
 from sceneprint.types import Intrinsics
 from sceneprint_lab.synth import Caster, cast_depth
-from sceneprint_lab.synth.mesh import ellipsoid, mesh_of
+from sceneprint_lab.synth.mesh import mesh_of
 from sceneprint_lab.synth.trajectories import pose
 
 SMALL = Intrinsics(24, 18, 20.0, 21.0, 11.3, 8.9)
@@ -24,9 +20,3 @@ def test_a_plane_has_its_analytic_depth_and_incidence():
     fall = np.sin(-pitch) + y * np.cos(pitch) + 0 * x  # metres lower a metre of depth
     np.testing.assert_allclose(depth, 1.5 / fall, rtol=1e-5)
     np.testing.assert_allclose(cosine, fall / np.sqrt(1 + x**2 + y**2), rtol=1e-4)
-
-
-def test_a_missing_embree_says_what_to_do(monkeypatch):
-    monkeypatch.setitem(sys.modules, "embreex.mesh_construction", None)
-    with pytest.raises(MissingDependency, match="pip install 'embreex"):
-        Caster(ellipsoid((1, 1, 1)))
