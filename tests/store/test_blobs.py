@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import os
+import resource
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -144,6 +145,22 @@ def test_a_blob_in_parts_is_there_whole_or_not_at_all(kept):
         assert file.read(1) == b""
 
 
+def test_a_full_disk_leaves_no_part_of_a_blob(kept):
+    def fill():
+        with kept.blobs.incoming() as blob:
+            for _ in range(20):
+                blob.write(b"x" * 5000)
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (65536, before[1]))  # stands for a full disk
+    try:
+        with pytest.raises(UnusableStore, match=r"cannot be written \(File too large\)"):
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert kept.files() == []
+
+
 def test_what_others_leave_there_is_no_blob(kept):
     kept.blobs.put(b"depth")
     kept.write(f"blobs/{DIGEST[:2]}/.0123456789ab.part", b"half")
@@ -190,7 +207,7 @@ def test_a_blob_may_be_put_and_removed_at_once(blobs, tmp_path):
         (errno.EIO, UnusableStore, "Check the folder and its permissions."),
     ],
 )
-def test_what_to_do_depends_on_what_failed(blobs, monkeypatch, number, kind, advice):
+def test_what_to_do_depends_on_what_failed(blobs, tmp_path, monkeypatch, number, kind, advice):
     def fail(_):
         raise OSError(number, os.strerror(number))
 
@@ -199,7 +216,7 @@ def test_what_to_do_depends_on_what_failed(blobs, monkeypatch, number, kind, adv
         blobs.put(b"depth")
     assert caught.type is kind
     assert str(caught.value).endswith(f"cannot be written ({os.strerror(number)}). {advice}")
-    assert not blobs.holds(DIGEST)
+    assert files(tmp_path) == []
 
 
 def test_what_is_there_already_is_made_durable_too(blobs, monkeypatch):
