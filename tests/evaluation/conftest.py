@@ -1,5 +1,6 @@
 """Fixtures of the evaluation tests: rooms, and outcomes with known figures."""
 
+import json
 import math
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from sceneprint.cli import main
 from sceneprint.geometry.validation.validation import PairValidation
+from sceneprint.models import save_model
 from sceneprint_lab.evaluation.protocol import Error, QueryOutcome, ValidatedPair
 
 
@@ -21,36 +23,36 @@ def building(once):
     return once("evaluated", make)
 
 
+@pytest.fixture(scope="session")
+def model_file(small_model, tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "small.safetensors"
+    save_model(small_model, path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def figures_of():
+    """A function that runs a command and returns the figures that it wrote to a folder."""
+
+    def run(folder, command, *arguments):
+        path = folder / "figures.json"
+        assert main([command, *map(str, arguments), "--jobs", "1", "--json", str(path)]) == 0
+        return json.loads(path.read_text(), parse_constant=pytest.fail)
+
+    return run
+
+
 def error(cm, degrees=0.0):
     return Error(cm / 100, math.radians(degrees))
 
 
 def pair(
-    match,
-    status="accepted",
-    strength="strong",
-    off=None,
-    *,
-    scene="here",
-    mean=0.5,
-    least=0.4,
+    match, status="accepted", strength="strong", off=None, *, scene="here", mean=0.5, least=0.4,
     bound=None,
-):
-    T = np.eye(4)
-    known = {"status": status, "strength": strength if status == "accepted" else None}
+):  # fmt: skip
+    strength = strength if status == "accepted" else None
     v = PairValidation(
-        **known,
-        reason="as given",
-        T_match_query=T,
-        residual_m=0.01,
-        residual_rad=0.01,
-        overlap=0.5,
-        plane_overlap=0.4,
-        violations=0.0,
-        inliers=100,
-        ambiguity=0.5,
-        T_rival=None,
-        seed=0,
+        status, strength, "as given", np.eye(4), 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.5, None, 0
     )
     same = scene == "here"
     off = off if same and off is not None else Error()
@@ -79,16 +81,6 @@ def outcome(ranking, selection, pairs, *, least=None, present=True, **rest):
 
 
 @pytest.fixture
-def make_pair():
-    return pair
-
-
-@pytest.fixture
-def make_outcome():
-    return outcome
-
-
-@pytest.fixture
 def three():
     """A successful query, a failed one, and one whose scene is not in the database.
 
@@ -97,7 +89,7 @@ def three():
     rank 2 weak and off by 15 cm, rank 3 ambiguous but correct; C has ranks 1 and 3.
     Third: a weak, wrong match.
     """
-    found = outcome(
+    results = outcome(
         [0, 1, 2],
         [0, 2],
         [
@@ -128,4 +120,4 @@ def three():
         least=[0.0] * 4,
         present=False,
     )
-    return [found, lost, away]
+    return [results, lost, away]

@@ -26,7 +26,6 @@ TRUTH = ConfidenceParameters(
 
 
 def drawn(rng):
-    """Evidence of every kind, anywhere between its knots."""
     values = {name: float(rng.uniform(min(knots), max(knots))) for name, knots in KNOTS.items()}
     values |= {"frames": 5.0 + values["frames"], "accepted": 5.0 * values.pop("acceptance")}
     names = [one.name for one in fields(PlaceEvidence)]
@@ -62,18 +61,18 @@ def test_what_was_drawn_from_a_model_is_learnt_again():
 
 
 def test_a_calibration_by_hand():
-    found = calibration(
+    actual = calibration(
         [0.95, 0.95, 0.91, 0.15, 0.05, 0.05], [True, True, False, False, True, False]
     )
     high, low, least = 2.81 / 3, 0.15, 0.05
-    assert found.bins == (
+    assert actual.bins == (
         (2, pytest.approx(least), 0.5), (1, pytest.approx(low), 0.0),
         (3, pytest.approx(high), pytest.approx(2 / 3)),
     )  # fmt: skip
     error = (2 * abs(least - 0.5) + low + 3 * abs(high - 2 / 3)) / 6
-    assert found.error == pytest.approx(error)
+    assert actual.error == pytest.approx(error)
     squares = 2 * 0.05**2 + 0.91**2 + 0.15**2 + 0.95**2 + 0.05**2
-    assert found.brier == pytest.approx(squares / 6)
+    assert actual.brier == pytest.approx(squares / 6)
     assert math.isclose(calibration([1.0], [True]).error, 0.0)
     with pytest.raises(ValueError, match="2 confidences for 1"):
         calibration([0.5, 0.5], [True])
