@@ -82,6 +82,12 @@ class Room:
         within = np.minimum(np.abs(points), np.abs(points - SIZE)).min(axis=1)
         return float(np.maximum(outside, np.where(outside > 0, 0, within)).max())
 
+    def error_of_frame(self, frame, T):
+        """Return the greatest error of a complete depth frame at a pose, metres."""
+        k = frame.intrinsics
+        lens = Lens(k.fx, k.fy, k.cx, k.cy, k.width, k.height)
+        return self.error_of_depth(frame.depth, lens, T)
+
     def error_of_depth(self, depth, lens, T):
         """Return the greatest error of a complete depth image at a pose, metres."""
         assert (depth > 0).all()

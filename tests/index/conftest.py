@@ -63,10 +63,10 @@ def nearest():
     """A function that returns the nearest keys and distances by sorting all sums."""
 
     def find(query, frames, size):
-        asked = query.astype(np.int64)
-        found = sorted(
-            (int(((x.astype(np.int64) - asked) ** 2).sum()), k) for k, x in frames.items()
+        request = query.astype(np.int64)
+        actual = sorted(
+            (int(((x.astype(np.int64) - request) ** 2).sum()), k) for k, x in frames.items()
         )
-        return [k for _, k in found[:size]], [d for d, _ in found[:size]]
+        return [k for _, k in actual[:size]], [d for d, _ in actual[:size]]
 
     return find

@@ -1,19 +1,15 @@
-"""Tests of publication: appending, merging, removal, and reopening."""
+"""Tests of publication: appending, merging, removal, reopening, and concurrent readers."""
 
-import contextlib
-import hashlib
-import os
-import subprocess
-import sys
+import threading
+import time
 
-import faiss
 import numpy as np
 import pytest
 
 from benchmarks.waiting import PATIENCE_S
 from sceneprint.atomic_files import folder_turn
 from sceneprint.index.index_manifest import newest_number
-from sceneprint.index.index_version import clear, newest, publish
+from sceneprint.index.index_version import Tail, clear, newest, publish, search
 
 LENGTH = 256
 
@@ -54,22 +50,6 @@ def test_what_is_published_is_what_is_opened(walk, published, tmp_path):
             version.vectors_of(np.array([keys[0], 3]))
 
 
-def test_files_are_keys_and_what_faiss_writes(walk, published, tmp_path):
-    """Byte for byte as FAISS serialises an index to which the signatures were added as floats."""
-    signatures = walk(100)
-    published(np.arange(100) + 5, signatures)
-    index = faiss.IndexScalarQuantizer(
-        LENGTH, faiss.ScalarQuantizer.QT_8bit_direct, faiss.METRIC_L2
-    )
-    index.add(signatures.astype(np.float32))
-    (path,) = (tmp_path / "map").glob("*.faiss")
-    assert path.read_bytes() == faiss.serialize_index(index).tobytes()
-    (keys,) = (tmp_path / "map").glob("*.keys")
-    assert keys.read_bytes() == (np.arange(100) + 5).astype("<i8").tobytes()
-    for each in (path, keys):
-        assert each.stem == hashlib.sha256(each.read_bytes()).hexdigest()
-
-
 def test_nothing_is_found_where_nothing_is(walk, published, tmp_path):
     assert newest(tmp_path / "map", "model", LENGTH) is None
     assert newest_number(tmp_path / "map") is None
@@ -83,7 +63,6 @@ def test_nothing_is_found_where_nothing_is(walk, published, tmp_path):
 def test_appending_gives_the_bytes_of_publishing_at_once(
     walk, published, tmp_path, monkeypatch, step
 ):
-    """Whatever came when, in blocks of whatever size."""
     monkeypatch.setattr("sceneprint.index.segment.BLOCK_BYTES", step * LENGTH)
     signatures, again = walk(120), walk(30, seed=5)
     first = published(np.arange(99, -1, -1), signatures[99::-1])
@@ -144,39 +123,6 @@ def test_two_versions_are_kept_and_only_our_files_removed(walk, published, tmp_p
     assert files(folder) == {".lock", "notes.txt"}
 
 
-def test_what_was_mapped_survives_its_file(walk, tmp_path):
-    """In a process of its own, which a lost mapping would kill."""
-    code = """
-import sys
-from pathlib import Path
-import numpy as np
-from sceneprint.index.index_version import Tail, newest, publish, search
-
-n = 4000
-rows = np.random.default_rng(0).integers(0, 256, (n, 256), np.uint8)
-for flat in (1 << 30, 0):
-    folder = Path(sys.argv[1]) / str(flat)
-    publish(folder, model_id="m", revision=1, blocks=[(np.arange(n), rows)], previous=None,
-            flat_bytes=flat)
-    found = newest(folder, "m", 256)
-    for path in folder.iterdir():
-        path.unlink()
-    vectors = found.segments[0].vectors
-    hits = search(rows[777], found, Tail.empty(256), 3, metric="l2")
-    assert hits.keys[0] == 777 and hits.distances[0] == 0
-    assert (vectors == rows).all()
-    where = next(line for line in open("/proc/self/smaps") if f"/{flat}/" in line)
-    del found, hits
-    assert (vectors == rows).all()  # keeps the mapping alive by itself
-    assert where.split()[1].startswith("r--")  # a file is mapped, and nobody may write there
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)],
-        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-
-
 def test_one_builds_at_a_time(walk, published, tmp_path):
     folder, signatures = tmp_path / "map", walk(20)
     first = published(np.arange(10), signatures[:10])
@@ -210,7 +156,7 @@ def test_an_emptied_folder_is_noticed(walk, published, tmp_path):
     assert holds(first, frames_of(np.arange(10), signatures[:10]))
 
 
-def test_mistakes_leave_the_version_before(walk, published, tmp_path):
+def test_a_publication_that_fails_leaves_the_version_before(walk, published, tmp_path):
     folder, signatures = tmp_path / "map", walk(20)
     first = published(np.arange(10), signatures[:10])
     before = files(folder)
@@ -219,64 +165,73 @@ def test_mistakes_leave_the_version_before(walk, published, tmp_path):
         yield np.arange(10, 12), signatures[10:12]
         raise ConnectionError("the database went away")
 
-    def attempt(blocks, model="model"):
-        publish(folder, model_id=model, revision=1, blocks=blocks, previous=first)
-
-    with pytest.raises(ConnectionError):
-        attempt(broken())
-    with pytest.raises(ValueError, match=r"\[10\] occur twice"):
-        attempt([(np.array([10, 11, 10]), signatures[10:13])])
-    with pytest.raises(ValueError, match=r"\[255, 256\] bytes in one map"):
-        attempt([(np.arange(10, 12), signatures[10:12, 1:])])
-    with pytest.raises(ValueError, match="keys of int32"):
-        attempt([(np.arange(10, 12, dtype=np.int32), signatures[10:12])])
-    with pytest.raises(ValueError, match=r"keys \(3,\)"):
-        attempt([(np.arange(10, 13), signatures[10:12])])
-    with pytest.raises(ValueError, match="an index of model model cannot contain frames of other"):
-        attempt([], "other")
-    with pytest.raises(ValueError, match="there are no frames"):
-        publish(folder, model_id="model", revision=1, blocks=[], previous=None)
+    for blocks, error in (
+        (broken(), ConnectionError),
+        ([(np.array([10, 11, 10]), signatures[10:13])], ValueError),  # a key twice
+        ([(np.arange(10, 12), signatures[10:12, 1:])], ValueError),  # too short
+    ):
+        with pytest.raises(error):
+            publish(folder, model_id="model", revision=1, blocks=blocks, previous=first)
     assert files(folder) == before
-    assert holds(newest(folder, "model", LENGTH), frames_of(np.arange(10), signatures[:10]))
     published(np.arange(10, 20), signatures[10:], first)
     assert holds(newest(folder, "model", LENGTH), frames_of(np.arange(20), signatures))
 
 
-@pytest.mark.parametrize("n", [10, 60])
-def test_a_failure_at_any_step_leaves_the_old_or_the_new(walk, published, tmp_path, monkeypatch, n):
-    """A disk that fills, at each of the calls that give a file its name or make it durable.
+def test_readers_go_on_while_versions_pass(walk, published, tmp_path):
+    folder, signatures = tmp_path / "map", walk(750, LENGTH)
+    first = published(np.arange(300), signatures[:300], revision=300)
+    old = {path.name for path in folder.iterdir()}
+    tail, errors, done = Tail.empty(LENGTH), [], threading.Event()
+    queries = signatures[::97]
+    expected = [search(q, first, tail, 20, metric="l2") for q in queries]
+    counts = [0, 0]
 
-    Of a publication that appends and deletes, and of one that merges.
-    """
-    signatures, real = walk(100), {"replace": os.replace, "fsync": os.fsync}
-    seen = set()
-    for call in ("replace", "fsync"):
-        for step in range(100):
-            folder = tmp_path / f"{call}-{step}"
-            first = published(np.arange(40), signatures[:40], folder=folder)
-            keys, gone = np.arange(40, 40 + n), frozenset([3])
-            left = step
+    def search_old():
+        while not done.is_set():
+            for query, right in zip(queries, expected, strict=True):
+                hits = search(query, first, tail, 20, metric="l2")
+                if (hits.keys != right.keys).any() or (hits.distances != right.distances).any():
+                    errors.append("an old version has changed")
+            counts[0] += 1
 
-            def failing(*arguments, call=call):
-                nonlocal left
-                left -= 1
-                if left < 0:
-                    raise OSError(28, "No space left on device")
-                real[call](*arguments)
+    def follow():
+        known = None
+        while not done.is_set():
+            actual = newest(folder, "model", LENGTH, previous=known)
+            if actual is None or (known is not None and actual.number < known.number):
+                errors.append(f"{actual and actual.number} after {known and known.number}")
+                continue
+            known = actual
+            n = known.revision
+            hits = search(signatures[n - 1], known, tail, 1, metric="l2")
+            if len(known) != n or hits.keys.tolist() != [n - 1]:
+                errors.append(f"version {known.number} has {len(known)} of {n}")
+            counts[1] += 1
 
-            with monkeypatch.context() as patch:
-                patch.setattr(os, call, failing)
-                with contextlib.suppress(OSError):
-                    published(keys, signatures[keys], first, folder=folder, drop=gone, flat_bytes=0)
-            found = newest(folder, "model", LENGTH)
-            last = {1: 40, 2: 40 + n}[found.number]
-            frames = frames_of(np.arange(last), signatures[:last])
-            if found.number == 2:
-                del frames[3]
-            assert holds(found, frames)
-            assert not list(folder.glob(".*.part"))
-            seen.add((call, found.number))
-            if left >= 0:
-                break
-        assert step >= 3
-    assert {("replace", 1), ("replace", 2), ("fsync", 1), ("fsync", 2)} <= seen
+    def guarded(work):
+        def run():
+            try:
+                work()
+            except Exception as error:  # what a thread raises would be lost
+                errors.append(repr(error))
+
+        return run
+
+    threads = [threading.Thread(target=guarded(w)) for w in (search_old, search_old, follow)]
+    for thread in threads:
+        thread.start()
+    version = first
+    for n in range(300, 750, 30):
+        new = np.arange(n, n + 30)
+        version = published(new, signatures[new], version, revision=n + 30)
+    deadline = time.monotonic() + PATIENCE_S
+    while min(counts) < 3 and not errors and time.monotonic() < deadline:
+        time.sleep(0.01)
+    done.set()
+    for thread in threads:
+        thread.join(PATIENCE_S)
+    assert errors == []
+    assert min(counts) >= 3
+    assert version.number == 16
+    left = {path.name for path in folder.iterdir()}
+    assert old & left == {".lock"}  # the first segment has been merged

@@ -1,6 +1,7 @@
-"""Tests of segments: appending, merging, and search over all of them."""
+"""Tests of segments: appending, merging, and exact search over all of them."""
 
 import hashlib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,27 +10,14 @@ from hypothesis import strategies as st
 
 from sceneprint.errors import DamagedIndex
 from sceneprint.index.index_manifest import SegmentFiles
-from sceneprint.index.index_version import (
-    Tail,
-    newest,
-    publish,
-    search,
-    signatures_of,
-)
-from sceneprint.index.segment import (
-    GONE_SHARE,
-    MOST_SEGMENTS,
-    RATIO,
-    merge_plan,
-    open_segment,
-)
+from sceneprint.index.index_version import Tail, newest, publish, search, signatures_of
+from sceneprint.index.segment import GONE_SHARE, MOST_SEGMENTS, RATIO, merge_plan, open_segment
 
 LENGTH = 24
 NONE = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
 
 
 def bits(n, seed):
-    """Signatures of 0 and 1 alone, so that many distances are equal."""
     return np.random.default_rng(seed).integers(0, 2, (n, LENGTH), np.uint8)
 
 
@@ -68,7 +56,6 @@ def test_merges_by_hand():
 @settings(max_examples=40)
 @given(data=st.data(), flat=st.sampled_from([0, 1 << 30]), seed=st.integers(0, 999))
 def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, flat, seed):
-    """New, signed anew, deleted and indexed again, in any order, against a dict of all frames."""
     folder, rng = tmp_path_factory.mktemp("map"), np.random.default_rng(seed)
     frames = {}
     made = None
@@ -104,8 +91,8 @@ def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, fla
     for version in (made, opened):
         assert version.keys.tolist() == sorted(frames)
         assert (len(version), version.manifest.frames) == (len(frames), len(frames))
-        asked = np.arange(-3, 210)
-        assert version.has(asked).tolist() == [int(key) in frames for key in asked]
+        candidates = np.arange(-3, 210)
+        assert version.has(candidates).tolist() == [int(key) in frames for key in candidates]
         for size, exact in ((1, True), (10, flat == 0), (300, flat == 0)):
             hits = search(
                 query, version, tail, size, metric="l2", dead=dead, among=given_keys, exact=exact
@@ -164,7 +151,6 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(walk, published,
     known = made.segments
     made = published(np.arange(2500, 2530), signatures[2500:2530], made, flat_bytes=flat)
     assert sizes(made) == [2000, 500, 30]
-    # a small segment is compared whole
     assert [one.sketches is None for one in made.segments] == [False, False, True]
     for one, before in zip(made.segments, known, strict=False):
         assert one.record.file("faiss") == before.record.file("faiss")
@@ -186,7 +172,6 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(walk, published,
 
 @pytest.fixture
 def worn(walk, published, tmp_path):
-    """Two versions of one segment, of which a frame is gone in the second; and what says so."""
     signatures = walk(40, LENGTH)
     first = published(np.arange(40), signatures)
     published(*NONE, first, drop=frozenset([7]))
@@ -197,27 +182,81 @@ def worn(walk, published, tmp_path):
 
 def test_a_list_of_what_is_gone_that_is_damaged_is_passed_over(worn):
     folder, path = worn
-    found = newest(folder, "model", LENGTH)
-    assert (found.number, len(found)) == (2, 39)
+    actual = newest(folder, "model", LENGTH)
+    assert (actual.number, len(actual)) == (2, 39)
     for data in (b"", bytes(7), bytes(8), path.read_bytes() + bytes(8), None):
         path.unlink()
         if data is not None:
             path.write_bytes(data)
-        found = newest(folder, "model", LENGTH)
-        assert (found.number, len(found)) == (1, 40)  # readers know of the deletion themselves
+        actual = newest(folder, "model", LENGTH)
+        assert (actual.number, len(actual)) == (1, 40)  # readers know of the deletion themselves
 
 
 @pytest.mark.parametrize(
     ("gone", "why"), [([7, 40], "not in the segment"), ([9, 7], "not in ascending order")]
 )
 def test_a_list_of_other_frames_is_refused(worn, gone, why):
-    """Sound bytes, of somebody's own making."""
     folder, _ = worn
-    found = newest(folder, "model", LENGTH)
+    actual = newest(folder, "model", LENGTH)
     data = np.array(gone, "<i8").tobytes()
     name = f"{hashlib.sha256(data).hexdigest()}.gone"
     (folder / name).write_bytes(data)
-    record = found.segments[0].record
+    record = actual.segments[0].record
     other = SegmentFiles(files=(*record.files[:2], (name, len(data))), recall=record.recall)
     with pytest.raises(DamagedIndex, match=why):
         open_segment(folder, other, LENGTH)
+
+
+search_l2 = partial(search, metric="l2")
+
+
+def answer(hits):
+    return hits.keys.tolist(), hits.distances.tolist()
+
+
+def frames_of(keys, signatures):
+    return dict(zip(keys.tolist(), signatures, strict=True))
+
+
+@settings(max_examples=60)
+@given(
+    n=st.integers(0, 12),
+    size=st.integers(0, 14),
+    seed=st.integers(0, 99),
+    dead=st.sets(st.integers(0, 12)),
+    metric=st.sampled_from(["l1", "l2"]),
+)
+def test_a_tail_alone(n, size, seed, dead, metric):
+    rng = np.random.default_rng(seed)
+    keys, signatures = rng.permutation(n).astype(np.int64), rng.integers(0, 4, (n, 3), np.uint8)
+    query = rng.integers(0, 4, 3, np.uint8)
+    hits = search(query, None, Tail(keys, signatures), size, metric=metric, dead=frozenset(dead))
+    power = {"l1": 1, "l2": 2}[metric]
+    alive = {k: x for k, x in frames_of(keys, signatures).items() if k not in dead}
+    right = sorted(
+        (int((np.abs(x.astype(int) - query) ** power).sum()), k) for k, x in alive.items()
+    )
+    assert answer(hits) == ([k for _, k in right[:size]], [d for d, _ in right[:size]])
+    assert (hits.exact, hits.compared) == (True, len(alive))
+
+
+def test_distances_that_floats_cannot_hold_are_exact(published, nearest):
+    """Above 2^24 FAISS rounds: neighbours that differ by one would be equal."""
+    signatures = np.full((40, 512), 255, np.uint8)
+    for i in range(40):
+        signatures[i, : 40 - i] = 254
+    keys, query = np.arange(40, dtype=np.int64), np.zeros(512, np.uint8)
+    version = published(keys, signatures)
+    for size in (1, 3, 40):
+        hits = search_l2(query, version, Tail.empty(512), size)
+        assert hits.distances[0] > 1 << 24
+        assert answer(hits) == nearest(query, frames_of(keys, signatures), size)
+
+
+def test_an_empty_map(published, walk):
+    query = walk(1)[0]
+    for version in (None, published(np.arange(0), walk(0), published(np.arange(3), walk(3)),
+                                       drop=frozenset({0, 1, 2}))):  # fmt: skip
+        hits = search_l2(query, version, Tail.empty(256), 5)
+        assert answer(hits) == ([], [])
+        assert (hits.exact, hits.compared) == (True, 0)

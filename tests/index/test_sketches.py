@@ -16,19 +16,17 @@ search_l2 = partial(search, metric="l2")
 
 
 def only(version):
-    """The segment of a version that has one."""
-    (found,) = version.segments
-    return found
+    (results,) = version.segments
+    return results
 
 
 def sketches_of(version):
-    found = only(version).sketches
-    assert found is not None
-    return found
+    results = only(version).sketches
+    assert results is not None
+    return results
 
 
 def codes_of(own):
-    """The bits of all rows, packed."""
     return np.stack([own.index.reconstruct(row) for row in range(len(own))])
 
 
@@ -65,7 +63,6 @@ def test_a_map_that_is_large_has_sketches(walk, published, nearest, tmp_path):
 
 
 def test_nothing_of_a_deleted_frame_is_in_sketches(walk, published):
-    """Those of a segment that is written anew are as if it had never been there."""
     signatures = walk(50, LENGTH, walks=5)
     signatures[7] = 255  # it moves every mean
     made = published(np.arange(50), signatures, flat_bytes=0)
@@ -80,19 +77,18 @@ def test_nothing_of_a_deleted_frame_is_in_sketches(walk, published):
 
 
 def test_recall_is_what_searches_find(walk, published, monkeypatch):
-    """By searches of the frames that were drawn, each without itself, against the exact scan."""
     for name, value in (("LEAST_SELECTED", 10), ("TIMES_WANTED", 1), ("ENOUGH", 0.5)):
         monkeypatch.setattr(sketches, name, value)  # so that some are missed
     signatures = walk(4000, LENGTH, walks=30)
     version = published(np.arange(4000), signatures, flat_bytes=0)
-    recall, found = version.manifest.recall, 0
+    recall, actual = version.manifest.recall, 0
     assert (recall.near, recall.sample, recall.frames) == (10, sketches.MOST, 4000)
     for row in draw(4000, recall.sample, 0).tolist():
         itself = frozenset([row])
         right = search_l2(signatures[row], version, EMPTY, 10, dead=itself, exact=True)
         hits = search_l2(signatures[row], version, EMPTY, 10, dead=itself)
-        found += int((hits.distances <= right.distances[-1]).sum())
-    assert recall.share == pytest.approx(found / (10 * recall.sample))
+        actual += int((hits.distances <= right.distances[-1]).sum())
+    assert recall.share == pytest.approx(actual / (10 * recall.sample))
     assert 0.5 <= recall.share < 1
 
 
@@ -105,7 +101,6 @@ def test_more_is_compared_until_almost_all_is_found(published):
 
 
 def test_as_many_come_back_as_there_are(walk, published, nearest):
-    """Sketches of frames that may not be found take no place of others."""
     signatures, keys = walk(2000, LENGTH, walks=10), np.arange(2000)
     version = published(keys, signatures, flat_bytes=0)
     query = signatures[1234]
@@ -145,9 +140,9 @@ def test_neighbours_are_the_nearest_by_exact_distance(walk, monkeypatch, most):
     signatures, chosen = walk(300, LENGTH, walks=3), np.array([0, 6, 7, 150, 299])
     for block in (7 * LENGTH, 1 << 20):
         monkeypatch.setattr(sketches, "BLOCK_BYTES", block)
-        found = list(neighbours(signatures, chosen, most))
-        assert [row for row, _ in found] == chosen.tolist()
-        for row, others in found:
+        actual = list(neighbours(signatures, chosen, most))
+        assert [row for row, _ in actual] == chosen.tolist()
+        for row, others in actual:
             exact = ((signatures.astype(int) - signatures[row]) ** 2).sum(axis=1)
             assert len(set(others.tolist())) == len(others) == min(most, 299)
             assert row not in others

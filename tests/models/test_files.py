@@ -1,6 +1,7 @@
-"""Tests of model files: round trips and damage."""
+"""Tests of model files and pair tables: round trips, optional groups of parameters, damage."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,20 @@ from safetensors.numpy import load, save
 from sceneprint.errors import UnreadableModel
 from sceneprint.geometry.registration.patch_descriptors import PatchDescriptorParameters
 from sceneprint.geometry.signature.segmentation import SegmentationParameters
+from sceneprint.geometry.surface.cloud import CloudParameters
 from sceneprint.geometry.surface.depth_image import DepthParameters
-from sceneprint.models import PRESETS, parse_model, read_model, save_model
+from sceneprint.geometry.validation.validation import ValidationParameters
+from sceneprint.models import (
+    PRESETS,
+    ModelParameters,
+    build_table,
+    open_table,
+    parse_model,
+    read_model,
+    save_model,
+    write_model,
+)
+from sceneprint.models.model import parse_parameters, to_mapping
 
 
 def test_round_trip(small_model, tmp_path):
@@ -24,12 +37,6 @@ def test_round_trip(small_model, tmp_path):
     for name, tensor in small_model.tensors.items():
         np.testing.assert_array_equal(read.tensors[name], tensor)
     assert [p.name for p in tmp_path.iterdir()] == ["small.safetensors"]
-
-
-def test_files_of_one_model_are_equal(small_model, tmp_path):
-    save_model(small_model, tmp_path / "a")
-    save_model(replace(small_model), tmp_path / "b")
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 def test_id_is_the_content_not_the_name(small_model):
@@ -87,9 +94,9 @@ def test_whitenings_that_are_none(small_whitened, tmp_path):
 
     def put(**values):
         def change(header):
-            told = header["whitening"]
-            assert isinstance(told, dict)
-            told.update(values)
+            result = header["whitening"]
+            assert isinstance(result, dict)
+            result.update(values)
 
         return with_header(good, change)
 
@@ -111,8 +118,7 @@ def test_whitenings_that_are_none(small_whitened, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("preset", "g", "size", "metric"),
-    [("depth", 256, 448, "l2"), ("paper", 1250, 125_000, "l1")],
+    ("preset", "g", "size", "metric"), [("depth", 256, 448, "l2"), ("paper", 1250, 125_000, "l1")]
 )
 def test_presets_ship(preset, g, size, metric):
     model = read_model(preset)
@@ -203,29 +209,6 @@ def test_a_name_that_would_drive_a_terminal(data):
         parse_model(escape, "a file")
 
 
-@pytest.mark.parametrize(
-    ("stage", "field", "value"),
-    [
-        ("table", "distance_bins", 100_000),
-        ("hierarchy", "n_levels", 0),
-        ("segmentation", "iterations", 10**9),
-        ("depth", "maximum_pixels", 10**9),
-        ("normals", "radius_px", float("inf")),
-        ("validation_segmentation", "n_patches", 2001),
-        ("surroundings", "far_distances", 10**6),
-        ("surroundings", "middle_radius", float("nan")),
-    ],
-)
-def test_parameters_that_would_take_all_memory(data, stage, field, value):
-    def enlarge(header):
-        parameters = header["parameters"]
-        assert isinstance(parameters, dict)
-        parameters[stage][field] = value
-
-    with pytest.raises(UnreadableModel, match="missing or malformed"):
-        parse_model(with_header(data, enlarge), "a file")
-
-
 def test_components_beyond_what_the_table_can_name(data):
     g = 2**15
     tensors = {
@@ -257,3 +240,134 @@ def test_paths_that_hold_no_model(tmp_path):
         file.truncate(17 << 20)
     with pytest.raises(UnreadableModel, match="exceed the maximum size"):
         read_model(large)
+
+
+@pytest.mark.parametrize(
+    ("preset", "start"), [("paper", "c8883ac257b4"), ("depth", "da1ec0e37999")]
+)
+def test_ids_of_shipped_models_stay(preset, start):
+    """Signatures of another id are never compared, so a change of them changes the id."""
+    model = read_model(preset)
+    assert model.without_whitening.id.startswith(start)
+    assert not {"cloud", "validation"} & set(model.header["parameters"])
+    assert model.parameters.cloud == CloudParameters()
+    assert model.parameters.validation == ValidationParameters()
+
+
+def changed(model):
+    p = model.parameters
+    coarse = replace(p.validation.alignment.coarse, stride=9, first_gate=0.5)
+    alignment = replace(p.validation.alignment, coarse=coarse)
+    validation = replace(p.validation, minimum_patches=7, alignment=alignment)
+    cloud = replace(p.cloud, maximum_range=60.0)
+    return replace(model, parameters=replace(p, cloud=cloud, validation=validation))
+
+
+def test_only_what_differs_is_written(small_model):
+    model = changed(small_model)
+    written = model.header["parameters"]
+    assert written["cloud"] == {"maximum_range": 60.0}
+    assert written["validation"] == {
+        "minimum_patches": 7,
+        "alignment": {"coarse": {"first_gate": 0.5, "stride": 9}},
+    }
+    assert model.id != small_model.id
+    read = parse_model(write_model(model), "a file")
+    assert (read.id, read.parameters) == (model.id, model.parameters)
+
+
+@pytest.mark.parametrize(
+    ("group", "value"),
+    [
+        ("cloud", {"maximum_reach": 3.0}),
+        ("cloud", {"maximum_range": "far"}),
+        ("cloud", {"maximum_pixels": True}),
+        ("cloud", None),
+        ("validation", {"alignment": {"coarse": {"strides": 2}}}),
+        ("validation", {"alignment": 3}),
+    ],
+)
+def test_what_is_not_known_is_refused(group, value):
+    with pytest.raises(UnreadableModel, match=f"parameters.{group}"):
+        parse_parameters(to_mapping(ModelParameters()) | {group: value})
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"table": {"distance_bins": 100_000}}, {"hierarchy": {"n_levels": 0}},
+        {"segmentation": {"iterations": 10**9}}, {"depth": {"maximum_pixels": 10**9}},
+        {"normals": {"radius_px": math.inf}}, {"validation_segmentation": {"n_patches": 2001}},
+        {"surroundings": {"far_distances": 10**6}}, {"surroundings": {"middle_radius": math.nan}},
+        {"cloud": {"maximum_pixels": 1 << 21}}, {"cloud": {"radius_px": 40}},
+        {"cloud": {"minimum_range": 0.0}}, {"cloud": {"maximum_range": 0.2}},
+        {"cloud": {"image_angle": 1e-9}}, {"cloud": {"range_gate": 0.0}},
+        {"cloud": {"maximum_range": math.inf}},
+        {"cloud": {"maximum_pixels": 1 << 20, "radius_px": 16}},
+        {"validation": {"agreement": {"edge_px": 10**9}}},
+        {"validation": {"alignment": {"consensus": {"rounds": 10**9}}}},
+        {"validation": {"alignment": {"sequence": {"n_sources": 10**9}}}},
+        {"validation": {"rivals": {"n_proposed": 10**9}}},
+        {"validation": {"alignment": {"plan": {"side": 10**9}}}},
+        {"validation": {"alignment": {"plan": {"height_step": 1e-9}}}},
+        {"validation": {"alignment": {"fine_stride": 0}}},
+    ],
+)  # fmt: skip
+def test_parameters_that_would_take_all_memory_or_time_are_refused(data, changes):
+    def merge(parameters, changes):
+        for name, value in changes.items():
+            if isinstance(value, dict):
+                merge(parameters.setdefault(name, {}), value)
+            else:
+                parameters[name] = value
+
+    with pytest.raises(UnreadableModel, match="missing or malformed"):
+        parse_model(
+            with_header(data, lambda header: merge(header["parameters"], changes)), "a file"
+        )
+
+
+def same(a, b):
+    return (
+        np.array_equal(a.features, b.features)
+        and np.array_equal(a.components, b.components)
+        and np.array_equal(a.posteriors, b.posteriors)
+    )
+
+
+def test_built_once_and_mapped(small_model, tmp_path):
+    steps = []
+    first = open_table(small_model, tmp_path / "cache", lambda done, n: steps.append((done, n)))
+    (file,) = (tmp_path / "cache").iterdir()
+    assert small_model.id in file.name
+    assert steps[-1] == (small_model.parameters.table.n_bins,) * 2
+    steps.clear()
+    again = open_table(small_model, tmp_path / "cache", lambda done, n: steps.append((done, n)))
+    assert steps == []
+    assert same(first, again)
+    assert same(first, build_table(small_model))
+    base = again.features
+    while isinstance(base, np.ndarray) and not isinstance(base, np.memmap):
+        base = base.base
+    assert isinstance(base, np.memmap)
+
+
+def test_a_damaged_file_is_built_anew(small_model, tmp_path):
+    right = build_table(small_model)
+    open_table(small_model, tmp_path)
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for damage in (b"", whole[: len(whole) // 2], b"x" * len(whole), bytes(flipped), whole + b"x"):
+        file.unlink()  # a file that is mapped somewhere must not be written over
+        file.write_bytes(damage)
+        assert same(open_table(small_model, tmp_path), right)
+        assert file.read_bytes() == whole
+
+
+def test_without_a_cache_folder_the_table_is_held(small_model, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert same(open_table(small_model, blocked), build_table(small_model))
+    assert blocked.read_text() == "not a folder"

@@ -74,12 +74,6 @@ def drive(room, ros):
 def send(writer, kind, t, samples, k):
     if kind == "depth":
         writer.image(t, samples)
-    elif kind == "compressed_metres":  # quantised like the transport: z = a / (v - b)
-        a, b = 10_100.0, 1 - 10_100.0 / 10.0
-        with np.errstate(divide="ignore"):
-            quantised = np.where(samples > 0, a / (samples / 1000.0) + b, 0)
-        quantised[(quantised < 1) | (quantised > 65_535)] = 0
-        writer.compressed(t, quantised.round(), "32FC1", a=a, b=b)
     else:
         v, u = np.mgrid[0 : k.height : 2, 0 : k.width : 2]
         z = np.where(samples[v, u] > 0, samples[v, u] / 1000.0, np.nan)

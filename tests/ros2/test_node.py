@@ -3,8 +3,6 @@
 The real rclpy is not tested here.
 """
 
-import ast
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,8 +13,6 @@ from sceneprint_client.poses import rotation_of
 from sceneprint_client.tracker import replay
 from sceneprint_client.tracker_core import difference
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGE = ROOT / "ros2" / "sceneprint_ros"
 SECOND = 1_000_000_000
 DEPTH = "/camera/depth/image_raw"
 
@@ -144,31 +140,7 @@ def test_a_manager_starts_and_stops_a_node(bus, node_module, drive):
 def test_parameters_that_are_none_end_it(wrong, bus, node_module, capsys):
     bus.parameters = {"map": "m", "topic": DEPTH, **wrong}
     assert node_module.main() == 2
-    said = capsys.readouterr().err
-    assert said.startswith("relocaliser: ")
-    assert said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.startswith("relocaliser: ")
+    assert output.count("\n") == 1
     assert not bus.is_up
-
-
-# What lies beside the node.
-
-
-def test_launch_files_set_what_the_node_declares(bus, node_module):
-    from ruamel.yaml import YAML
-
-    bus.parameters = {"map": "m", "topic": DEPTH}
-    node_module.RelocaliserNode().destroy_node()
-    told = YAML(typ="safe").load(PACKAGE / "config" / "relocaliser.yaml")
-    values = told["/**"]["relocaliser"]["ros__parameters"]
-    assert values.keys() <= bus.declared.keys()
-    assert [name for name, value in values.items()
-            if type(value) is not type(bus.declared[name])] == []  # fmt: skip
-    for path in sorted(PACKAGE.glob("launch/*.py")):
-        for call in ast.walk(ast.parse(path.read_text())):
-            if isinstance(call, ast.Call) and "relocaliser" in (
-                one.value.value for one in call.keywords if isinstance(one.value, ast.Constant)
-            ):
-                (given,) = (one.value for one in call.keywords if one.arg == "parameters")
-                keys = {key.value for one in ast.walk(given) if isinstance(one, ast.Dict)
-                        for key in one.keys if isinstance(key, ast.Constant)}  # fmt: skip
-                assert keys - {"use_sim_time"} <= bus.declared.keys(), path
