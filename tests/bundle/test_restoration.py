@@ -255,9 +255,9 @@ def test_no_number_is_given_out_twice(data, postgres_url, tmp_path, rows, settin
     changed(data, f"DELETE FROM events WHERE number = {newest}")
     take_backup(settings(data), str(tmp_path / "place"))
     restore_to_server(str(tmp_path / "place"), fleet_of(tmp_path / "fleet", postgres_url))
-    request = "SELECT nextval(pg_get_serial_sequence('{}', 'number'))"
-    assert ask(postgres_url, request.format("events")) == [(highest + 1,)]
-    assert ask(postgres_url, request.format("samples")) == [(1,)]  # none was ever given out
+    statement = "SELECT nextval(pg_get_serial_sequence('{}', 'number'))"
+    assert ask(postgres_url, statement.format("events")) == [(highest + 1,)]
+    assert ask(postgres_url, statement.format("samples")) == [(1,)]  # none was ever given out
     restore_to_folder(str(tmp_path / "place"), tmp_path / "home")
     given = rows(tmp_path / "home", "SELECT seq FROM sqlite_sequence WHERE name = 'events'")
     assert given == [(highest,)]

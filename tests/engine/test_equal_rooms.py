@@ -27,7 +27,6 @@ APART = 30.0
 
 
 def equal(frame, rng):
-    """The same view in another room: a millimetre of noise, the pose shifted."""
     depth = frame.depth + (frame.depth > 0) * rng.normal(0.0, 1e-3, frame.depth.shape)
     T = np.array(frame.pose)
     T[0, 3] += APART
@@ -35,33 +34,33 @@ def equal(frame, rng):
 
 
 @pytest.fixture(scope="module")
-def twin_folder(signed_folder, uploads, make_upload, work_off, tmp_path_factory):
+def twin_folder(signed_folder, uploads, make_upload, tmp_path_factory):
     """A data folder whose map `hall` has the second room twice, 30 m apart."""
     rng = np.random.default_rng(5)
     folder = Path(shutil.copytree(signed_folder, tmp_path_factory.mktemp("twins") / "data"))
     with Engine(Settings(data_dir=folder)) as engine:
         for one in uploads[6:]:
             copy = make_upload(equal(replace(one.frame, pose=one.pose), rng), one.room)
-            engine.add_frame("hall", copy.data, copy.meta)
-        work_off(engine)
+            engine.add(copy)
+        engine.work_off()
     return folder
 
 
 @pytest.fixture
-def twins(twin_folder, make_engine, uploads, ids, tmp_path):
+def twins(twin_folder, make_engine, uploads, tmp_path):
     """A function that asks where a frame was taken, of which the map holds the twin alone; with
     that frame, and the ids of the frames of each room.
     """
-    engine, asked = make_engine(shutil.copytree(twin_folder, tmp_path / "twins")), uploads[8]
-    every = ids(engine)
+    engine, request = make_engine(shutil.copytree(twin_folder, tmp_path / "twins")), uploads[8]
+    every = engine.ids()
     engine.delete_frame("hall", every[8])
-    meta = asked.meta.model_copy(update={"pose": None})
+    meta = request.meta.model_copy(update={"pose": None})
 
     def ask(**how):
         query = Query.model_validate({"keep": False, **how})
-        return engine.queries.upload(["hall"], asked.data, meta, query)
+        return engine.ask(request, query, meta=meta)
 
-    return SimpleNamespace(ask=ask, asked=asked, first=every[6:12], second=every[12:])
+    return SimpleNamespace(ask=ask, asked=request, first=every[6:12], second=every[12:])
 
 
 #: So many candidates are all but one of the twin room.
@@ -87,8 +86,8 @@ def test_an_equal_room_that_fills_the_selection_makes_the_answer_ambiguous(twins
         (4, None, True), (3, None, True)
     ]  # fmt: skip
     assert set(accepted(answer)) & set(twins.first) == {m.frame_id for m in beyond}
-    told = {one.frame_id: (one.stage, one.outcome) for one in answer.explanations or ()}
-    assert {told[m.frame_id] for m in beyond} == {("validate", "accepted")}
+    result = {one.frame_id: (one.stage, one.outcome) for one in answer.explanations or ()}
+    assert {result[m.frame_id] for m in beyond} == {("validate", "accepted")}
     assert answer.counts.selected == FEW
     assert answer.counts.validated == FEW + len(beyond)
     places = [one.pose.matrix[0][3] - twins.asked.pose[0, 3] for one in answer.alternatives[:2]]
@@ -109,7 +108,6 @@ def test_a_prior_tells_equal_rooms_apart(twins):
 
 
 def test_what_the_deadline_leaves_uncompared_is_not_found(twins, monkeypatch):
-    """The selection is validated in time, the frames elsewhere are not."""
     passed, look, clock = [0.0], rival_rows, time.perf_counter
 
     def late(*given):
@@ -128,13 +126,11 @@ def test_what_the_deadline_leaves_uncompared_is_not_found(twins, monkeypatch):
 
 
 @pytest.fixture
-def both(empty, work_off, signer):
-    """Ask a service and an evaluation of the same frames."""
-
+def both(empty, signer):
     def ask(in_map, queries, candidates=10):
         for one in in_map:
-            empty.add_frame("hall", one.data, one.meta)
-        work_off(empty)
+            empty.add(one)
+        empty.work_off()
         shown, sent = ([replace(one.frame, pose=one.pose) for one in some]
                        for some in (in_map, queries))  # fmt: skip
         _, database, of_map = signed(shown, "room", signer, 0)
@@ -158,7 +154,7 @@ def both(empty, work_off, signer):
             )
             meta = one.meta.model_copy(update={"pose": None})
             how = Query(candidates=candidates, keep=False)
-            served = empty.queries.upload(["hall"], one.data, meta, how)
+            served = empty.ask(one, how, meta=meta)
             pairs.append((served, answer_of(judge, task)))
             see_same(*pairs[-1], one.pose)
         return pairs
@@ -167,7 +163,6 @@ def both(empty, work_off, signer):
 
 
 def see_same(served, evaluated, truth):
-    """See that a service and an evaluation answer alike."""
     assert served.status == evaluated.status
     poses = list(served.alternatives)
     if served.location is not None:

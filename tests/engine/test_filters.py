@@ -65,7 +65,6 @@ def fill(engine, count, seed, name="hall"):
 
 
 def passes(one, wanted, own):
-    """By the sentences of `Filter`, condition by condition."""
     inside = is_far = True
     if wanted.not_within_s is not None and one.session == own.session:
         other_robot = None not in (one.robot, own.robot) and one.robot != own.robot
@@ -89,17 +88,15 @@ def passes(one, wanted, own):
 
 
 def ranked(frames, own, wanted):
-    """The oracle: all that pass, nearest first, ties as they came."""
-    found = [
+    actual = [
         (int(((one.vector.astype(int) - own.vector) ** 2).sum()), i, one.id)
         for i, one in enumerate(frames)
         if one.id != own.id and passes(one, wanted, own)
     ]
-    return [(frame_id, distance) for distance, _, frame_id in sorted(found)]
+    return [(frame_id, distance) for distance, _, frame_id in sorted(actual)]
 
 
 def hold(answer, frames, own, wanted):
-    """Compare an answer with the oracle; returns how many frames passed."""
     expected = ranked(frames, own, wanted)
     counts = answer.counts
     assert (counts.map, counts.passed) == (len(frames) - 1, len(expected))
@@ -110,7 +107,6 @@ def hold(answer, frames, own, wanted):
 
 
 def draw(rng, frames):
-    """A filter of one to three conditions."""
     seconds = [int(one) for one in sorted(rng.integers(0, 60, 2))]
     corners = np.sort(rng.integers(-2, 3, (2, 3)), axis=0).tolist()
     given = {
@@ -138,7 +134,6 @@ def ask(engine, own, wanted, *, exact=False):
 
 @pytest.mark.parametrize("published", [False, True])
 def test_a_filter_leaves_what_plain_python_leaves(make_engine, published):
-    """With a tail alone and with a version; frames come and go; another map is beside it."""
     engine = make_engine(unindexed_frames=50)
     for name in ("hall", "other"):
         engine.create_map(NewMap(name=name, model="depth"))
@@ -170,28 +165,27 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine, published):
         assert hold(ask(engine, own, wanted), frames, own, wanted) > 0
 
 
-def test_what_does_not_pass_is_neither_matched_nor_located_by(full, uploads, ids):
-    """All stages, of an uploaded frame: the other room's frames are as good as not there."""
-    asked, names = uploads[8], ids(full)
+def test_what_does_not_pass_is_neither_matched_nor_located_by(full, uploads):
+    request, names = uploads[8], full.ids()
     for wanted in (
         Filter(exclude_frames=[names[8]]),
         Filter(exclude_frames=names[:6]),
         Filter.model_validate(
-            {"region": {"parent_frame": asked.room, "min": {"x": -99, "y": -99, "z": -99},
+            {"region": {"parent_frame": request.room, "min": {"x": -99, "y": -99, "z": -99},
                         "max": {"x": 99, "y": 99, "z": 99}}}
         ),
     ):  # fmt: skip
-        answer = full.queries.upload(["hall"], asked.data, asked.meta, Query(k=50, filter=wanted))
-        told = {match.frame_id for match in answer.matches}
+        answer = full.ask(request, Query(k=50, filter=wanted))
+        result = {match.frame_id for match in answer.matches}
         if wanted.region is not None:
-            assert told == set(names[6:])
+            assert result == set(names[6:])
         else:
-            assert told == set(names) - set(wanted.exclude_frames)
-        assert answer.counts.passed == len(told)
+            assert result == set(names) - set(wanted.exclude_frames)
+        assert answer.counts.passed == len(result)
         assert answer.status == "found"
     for stages in (("retrieve",), ("retrieve", "diversify", "validate")):
         query = Query(stages=stages, filter=Filter(tags=["nowhere"]))
-        answer = full.queries.upload(["hall"], asked.data, asked.meta, query)
+        answer = full.ask(request, query)
         assert answer.status == ("unvalidated" if len(stages) == 1 else "not_found")
         assert (answer.matches, answer.location) == ([], None)
         assert answer.counts.model_dump() == {
@@ -200,17 +194,16 @@ def test_what_does_not_pass_is_neither_matched_nor_located_by(full, uploads, ids
         }  # fmt: skip
 
 
-def test_who_asks_to_keep_away_from_itself_says_where_it_is(full, uploads, ids, make_engine):
+def test_who_asks_to_keep_away_from_itself_says_where_it_is(full, uploads, make_engine):
     query = Query(stages=("retrieve",), filter=Filter(not_within_s=5))
     needed = "needed by filter.not_within_s"
     with pytest.raises(InvalidRequest, match=r"captured_at\. Send both in") as caught:
-        full.queries.upload(["hall"], uploads[0].data, uploads[0].meta, query)
+        full.ask(uploads[0], query)
     assert caught.value.fields == (("session", needed), ("captured_at", needed))
     with pytest.raises(InvalidRequest, match="has no session and no captured_at"):
-        full.query_frame("hall", ids(full)[0], query)
+        full.query_frame("hall", full.ids()[0], query)
     named = uploads[0].meta.model_copy(update={"session": "s1"})
-    with pytest.raises(InvalidRequest, match="has no captured_at") as caught:
-        full.queries.upload(["hall"], uploads[0].data, named, query)
-    assert caught.value.fields == (("captured_at", needed),)
+    with pytest.raises(InvalidRequest, match="has no captured_at"):
+        full.ask(uploads[0], query, meta=named)
     whole = named.model_copy(update={"captured_at": START})
-    assert full.queries.upload(["hall"], uploads[0].data, whole, query).counts.passed == 12
+    assert full.ask(uploads[0], query, meta=whole).counts.passed == 12

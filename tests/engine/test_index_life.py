@@ -9,7 +9,6 @@ import pytest
 
 from sceneprint.engine.search import local_index
 from sceneprint.engine.search.local_index import AppendBuffer
-from sceneprint.errors import UnusableStore
 from sceneprint.index.index_manifest import scrub
 from sceneprint.index.index_version import newest
 from sceneprint.models import read_model
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("_always_look")
 
 
 def ranked(engine, uploads):
-    answer = engine.queries.upload(["hall"], uploads[2].data, uploads[2].meta, ALL)
+    answer = engine.ask(uploads[2], ALL)
     return [(match.frame_id, match.distance) for match in answer.matches], answer.index_version
 
 
@@ -104,25 +103,8 @@ def test_what_is_out_of_reach_for_a_moment_is_not_removed(data, make_engine, mon
     assert sorted(path.name for path in folder.iterdir()) == before
 
 
-def test_a_tail_that_finds_no_room_is_as_it_was(tmp_path, monkeypatch):
-    tail, row = AppendBuffer(50, tmp_path), np.ones(50, np.uint8)
-    for i in range(64):
-        tail.append(SignatureChange(i, "", i + 1, None), row)
-
-    def full(*_):
-        raise UnusableStore("no room")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(AppendBuffer, "_allocate", full)
-        with pytest.raises(UnusableStore):
-            tail.append(SignatureChange(64, "", 65, None), row)
-    assert len(tail.tail()) == 64
-    tail.append(SignatureChange(64, "", 65, None), row)  # there is room again
-    np.testing.assert_array_equal(tail.tail().keys, np.arange(65))
-
-
 @pytest.fixture
-def more(uploads, work_off):
+def more(uploads):
     """Index that many frames more, by cameras that differ by half a pixel."""
     shifts = iter(range(1, 100))
 
@@ -134,7 +116,7 @@ def more(uploads, work_off):
             camera = meta.intrinsics.model_copy(update={"cx": meta.intrinsics.cx + shift / 2})
             given = meta.model_copy(update={"intrinsics": camera})
             added.append(engine.add_frame("hall", uploads[shift % 12].data, given)[0].frame_id)
-        assert work_off(engine) == [JobState.SUCCEEDED] * count
+        assert engine.work_off() == [JobState.SUCCEEDED] * count
         return added
 
     return add
@@ -146,18 +128,17 @@ def found(answer):
 
 
 def ask(engine, uploads, which=2, query=ALL):
-    return engine.queries.upload(["hall"], uploads[which].data, uploads[which].meta, query)
+    return engine.ask(uploads[which], query)
 
 
 def truth(make, uploads, folder, tmp_path):
-    """What an engine says that has no index and has held nothing before."""
     fresh = make(folder, index_dir=tmp_path / "none", unindexed_frames=100_000)
     answer = ask(fresh, uploads)
     assert answer.index_version == 0
     return found(answer)
 
 
-def test_publishing_changes_no_answer(data, make_engine, uploads, more, ids):
+def test_publishing_changes_no_answer(data, make_engine, uploads, more):
     reader, builder = make_engine(data, unindexed_frames=5), make_engine(data, unindexed_frames=5)
     for query in (ALL, Query()):
         ask(reader, uploads, query=query)
@@ -171,7 +152,7 @@ def test_publishing_changes_no_answer(data, make_engine, uploads, more, ids):
             assert new.index_version == 1  # the reader has looked
             free = {"query_id": "", "milliseconds": {}, "index_version": 0}
             assert new.model_copy(update=free) == old.model_copy(update=free)
-    gone = ids(reader)[3]
+    gone = reader.ids()[3]
     builder.delete_frame("hall", gone)
     left = [pair for pair in found(before[0]) if pair[0] != gone]
     for engine in (reader, fresh, make_engine(data, unindexed_frames=5)):
@@ -188,7 +169,7 @@ def test_an_index_is_due_beyond_so_many_frames(data, make_engine):
     assert make_engine(data, unindexed_frames=11).publish_due() == 1
 
 
-def test_readers_follow_a_map_through_versions(data, make_engine, uploads, more, ids, tmp_path):
+def test_readers_follow_a_map_through_versions(data, make_engine, uploads, more, tmp_path):
     first, builder = make_engine(data, unindexed_frames=3), make_engine(data, unindexed_frames=3)
     ask(first, uploads)
     assert builder.publish_due() == 1
@@ -196,7 +177,7 @@ def test_readers_follow_a_map_through_versions(data, make_engine, uploads, more,
     ask(late, uploads)
     for step in range(3):
         new = more(builder, 2)
-        builder.delete_frame("hall", ids(builder)[2 * step])
+        builder.delete_frame("hall", builder.ids()[2 * step])
         builder.delete_frame("hall", new[0])  # before any index has it
         wanted = truth(make_engine, uploads, data, tmp_path)
         assert len(wanted) == 12  # two came, two went
@@ -219,7 +200,7 @@ def test_readers_follow_a_map_through_versions(data, make_engine, uploads, more,
         assert found(ask(engine, uploads)) == wanted
 
 
-def test_a_map_made_anew_has_none_of_the_old_frames(data, make_engine, uploads, work_off):
+def test_a_map_made_anew_has_none_of_the_old_frames(data, make_engine, uploads):
     reader, other = make_engine(data, unindexed_frames=5), make_engine(data, unindexed_frames=5)
     assert len(found(ask(reader, uploads))) == len(found(ask(other, uploads))) == 12
     assert other.publish_due() == 1
@@ -227,29 +208,9 @@ def test_a_map_made_anew_has_none_of_the_old_frames(data, make_engine, uploads, 
     other.create_map(NewMap(name="hall", model="depth"))
     for engine in (reader, other, make_engine(data, unindexed_frames=5)):
         assert found(ask(engine, uploads)) == []
-    added, _ = other.add_frame("hall", uploads[7].data, uploads[7].meta)
-    assert work_off(other) == [JobState.SUCCEEDED]
+    added, _ = other.add(uploads[7])
+    assert other.work_off() == [JobState.SUCCEEDED]
     for engine in (reader, other, make_engine(data, unindexed_frames=5)):
         answer = ask(engine, uploads, 7)
         assert found(answer) == [(added.frame_id, 0)]
         assert answer.index_version == 0
-
-
-def test_a_node_that_is_far_behind_begins_with_the_newest_index(
-    data, make_engine, uploads, more, monkeypatch
-):
-    monkeypatch.setattr(local_index, "READ_MOST", 2)
-    reader, builder = make_engine(data, unindexed_frames=2), make_engine(data, unindexed_frames=2)
-    ask(reader, uploads)
-    more(builder, 3)
-    assert builder.publish_due() == 1
-    read, changes_since = [], local_index.changes_since
-
-    def noted(*given, **named):
-        for block in changes_since(*given, **named):
-            read.extend(block)
-            yield block
-
-    monkeypatch.setattr(local_index, "changes_since", noted)
-    answer = ask(reader, uploads)
-    assert (len(found(answer)), answer.index_version, read) == (15, 1, [])

@@ -55,15 +55,14 @@ def upload(client, views, name=MAP):
 
 
 def answers(client, views):
-    """All that is answered to each view, and what is told of the map's frames."""
-    asked = [client.query(MAP, one.depth, camera_of(one), explain=True) for one in views]
-    told = [one.model_dump(mode="json") for one in asked]
+    responses = [client.query(MAP, one.depth, camera_of(one), explain=True) for one in views]
+    result = [one.model_dump(mode="json") for one in responses]
     frames = [
         one.model_dump(mode="json", exclude={"job_id"}) for one in client.frames(MAP)
         if one.state == "indexed"  # of those that are gone, the copy need not have known
     ]  # fmt: skip
     return [
-        *({name: one[name] for name in one if name not in OF_THE_QUERY} for one in told), *frames
+        *({name: one[name] for name in one if name not in OF_THE_QUERY} for one in result), *frames
     ]  # fmt: skip
 
 
@@ -93,7 +92,7 @@ def robot(tmp_path):
 
 
 def test_a_pulled_map_answers_as_the_service_and_follows_it(robot, walk):
-    service, asked = robot.service, walk[1:8:3]
+    service, queries = robot.service, walk[1:8:3]
     with pytest.raises(UnknownMap):
         robot.pull()
     service.create_map(MAP, title="The hall", model="depth")
@@ -101,13 +100,13 @@ def test_a_pulled_map_answers_as_the_service_and_follows_it(robot, walk):
     ids = upload(service, walk[:10:2])
     first = robot.pull()
     assert (first.frames, first.written, first.removed, first.artifacts) == (5, 5, 0, 5)
-    online = answers(service, asked)
+    online = answers(service, queries)
     assert [one["status"] for one in online[:3]].count("found") >= 2
-    assert robot.answers(asked) == online
+    assert robot.answers(queries) == online
     with Client.embedded(robot.folder) as client:
         assert [one.name for one in client.maps()] == [MAP]
-        told = client.map(MAP)
-        assert (told.title, told.created_at) == ("The hall", service.map(MAP).created_at)
+        result = client.map(MAP)
+        assert (result.title, result.created_at) == ("The hall", service.map(MAP).created_at)
     again = robot.pull()
     assert (again.written, again.removed, again.artifacts, again.bytes) == (0, 0, 0, 0)
     # one is new, one is gone, one edited, and one uploaded again under its id
@@ -121,15 +120,14 @@ def test_a_pulled_map_answers_as_the_service_and_follows_it(robot, walk):
     )
     second = robot.pull()
     assert (second.frames, second.written, second.removed, second.artifacts) == (5, 3, 1, 2)
-    assert robot.answers(asked) == answers(service, asked)
+    assert robot.answers(queries) == answers(service, queries)
     assert robot.pull().written == 0
-    # the map is deleted and created again
     service.delete_map(MAP)
     service.create_map(MAP, model="depth")
     upload(service, walk[:2])
     third = robot.pull()
     assert (third.frames, third.written, third.artifacts) == (2, 2, 1)
-    assert robot.answers(asked) == answers(service, asked)
+    assert robot.answers(queries) == answers(service, queries)
 
 
 def test_what_was_uploaded_into_the_copy_is_not_lost(robot, walk):
@@ -176,28 +174,27 @@ with Client.embedded(service) as client, closing(store):
 
 @pytest.mark.thorough
 def test_a_killed_pull_leaves_the_copy_and_goes_on(robot, walk, tmp_path):
-    service, asked = robot.service, walk[1:4:2]
+    service, queries = robot.service, walk[1:4:2]
     service.create_map(MAP, model="depth")
     upload(service, walk[:2])
     robot.pull()
-    before = robot.answers(asked)
+    before = robot.answers(queries)
     upload(service, walk[2:6])
 
     def kill(what, count):
         given = [tmp_path / "service", robot.folder, what, str(count)]
         ran = subprocess.run([sys.executable, "-c", CHILD, *given], check=False)
         assert ran.returncode == -signal.SIGKILL
-        assert robot.answers(asked) == before
+        assert robot.answers(queries) == before
 
     kill("artifacts", 2)
     kill("rows", 3)  # all four artifacts are there by then
-    found = robot.pull()
-    assert (found.frames, found.written, found.artifacts, found.bytes) == (6, 4, 0, 0)
-    assert robot.answers(asked) == answers(service, asked)
+    actual = robot.pull()
+    assert (actual.frames, actual.written, actual.artifacts, actual.bytes) == (6, 4, 0, 0)
+    assert robot.answers(queries) == answers(service, queries)
 
 
 def test_a_copy_is_one_state_of_a_map_that_changes(robot, walk, monkeypatch):
-    """Parts that do not fit into one answer come with the next, whatever has changed by then."""
     service = robot.service
     service.create_map(MAP, model="depth")
     ids = upload(service, walk[:6])
@@ -213,11 +210,11 @@ def test_a_copy_is_one_state_of_a_map_that_changes(robot, walk, monkeypatch):
         return answered[-1]
 
     monkeypatch.setattr(service, "map_copy", changing)
-    found = robot.pull()
+    actual = robot.pull()
     assert [len(parts) for _, parts in answered] == [1] * 6
     assert [len(head.parts) for head, _ in answered] == [6, 6, 5, 5, 5, 5]
-    assert (found.frames, found.written) == (5, 5)
-    assert found.revision == service.map(MAP).revision
+    assert (actual.frames, actual.written) == (5, 5)
+    assert actual.revision == service.map(MAP).revision
     with Client.embedded(robot.folder) as client:
         living = [one for one in client.frames(MAP) if one.state == "indexed"]
         assert {one.frame_id for one in living} == set(ids[1:])

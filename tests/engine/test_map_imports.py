@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from sceneprint.engine.ingest import map_import
 from sceneprint.engine.ingest.map_import import StoredSurface, weak_areas
@@ -27,7 +26,6 @@ CAMERA = {"fx": 73.0, "fy": 73.0, "cx": 39.5, "cy": 29.5, "width": 80, "height":
 
 
 def options_of(**more):
-    """Options of the import of `room.ply`, with a small camera at one height."""
     usual = {"as": "map", "name": "room.ply", "up": "z", "camera": CAMERA, "heights": [1.0]}
     return ImportOptions.model_validate({**usual, **more})
 
@@ -37,7 +35,6 @@ def begun(engine, data, **more):
 
 
 def slice_of(engine, task, is_over):
-    """What a slice of the import comes to, if it is never stored: its worker dies."""
     return engine.jobs.handlers["import-map"](task, is_over)
 
 
@@ -63,17 +60,16 @@ def chosen_folder(once, room_mesh):
 
 @pytest.fixture
 def chosen(chosen_folder, tmp_path, make_engine):
-    """An engine on a copy of `chosen_folder`."""
     shutil.copytree(chosen_folder, tmp_path / "data")
     return make_engine()
 
 
-def test_a_room_becomes_a_map_in_which_it_is_found(chosen, due_now):
+def test_a_room_becomes_a_map_in_which_it_is_found(chosen):
     phases, state = list[str](), None
     while state != JobState.SUCCEEDED:
         work = chosen.claim("test")
         if work is None:  # the import waits for the last views to be signed
-            due_now(chosen)
+            chosen.make_due()
             continue
         state = chosen.run(work)
         if isinstance(work, LongJob):
@@ -98,7 +94,6 @@ def test_a_room_becomes_a_map_in_which_it_is_found(chosen, due_now):
     assert result.wrong == 0
     assert result.coverage == result.found / result.tested
     assert progress.views == progress.rendered == progress.signed == len(frames) + result.refused
-    # neither the file nor what was read of it is left
     assert used_bytes(chosen) == sum(one.bytes for one in frames)
     # most frames that bear a pose out are read beside the one candidate
     query = Query(candidates=1, keep=False)
@@ -140,7 +135,6 @@ def test_what_the_quota_has_no_room_for_is_refused_as_early_as_can_be(chosen, mo
 
 
 def test_a_surface_needs_room_beyond_that_of_its_file(empty):
-    """A PLY of text with short numbers, whose points are larger as arrays."""
     rows = "".join(f"{x} {y} {z}\n" for x in range(9) for y in range(9) for z in range(9))
     data = "ply\nformat ascii 1.0\nelement vertex 729\nproperty float x\nproperty float y\n"
     data += f"property float z\nend_header\n{rows}"
@@ -166,8 +160,6 @@ def room_at(place):
 
 @pytest.mark.thorough
 def test_files_in_one_parent_frame_need_one_offset(empty):
-    """Each would have its own middle as its offset, and views of one would lie in the other."""
-
     def slices(place, name, count, **more):
         job = begun(empty, room_at(place), name=name, parent_frame="district", **more)
         for _ in range(count):
@@ -216,24 +208,7 @@ def test_files_that_are_no_map_are_refused(empty, room_mesh):
         pass
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"as": "map", "every": 2}, "every: does not apply to a map"),
-        ({"as": "map", "up": [0, 0, 1]}, "up: one of x, -x, y, -y, z, -z"),
-        ({"as": "map", "heights": [0.0]}, "greater than 0"),
-        ({"up": "z"}, "up: a unit vector in the axes of the sensor"),
-        ({"heights": [1.0]}, "heights: applies only if `as` is `map`"),
-        ({"camera": CAMERA}, "camera: applies only"),
-    ],
-)
-def test_options_of_another_import_are_errors(fields, message):
-    with pytest.raises(ValidationError, match=message):
-        ImportOptions.model_validate(fields)
-
-
 def test_weak_areas_are_where_most_views_are_lost():
-    """Views along x, 1 m apart: of ten at x = 0 all are found, of four at x = 9 one."""
     points = np.zeros((3, 3), np.float32)
     surface = ReferenceSurface(points, None, np.zeros(3), np.array([0.0, 0.0, 1.0]))
     held_out = np.tile(np.eye(4), (14, 1, 1))

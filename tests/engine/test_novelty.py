@@ -1,7 +1,6 @@
 """Tests of `if_novel`, which keeps only frames of new places."""
 
 import threading
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -12,13 +11,9 @@ from benchmarks.waiting import PATIENCE_S
 from sceneprint.engine.jobs import signature_job as working
 from sceneprint.engine.jobs.signature_job import find_nearest
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.errors import InvalidRequest
 from sceneprint.store.tables import signatures
 from sceneprint_client.api import FrameState, JobState, NewMap, Query
-from sceneprint_client.api.base import NOVEL, novelty_of
 from tests.whole_engine import Engine
-
-Told = Callable[[Engine], list[str]]
 
 
 @pytest.fixture
@@ -33,15 +28,13 @@ def share(prepared, signer):
 
 
 @pytest.fixture
-def send(uploads, work_off):
-    """Upload one of the uploads, sign it, and return the frame."""
-
+def send(uploads):
     def run(engine, which, if_novel=None, name="hall"):
         added, new = engine.add_frame(
             name, uploads[which].data, uploads[which].meta, if_novel=if_novel
         )
         assert new
-        assert work_off(engine) == [JobState.SUCCEEDED]
+        assert engine.work_off() == [JobState.SUCCEEDED]
         return engine.get_frame(name, added.frame_id)
 
     return run
@@ -49,7 +42,7 @@ def send(uploads, work_off):
 
 def found(engine, uploads):
     query = Query(stages=("retrieve",), k=50)
-    answer = engine.queries.upload(["hall"], uploads[0].data, uploads[0].meta, query)
+    answer = engine.ask(uploads[0], query)
     return {match.frame_id for match in answer.matches}
 
 
@@ -57,7 +50,7 @@ def rows(engine):
     return len(engine.fetch(select(signatures.c.frame_number)).all())
 
 
-def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share, told):
+def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share):
     near, far = share(0, 1), share(0, 7)
     assert 0 < near < far
     between = (near + far) / 2
@@ -77,7 +70,7 @@ def test_a_frame_whose_place_the_map_has_is_not_kept(empty, uploads, send, share
     third = send(empty, 7, between)
     assert third.state == FrameState.INDEXED
     assert found(empty, uploads) == {first.frame_id, third.frame_id}
-    assert told(empty)[1:] == ["frame.received", "frame.indexed", "frame.received",
+    assert empty.event_kinds()[1:] == ["frame.received", "frame.indexed", "frame.received",
                                "frame.redundant", "frame.received", "frame.indexed"]  # fmt: skip
     assert send(empty, 2).state == FrameState.INDEXED  # without the condition
 
@@ -94,7 +87,6 @@ def test_the_nearest_frame_decides_and_must_be_farther(empty, uploads, send, sha
 
 
 def test_what_is_gone_is_no_place_and_a_frame_may_come_again(empty, uploads, send):
-    """The same frame with the same id and another job, once the map has lost what was near."""
     first = send(empty, 0)
     blob_count = len(list(empty.store.blobs.digests()))
     redundant = send(empty, 1, 1.0)
@@ -128,22 +120,20 @@ def test_another_map_has_other_places(empty, uploads, send):
      (1.0, 1.0, False, True)],
 )  # fmt: skip
 def test_who_sends_it_without_the_condition_is_not_let_down(
-    empty, uploads, send, work_off, first, second, kept, claimed
+    empty, uploads, send, first, second, kept, claimed
 ):
-    """Told that it is there, waiting or being signed: then the weaker condition counts."""
     send(empty, 0)
     frame, _ = empty.add_frame("hall", uploads[1].data, uploads[1].meta, if_novel=first)
     work = empty.claim("w") if claimed else None
     again, new = empty.add_frame("hall", uploads[1].data, uploads[1].meta, if_novel=second)
     assert (again.frame_id, again.job_id, new) == (frame.frame_id, frame.job_id, False)
-    states = [empty.run(work)] if work is not None else work_off(empty)
+    states = [empty.run(work)] if work is not None else empty.work_off()
     assert states == [JobState.SUCCEEDED]
     state = FrameState.INDEXED if kept else FrameState.REDUNDANT
     assert empty.get_frame("hall", frame.frame_id).state == state
 
 
 def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkeypatch):
-    """Two workers look at an empty map, and only then either stores what it made."""
     engines = [make_engine(), make_engine()]
     engines[0].create_map(NewMap(name="hall", model="depth"))
     for which in (0, 1):
@@ -165,16 +155,6 @@ def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkey
     assert set(frames) == {FrameState.INDEXED, FrameState.REDUNDANT}
     assert frames[FrameState.INDEXED].frame_id in str(frames[FrameState.REDUNDANT].reason)
     assert rows(engines[0]) == 1
-
-
-def test_what_may_be_asked():
-    for nothing in (None, False, "false"):
-        assert novelty_of(nothing) is None
-    assert [novelty_of(one) for one in (True, "true", 1, "0.25")] == [NOVEL, NOVEL, 1.0, 0.25]
-    for wrong in (0, "0", -0.1, 1.1, "nan", float("inf"), "yes", ""):
-        with pytest.raises(InvalidRequest, match="above 0 and up to 1") as caught:
-            novelty_of(wrong)
-        assert [place for place, _ in caught.value.fields] == ["if_novel"]
 
 
 def test_a_nearest_frame_that_is_deleted_meanwhile_is_looked_for_again(

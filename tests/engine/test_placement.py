@@ -26,11 +26,10 @@ from sceneprint_client.api import Counts, Prior, Query
 def localized(engine, upload, **how):
     query = Query.model_validate({"keep": False, **how})
     meta = upload.meta.model_copy(update={"pose": None})
-    return localization_of(engine.queries.upload(["hall"], upload.data, meta, query))
+    return localization_of(engine.ask(upload, query, meta=meta))
 
 
 def judged(there):
-    """Each pose that is told, with its confidence and evidence."""
     if there.pose is not None:
         return [(there.pose.matrix, there.confidence, there.evidence)]
     return [(one.pose.matrix, one.confidence, one.evidence) for one in there.alternatives]
@@ -46,7 +45,7 @@ def listed(covariance):
     return covariance.ravel().tolist()
 
 
-def test_frames_are_found_by_where_they_were_taken(full, uploads, ids):
+def test_frames_are_found_by_where_they_were_taken(full, uploads):
     poses = [np.array(one.pose)[:3, 3] for one in uploads]
     with full.store.database.read() as connection:
         row, _, _ = full.view("hall")
@@ -62,14 +61,14 @@ def test_frames_are_found_by_where_they_were_taken(full, uploads, ids):
                 for i, at in enumerate(poses[:6])
                 if np.abs(at - poses[2]).max() <= within
             )
-            found = near(poses[2], within)
-            assert [one.number for one in found] == [i + 1 for _, i in by_hand]
-            for one in found:
+            actual = near(poses[2], within)
+            assert [one.number for one in actual] == [i + 1 for _, i in by_hand]
+            for one in actual:
                 np.testing.assert_allclose(one.pose, uploads[one.number - 1].pose, atol=1e-12)
         assert [one.number for one in near(poses[2], 5.0, most=2)] == [3, by_hand[1][1] + 1]
         assert near(poses[2] + 50.0, 5.0) == []
         assert near(poses[2], 5.0, room="nowhere") == []
-    full.delete_frame("hall", ids(full)[2])
+    full.delete_frame("hall", full.ids()[2])
     with full.store.database.read() as connection:
         left = placed_frames(
             connection, row.number, uploads[0].room, row.model_id, poses[2].tolist(), 5.0, 99
@@ -82,10 +81,9 @@ def test_frames_are_found_by_where_they_were_taken(full, uploads, ids):
     [(8, 10, ()), (8, 1, ()), (8, 10, (1, 2, 3, 7)), (2, 1, (3, 9))],
 )
 def test_poses_are_scored_on_the_frames_that_pass_alone(
-    full, prepared, signer, uploads, ids, asked, candidates, without
+    full, prepared, signer, uploads, asked, candidates, without
 ):
-    """Neither the frame that asks nor what a filter excludes bears a pose out."""
-    names = ids(full)
+    names = full.ids()
     others = [i for i in range(len(prepared)) if i != asked and i not in without]
     signatures = [prepared[i][0] for i in others]
     geometries = [prepared[i][1] for i in others]
@@ -106,8 +104,8 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
         how["filter"] = {"exclude_frames": [names[i] for i in without]}
     answer = full.query_frame("hall", names[asked], Query.model_validate(how))
     assert answer.status == by_library.status != "not_found"
-    told = judged(localization_of(answer))
-    for (matrix, confidence, evidence), one in zip(told, by_library.alternatives, strict=True):
+    result = judged(localization_of(answer))
+    for (matrix, confidence, evidence), one in zip(result, by_library.alternatives, strict=True):
         np.testing.assert_allclose(matrix, one.T, atol=1e-9)
         assert confidence == pytest.approx(one.confidence)
         assert evidence.score == pytest.approx(one.evidence.score, abs=1e-3)
@@ -117,11 +115,10 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
 UNSURE = {"validation": {"ambiguous": 0.0}}
 
 
-def test_frames_of_other_parent_frames_tell_nothing_of_a_pose(full, uploads, ids):
-    """Whatever their coordinates: here those of the room that is asked about."""
+def test_frames_of_other_parent_frames_tell_nothing_of_a_pose(full, uploads):
     before = localized(full, uploads[8], **UNSURE)
     assert judged(before)
-    for frame_id, own, there in zip(ids(full), uploads[:6], uploads[6:], strict=False):
+    for frame_id, own, there in zip(full.ids(), uploads[:6], uploads[6:], strict=False):
         pose = {"matrix": there.pose.tolist(), "parent_frame": own.room}
         edit_frame(full.store, "hall", frame_id, {"pose": pose})
     after = localized(full, uploads[8], **UNSURE)
@@ -129,7 +126,6 @@ def test_frames_of_other_parent_frames_tell_nothing_of_a_pose(full, uploads, ids
 
 
 def test_frames_about_each_pose_are_asked(full, uploads):
-    """A prior where nothing was taken is looked at too, and first."""
     alone = localized(full, uploads[8], candidates=1, **UNSURE)
     prior = prior_at(uploads[8], 50.0)
     there = localized(full, uploads[8], candidates=1, prior=prior, **UNSURE)
@@ -138,20 +134,18 @@ def test_frames_about_each_pose_are_asked(full, uploads):
 
 
 def test_the_paper_s_test_asks_no_other_frames(full, uploads):
-    for mode, told in (("full", True), ("paper", False)):
+    for mode, answer in (("full", True), ("paper", False)):
         there = localized(full, uploads[8], validation={"mode": mode})
         assert (there.status, there.verified_by) == ("found", "matches")
-        assert (there.confidence is not None) is told
-        assert (there.evidence is not None) is told
+        assert (there.confidence is not None) is answer
+        assert (there.evidence is not None) is answer
 
 
 def test_a_query_says_how_sure_a_pose_must_be(full, uploads):
     sure = localized(full, uploads[8], confidence=0.5)
     assert sure.status == "found"
-    asked = full.queries.upload(
-        ["hall"], uploads[8].data, uploads[8].meta, Query(confidence=0.5, keep=False)
-    )
-    assert asked.location.confidence == sure.confidence
+    answer = full.ask(uploads[8], Query(confidence=0.5, keep=False))
+    assert answer.location.confidence == sure.confidence
     model = read_model("depth")
     for wanted in (0.5, 0.99, 0.999):
         assert numbers_of(model, Query(confidence=wanted)).confidence == wanted
@@ -161,14 +155,13 @@ def test_a_query_says_how_sure_a_pose_must_be(full, uploads):
             Query(confidence=wrong)
 
 
-def test_candidates_near_a_prior_are_tried_first(full, uploads, ids):
-    """Those of its parent frame, here the other room: they are rejected before the right one."""
-    rooms = dict(zip(ids(full), (one.room for one in uploads), strict=True))
+def test_candidates_near_a_prior_are_tried_first(full, uploads):
+    rooms = dict(zip(full.ids(), (one.room for one in uploads), strict=True))
 
     def tried(prior):
         query = Query.model_validate({"keep": False, "prior": prior})
         meta = uploads[8].meta.model_copy(update={"pose": None})
-        answer = full.queries.upload(["hall"], uploads[8].data, meta, query)
+        answer = full.ask(uploads[8], query, meta=meta)
         assert len(answer.matches) == 10
         elsewhere = [one for one in answer.matches if rooms[one.frame_id] == uploads[0].room]
         assert len(elsewhere) > 1
@@ -194,57 +187,50 @@ def test_candidates_near_a_prior_are_tried_first(full, uploads, ids):
     ],
 )
 def test_priors_of_any_deviation_in_range_are_used(full, uploads, how):
-    told = {name: listed(one) if name == "covariance" else one for name, one in how.items()}
+    answer = {name: listed(one) if name == "covariance" else one for name, one in how.items()}
     for away in (0.3, 9e8):
-        there = localized(full, uploads[8], prior=prior_at(uploads[8], away, **told))
+        there = localized(full, uploads[8], prior=prior_at(uploads[8], away, **answer))
         assert (there.status, there.verified_by) == ("found", "matches")
 
 
 def test_a_prior_that_cannot_be_used_says_why(full, uploads):
-    flat = np.eye(6)
-    flat[0, 0] = 0.0
-    with pytest.raises(InvalidRequest, match="covariance of the prior is not valid"):
-        localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(flat)))
-    unlike = np.eye(6)
-    unlike[0, 1] = 0.5  # the first axis with the second, and not the second with the first
-    equal = np.ones((6, 6)) * 0.04  # an error of all axes at once, and of none alone
-    hostile = np.eye(6)
+    flat, asymmetric, hostile = np.eye(6), np.eye(6), np.eye(6)
+    flat[0, 0], asymmetric[0, 1] = 0.0, 0.5
     hostile[0, 1], hostile[1, 0] = 1e308, -1e308
-    for given in (unlike, equal, hostile, -np.eye(6)):
-        with pytest.raises(InvalidRequest, match="covariance of the prior is not valid"):
-            localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
-    for least, most, told in (
-        (1e-320, 1.0, "between 1e-160 and 1, but"), (0.9e-12, 1.0, "between 9.49e-07 and 1, but"),
-        (1.0, 1e308, r"between 1 and 1e\+154, but"), (1e-4, 1.1e6, r"between 0.01 and 1.05e\+03"),
-    ):  # fmt: skip
-        given = np.diag([least, 1.0, most, 1.0, 1.0, 1.0])
-        with pytest.raises(InvalidRequest, match=told):
-            localized(full, uploads[8], prior=prior_at(uploads[8], covariance=listed(given)))
+    equal = np.ones((6, 6)) * 0.04  # one error that all axes share
+    skew, elsewhere = prior_at(uploads[8]), prior_at(uploads[8])
+    skew["pose"]["matrix"][0][0] += 0.5
+    elsewhere["pose"]["parent_frame"] = "elsewhere"
+    for prior, error, message in (
+        *(
+            (prior_at(uploads[8], covariance=listed(matrix)), InvalidRequest, "is not valid")
+            for matrix in (flat, asymmetric, equal, hostile, -np.eye(6))
+        ),
+        *(
+            (prior_at(uploads[8], covariance=listed(np.diag(variances))), InvalidRequest, limits)
+            for variances, limits in (
+                ([1e-320, 1, 1, 1, 1, 1], "between 1e-160 and 1, but"),
+                ([0.9e-12, 1, 1, 1, 1, 1], "between 9.49e-07 and 1, but"),
+                ([1, 1, 1e308, 1, 1, 1], r"between 1 and 1e\+154, but"),
+                ([1e-4, 1, 1.1e6, 1, 1, 1], r"between 0.01 and 1.05e\+03"),
+            )
+        ),
+        *((prior_at(uploads[8], x), InvalidRequest, "from the origin") for x in (1.1e9, -1.7e308)),
+        (skew, InvalidPose, "The prior"),
+        (elsewhere, InvalidRequest, "No frame of map 'hall' has a pose in the parent"),
+    ):
+        with pytest.raises(error, match=message):
+            localized(full, uploads[8], prior=prior)
     for deviation in ({"deviation_m": 1e-200}, {"deviation_deg": 1e-320}):
         with pytest.raises(ValueError, match="greater than or equal to"):
             Prior.model_validate(prior_at(uploads[8], **deviation))
-    for away in (1.1e9, 1e300, -1.7e308):
-        with pytest.raises(InvalidRequest, match="more than 1,000,000,000 m from the origin"):
-            localized(full, uploads[8], prior=prior_at(uploads[8], away))
-    skew = prior_at(uploads[8])
-    skew["pose"]["matrix"][0][0] += 0.5
-    with pytest.raises(InvalidPose, match="The prior"):
-        localized(full, uploads[8], prior=skew)
     with pytest.raises(InvalidRequest, match="A prior requires validated matches"):
-        full.queries.upload(
-            ["hall"], uploads[8].data, uploads[8].meta,
-            Query.model_validate({"stages": "retrieve", "prior": prior_at(uploads[8])}),
-        )  # fmt: skip
-    elsewhere = prior_at(uploads[8])
-    elsewhere["pose"]["parent_frame"] = "elsewhere"
-    with pytest.raises(InvalidRequest, match="No frame of map 'hall' has a pose in the parent"):
-        localized(full, uploads[8], prior=elsewhere)
-    with pytest.raises(ValueError, match=r"requires pose\.parent_frame"):
-        Prior.model_validate({"pose": {"matrix": np.eye(4).tolist()}})
+        full.ask(
+            uploads[8], Query.model_validate({"stages": "retrieve", "prior": prior_at(uploads[8])})
+        )
 
 
 def test_a_sequence_places_its_last_frame(full, uploads):
-    """The odometry starts anywhere: only what lies between the frames counts."""
     start = np.eye(4)
     start[:3, 3] = 40.0, -7.0, 1.0
     sent = []
@@ -289,13 +275,13 @@ def test_what_is_not_found_names_its_likeliest_cause(
     if change == "scale":
         upload = uploads[0]
         meta = upload.meta.model_copy(update={"depth_scale": 5000.0, "pose": None})
-        answer = full.queries.upload(["hall"], upload.data, meta, Query(keep=False))
+        answer = full.ask(upload, Query(keep=False), meta=meta)
     else:
         # a slanted wall, which fills the view
         slant = 1.5 + np.linspace(0.0, 1.0, frame.depth.shape[1])[None, :]
         depth = np.broadcast_to(slant, frame.depth.shape).astype(np.float32)
         wall = make_upload(replace(frame, depth=depth, pose=np.eye(4)), "wall")
-        answer = full.queries.upload(["hall"], wall.data, wall.meta, Query(keep=False))
+        answer = full.ask(wall, Query(keep=False))
     assert (answer.status, answer.cause, answer.location) == ("not_found", cause, None)
     assert told in answer.reason
     assert [m.pose_in_map for m in answer.matches if m.validation.status == "rejected"] == [
@@ -303,11 +289,7 @@ def test_what_is_not_found_names_its_likeliest_cause(
     ]
 
 
-# What came of a query, by hand
-
-
 def came_of(geometry, *statuses, estimate=None, late=False, others=()):
-    """Of a query with matches of these statuses, compared with these others."""
     matches = []
     for i, status in enumerate(statuses):
         made = PairValidation(
@@ -326,16 +308,15 @@ def came_of(geometry, *statuses, estimate=None, late=False, others=()):
 
 
 def supported(*confidences):
-    """Poses of the map that no match votes for, with these confidences."""
-    told = tuple(AlternativePose(np.eye(4), 0, one, None) for one in confidences)
-    status = "ambiguous" if told else "not_found"
-    return PoseEstimate(status, "the map's say", "hall", None, None, None, None, told)
+    answer = tuple(AlternativePose(np.eye(4), 0, one, None) for one in confidences)
+    status = "ambiguous" if answer else "not_found"
+    return PoseEstimate(status, "the map's say", "hall", None, None, None, None, answer)
 
 
 def test_poses_of_the_map_are_told_where_no_match_is_accepted(prepared):
     seen = prepared[0][1]
-    told = came_of(seen, "rejected", estimate=supported(0.5, 0.4), others=[seen])
-    assert (told.status, told.reason, told.cause) == ("ambiguous", "the map's say", None)
+    answer = came_of(seen, "rejected", estimate=supported(0.5, 0.4), others=[seen])
+    assert (answer.status, answer.reason, answer.cause) == ("ambiguous", "the map's say", None)
     none = came_of(seen, "rejected", estimate=supported(), others=[seen])
     assert (none.status, none.cause) == ("not_found", "nothing_alike")
     assert "(the nearest: as given 0)" in none.reason
@@ -352,9 +333,9 @@ def test_poses_of_the_map_are_told_where_no_match_is_accepted(prepared):
 def test_what_in_view_is_no_help_is_the_cause(prepared):
     seen, other = prepared[0][1], prepared[1][1]
     few = Patches(*(one[:9] for one in vars(seen.patches).values()))
-    told = came_of(replace(seen, patches=few), "rejected", others=[other])
-    assert (told.status, told.cause) == ("not_found", "too_little_in_view")
-    assert "the frame has 9 surface patches, but 10 are needed" in told.reason
+    answer = came_of(replace(seen, patches=few), "rejected", others=[other])
+    assert (answer.status, answer.cause) == ("not_found", "too_little_in_view")
+    assert "the frame has 9 surface patches, but 10 are needed" in answer.reason
     cloud = replace(other, surface=replace(other.surface, camera=None))
     for others, cause in (
         ([cloud], "other_sensor"), ([cloud, cloud], "other_sensor"), ([], "nothing_alike"),

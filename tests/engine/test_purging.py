@@ -31,14 +31,13 @@ PIECE, MANY = 24, 40
 
 
 def pieces(data, others):
-    """Parts of some bytes that tell them from others: even over their length."""
-    found = []
+    results = []
     for start in np.linspace(0, len(data) - PIECE, 8 * MANY).astype(int).tolist():
         piece = data[start : start + PIECE]
         if len(set(piece)) > PIECE // 3 and not any(piece in other for other in others):
-            found.append(piece)
-    assert len(found) > MANY // 2
-    return found[:: max(len(found) // MANY, 1)]
+            results.append(piece)
+    assert len(results) > MANY // 2
+    return results[:: max(len(results) // MANY, 1)]
 
 
 def files(folder):
@@ -48,29 +47,28 @@ def files(folder):
 
 
 def rows(engine):
-    """All tables of a server's database, as bytes and as text."""
     if engine.store.database.is_sqlite:
         return  # it is one of the files
     with engine.store.database.read() as connection:
         for table in inspect(connection).get_table_names():
-            told = connection.execute(text(f'SELECT t::text FROM "{table}" t')).scalars()
-            for row in told:
+            result = connection.execute(text(f'SELECT t::text FROM "{table}" t')).scalars()
+            for row in result:
                 raw = b"".join(map(bytes.fromhex, re.findall(r"x([0-9a-f]{40,})", row)))
                 yield f"table {table}", row.encode() + raw
 
 
 def places(engine, folder, wanted):
     """Kinds of files, and tables, in which any of some pieces is."""
-    found = set()
+    results = set()
     for name, data in (*files(folder), *rows(engine)):
         if any(piece in data for piece in wanted):
             kind = name.removeprefix("data/").partition("/")[0].removesuffix("-wal")
-            found.add(f"{kind} {Path(name).suffix}" if kind == "index" else kind)
-    return found
+            results.add(f"{kind} {Path(name).suffix}" if kind == "index" else kind)
+    return results
 
 
 @pytest.fixture
-def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
+def lived_in(make_engine, store_url, uploads, tmp_path):
     """A map whose index was published twice."""
     (tmp_path / "data" / "blobs").mkdir(parents=True)  # of a database that is there nobody makes it
     given = {"database_url": store_url, "unindexed_frames": 2}
@@ -80,18 +78,18 @@ def lived_in(make_engine, store_url, uploads, work_off, tmp_path):
         meta = one.meta.model_copy(update={"tags": ["by-the-door"], "session": "one-morning"})
         engine.uploads.add("hall", Upload(one.data, meta))
         if one in (uploads[2], uploads[5]):
-            work_off(engine)
+            engine.work_off()
             assert engine.publish_due() == 1
     return engine
 
 
 @pytest.fixture
-def secret(lived_in, ids, uploads):
+def secret(lived_in, uploads):
     """What of the first frame is looked for."""
     engine = lived_in
     with engine.store.database.read() as connection:
         row = find_map(connection, "hall")
-        numbers = [find_frame(connection, row, name).number for name in ids(engine)]
+        numbers = [find_frame(connection, row, name).number for name in engine.ids()]
         vectors = [stored_vector(connection, n, row.model_id) or b"" for n in numbers]
         blobs = geometry_blobs(connection, numbers, row.model_id)
     artifacts = [engine.store.blobs.get(blobs[n]) for n in numbers]
@@ -107,10 +105,9 @@ def secret(lived_in, ids, uploads):
 
 
 def asked(engine, frame_id, uploads):
-    """Ids of an answer that was made from a frame, of one that shows it, and of a surface."""
     options = Query(stages="retrieve,diversify,validate", seed=1)
     own = engine.query_frame("hall", frame_id, options)
-    other = engine.queries.upload(["hall"], uploads[1].data, uploads[1].meta, options)
+    other = engine.ask(uploads[1], options)
     assert frame_id in {match.frame_id for match in other.matches}
     fused = engine.reconstructions.begin_for(
         engine.query_log.find(own.query_id), NewReconstruction()
@@ -118,22 +115,22 @@ def asked(engine, frame_id, uploads):
     return own.query_id, other.query_id, fused.job_id
 
 
-def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
-    engine, frame_id = lived_in, ids(lived_in)[0]
+def test_no_byte_is_left(lived_in, secret, uploads, tmp_path):
+    engine, frame_id = lived_in, lived_in.ids()[0]
     own, shows, fused = asked(engine, frame_id, uploads)
     third = engine.query_frame("hall", frame_id, Query(seed=1)).query_id
     for one in (shows, third):
         assert engine.query_log.keep(one, None).kept_at is not None
     truth = "sceneprint.db" if engine.store.database.is_sqlite else "table signatures"
-    found = {what: places(engine, tmp_path, wanted) for what, wanted in secret.items()}
-    assert found["upload"] == {"blobs"}
+    actual = {what: places(engine, tmp_path, wanted) for what, wanted in secret.items()}
+    assert actual["upload"] == {"blobs"}
     is_sqlite = engine.store.database.is_sqlite
     answers = {"queries", "sceneprint.db" if is_sqlite else "table queries"}  # one is kept
-    assert found["signature"] == {truth, *answers, "index .faiss"}
-    assert found["artifact"] == {"blobs", *answers}
+    assert actual["signature"] == {truth, *answers, "index .faiss"}
+    assert actual["artifact"] == {"blobs", *answers}
     with engine.store.database.write() as connection:  # of the others, which stay
         row = find_map(connection, "hall")
-        for name in ids(engine)[1:]:
+        for name in engine.ids()[1:]:
             write_frame(connection, row, find_frame(connection, row, name), {"tags": []})
     engine.delete_frame("hall", frame_id)
     assert places(engine, tmp_path, secret["upload"]) == {"blobs"}  # it can be restored
@@ -148,9 +145,8 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
         engine.inspection.answer(shows)
     with pytest.raises(UnknownJob):
         engine.reconstructions.get(None, fused)
-    # the others are found as before
-    told = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, Query(seed=1))
-    assert told.matches[0].frame_id == ids(engine)[3]
+    result = engine.ask(uploads[4], Query(seed=1))
+    assert result.matches[0].frame_id == engine.ids()[3]
     # part of an index whose removal failed after that of its manifest
     (part,) = tmp_path.rglob("*.keys")
     left = part.with_name("0" * 64 + part.suffix)
@@ -159,11 +155,11 @@ def test_no_byte_is_left(lived_in, secret, ids, uploads, tmp_path):
     assert (left.exists(), part.exists()) == (False, True)
 
 
-def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
-    engine, frame_id = lived_in, ids(lived_in)[0]
+def test_no_byte_of_a_map_is_left(lived_in, secret, uploads, tmp_path):
+    engine, frame_id = lived_in, lived_in.ids()[0]
     _, shows, _ = asked(engine, frame_id, uploads)
     engine.query_log.keep(shows, None)
-    engine.delete_frame("hall", ids(engine)[1])
+    engine.delete_frame("hall", engine.ids()[1])
     engine.delete_map("hall")
     engine.publish_due()
     engine.purging.now()
@@ -173,10 +169,9 @@ def test_no_byte_of_a_map_is_left(lived_in, secret, ids, uploads, tmp_path):
 
 
 @pytest.mark.sqlite_only("the files of a data folder are damaged")
-def test_bytes_in_quarantine_go_with_their_frame(full, ids):
-    """An upload is found damaged and set aside; then its frame is deleted."""
+def test_bytes_in_quarantine_go_with_their_frame(full):
     with full.store.database.read() as connection:
-        frame = find_frame(connection, find_map(connection, "hall"), ids(full)[0])
+        frame = find_frame(connection, find_map(connection, "hall"), full.ids()[0])
     full.store.blobs.path(frame.blob).write_bytes(b"damaged" * 100)
     assert len(list(fsck(full.settings, repair=True, grace_s=0))) == 1
     aside = full.settings.quarantine_dir
@@ -190,11 +185,11 @@ def test_bytes_in_quarantine_go_with_their_frame(full, ids):
     assert [one.name for one in aside.iterdir()] == ["notes.txt"]
 
 
-def test_readers_let_go_of_what_was_deleted(empty, uploads, work_off):
+def test_readers_let_go_of_what_was_deleted(empty, uploads):
     engine = empty
     for one in uploads[:3]:
-        engine.add_frame("hall", one.data, one.meta)
-    work_off(engine)
+        engine.add(one)
+    engine.work_off()
     view = engine.view("hall")[2]
     gone = bytes(view.tail.signatures[0])
     engine.delete_frame("hall", engine.list_frames("hall").items[0].frame_id)
@@ -211,7 +206,7 @@ def test_readers_let_go_of_what_was_deleted(empty, uploads, work_off):
 def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
     engine, (a, b, *_) = empty, uploads
     for one in (a, b):
-        engine.add_frame("hall", one.data, one.meta)
+        engine.add(one)
     first, second = (one.frame_id for one in engine.list_frames("hall").items)
     with engine.store.blobs.block_removals():  # as while a snapshot is being taken
         engine.delete_frame("hall", first)
@@ -221,15 +216,15 @@ def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
     with engine.store.database.write() as connection:  # and then the process died
         row = find_map(connection, "hall")
         delete_frame(connection, row, find_frame(connection, row, second))
-    engine.add_frame("hall", b.data, b.meta)  # the same upload has come again
+    engine.add(b)  # the same upload has come again
     assert engine.purging.now().blobs == 2
     assert list(engine.store.blobs.digests()) == [hashlib.sha256(b.data).hexdigest()]
     assert engine.purging.now().blobs == 0
 
 
-def test_an_index_that_another_process_builds_is_not_said_to_be_purged(lived_in, ids, monkeypatch):
+def test_an_index_that_another_process_builds_is_not_said_to_be_purged(lived_in, monkeypatch):
     monkeypatch.setattr(purge, "PAUSE", 1e4)
-    engine, names = lived_in, ids(lived_in)
+    engine, names = lived_in, lived_in.ids()
     worker = Purging(
         engine.store, engine.upkeep, engine.query_log, engine.tombstones,
         (engine.reconstructions, engine.differences), 0.0, engine.settings.quarantine_dir,

@@ -33,12 +33,11 @@ def ask(engine, frame_id, **how):
 
 
 def told(answer, *without):
-    """Its bytes, but for who it is and how long it took."""
     return answer.model_dump_json(exclude={"query_id", "milliseconds", *without})
 
 
-def test_so_many_candidates_are_selected_and_tried(full, ids):
-    names = ids(full)
+def test_so_many_candidates_are_selected_and_tried(full):
+    names = full.ids()
     for candidates, stages in product((1, 7), (VR, ("retrieve", "diversify", "validate"))):
         answer = ask(full, names[0], candidates=candidates, k=50, stages=stages)
         assert len(answer.matches) == answer.counts.validated == candidates
@@ -49,8 +48,8 @@ def test_so_many_candidates_are_selected_and_tried(full, ids):
     assert len(ask(full, names[0], candidates=7, k=2, stages=["retrieve"]).matches) == 2
 
 
-def test_the_scales_of_diversity_are_those_of_the_library(full, prepared, ids):
-    names, chosen = ids(full), {}
+def test_the_scales_of_diversity_are_those_of_the_library(full, prepared):
+    names, chosen = full.ids(), {}
     vectors = np.stack([one.vector for one, _ in prepared[1:]])
     d = distances(prepared[0][0].vector, vectors, "l2")
     order = np.argsort(d, kind="stable")
@@ -67,8 +66,8 @@ def test_the_scales_of_diversity_are_those_of_the_library(full, prepared, ids):
     assert chosen[1000.0] != chosen[0.01]
 
 
-def test_thresholds_decide_what_is_accepted(full, ids):
-    name = ids(full)[0]
+def test_thresholds_decide_what_is_accepted(full):
+    name = full.ids()[0]
     before = {one.frame_id: one.validation for one in ask(full, name, k=50).matches}
     accepted = {one for one, v in before.items() if v.status == "accepted"}
     least = sorted(before[one].overlap for one in accepted)[1]
@@ -92,20 +91,19 @@ def test_thresholds_decide_what_is_accepted(full, ids):
 
 def test_a_limit_of_the_caller_holds_however_little_the_frames_share():
     p = ValidationParameters()
-    asked = ValidationOptions(evidence=0.4, plane_overlap=0.3, residual_m=0.05, residual_deg=3.0)
-    a = thresholds(asked, p)[0].acceptance
+    limits = ValidationOptions(evidence=0.4, plane_overlap=0.3, residual_m=0.05, residual_deg=3.0)
+    a = thresholds(limits, p)[0].acceptance
     assert (a.evidence, a.sparse_evidence, a.blind_evidence) == (0.4, 0.4, 0.4)
     assert (a.plane_overlap, a.sparse_plane_overlap, a.apart_plane_overlap) == (0.3, 0.3, 0.3)
     assert (a.residual_m, a.apart_m) == (0.05, 0.05)
     assert (a.residual_rad, a.apart_rad) == (math.radians(3.0), math.radians(3.0))
-    # what is left out is as the model has it
     assert thresholds(ValidationOptions(weak=0.1), p)[0].acceptance == replace(
         p.acceptance, weak=0.1
     )
 
 
-def test_a_deadline_stops_validation_and_says_so(full, ids, monkeypatch):
-    name = ids(full)[0]
+def test_a_deadline_stops_validation_and_says_so(full, monkeypatch):
+    name = full.ids()[0]
     whole = ask(full, name, k=50, deadline_ms=600_000)
     assert whole.deadline_reached is False
     assert told(whole, "deadline_reached") == told(ask(full, name, k=50), "deadline_reached")
@@ -115,11 +113,11 @@ def test_a_deadline_stops_validation_and_says_so(full, ids, monkeypatch):
     assert {one.validation.reason for one in none.matches} == {
         "the deadline passed before it was validated"
     }
-    allows, asked = Deadline.allows, []
+    allows, calls = Deadline.allows, []
 
     def thrice(self):
-        asked.append(allows(self))
-        self.reached = len(asked) > 3
+        calls.append(allows(self))
+        self.reached = len(calls) > 3
         return not self.reached
 
     monkeypatch.setattr(Deadline, "allows", thrice)
@@ -150,8 +148,8 @@ def test_no_candidate_is_begun_that_would_likely_end_too_late(monkeypatch):
     assert (Deadline(None).allows(), Deadline(None).reached) == (True, None)
 
 
-def test_every_frame_of_the_ranking_is_explained(full, prepared, ids):
-    names = ids(full)
+def test_every_frame_of_the_ranking_is_explained(full, prepared):
+    names = full.ids()
     vectors = {name: one.vector for name, (one, _) in zip(names, prepared, strict=True)}
 
     def apart(a, b):
@@ -163,20 +161,20 @@ def test_every_frame_of_the_ranking_is_explained(full, prepared, ids):
         how = {"k": 2, "candidates": candidates}
         plain, answer = ask(full, names[0], **how), ask(full, names[0], **how, explain=True)
         assert told(answer, "explanations") == told(plain, "explanations")
-        found = answer.explanations
-        assert [(one.rank, one.frame_id) for one in found] == list(enumerate(ranked, 1))
+        actual = answer.explanations
+        assert [(one.rank, one.frame_id) for one in actual] == list(enumerate(ranked, 1))
         matches = {one.frame_id: one for one in answer.matches}
         # accepted ones beyond `k` are not listed
-        chosen = {*matches, *(one.frame_id for one in found if one.outcome == "accepted")}
+        chosen = {*matches, *(one.frame_id for one in actual if one.outcome == "accepted")}
         assert len(chosen) == candidates
-        for one in found:
+        for one in actual:
             outcomes.add(one.outcome)
             assert one.distance == apart(names[0], one.frame_id)
             if one.frame_id not in chosen:
                 assert (one.stage, one.outcome) == ("retrieve", "not_selected")
                 near = min((apart(one.frame_id, name), ranked.index(name), name) for name in chosen)
-                said = f"most similar to the selected frame {near[2]} (distance {near[0]})"
-                assert one.reason.startswith(said)
+                output = f"most similar to the selected frame {near[2]} (distance {near[0]})"
+                assert one.reason.startswith(output)
             elif one.frame_id in matches:
                 match = matches[one.frame_id]
                 assert (one.rank, one.similarity) == (match.rank, match.similarity)
@@ -191,8 +189,8 @@ def test_every_frame_of_the_ranking_is_explained(full, prepared, ids):
     assert plain[3].reason == "not a candidate: these were the first 3 frames of the ranking"
 
 
-def test_a_frame_is_explained_where_it_was_lost(full, prepared, ids, signer, monkeypatch):
-    names = ids(full)
+def test_a_frame_is_explained_where_it_was_lost(full, prepared, signer, monkeypatch):
+    names = full.ids()
     index = {name: i for i, name in enumerate(names)}
     own = retrieve(prepared[0][0], [one for one, _ in prepared[1:]], signer.model)
     rank = {names[1 + i]: place + 1 for place, i in enumerate(own.indices.tolist())}
@@ -229,8 +227,8 @@ def test_a_frame_is_explained_where_it_was_lost(full, prepared, ids, signer, mon
     turn = explained(near[5], k=1, stages=VR)
     right(turn)
     assert (turn.lost_at, turn.selected) == ("turn", True)
-    said = "enough matches were accepted before it; validated only for this explanation"
-    assert turn.reason.startswith(said)
+    output = "enough matches were accepted before it; validated only for this explanation"
+    assert turn.reason.startswith(output)
     missed = explained(near[4], candidates=2, stages=VR)
     right(missed)
     assert (missed.lost_at, missed.ranked, missed.selected) == ("selection", True, False)
@@ -246,8 +244,8 @@ def test_a_frame_is_explained_where_it_was_lost(full, prepared, ids, signer, mon
     assert (bare.validation, bare.transform, bare.lost_at) == (None, None, "ranking")
 
 
-def test_a_frame_that_is_not_searched_is_explained(full, ids):
-    names = ids(full)
+def test_a_frame_that_is_not_searched_is_explained(full):
+    names = full.ids()
     itself = ask(full, names[0], explain_frame=names[0]).explained_frame
     assert (itself.lost_at, itself.rank, itself.passes_filter) == ("query", None, None)
     full.delete_frame("hall", names[4])
@@ -260,8 +258,8 @@ def test_a_frame_that_is_not_searched_is_explained(full, ids):
         ask(full, names[0], explain_frame="nobody")
 
 
-def test_what_an_approximate_index_missed_is_said(full, ids, monkeypatch):
-    names = ids(full)
+def test_what_an_approximate_index_missed_is_said(full, monkeypatch):
+    names = full.ids()
     near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
     real, lost = local_index.search, near[1]
     number = names.index(lost) + 1
@@ -282,20 +280,20 @@ def test_what_an_approximate_index_missed_is_said(full, ids, monkeypatch):
         assert (one.lost_at, one.ranked) == (lost_at, lost_at is None)  # one place is free
 
 
-def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(full, ids, monkeypatch):
-    name, asked = ids(full)[0], []
+def test_a_frame_that_there_is_no_time_to_explain_changes_no_answer(full, monkeypatch):
+    name, calls = full.ids()[0], []
     last = ask(full, name, k=50, stages=["retrieve"]).matches[-1].frame_id
 
     def so_often(self):
-        asked.append(self)
-        self.reached = len(asked) > 3
+        calls.append(self)
+        self.reached = len(calls) > 3
         return not self.reached
 
     monkeypatch.setattr(Deadline, "allows", so_often)
     how = {"candidates": 3, "stages": VR, "deadline_ms": 600_000, "validation": {"evidence": 1.0}}
     answer = ask(full, name, **how, explain_frame=last)
     one = answer.explained_frame
-    assert (len(asked), one.lost_at) == (4, "selection")
+    assert (len(calls), one.lost_at) == (4, "selection")
     assert one.validation.reason == "the deadline passed before it was validated"
     assert (answer.counts.validated, answer.counts.accepted) == (3, 0)
     assert (answer.status, answer.deadline_reached) == ("not_found", False)  # all were tried

@@ -26,14 +26,14 @@ def limit(engine, **limits):
 def test_a_map_takes_what_its_quota_allows(empty, uploads):
     a, b, c, d, *_ = uploads
     limit(empty, quota_frames=2)
-    first, _ = empty.add_frame("hall", a.data, a.meta)
-    empty.add_frame("hall", b.data, b.meta)
+    first, _ = empty.add(a)
+    empty.add(b)
     assert used(empty) == MapUsage(2, len(a.data) + len(b.data))
     with pytest.raises(QuotaExceeded, match=r"has 2 frames, and its quota is 2.*PATCH /v1/maps"):
-        empty.add_frame("hall", c.data, c.meta)
+        empty.add(c)
     blobs = set(empty.store.blobs.digests())
     assert len(blobs) == 2  # nothing is left of what was not taken
-    again, new = empty.add_frame("hall", a.data, a.meta)  # no new frame
+    again, new = empty.add(a)  # no new frame
     assert (again.frame_id, new) == (first.frame_id, False)
     empty.delete_frame("hall", first.frame_id)
     assert used(empty) == MapUsage(1, len(a.data) + len(b.data))  # it can be restored
@@ -45,17 +45,17 @@ def test_a_map_takes_what_its_quota_allows(empty, uploads):
     assert isinstance(outcomes[2].error, QuotaExceeded)
     assert used(empty) == MapUsage(2, len(b.data) + len(c.data))
     limit(empty, quota_frames=None)
-    empty.add_frame("hall", d.data, d.meta)
+    empty.add(d)
 
 
 def test_bytes_are_those_of_uploads(empty, uploads):
     a, b, *_ = uploads
     limit(empty, quota_bytes=len(a.data) + len(b.data) - 1)
-    empty.add_frame("hall", a.data, a.meta)
+    empty.add(a)
     with pytest.raises(QuotaExceeded, match=f"has {len(a.data)} bytes of uploads, and its quota"):
-        empty.add_frame("hall", b.data, b.meta)
+        empty.add(b)
     limit(empty, quota_bytes=len(a.data) + len(b.data))
-    empty.add_frame("hall", b.data, b.meta)
+    empty.add(b)
     limit(empty, quota_bytes=1)  # what is there stays
     assert used(empty) == MapUsage(2, len(a.data) + len(b.data))
 
@@ -69,7 +69,7 @@ def test_a_quota_holds_to_the_frame_whoever_sends_at_once(empty, make_engine, up
             if i % 4 == part:
                 continue  # each frame is sent three times
             with suppress(QuotaExceeded):
-                taken.append(engines[part % 2].add_frame("hall", one.data, one.meta)[1])
+                taken.append(engines[part % 2].add(one)[1])
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(send, range(4)))
@@ -77,9 +77,8 @@ def test_a_quota_holds_to_the_frame_whoever_sends_at_once(empty, make_engine, up
 
 
 def test_every_change_of_a_frame_is_counted(empty, uploads):
-    """Frames through states at random, beside a count over all of them."""
     rng, data = np.random.default_rng(3), uploads[0]
-    empty.add_frame("hall", data.data, data.meta)
+    empty.add(data)
     with empty.store.database.write() as connection:
         row = find_map(connection, "hall")
         [template] = connection.execute(select(frames)).mappings()
@@ -149,15 +148,15 @@ def test_limits_are_looked_at_before_they_are_set(empty):
         with pytest.raises(InvalidRequest):
             edit_map(empty.store, "hall", bad)
     assert empty.get_map("hall").etag == before
-    told = edit_map(empty.store, "hall", {"quota_frames": 0, "quota_bytes": 10})
-    assert (told.quota_frames, told.quota_bytes, told.retention_days) == (0, 10, None)
-    assert told.etag != before
+    result = edit_map(empty.store, "hall", {"quota_frames": 0, "quota_bytes": 10})
+    assert (result.quota_frames, result.quota_bytes, result.retention_days) == (0, 10, None)
+    assert result.etag != before
     assert edit_map(empty.store, "hall", {"quota_frames": None}).quota_bytes == 10
 
 
 def test_a_failed_frame_that_comes_larger_needs_room_too(empty, uploads):
     one = uploads[0]
-    added, _ = empty.add_frame("hall", one.data, one.meta)
+    added, _ = empty.add(one)
     with empty.store.database.write() as connection:
         row = find_map(connection, "hall")
         number = maps.find_frame(connection, row, added.frame_id).number
@@ -167,5 +166,5 @@ def test_a_failed_frame_that_comes_larger_needs_room_too(empty, uploads):
     with pytest.raises(QuotaExceeded, match=f"{len(loose) - len(one.data)} more bytes"):
         empty.add_frame("hall", loose, one.meta)
     assert used(empty) == MapUsage(1, len(one.data))
-    again, new = empty.add_frame("hall", one.data, one.meta)  # as it was: no more room than before
+    again, new = empty.add(one)  # as it was: no more room than before
     assert (again.frame_id, new, used(empty)) == (added.frame_id, True, MapUsage(1, len(one.data)))

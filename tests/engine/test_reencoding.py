@@ -17,14 +17,7 @@ from sceneprint.engine.maps import map_lifecycle
 from sceneprint.engine.search import local_index, query
 from sceneprint.engine.search.local_index import index_folder
 from sceneprint.engine.search.retrieval import Deadline
-from sceneprint.errors import (
-    Busy,
-    Conflict,
-    ModelMismatch,
-    UnknownMap,
-    UnreadableModel,
-    UselessFrame,
-)
+from sceneprint.errors import Busy, ModelMismatch, UselessFrame
 from sceneprint.geometry.retrieval.ranking import distances
 from sceneprint.models import save_model
 from sceneprint.pipeline import open_signer, prepare
@@ -57,14 +50,14 @@ def far_off(make_upload, room_views):
 
 
 @pytest.fixture(scope="module")
-def paper_folder(uploads, work_off, tmp_path_factory):
+def paper_folder(uploads, tmp_path_factory):
     """A data folder whose map `hall` holds all uploads and never had a model but `paper`."""
     folder = tmp_path_factory.mktemp("paper") / "data"
     with Engine(Settings(data_dir=folder)) as engine:
         engine.create_map(NewMap(name="hall", model="paper"))
         for each in uploads:
-            engine.add_frame("hall", each.data, each.meta)
-        work_off(engine)
+            engine.add(each)
+        engine.work_off()
     return folder
 
 
@@ -75,10 +68,10 @@ def listed(engine, state=None):
 def said(engine, answer):
     """All of an answer but what no two have in common, frames by their places in the map."""
     places = {name: str(i) for i, name in enumerate(listed(engine))}
-    told = answer.model_dump_json(exclude={"query_id", "milliseconds", "index_version"})
+    result = answer.model_dump_json(exclude={"query_id", "milliseconds", "index_version"})
     for name, place in places.items():
-        told = told.replace(name, place)
-    return json.loads(told)
+        result = result.replace(name, place)
+    return json.loads(result)
 
 
 def models_of(engine):
@@ -88,19 +81,19 @@ def models_of(engine):
 
 
 def queued(engine):
-    asked = select(jobs.c.kind, jobs.c.priority, jobs.c.model_id).where(
+    statement = select(jobs.c.kind, jobs.c.priority, jobs.c.model_id).where(
         jobs.c.state == JobState.QUEUED
     )
-    return [tuple(row) for row in engine.fetch(asked)]
+    return [tuple(row) for row in engine.fetch(statement)]
 
 
 def test_after_the_switch_the_map_is_as_if_made_with_that_model(
-    full, make_engine, paper_folder, uploads, told, work_off, tmp_path
+    full, make_engine, paper_folder, uploads, tmp_path
 ):
     shutil.copytree(paper_folder, tmp_path / "paper")
     fresh = make_engine(tmp_path / "paper")
     before, paper = full.get_map("hall"), fresh.get_map("hall")
-    seen = said(full, full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R))
+    seen = said(full, full.ask(uploads[4], R))
     now = full.reencode("hall", "paper").reencoding
     assert (now.model, now.model_id) == (paper.model, paper.model_id)
     assert (now.done, now.left, now.failed, now.dead) == (0, 12, 0, 0)
@@ -114,7 +107,7 @@ def test_after_the_switch_the_map_is_as_if_made_with_that_model(
         assert during.model_copy(update={"reencoding": None}) == before
         assert (during.reencoding.done, during.reencoding.left) == (done, 12 - done)
         if done % 4 == 0:
-            again = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
+            again = full.ask(uploads[4], R)
             assert said(full, again) == seen
         assert full.get_frame("hall", claimed.frame.id).state == FrameState.INDEXED
         assert full.run(claimed) == JobState.SUCCEEDED
@@ -127,23 +120,23 @@ def test_after_the_switch_the_map_is_as_if_made_with_that_model(
     assert after == before.model_copy(update=changed)
     assert models_of(full) == {paper.model_id: 12}
     assert set(full.store.blobs.digests()) == set(fresh.store.blobs.digests())
-    assert told(full)[-13:] == ["frame.reencoded"] * 12 + ["map.reencoded"]
+    assert full.event_kinds()[-13:] == ["frame.reencoded"] * 12 + ["map.reencoded"]
     other = make_engine(full.settings.data_dir)  # beside one that held the former signatures
     names, others = listed(full), listed(fresh)
     for how, which in ((R, (0, 4, 9)), (Query(seed=3), (4,))):
         for i in which:
-            for asked in (full, other):
-                answer = asked.queries.upload(["hall"], uploads[i].data, uploads[i].meta, how)
-                wanted = fresh.queries.upload(["hall"], uploads[i].data, uploads[i].meta, how)
+            for engine in (full, other):
+                answer = engine.ask(uploads[i], how)
+                wanted = fresh.ask(uploads[i], how)
                 assert said(full, answer) == said(fresh, wanted)
             answer = full.query_frame("hall", names[i], how)
             assert said(full, answer) == said(fresh, fresh.query_frame("hall", others[i], how))
-    assert work_off(full) == []
+    assert full.work_off() == []
     full.publish_due()
     assert full.get_map("hall") == after
 
 
-def test_what_comes_and_goes_meanwhile(full, uploads, far_off, short_sighted, work_off):
+def test_what_comes_and_goes_meanwhile(full, uploads, far_off, short_sighted):
     names = listed(full)
     full.reencode("hall", short_sighted)
     full.delete_frame("hall", names[2])
@@ -151,7 +144,7 @@ def test_what_comes_and_goes_meanwhile(full, uploads, far_off, short_sighted, wo
     claimed = full.claim("w")
     full.delete_frame("hall", claimed.frame.id)  # while it is signed
     assert full.run(claimed) is None
-    added, new = full.add_frame("hall", far_off.data, far_off.meta)
+    added, new = full.add(far_off)
     assert new
     first = full.claim("w")
     assert first.frame.id == added.frame_id  # what robots send goes first
@@ -159,56 +152,57 @@ def test_what_comes_and_goes_meanwhile(full, uploads, far_off, short_sighted, wo
     job = full.get_job(added.job_id)
     assert (job.kind, job.state) == ("sign", JobState.SUCCEEDED)
     assert full.get_frame("hall", added.frame_id).job_id == added.job_id
-    assert work_off(full) == [JobState.SUCCEEDED] * 10 + [JobState.FAILED]
+    assert full.work_off() == [JobState.SUCCEEDED] * 10 + [JobState.FAILED]
     now = full.get_map("hall").reencoding
     assert (now.done, now.left, now.failed, now.dead) == (10, 0, 1, 0)
     assert full.get_frame("hall", added.frame_id).state == FrameState.INDEXED
     full.publish_due()
-    told = full.get_map("hall")
-    assert told.model_id == now.model_id
-    assert told.reencoding is None
-    assert told.frames == {"deleted": 2, "indexed": 10, "rejected": 1}
+    result = full.get_map("hall")
+    assert result.model_id == now.model_id
+    assert result.reencoding is None
+    assert result.frames == {"deleted": 2, "indexed": 10, "rejected": 1}
     frame = full.get_frame("hall", added.frame_id)
     assert frame.state == FrameState.REJECTED
     assert "range" in frame.reason
-    answer = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
+    answer = full.ask(uploads[4], R)
     assert {match.frame_id for match in answer.matches} == set(listed(full, FrameState.INDEXED))
     assert (answer.counts.map, answer.matches[0].distance) == (10, 0)
     assert models_of(full) == {now.model_id: 10}
 
 
-def test_a_frame_that_breaks_down_holds_the_switch_up(
-    full, uploads, short_sighted, due_now, work_off
-):
-    """Until it is tried again with success, or deleted."""
+def test_a_frame_that_breaks_down_holds_the_switch_up(full, uploads, short_sighted):
     before = full.get_map("hall").model_id
     lost = [full.store.blobs.put(uploads[i].data) for i in (3, 5)]
     for blob in lost:
         full.store.blobs.remove(blob)
     full.reencode("hall", short_sighted)
-    states = work_off(full)
+    states = full.work_off()
     for _ in range(2):
-        due_now(full)
-        states += work_off(full)
+        full.make_due()
+        states += full.work_off()
     assert states.count(JobState.DEAD) == 2
     for _ in range(2):
         full.publish_due()
-        told = full.get_map("hall")
-        assert (told.model_id, told.frames) == (before, {"indexed": 12})
-        assert (told.reencoding.done, told.reencoding.left, told.reencoding.dead) == (10, 0, 2)
+        result = full.get_map("hall")
+        assert (result.model_id, result.frames) == (before, {"indexed": 12})
+        assert (result.reencoding.done, result.reencoding.left, result.reencoding.dead) == (
+            10,
+            0,
+            2,
+        )
         assert queued(full) == []  # nobody tries it again unasked
     full.store.blobs.put(uploads[3].data)
     now = full.reencode("hall", short_sighted).reencoding
     assert (now.done, now.left, now.dead) == (10, 2, 0)
-    assert work_off(full) == [JobState.SUCCEEDED, JobState.QUEUED]
+    assert full.work_off() == [JobState.SUCCEEDED, JobState.QUEUED]
     full.delete_frame("hall", listed(full)[5])
     full.publish_due()
-    told = full.get_map("hall")
-    assert (told.model_id, told.reencoding) == (now.model_id, None)
-    assert told.frames == {"deleted": 1, "indexed": 11}
+    result = full.get_map("hall")
+    assert (result.model_id, result.reencoding) == (now.model_id, None)
+    assert result.frames == {"deleted": 1, "indexed": 11}
 
 
-def test_what_is_given_up_leaves_nothing(full, short_sighted, uploads, work_off, told):
+def test_what_is_given_up_leaves_nothing(full, short_sighted, uploads):
     before, blobs = full.get_map("hall"), set(full.store.blobs.digests())
     full.reencode("hall", short_sighted)
     for _ in range(5):
@@ -220,34 +214,9 @@ def test_what_is_given_up_leaves_nothing(full, short_sighted, uploads, work_off,
     assert full.claim("w") is None
     assert models_of(full) == {before.model_id: 12}
     assert set(full.store.blobs.digests()) == blobs
-    assert told(full)[-1] == "map.reencoding_cancelled"
+    assert full.event_kinds()[-1] == "map.reencoding_cancelled"
     full.publish_due()
     assert full.get_map("hall") == before
-    # it can be begun once more
-    full.reencode("hall", short_sighted)
-    assert work_off(full) == [JobState.SUCCEEDED] * 12
-    full.publish_due()
-    assert full.get_map("hall").model.startswith("short-")
-
-
-def test_what_cannot_be_begun(full, short_sighted):
-    with pytest.raises(UnknownMap):
-        full.reencode("nowhere", "paper")
-    with pytest.raises(UnreadableModel):
-        full.reencode("hall", "/nowhere.safetensors")
-    with pytest.raises(Conflict, match=r"already uses the model depth-.*\."):
-        full.reencode("hall", "depth")
-    with pytest.raises(Conflict, match="not switching to another model"):
-        map_lifecycle.cancel_reencoding(full.store, "hall")
-    full.reencode("hall", short_sighted)
-    assert full.reencode("hall", short_sighted).reencoding is not None  # the same again
-    assert len(queued(full)) == 12
-    for other in ("paper", "depth"):
-        with pytest.raises(Conflict, match=r"is already switching to short-.* --cancel"):
-            full.reencode("hall", other)
-
-
-DEPTH = "depth"
 
 
 @pytest.fixture(scope="module")
@@ -271,10 +240,10 @@ def by_model(uploads, signer, whitened_signer):
     }
 
 
-def switch(engine, model, work_off):
+def switch(engine, model):
     """Begin, work off, switch."""
     engine.reencode("hall", model)
-    work_off(engine)
+    engine.work_off()
     engine.publish_due()
     assert engine.get_map("hall").reencoding is None
 
@@ -295,16 +264,15 @@ def right(names, by_model, label, asked):
 
 
 def test_a_query_signed_before_the_switch_is_signed_again(
-    full, uploads, ids, work_off, small_file, by_model, monkeypatch
+    full, uploads, small_file, by_model, monkeypatch
 ):
-    """The map switches between the signing of a query and its search, and behind the search."""
-    names, models = ids(full), [small_file, DEPTH, small_file, DEPTH]
+    names, models = full.ids(), [small_file, "depth", small_file, "depth"]
 
     def then_switch(step):
         def run(*given, **more):
             made = step(*given, **more)
             if models:
-                switch(full, models.pop(0), work_off)
+                switch(full, models.pop(0))
             return made
 
         return run
@@ -312,23 +280,21 @@ def test_a_query_signed_before_the_switch_is_signed_again(
     for name in ("prepare_upload", "prepare_stored", "answer"):
         monkeypatch.setattr(query, name, then_switch(getattr(query, name)))
     del models[1:]
-    answer = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, Query())
+    answer = full.ask(uploads[4])
     assert answer.model.startswith("small-")
-    assert found(full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)) == right(
-        names, by_model, answer.model, 4
-    )
-    models[:] = [DEPTH]
+    assert found(full.ask(uploads[4], R)) == right(names, by_model, answer.model, 4)
+    models[:] = ["depth"]
     answer = full.query_frame("hall", names[4], R)
     assert answer.model.startswith("depth-")
     assert found(answer) == right(names, by_model, answer.model, 4)[1:]
     monkeypatch.undo()
     monkeypatch.setattr(query, "answer", then_switch(query.answer))
     models[:] = [small_file]
-    answer = full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
+    answer = full.ask(uploads[4], R)
     assert answer.model.startswith("small-")
-    models[:] = [DEPTH, small_file] * 5
+    models[:] = ["depth", small_file] * 5
     with pytest.raises(Busy, match="switched its model repeatedly"):
-        full.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
+        full.ask(uploads[4], R)
 
 
 def test_signatures_of_two_models_are_not_compared_whatever_their_length(
@@ -336,53 +302,53 @@ def test_signatures_of_two_models_are_not_compared_whatever_their_length(
 ):
     row = full.row("hall")
     decoders = full.store.decoders
-    asked = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R, decoders)
-    given = ([row], asked, R, Deadline(None))
+    request = query.prepare_upload(uploads[0].data, uploads[0].meta, signer, R, decoders)
+    given = ([row], request, R, Deadline(None))
     assert full.queries.answer(*given).matches[0].distance == 0
     with pytest.raises(ModelMismatch, match="two models cannot be compared"):
-        full.queries.answer([row], replace(asked, model_id=whitened_model.id), R, Deadline(None))
+        full.queries.answer([row], replace(request, model_id=whitened_model.id), R, Deadline(None))
 
 
 def test_what_was_being_signed_at_the_switch_is_signed_with_the_new_model(
-    empty, uploads, work_off, small_file, whitened_model, monkeypatch
+    empty, uploads, small_file, whitened_model, monkeypatch
 ):
     for each in uploads[:2]:
-        empty.add_frame("hall", each.data, each.meta)
-    work_off(empty)
-    added, _ = empty.add_frame("hall", uploads[2].data, uploads[2].meta)
+        empty.add(each)
+    empty.work_off()
+    added, _ = empty.add(uploads[2])
     held = empty.claim("slow")
-    switch(empty, small_file, work_off)  # it is not indexed: nobody waits for it
+    switch(empty, small_file)  # it is not indexed: nobody waits for it
     assert empty.run(held) == JobState.QUEUED
     assert empty.get_frame("hall", added.frame_id).state == FrameState.RECEIVED
     assert len(list(empty.store.blobs.digests())) == 3 + 2
-    assert work_off(empty) == [JobState.SUCCEEDED]
-    answer = empty.queries.upload(["hall"], uploads[2].data, uploads[2].meta, R)
+    assert empty.work_off() == [JobState.SUCCEEDED]
+    answer = empty.ask(uploads[2], R)
     assert (answer.counts.map, found(answer)[0]) == (3, (added.frame_id, 0))
     # and one in which the former model finds nothing is not rejected for it
-    added, _ = empty.add_frame("hall", uploads[3].data, uploads[3].meta)
+    added, _ = empty.add(uploads[3])
     held = empty.claim("slow")
-    switch(empty, DEPTH, work_off)
+    switch(empty, "depth")
     with monkeypatch.context() as patch:
         patch.setattr(working, "prepare", useless)
         assert empty.run(held) == JobState.QUEUED
-    assert work_off(empty) == [JobState.SUCCEEDED]
+    assert empty.work_off() == [JobState.SUCCEEDED]
     assert empty.get_map("hall").frames == {"indexed": 4}
 
 
 def test_the_index_of_the_next_model_is_there_at_the_switch(
-    full, make_engine, uploads, ids, work_off, small_file, by_model, monkeypatch
+    full, make_engine, uploads, small_file, by_model, monkeypatch
 ):
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
-    engine, names = make_engine(full.settings.data_dir, unindexed_frames=5), ids(full)
+    engine, names = make_engine(full.settings.data_dir, unindexed_frames=5), full.ids()
     assert engine.publish_due() == 1
     before = index_folder(engine.settings.indexes, engine.row("hall"))
     engine.reencode("hall", small_file)
-    assert set(work_off(engine)) == {JobState.SUCCEEDED}
-    for asked in (engine, full):
-        answer = asked.query_frame("hall", names[1], R)
+    assert set(engine.work_off()) == {JobState.SUCCEEDED}
+    for node in (engine, full):
+        answer = node.query_frame("hall", names[1], R)
         assert (answer.index_version, answer.model[:6]) == (1, "depth-")
     engine.publish_due()
-    answer = engine.queries.upload(["hall"], uploads[4].data, uploads[4].meta, R)
+    answer = engine.ask(uploads[4], R)
     assert (answer.index_version, answer.counts.map) == (1, 12)
     assert found(answer) == right(names, by_model, answer.model, 4)
     assert not before.exists()
@@ -393,29 +359,28 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
 
 
 def test_a_rejected_frame_is_gone_for_readers_that_knew_it(
-    full, make_engine, uploads, ids, work_off, small_file, by_model, monkeypatch
+    full, make_engine, uploads, small_file, by_model, monkeypatch
 ):
-    """One that slept while the map went to another model, which rejected a frame, and back."""
-    sleeper, names = make_engine(full.settings.data_dir), ids(full)
+    sleeper, names = make_engine(full.settings.data_dir), full.ids()
     assert sleeper.query_frame("hall", names[0], R).counts.map == 11
     full.reencode("hall", small_file)
     blind = full.claim("w")
     with monkeypatch.context() as patch:
         patch.setattr(working, "prepare", useless)
         full.run(blind)
-    work_off(full)
+    full.work_off()
     full.publish_due()
     assert full.get_frame("hall", blind.frame.id).reason == "nothing"
-    switch(full, DEPTH, work_off)
+    switch(full, "depth")
     at = names.index(blind.frame.id)
-    asked = (at + 1) % 12
-    wanted = right(names, by_model, full.get_map("hall").model, asked)
-    answer = sleeper.queries.upload(["hall"], uploads[asked].data, uploads[asked].meta, R)
+    other = (at + 1) % 12
+    wanted = right(names, by_model, full.get_map("hall").model, other)
+    answer = sleeper.ask(uploads[other], R)
     assert found(answer) == [one for one in wanted if one[0] != blind.frame.id]
     # what one model rejects another has to look at: it is found again
     assert full.get_frame("hall", blind.frame.id).state == FrameState.RECEIVED
-    assert work_off(full) == [JobState.SUCCEEDED]
-    answer = sleeper.queries.upload(["hall"], uploads[asked].data, uploads[asked].meta, R)
+    assert full.work_off() == [JobState.SUCCEEDED]
+    answer = sleeper.ask(uploads[other], R)
     assert found(answer) == wanted
 
 
@@ -461,10 +426,10 @@ while True:
     ],
 )
 def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
-    full, make_engine, uploads, ids, due_now, work_off, small_file, by_model, stop, switched
+    full, make_engine, uploads, small_file, by_model, stop, switched
 ):
     module, step, call = stop
-    names, folder = ids(full), str(full.settings.data_dir)
+    names, folder = full.ids(), str(full.settings.data_dir)
     full.reencode("hall", small_file)
     command = [sys.executable, "-c", WORKER, folder, module, step, str(call)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as worker:
@@ -477,16 +442,16 @@ def test_whoever_is_killed_on_the_way_leaves_what_another_ends(
             worker.kill()
     label = full.get_map("hall").model
     assert label.startswith("small-") == switched
-    answer = full.queries.upload(["hall"], uploads[7].data, uploads[7].meta, R)
+    answer = full.ask(uploads[7], R)
     assert found(answer) == right(names, by_model, label, 7)
-    due_now(full)
+    full.make_due()
     other = make_engine(full.settings.data_dir, unindexed_frames=5)
-    work_off(other)
+    other.work_off()
     for _ in range(2):
         other.publish_due()
     assert other.get_map("hall").frames == {"indexed": 12}
-    for asked in (full, other):
-        answer = asked.queries.upload(["hall"], uploads[7].data, uploads[7].meta, R)
+    for engine in (full, other):
+        answer = engine.ask(uploads[7], R)
         assert answer.model.startswith("small-")
         assert found(answer) == right(names, by_model, answer.model, 7)
     assert models_of(other) == {other.get_map("hall").model_id: 12}

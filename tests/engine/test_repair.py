@@ -15,15 +15,15 @@ from tests.engine.conftest import flip, packed_again
 
 
 def number_of(engine, frame_id):
-    found = engine.fetch(select(frames.c.number).where(frames.c.id == frame_id))
-    return int(found.scalar_one())
+    actual = engine.fetch(select(frames.c.number).where(frames.c.id == frame_id))
+    return int(actual.scalar_one())
 
 
 def column(engine, frame_id, name):
-    asked = select(signatures.c[name]).where(
+    statement = select(signatures.c[name]).where(
         signatures.c.frame_number == number_of(engine, frame_id)
     )
-    return engine.fetch(asked).scalar_one()
+    return engine.fetch(statement).scalar_one()
 
 
 def upload_of(engine, frame_id):
@@ -35,8 +35,8 @@ def artifact(engine, frame_id):
 
 
 def waiting(engine):
-    asked = select(jobs).where(jobs.c.state == JobState.QUEUED)
-    return list(engine.fetch(asked).all())
+    statement = select(jobs).where(jobs.c.state == JobState.QUEUED)
+    return list(engine.fetch(statement).all())
 
 
 def damage_signature(engine, frame_id):
@@ -54,12 +54,12 @@ def statuses(answer):
 
 
 @pytest.mark.parametrize("how", ["changed", "missing"])
-def test_a_damaged_artifact_is_skipped_and_soon_made_again(full, uploads, ids, work_off, how):
+def test_a_damaged_artifact_is_skipped_and_soon_made_again(full, uploads, how):
     def ask():
-        return statuses(full.queries.upload(["hall"], uploads[1].data, uploads[1].meta, Query()))
+        return statuses(full.ask(uploads[1]))
 
     before = ask()
-    hurt = ids(full)[1]
+    hurt = full.ids()[1]
     path = artifact(full, hurt)
     sound, revision = path.read_bytes(), full.row("hall").revision
     path.unlink() if how == "missing" else flip(path, 500)
@@ -74,16 +74,15 @@ def test_a_damaged_artifact_is_skipped_and_soon_made_again(full, uploads, ids, w
     wanted = ("reencode", number_of(full, hurt), PRIORITY)
     assert (job.kind, job.frame_number, job.priority) == wanted
     assert full.get_frame("hall", hurt).state == "indexed"
-    assert work_off(full) == [JobState.SUCCEEDED]
+    assert full.work_off() == [JobState.SUCCEEDED]
     assert path.read_bytes() == sound
     assert ask() == before
-    # the signature is the same, and nobody has anything to learn
     assert full.row("hall").revision == revision
     assert waiting(full) == []
 
 
-def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(full, ids, work_off):
-    hurt = ids(full)[3]
+def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(full):
+    hurt = full.ids()[3]
     before = full.query_frame("hall", hurt, Query())
     flip(artifact(full, hurt), 500)
     answer = full.query_frame("hall", hurt, Query())
@@ -93,17 +92,15 @@ def test_a_frame_whose_own_artifact_is_damaged_is_answered_and_soon_well(full, i
     (event,) = full.events.page(wanted).items
     assert (event.frame_id, event.job_id) == (hurt, waiting(full)[0].id)
     assert [job.frame_number for job in waiting(full)] == [number_of(full, hurt)]
-    assert work_off(full) == [JobState.SUCCEEDED]
+    assert full.work_off() == [JobState.SUCCEEDED]
     assert statuses(full.query_frame("hall", hurt, Query())) == statuses(before)
 
 
-def test_a_damaged_signature_is_never_compared_and_soon_made_again(
-    full, make_engine, uploads, ids, work_off
-):
-    hurt, query = ids(full)[3], Query(stages=("retrieve",), k=50)
+def test_a_damaged_signature_is_never_compared_and_soon_made_again(full, make_engine, uploads):
+    hurt, query = full.ids()[3], Query(stages=("retrieve",), k=50)
 
     def ask(engine):
-        answer = engine.queries.upload(["hall"], uploads[3].data, uploads[3].meta, query)
+        answer = engine.ask(uploads[3], query)
         return [(m.frame_id, m.distance) for m in answer.matches]
 
     whole = ask(full)
@@ -112,14 +109,14 @@ def test_a_damaged_signature_is_never_compared_and_soon_made_again(
     fresh = make_engine()  # `full` holds it from before
     assert ask(fresh) == whole[1:]
     assert [job.frame_number for job in waiting(full)] == [number_of(full, hurt)]
-    assert work_off(full) == [JobState.SUCCEEDED]
+    assert full.work_off() == [JobState.SUCCEEDED]
     assert column(full, hurt, "vector") == sound
     for engine in (fresh, full):  # one that passed it over, and one that held it
         assert ask(engine) == whole
 
 
-def test_a_frame_with_nothing_sound_left_says_so(full, ids):
-    hurt = ids(full)[3]
+def test_a_frame_with_nothing_sound_left_says_so(full):
+    hurt = full.ids()[3]
     flip(artifact(full, hurt), 500)
     blob = upload_of(full, hurt)
     flip(full.store.blobs.path(blob), 500)
@@ -127,18 +124,18 @@ def test_a_frame_with_nothing_sound_left_says_so(full, ids):
         full.query_frame("hall", hurt, Query())
 
 
-def test_what_cannot_be_healed_is_not_tried_for_ever(full, uploads, ids, work_off, due_now):
-    hurt = ids(full)[1]
+def test_what_cannot_be_healed_is_not_tried_for_ever(full, uploads):
+    hurt = full.ids()[1]
     artifact(full, hurt).unlink()
     full.store.blobs.path(upload_of(full, hurt)).unlink()
 
     def ask():
-        return full.queries.upload(["hall"], uploads[1].data, uploads[1].meta, Query())
+        return full.ask(uploads[1])
 
     assert statuses(ask())[hurt][0] == "skipped"
     for _ in range(3):
-        assert len(work_off(full)) == 1
-        due_now(full)
+        assert len(full.work_off()) == 1
+        full.make_due()
     assert full.statistics.state_counts()[1]["dead"] == 1
     assert statuses(ask())[hurt][0] == "skipped"
     assert waiting(full) == []
@@ -148,9 +145,8 @@ def test_what_cannot_be_healed_is_not_tried_for_ever(full, uploads, ids, work_of
     assert len(waiting(full)) == 1
 
 
-def test_an_upload_that_comes_again_otherwise_packed_takes_the_place(full, uploads, ids):
-    """Other bytes of the same content: the frame refers to them, and nothing to the damaged."""
-    hurt, each = ids(full)[2], uploads[2]
+def test_an_upload_that_comes_again_otherwise_packed_takes_the_place(full, uploads):
+    hurt, each = full.ids()[2], uploads[2]
     other = packed_again(each.data, 1)
     blob = upload_of(full, hurt)
     flip(full.store.blobs.path(blob), 500)
@@ -167,7 +163,7 @@ def test_a_store_that_cannot_be_written_costs_no_answer(full, uploads, caplog):
     flip(artifact(full, frame), 500)
     with full.store.database.write() as connection:
         connection.exec_driver_sql("ALTER TABLE jobs RENAME TO away")
-    answer = full.queries.upload(["hall"], uploads[0].data, uploads[0].meta, Query())
+    answer = full.ask(uploads[0])
     assert statuses(answer)[frame][0] == "skipped"
     assert answer.status == "found"
     assert "repair failed" in caplog.text
@@ -216,11 +212,11 @@ def test_all_bytes_are_read_once_a_day(full):
     assert before <= stored.began_at <= stored.finished_at <= time.time()
     assert stored.next_at == stored.began_at + PASS_S
     assert _scrub(full).run(now=True) is None  # nobody else begins another
-    told = full.statistics.collect().scrub
-    assert (told.blobs, told.bytes, told.damaged) == (row.blobs, row.bytes, 0)
+    result = full.statistics.collect().scrub
+    assert (result.blobs, result.bytes, result.damaged) == (row.blobs, row.bytes, 0)
 
 
-def test_damage_is_told_and_what_can_be_made_again_is(full, work_off):
+def test_damage_is_told_and_what_can_be_made_again_is(full):
     uploads, artifacts, ids = _blobs(full)
     sound = artifacts[1].read_bytes()
     flip(artifacts[1], 500)
@@ -239,12 +235,12 @@ def test_damage_is_told_and_what_can_be_made_again_is(full, work_off):
     row = _scrub(full).run(now=True)
     assert row.damaged == 5
     wanted = full.events.wanted("hall", ["frame.damaged"])
-    found = full.events.page(wanted).items
-    assert {(one.frame_id, one.data.get("upload", False)) for one in found} == {
+    actual = full.events.page(wanted).items
+    assert {(one.frame_id, one.data.get("upload", False)) for one in actual} == {
         (ids[1], False), (ids[2], False), (ids[3], True), (ids[4], False),
     }  # fmt: skip
     assert uploads[3].exists()  # nothing is moved while nobody looks
-    assert work_off(full) == [JobState.SUCCEEDED] * 3
+    assert full.work_off() == [JobState.SUCCEEDED] * 3
     assert artifacts[1].read_bytes() == sound
     assert artifacts[2].exists()
     _due(full)

@@ -47,8 +47,8 @@ def of_sessions(empty, uploads):
 
 def known(engine):
     """Session, robot and tags of all frames by their ids."""
-    found = engine.list_frames("hall", None, 100).items
-    return {one.frame_id: (one.session, one.robot, sorted(one.tags)) for one in found}
+    actual = engine.list_frames("hall", None, 100).items
+    return {one.frame_id: (one.session, one.robot, sorted(one.tags)) for one in actual}
 
 
 def delete(engine, **wanted):
@@ -60,8 +60,8 @@ def edit(engine, seconds=10.0, **wanted):
 
 
 def test_frames_are_deleted_by_their_ids_once(empty, ids):
-    told = delete(empty, frame_ids=[ids[0], ids[7], "none", ids[0], ids[3]])
-    assert (told.frames, told.remaining, told.deletion.frames) == (3, 0, 3)
+    result = delete(empty, frame_ids=[ids[0], ids[7], "none", ids[0], ids[3]])
+    assert (result.frames, result.remaining, result.deletion.frames) == (3, 0, 3)
     assert list(known(empty)) == [one for one in ids if one not in (ids[0], ids[3], ids[7])]
     again = delete(empty, frame_ids=[ids[0], ids[7]])
     assert (again.frames, again.remaining, again.deletion) == (0, 0, None)
@@ -79,28 +79,27 @@ def test_frames_are_deleted_by_a_filter(empty, ids):
     ):  # fmt: skip
         start = wanted.get("find", "-")  # an id may begin so as well
         places = [i for i, one in enumerate(ids) if i in selected or one.startswith(start)]
-        told = delete(empty, filter=wanted)
-        assert (told.frames, told.remaining) == (len(places), 0)
+        result = delete(empty, filter=wanted)
+        assert (result.frames, result.remaining) == (len(places), 0)
         assert list(known(empty)) == [one for i, one in enumerate(ids) if i not in places]
         if places:
-            empty.tombstones.restore("hall", told.deletion.deletion_id)
+            empty.tombstones.restore("hall", result.deletion.deletion_id)
 
 
 def test_a_call_that_runs_out_of_time_says_what_is_left(empty, ids):
     wanted = FrameSelection(filter=FrameListing(session=["a"]))
-    told = [
+    result = [
         delete_selection(empty.store, "hall", wanted, empty.tombstones, seconds=0.0)
         for _ in range(4)
     ]
-    assert [(one.frames, one.remaining) for one in told] == [(2, 3), (2, 1), (1, 0), (0, 0)]
-    assert [one.deletion and one.deletion.frames for one in told] == [2, 2, 1, None]
-    for one in told[:3]:
+    assert [(one.frames, one.remaining) for one in result] == [(2, 3), (2, 1), (1, 0), (0, 0)]
+    assert [one.deletion and one.deletion.frames for one in result] == [2, 2, 1, None]
+    for one in result[:3]:
         empty.tombstones.restore("hall", one.deletion.deletion_id)
     assert list(known(empty)) == ids
 
 
 def changed(session, robot, tags, changes):
-    """Return the session, the robot and the tags of a frame after an edit."""
     kept = [one for one in tags if one not in changes.get("remove_tags", [])]
     return (
         changes.get("session", session), changes.get("robot", robot),
@@ -115,16 +114,16 @@ def test_an_edit_is_undone_by_its_inverse(empty, ids):
         {"add_tags": ["y", "n"]}, {"remove_tags": ["x"], "add_tags": ["n"]}, {"robot": None},
     ]  # fmt: skip
     for changes in every:
-        told = edit(empty, filter={"name": "0"}, **changes)
+        result = edit(empty, filter={"name": "0"}, **changes)
         after = {one: changed(*before[one], changes) if i < 10 else before[one]
                  for i, one in enumerate(ids)}  # fmt: skip
         assert known(empty) == after
-        assert told.frames == sum(after[one] != before[one] for one in ids)
-        assert (told.remaining, told.last_frame_id) == (0, None)
+        assert result.frames == sum(after[one] != before[one] for one in ids)
+        assert (result.remaining, result.last_frame_id) == (0, None)
         again = edit(empty, filter={"name": "0"}, **changes)
         assert (again.frames, again.inverse) == (0, [])
-        assert sum(len(one["frame_ids"]) for one in told.inverse) == told.frames
-        for one in told.inverse:
+        assert sum(len(one["frame_ids"]) for one in result.inverse) == result.frames
+        for one in result.inverse:
             edit(empty, **one)
         assert known(empty) == before
 
@@ -206,5 +205,5 @@ def test_tags_are_added_once_and_removed(empty, of_sessions):
         ("a/..", "r1", ["old"]),
     ]  # fmt: skip
     edit_session(empty.store, "hall", "a", SessionEdit(remove_tags=["old"]))
-    found = empty.list_frames("hall", None, 100, wanted=FrameListing(tag=["old"])).items
-    assert [one.frame_id for one in found] == of_sessions[8:]
+    actual = empty.list_frames("hall", None, 100, wanted=FrameListing(tag=["old"])).items
+    assert [one.frame_id for one in actual] == of_sessions[8:]

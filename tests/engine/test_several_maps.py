@@ -11,12 +11,12 @@ MAPS = ["hall", "lab"]
 
 
 @pytest.fixture
-def two(full, uploads, work_off):
+def two(full, uploads):
     """`hall` with all twelve frames, and `lab` with two of each room."""
     full.create_map(NewMap(name="lab", model="depth"))
     for i in (1, 4, 7, 10):
-        full.add_frame("lab", uploads[i].data, uploads[i].meta)
-    work_off(full)
+        full.add(uploads[i], "lab")
+    full.work_off()
     return full
 
 
@@ -35,8 +35,8 @@ def test_the_ranking_is_that_of_both_maps_together(two, uploads):
     both = ask(two, MAPS, uploads[1], **how)
     listed = [(one.distance, one.map, one.frame_id, one.similarity)
               for name in MAPS for one in alone[name].matches]  # fmt: skip
-    found = [(one.distance, one.map, one.frame_id, one.similarity) for one in both.matches]
-    assert sorted(found) == sorted(listed)
+    actual = [(one.distance, one.map, one.frame_id, one.similarity) for one in both.matches]
+    assert sorted(actual) == sorted(listed)
     assert [one.distance for one in both.matches] == sorted(one[0] for one in listed)
     assert [(one.distance, one.map) for one in both.matches[:2]] == [(0, "hall"), (0, "lab")]
     assert (both.maps, both.per_map.keys()) == (MAPS, set(MAPS))
@@ -70,8 +70,8 @@ def test_a_pose_is_of_one_map(two, uploads):
     assert diverse.matches[0].rank == 1
 
 
-def test_a_stored_frame_does_not_find_itself_and_finds_others(two, ids):
-    own = ids(two)[4]
+def test_a_stored_frame_does_not_find_itself_and_finds_others(two):
+    own = two.ids()[4]
     query = Query(stages=("retrieve",), k=50, keep=False)
     both = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), query)
     assert own not in [one.frame_id for one in both.matches]
@@ -81,22 +81,22 @@ def test_a_stored_frame_does_not_find_itself_and_finds_others(two, ids):
     away = two.queries.stored(["lab"], NamedFrame(map="hall", frame_id=own), query)
     assert (away.maps, away.counts.map, away.per_map) == (["lab"], 4, None)
     explain = query.model_copy(update={"explain_frame": names_of(two, "lab")[2]})
-    told = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), explain)
+    answer = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), explain)
     rank = next(one.rank for one in both.matches if one.frame_id == explain.explain_frame)
-    assert (told.explained_frame.map, told.explained_frame.rank) == ("lab", rank)
-    assert told.explained_frame.of == 15
+    assert (answer.explained_frame.map, answer.explained_frame.rank) == ("lab", rank)
+    assert answer.explained_frame.of == 15
     with pytest.raises(UnknownFrame):
         two.queries.stored(["lab"], NamedFrame(map="lab", frame_id=own), query)
 
 
-def test_two_maps_may_call_their_frames_alike(full, uploads, work_off):
+def test_two_maps_may_call_their_frames_alike(full, uploads):
     maps = ["attic", "cellar"]
     for name, places in zip(maps, ((0, 1), (1, 2)), strict=True):
         full.create_map(NewMap(name=name, model="depth"))
         for frame_id, i in zip(("a", "b"), places, strict=True):
             upload = Upload(uploads[i].data, uploads[i].meta, frame_id=frame_id)
             full.uploads.add(name, upload)
-    work_off(full)
+    full.work_off()
 
     def asked(of, **how):
         return full.queries.stored(of, NamedFrame(map="attic", frame_id="b"), Query(**how))
@@ -107,26 +107,25 @@ def test_two_maps_may_call_their_frames_alike(full, uploads, work_off):
     for match in several.matches:
         ends = match.transform.parent_frame, match.transform.child_frame
         assert ends == (f"{match.frame_id}.optical", "query.optical")
-    # attic's b is asked for, and cellar's is among the matches
     same = next(one for one in several.matches if (one.map, one.frame_id) == ("cellar", "b"))
     details = full.inspection.match(several.query_id, "b", "cellar")
     assert details.transform == same.transform
     assert b"comment frame query.optical" in full.inspection.cloud(several.query_id)
     assert asked(["cellar"]).location.pose.child_frame == "query.optical"
     assert asked(["attic"]).location.pose.child_frame == "b.optical"
-    told = asked(maps, explain_frame="b", keep=False).explained_frame
-    assert (told.map, told.lost_at, told.rank) == ("cellar", None, same.rank)
-    assert told.transform == same.transform
+    answer = asked(maps, explain_frame="b", keep=False).explained_frame
+    assert (answer.map, answer.lost_at, answer.rank) == ("cellar", None, same.rank)
+    assert answer.transform == same.transform
     full.delete_frame("attic", "a")
     assert asked(maps, explain_frame="a", keep=False).explained_frame.map == "cellar"
 
 
-def test_maps_of_two_models_are_not_asked_as_one(two, uploads, ids):
+def test_maps_of_two_models_are_not_asked_as_one(two, uploads):
     two.create_map(NewMap(name="big", model="paper"))
     with pytest.raises(InvalidRequest, match=r"hall has depth-.*big has paper-") as caught:
         ask(two, ["hall", "big"], uploads[0])
     assert [field for field, _ in caught.value.fields] == ["maps.hall", "maps.big"]
-    stored = NamedFrame(map="hall", frame_id=ids(two)[0])
+    stored = NamedFrame(map="hall", frame_id=two.ids()[0])
     with pytest.raises(InvalidRequest, match=r"big has paper-.*hall has depth-"):
         two.queries.stored(["big"], stored, Query())
     with pytest.raises(UnknownMap, match="'attic'"):

@@ -7,14 +7,7 @@ from sceneprint.engine.ingest.uploads import Upload
 from sceneprint.engine.maps import selections, tombstones
 from sceneprint.engine.maps.map_lifecycle import edit_map
 from sceneprint.engine.maps.selections import delete_selection, delete_session
-from sceneprint.errors import (
-    Conflict,
-    InvalidRequest,
-    QuotaExceeded,
-    UnknownDeletion,
-    UnknownFrame,
-    UnknownMap,
-)
+from sceneprint.errors import Conflict, InvalidRequest, QuotaExceeded, UnknownDeletion, UnknownFrame
 from sceneprint.store.frames import set_state
 from sceneprint.store.maps import MapUsage, find_frame, find_map
 from sceneprint.store.tables import frames as frames_table
@@ -43,12 +36,11 @@ def restore(engine, deletion):
 
 
 def end_undo(engine):
-    """Let the time of all deletions be over."""
     engine.write(update(frames_table).values(ended_at=frames_table.c.ended_at - 601))
 
 
 def nearest(engine, upload):
-    answer = engine.queries.upload(["hall"], upload.data, upload.meta, Query(seed=5))
+    answer = engine.ask(upload, Query(seed=5))
     return answer.matches[0].frame_id, answer.matches[0].distance
 
 
@@ -77,21 +69,20 @@ def test_a_deleted_frame_is_found_by_nothing(full, uploads):
     assert first not in {one.frame_id for one in answer.matches}
 
 
-def test_a_restored_frame_is_as_it_was_and_found_at_once(full, uploads, told):
-    """No worker runs: its signature was there all the while."""
+def test_a_restored_frame_is_as_it_was_and_found_at_once(full, uploads):
     before, use = frames(full), used(full)
     first = next(iter(before))
-    found = nearest(full, uploads[0])
+    actual = nearest(full, uploads[0])
     full.delete_frame("hall", first)
     full.rebuild_index("hall")  # an index that was published without it
     assert nearest(full, uploads[0])[0] != first
     full.tombstones.restore_one("hall", first)
-    assert nearest(full, uploads[0]) == found
+    assert nearest(full, uploads[0]) == actual
     assert frames(full) == before
     assert used(full) == use
     assert full.claim("w") is None
     assert full.get_frame("hall", first).state == FrameState.INDEXED
-    assert told(full)[-2:] == ["frame.deleted", "frame.restored"]
+    assert full.event_kinds()[-2:] == ["frame.deleted", "frame.restored"]
     assert full.tombstones.list_all("hall", None, 9).items == []
     for name in (first, "none"):
         with pytest.raises(UnknownFrame, match="was not deleted, or can no longer be restored"):
@@ -131,7 +122,7 @@ def test_a_session_is_restored_with_names_tags_and_states(empty, uploads, monkey
 def test_what_has_come_again_is_not_restored(full, uploads):
     first, second, third = list(frames(full))[:3]
     deletion = delete(full, [first, second, third]).deletion
-    again, new = full.add_frame("hall", uploads[0].data, uploads[0].meta)
+    again, new = full.add(uploads[0])
     assert new
     other = uploads[8].meta.model_copy(update={"name": "other"})
     put = Upload(uploads[8].data, other, frame_id=second)  # another frame under the second's id
@@ -165,13 +156,13 @@ def test_a_quota_of_frames_holds(full):
 
 
 def test_an_upload_beyond_the_quota_purges_the_oldest_deletions(empty, uploads):
-    names = [empty.add_frame("hall", one.data, one.meta)[0].frame_id for one in uploads[:4]]
+    names = [empty.add(one)[0].frame_id for one in uploads[:4]]
     sizes = [len(one.data) for one in uploads]
     quota = sum(sizes[:4])
     edit_map(empty.store, "hall", {"quota_bytes": quota})
     for name in names[:3]:
         empty.delete_frame("hall", name)
-    empty.add_frame("hall", uploads[4].data, uploads[4].meta)  # as large as one, or as two
+    empty.add(uploads[4])  # as large as one, or as two
     assert names[0] not in restorable(empty, names)
     assert names[2] in restorable(empty, names)
     assert used(empty).bytes == bytes_on_disk(empty) <= quota
@@ -183,21 +174,21 @@ def test_an_upload_beyond_the_quota_purges_the_oldest_deletions(empty, uploads):
     left = restorable(empty, names)
     edit_map(empty.store, "hall", {"quota_bytes": 1})
     with pytest.raises(QuotaExceeded):
-        empty.add_frame("hall", uploads[8].data, uploads[8].meta)
+        empty.add(uploads[8])
     assert restorable(empty, names) == left
 
 
 def restorable(engine, names):
     """Return the names of the frames that can be restored, by restoring and deleting them."""
-    found = set()
+    results = set()
     for name in names:
         try:
             engine.tombstones.restore_one("hall", name)
         except UnknownFrame:
             continue
         engine.delete_frame("hall", name)
-        found.add(name)
-    return found
+        results.add(name)
+    return results
 
 
 def test_after_its_time_a_deletion_is_for_good(full):
@@ -219,28 +210,13 @@ def test_after_its_time_a_deletion_is_for_good(full):
     assert full.tombstones.purge() == 0
 
 
-def test_deletions_are_listed_a_page_at_a_time(full):
-    names = list(frames(full))
-    made = [delete(full, [one]).deletion for one in names[:3]]
-    page = full.tombstones.list_all("hall", None, 2)
-    assert page.items == [made[2], made[1]]
-    assert full.tombstones.list_all("hall", page.next_cursor, 2).items == [made[0]]
-    with pytest.raises(InvalidRequest):
-        full.tombstones.list_all("hall", "x", 2)
-    with pytest.raises(UnknownMap):
-        full.tombstones.list_all("attic", None, 2)
-    full.delete_map("hall")
-    assert list(full.store.blobs.digests()) == []
-
-
 def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
-    """A redundant frame has no upload any more, and is deleted for good."""
     made = []
     for one, state in zip(uploads, (FrameState.REJECTED, FrameState.REDUNDANT), strict=False):
-        name = empty.add_frame("hall", one.data, one.meta)[0].frame_id
+        name = empty.add(one)[0].frame_id
         with empty.store.database.write() as connection:
-            found = find_frame(connection, find_map(connection, "hall"), name)
-            set_state(connection, found.number, state, "as a test says")
+            actual = find_frame(connection, find_map(connection, "hall"), name)
+            set_state(connection, actual.number, state, "as a test says")
         made.append(empty.get_frame("hall", name))
     use = used(empty)
     deletion = delete(empty, [one.frame_id for one in made]).deletion
@@ -252,13 +228,13 @@ def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
     assert used(empty) == use
 
 
-def test_a_frame_of_a_map_that_has_another_model_now_is_signed_again(full, work_off, small_model):
+def test_a_frame_of_a_map_that_has_another_model_now_is_signed_again(full, small_model):
     first = next(iter(frames(full)))
     full.delete_frame("hall", first)
     full.reencode("hall", small_model)
-    work_off(full)
+    full.work_off()
     full.publish_due()
     assert full.get_map("hall").model_id == small_model.id
     full.tombstones.restore_one("hall", first)
     assert full.get_frame("hall", first).state == FrameState.RECEIVED
-    assert work_off(full) == ["succeeded"]
+    assert full.work_off() == ["succeeded"]

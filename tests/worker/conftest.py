@@ -77,11 +77,11 @@ class Crew:
 @pytest.fixture(scope="module")
 def frames(room_frames, small_image):
     """Small frames with different content, from different offsets."""
-    found = []
+    results = []
     for number in range(64):
         data, lens = small_image(room_frames[number // 16], *divmod(number % 16, 4))
-        found.append((data, FrameMeta(intrinsics=lens)))
-    return found
+        results.append((data, FrameMeta(intrinsics=lens)))
+    return results
 
 
 @pytest.fixture(scope="session")

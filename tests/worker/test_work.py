@@ -22,9 +22,6 @@ def test_two_workers_sign_each_frame_once(crew, frames):
     assert {job.attempts for job in jobs} == {1}
     assert crew.signed("many") == [1] * len(added)
     assert crew.engine.get_map("many").revision == len(added)
-    lines = [line for line in crew.log("job succeeded") if line["map"] == "many"]
-    assert sorted(line["frame_id"] for line in lines) == sorted(one.frame_id for one in added)
-    assert {line["attempt"] for line in lines} == {1}
 
 
 def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
@@ -35,8 +32,8 @@ def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
     for one in frames[32:36]:
         crew.engine.add_frame("shaken", *one)
     crew.settled("shaken", 4)
-    said = crew.log("store unreachable")[0]["error"]  # in the words of either database
-    assert re.search('no such table: jobs|relation "jobs" does not', said)
+    output = crew.log("store unreachable")[0]["error"]  # in the words of either database
+    assert re.search('no such table: jobs|relation "jobs" does not', output)
     assert len(crew.log("worker ready")) == 2  # the same two
 
 

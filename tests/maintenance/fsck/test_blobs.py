@@ -150,10 +150,10 @@ def test_an_upload_that_is_found_again_clears_the_reason(house, state):
     actual = only(house.look())
     assert (actual.kind, actual.severity, actual.frame_id) == ("found-upload", "leftover", frame_id)
     assert only(house.look(repair=True)).done is not None
-    request = "SELECT state, reason FROM frames WHERE id = ?"
-    assert house.sql(request, frame_id) == [(state, None)]
+    statement = "SELECT state, reason FROM frames WHERE id = ?"
+    assert house.sql(statement, frame_id) == [(state, None)]
     assert house.work() == ["succeeded"]
-    assert house.sql(request, frame_id) == [("indexed", None)]
+    assert house.sql(statement, frame_id) == [("indexed", None)]
 
 
 @pytest.mark.parametrize("made", ["artifact", "signature"])

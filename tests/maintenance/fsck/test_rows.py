@@ -82,15 +82,15 @@ def test_a_fault_is_named_and_repaired(house, fault):
 
 
 def test_what_a_map_is_counted_to_hold(house):
-    request = "SELECT used_frames, used_bytes FROM maps ORDER BY number"
-    before = house.sql(request)
+    statement = "SELECT used_frames, used_bytes FROM maps ORDER BY number"
+    before = house.sql(statement)
     house.sql("UPDATE maps SET used_frames = used_frames + 1 WHERE name = 'hall'")
     assert house.look(quick=True) == house.look(map_name="attic") == []
     [actual] = house.look()
     assert (actual.kind, actual.map) == ("stale-value", "hall")
     assert f"usage is {before[0][0] + 1} frames with {before[0][1]} bytes" in actual.means
     assert [one.left for one in house.look(repair=True)] == [False]
-    assert (house.sql(request), house.look()) == (before, [])
+    assert (house.sql(statement), house.look()) == (before, [])
 
 
 def test_one_map_is_looked_at_alone(house):
@@ -120,8 +120,8 @@ def test_a_row_that_cannot_be_read_does_not_hide_the_others(house):
 
 
 def test_a_damaged_signature_is_made_again(house, truth, uploads):
-    request = "SELECT * FROM signatures ORDER BY frame_number"
-    sound, checksum = house.sql(request), zlib.crc32(b"\0")  # which fits: the length does not
+    statement = "SELECT * FROM signatures ORDER BY frame_number"
+    sound, checksum = house.sql(statement), zlib.crc32(b"\0")  # which fits: the length does not
     change = "UPDATE signatures SET {} WHERE frame_number = {}".format
     house.sql(change("vector = SUBSTR(vector, 2) || SUBSTR(vector, 1, 1)", 1))
     house.sql(change("vector = ?, checksum = ?", 3), b"\0", checksum)
@@ -141,6 +141,6 @@ def test_a_damaged_signature_is_made_again(house, truth, uploads):
     assert others
     assert not others & {frame_id for (frame_id,) in rows}
     assert set(house.work()) == {"succeeded"}
-    assert [one for one in house.sql(request) if one[0] <= 13] == [o for o in sound if o[0] <= 13]
+    assert [one for one in house.sql(statement) if one[0] <= 13] == [o for o in sound if o[0] <= 13]
     assert house.look() == []
     assert house.answers(uploads[:12]) == truth
