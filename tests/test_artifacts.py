@@ -138,12 +138,9 @@ def test_the_layout_is_what_its_schema_says():
     # 4 m is half of 65535, to the even one; -z is the middle of the square, between two numbers
     assert packed[..., 0].tolist() == [[0, 65535, 65535], [65535, 65535, 32768]]
     assert packed[0].tolist() == [[0, 0, 0], [65535, 32768, 32768], [65535, 32768, 32768]]
-    assert (
-        data[127:155]
-        == np.float32(
-            np.r_[geometry.patches.means[0], geometry.patches.normals[0], geometry.patches.areas[0]]
-        ).tobytes()
-    )
+    patches = geometry.patches
+    row = np.float32(np.r_[patches.means[0], patches.normals[0], patches.areas[0]])
+    assert data[127:155] == row.tobytes()
     assert data[-4:] == geometry.descriptors.tobytes()
 
 

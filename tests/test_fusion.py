@@ -111,10 +111,8 @@ def test_first_seen_by_hand():
     assert added_areas(mesh, first, 2).tolist() == [0.5, 0.5]
     assert share_seen(points, views[:1]) == 0.25
     assert share_seen(points, views) == 1.0
-    assert (
-        share_seen(points + np.array([0, 0, 0.0799]), views[1:]) == 0.75
-    )  # 5 cm and 3 % of 1.08 m
-    assert share_seen(points + np.array([0, 0, 0.0830]), views[1:]) == 0.0
+    for farther, share in ((0.0799, 0.75), (0.0830, 0.0)):  # 5 cm and 3 % of 1.08 m
+        assert share_seen(points + np.array([0, 0, farther]), views[1:]) == share
 
 
 def test_the_observed_volume_is_that_of_the_view_cone(around):

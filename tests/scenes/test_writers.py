@@ -32,28 +32,17 @@ SQUARE = np.array([[0.0, 0, 0], [0, 1, 0], [0, 1, 1]])
 
 def written(stream):
     """A map, then a query with a label, then nothing but a text."""
-    stream.write(
-        Moment(
-            [
-                SceneEntity(("my hall",), UpAxis(np.array([0.0, -1.0, 0.0]))),
-                SceneEntity(("my hall", "map", "points"), PointSet(POINTS, COLOURS, 0.012)),
-            ]
-        )
-    )
-    query = ("my hall", "query")
-    stream.write(
-        Moment(
-            [
-                SceneEntity(query, Placement(T, "query.optical")),
-                SceneEntity((*query, "points"), PointSet(-POINTS, COLOURS, 0.02)),
-                SceneEntity((*query, "sensor"), LineSet([SQUARE, SQUARE[:2]], [(255, 0, 0)] * 2)),
-                SceneEntity((*query, "label"), TextLabel(SQUARE[1], "#1 name", (0, 255, 0))),
-                SceneEntity(("answer",), TextPage("found\n  at `here`")),
-            ],
-            0,
-            START,
-        )
-    )
+    hall, query = ("my hall",), ("my hall", "query")
+    points = SceneEntity((*hall, "map", "points"), PointSet(POINTS, COLOURS, 0.012))
+    stream.write(Moment([SceneEntity(hall, UpAxis(np.array([0.0, -1.0, 0.0]))), points]))
+    entities = [
+        SceneEntity(query, Placement(T, "query.optical")),
+        SceneEntity((*query, "points"), PointSet(-POINTS, COLOURS, 0.02)),
+        SceneEntity((*query, "sensor"), LineSet([SQUARE, SQUARE[:2]], [(255, 0, 0)] * 2)),
+        SceneEntity((*query, "label"), TextLabel(SQUARE[1], "#1 name", (0, 255, 0))),
+        SceneEntity(("answer",), TextPage("found\n  at `here`")),
+    ]
+    stream.write(Moment(entities, 0, START))
     stream.write(Moment([SceneEntity(("answer",), TextPage("lost"))], 1, LATER))
 
 

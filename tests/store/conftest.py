@@ -91,9 +91,7 @@ def empty_file(tmp_path_factory):
 def url(request, tmp_path):
     """URL of a new database; on a server it already has the schema."""
     if request.param == "postgresql":
-        (
-            tmp_path / "blobs"
-        ).mkdir()  # the store does not create the folder for an existing database
+        (tmp_path / "blobs").mkdir()  # the store creates none for an existing database
         return str(request.getfixturevalue("postgres_url"))
     return f"sqlite:///{tmp_path / 'truth.db'}"
 
@@ -209,10 +207,8 @@ def plans():
     return looked_at
 
 
-@pytest.fixture(scope="session")
-def opens():
-    """Code for `race` that opens the database of a URL and returns its schema version."""
-    return """
+#: Code for `race` that opens the database of a URL and returns its schema version.
+SCHEMA_OF = """
 from sceneprint.store import open_database
 from sqlalchemy import text
 

@@ -14,11 +14,12 @@ from sceneprint.errors import UnusableStore
 from sceneprint.store import open_database
 from sceneprint.store.database import known_revisions, migration_config, revision_of
 from sceneprint.store.tables import metadata
+from tests.store.conftest import SCHEMA_OF
 
 
 @pytest.mark.sqlite_only("a file")
-def test_four_processes_may_migrate_one_empty_database_at_once(url, tmp_path, race, opens):
-    assert race(opens, 4, url) == [[known_revisions()[0]]] * 4
+def test_four_processes_may_migrate_one_empty_database_at_once(url, tmp_path, race):
+    assert race(SCHEMA_OF, 4, url) == [[known_revisions()[0]]] * 4
     with closing(sqlite3.connect(tmp_path / "truth.db")) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()

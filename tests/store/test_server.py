@@ -19,6 +19,7 @@ from sceneprint.store.maps import add_map, frames_of, list_maps, store_model
 from sceneprint.store.postgres import connection as postgres
 from sceneprint.store.read_only import inspect_database
 from sceneprint.store.tables import events, maps, metadata
+from tests.store.conftest import SCHEMA_OF
 
 
 @pytest.fixture
@@ -45,9 +46,9 @@ def keeper(postgres_url):
     other.close()
 
 
-def test_two_processes_may_open_an_empty_database_at_once(empty_url, race, opens):
+def test_two_processes_may_open_an_empty_database_at_once(empty_url, race):
     assert not database_exists(empty_url)
-    assert race(opens, 2, empty_url) == [[known_revisions()[0]]] * 2
+    assert race(SCHEMA_OF, 2, empty_url) == [[known_revisions()[0]]] * 2
     assert database_exists(empty_url)
     made = open_database(empty_url)
     with made.read() as connection:
