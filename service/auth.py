@@ -168,11 +168,13 @@ async def authenticate(
     tenant sends too many requests.
     """
     if credentials is None:
-        if requires_key(request, here):
+        if (is_other := "authorization" in request.headers) or requires_key(request, here):
             header = request.state.forwarded
             reason = (
                 "This service requires a key."
                 if here.keys
+                else "The Authorization header contains no key in the scheme Bearer."
+                if is_other
                 else (
                     f"The request came through a proxy (it has the header {header}), so anyone may "
                     "have sent it, and a key is required."
@@ -286,9 +288,7 @@ async def guest(
     request: Request, here: Here,
     credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)],
 ) -> Caller | None:  # fmt: skip
-    """Return the caller of a route without authentication; None without a key. Raise KeyRequired
-    if the key is unknown, revoked or expired.
-    """
+    """Return the caller of a public route, or None without a key. Raise as `authenticate` does."""
     if credentials is None and requires_key(request, here):
         return None
     return await authenticate(request, here, credentials)

@@ -44,6 +44,12 @@ def test_without_its_key_nothing_below_v1_is_told(walled, secret, refused, shown
         assert answer.headers["www-authenticate"] == "Bearer"
 
 
+@pytest.mark.parametrize("shown", ["Basic YTpi", "Token sp_x", "sp_x", "Bearer"])
+def test_on_loopback_an_authorization_without_a_key_is_refused(served, refused, shown):
+    answer = served.client.get("/v1/maps", headers={"Authorization": shown})
+    refused(answer, 401, "key-required", "contains no key in the scheme Bearer. Send the header")
+
+
 @pytest.mark.sqlite_only("the files of the database are in the data folder")
 def test_the_secret_is_in_no_file_and_no_line(walled, secret):
     server = walled.server
