@@ -121,9 +121,14 @@ def _read_chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
                 "Copy or write the file again."
             )
         yield kind, view[position + 8 : end]
-        if kind == b"IEND":
-            return
         position = end + 4
+        if kind == b"IEND":
+            if data[position:].strip(b"\0\r\n"):
+                raise UnreadableFrame(
+                    f"{len(data) - position} bytes follow after the end of the PNG, such as a "
+                    "second image. Send one image per frame."
+                )
+            return
     raise UnreadableFrame(
         f"The PNG has more than {_MAXIMUM_CHUNKS} chunks. Write it with larger chunks."
     )

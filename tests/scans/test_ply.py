@@ -115,6 +115,7 @@ def test_lies(case):
     [
         ("1.00 2.00 3.00\n" * 9, "Row 10 of 10.*file ends before"),
         ("1.0 2.0 3.0\n" * 9 + "1.0 2.0\n", "Row 10 of 10.*fewer values"),
+        ("1.0 2.0 3.0\n" * 12, "bytes follow after the rows"),
         ("1.0 2.0 3.0 4.0\n" * 10, "Row 1 of 10.*more values"),
         ("1.0 2.0 3.0\n" * 4 + "1.0 x 3.0\n" * 6, "Row 5 of 10.*not a number"),
     ],

@@ -20,6 +20,7 @@ from sceneprint.formats.points.rows import (
     FilePoints,
     axis_names,
     check_count,
+    check_end,
     check_room,
     parse_blocks,
     record_blocks,
@@ -152,11 +153,12 @@ def read_pcd(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
     if form == "ascii":
         blocks = _ascii_blocks(data, start, count, fields)
     elif form == "binary":
-        if len(data) - start < count * width:  # some files are padded, so more bytes are accepted
+        if len(data) - start < count * width:  # some files are padded, so zeros may follow
             raise UnreadableCloud(
                 f"The PCD header declares {count} points of {width} bytes, but "
                 f"{len(data) - start} of {count * width} bytes follow. {_AGAIN}"
             )
+        check_end(np.frombuffer(data, np.uint8), start + count * width)
         kinds = [(field.name, field.kind, field.count) for field in fields]
         blocks = record_blocks(data, start, count, kinds)
     elif form == "binary_compressed":
@@ -199,6 +201,7 @@ def _compressed_blocks(
             f"The decompressed points have {size} bytes; the limit is {most_bytes}. "
             "Write only x, y and z."
         )
+    check_end(np.frombuffer(data, np.uint8), start + 8 + packed)
     everything = inflate(np.frombuffer(data, np.uint8, packed, start + 8), size)
     begins, columns = 0, dict[str, np.ndarray[tuple[int], np.dtype[np.number]]]()
     for field in fields:

@@ -181,7 +181,7 @@ def read_ply(data: FileBytes, most: int = MAXIMUM_POINTS) -> FilePoints:
         )
     check_count(vertex.count, most)
     if order == "":
-        return FilePoints(vertex.count, _ascii_blocks(data, start, elements[: at + 1]))
+        return FilePoints(vertex.count, _ascii_blocks(data, start, elements, at))
     view, begins = np.frombuffer(data, np.uint8), 0
     for i, element in enumerate(elements):
         begins = start if i == at else begins
@@ -214,18 +214,20 @@ def element_end(data: FileBytes, start: int, element: Element, order: str) -> in
     return skip_rows(np.frombuffer(data, np.uint8), start, element.count, kinds, order)
 
 
-def _ascii_blocks(data: FileBytes, start: int, elements: list[Element]) -> Iterator[Floats]:
-    """Return the coordinates of the last element of `elements` in an ascii file, in blocks."""
-    *before, vertex = elements
-    text = np.frombuffer(data, np.uint8)
-    for element in before:
+def _ascii_blocks(
+    data: FileBytes, start: int, elements: list[Element], at: int
+) -> Iterator[Floats]:
+    """Return the coordinates of the element with the index `at` in an ascii file, in blocks."""
+    text, vertex = np.frombuffer(data, np.uint8), elements[at]
+    for element in elements[:at]:
         start = skip_lines(text, start, element.count)
     check_room(text, start, vertex.count, len(vertex.properties))
     axes = np.array(
         [_XYZ.index(p.name) if p.name in _XYZ else -1 for p in vertex.properties], np.int8
     )
     lists = np.array([p.length is not None for p in vertex.properties])
-    return parse_blocks(text, start, vertex.count, axes, lists)
+    further = sum(element.count for element in elements[at + 1 :])
+    return parse_blocks(text, start, vertex.count, axes, lists, further)
 
 
 def ply_header(data: FileBytes) -> tuple[str, list[Element], int]:

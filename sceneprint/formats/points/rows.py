@@ -107,11 +107,13 @@ _TENS = np.array([float(f"1e{k}") for k in range(23)])
 
 
 def parse_blocks(
-    text: Bytes, start: int, count: int, axes: NDArray[np.int8], lists: NDArray[np.bool_]
-) -> Iterator[Floats]:
+    text: Bytes, start: int, count: int, axes: NDArray[np.int8], lists: NDArray[np.bool_],
+    further: int = 0,
+) -> Iterator[Floats]:  # fmt: skip
     """Yield the coordinates of `count` rows of text in blocks (n, 3); see `parse_rows`.
 
-    Raise UnreadableCloud if a row is missing or malformed. The message states its number.
+    Raise UnreadableCloud if a row is missing or malformed, with its number, or if more than
+    `further` lines follow.
     """
     for first, n in steps(count):
         block = np.full((n, 3), np.nan)
@@ -122,6 +124,16 @@ def parse_blocks(
                 "Copy or write the file again."
             )
         yield block
+    check_end(text, _skip_lines(text, start, min(further, len(text)))[0])
+
+
+def check_end(data: Bytes, start: int) -> None:
+    """Raise UnreadableCloud if more than blanks and zeros follows after the declared rows."""
+    if any((data[place : place + BLOCK] > 32).any() for place in range(start, len(data), BLOCK)):
+        raise UnreadableCloud(
+            f"{len(data) - start} bytes follow after the rows that the header declares. Correct "
+            "the number of points, or write the file again."
+        )
 
 
 def skip_lines(text: Bytes, start: int, count: int) -> int:
