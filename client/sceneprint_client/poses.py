@@ -63,7 +63,8 @@ def slerp(q: Floats, other: Floats, w: Floats) -> Floats:
     a = np.where(small, 1.0 - w, np.sin((1.0 - w) * angle) / safe)
     b = np.where(small, w, np.sin(w * angle) / safe)
     mixed: Floats = a[:, None] * q + b[:, None] * other
-    mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore"):  # far beyond both ends
+        mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
     return mixed
 
 

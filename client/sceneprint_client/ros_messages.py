@@ -11,6 +11,7 @@ A message is any object with the attributes of its ROS type, from rclpy, rosbags
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -263,16 +264,21 @@ def topic_without_transport(topic: str) -> str:
     return base if last in ("compressedDepth", "compressed") else topic
 
 
+#: Names of lens models of fisheye cameras.
+_FISHEYE = re.compile("equi|kannala|fisheye|theta|fov|omni|unified|sphere|mei", re.IGNORECASE)
+
+
 def _distortion(info: Any) -> tuple[float, ...]:
     """Return the lens coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]; () if all are 0.
 
-    Raise InvalidIntrinsics for another lens model.
+    Raise InvalidIntrinsics for another lens model. Coefficients of 0 of a fisheye model do not
+    describe a pinhole camera.
     """
     distortion = getattr(info, "d", None)
     d = [float(value) for value in (info.D if distortion is None else distortion)]
-    if not any(d):
-        return ()
     model = str(info.distortion_model)
+    if not any(d) and not _FISHEYE.search(model):
+        return ()
     if model in ("plumb_bob", "rational_polynomial", "") and len(d) in (4, 5, 8, 12, 14):
         if not any(d[8:]):
             return tuple(d[:8] if any(d[5:]) else d[:5])

@@ -88,6 +88,8 @@ class TransformTree:
         self.passed_over: dict[tuple[str, str], tuple[str, int]] = {}
         #: Length of the last normalised quaternion, by (parent, child).
         self.normalised: dict[tuple[str, str], float] = {}
+        #: Longest step above `FASTEST` that `lookup` used, metres or radians, by (parent, child).
+        self.jumps: dict[tuple[str, str], float] = {}
 
     def add(
         self, parent: str, child: str, stamp_ns: int, sample: Sequence[float], *, fixed: bool
@@ -397,10 +399,13 @@ class TransformTree:
         times: Floats = (recorded[order] - origin).astype(np.float64) * 1e-9
         rows = rows[order]
         seconds = (np.asarray(stamps_ns, np.int64) - origin) * 1e-9
-        before = np.maximum(np.searchsorted(times, seconds, "right") - 1, 0)
-        after = np.minimum(np.searchsorted(times, seconds), len(times) - 1)
+        before, after = _neighbours(times, seconds)
         distance = np.minimum(np.abs(times[before] - seconds), np.abs(times[after] - seconds))
-        doubted = _contradict_around(*contradictions(times, rows), before, after)
+        too_fast, disputed = contradictions(times, rows)
+        doubted = _contradict_around(too_fast, disputed, before, after)
+        steps = np.flatnonzero(too_fast & ~disputed[:-1] & ~disputed[1:])
+        if len(steps):
+            self.jumps[parent, child] = float(motion(rows[steps], rows[steps + 1]).max())
 
         _, first = np.unique(times, return_index=True)
         trajectory = SensorTrajectory(times[first], rows[first, :3], rows[first, 3:])
@@ -450,6 +455,21 @@ def contradictions(
         if times[back + 1] - times[out] <= _BACK_S and rest < 0.5 * min(reach[out], reach[back]):
             disputed[out : back + 2] = True
     return too_fast, disputed
+
+
+def doubtful(trajectory: SensorTrajectory, stamps: Sequence[float]) -> NDArray[np.bool_]:
+    """Return whether the poses around each of M stamps, seconds, contradict each other."""
+    rows = np.hstack([trajectory.positions, trajectory.quaternions])
+    around = _neighbours(trajectory.stamps, np.asarray(stamps, np.float64))
+    return _contradict_around(*contradictions(trajectory.stamps, rows), *around)
+
+
+def _neighbours(
+    times: Floats, seconds: NDArray[np.floating]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the indices of the samples before and after each of M times."""
+    before = np.maximum(np.searchsorted(times, seconds, "right") - 1, 0)
+    return before, np.minimum(np.searchsorted(times, seconds), len(times) - 1)
 
 
 def motion(rows: Floats, others: Floats) -> Floats:

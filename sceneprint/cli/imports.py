@@ -21,6 +21,7 @@ from sceneprint.cli.output import print_error, waiting_reason
 from sceneprint.errors import Busy, DatasetError, InvalidRequest, SceneprintError, UnknownFrame
 from sceneprint.formats.archive import is_archive
 from sceneprint.formats.exports import is_export
+from sceneprint.formats.recording.bag import is_recording
 from sceneprint_client.api.base import checked
 from sceneprint_client.api.frames import (
     Axis,
@@ -126,7 +127,7 @@ _HEAD, _PAUSE_S = 512, 2.0
 def is_archive_file(path: Path) -> bool:
     """Return whether a path is an archive file, but not an export with frames."""
     try:
-        if not path.is_file() or is_export(path):
+        if not path.is_file() or is_export(path) or is_recording(path):
             return False
         with path.open("rb") as file:
             return is_archive(file.read(_HEAD))

@@ -314,7 +314,7 @@ _XZ_MEMORY = 192 << 20  #: bytes; `xz -9` needs less
 
 _MAGIC = (b"PK\x03\x04", b"\x1f\x8b", b"BZh", b"\xfd7zXZ\x00")
 _KINDS = "a zip, or a tar (plain, .gz, .bz2 or .xz)"
-_NO_TAR = f"The compressed file is not a tar. Send {_KINDS}."
+_NO_TAR = f"The compressed file is not a tar. Decompress a recording or frame; else send {_KINDS}."
 
 
 class _Stream(Protocol):

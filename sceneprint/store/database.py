@@ -41,9 +41,10 @@ if TYPE_CHECKING:
 
 
 _FOLDER = Path(migrations.__file__).parent
-#: Pattern of the lines of a migration that state its revision and its predecessor.
+#: Lines of a file in `migrations/versions` that state its revision and its predecessor.
 _REVISIONS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
-#: Connection option of a transaction that writes to single maps, concurrently with others.
+#: Connection option: whether the transaction writes to single maps, concurrently with other
+#: writers.
 MAPS_OPTION = "sceneprint_maps"
 #: Maximum number of concurrent writers of single maps in a process.
 MAP_WRITERS = 8

@@ -56,6 +56,27 @@ def test_tum_stamps_that_differ_by_rounding_or_a_millisecond(tmp_path):
     )
 
 
+def test_tum_poses_that_contradict_each_other_are_not_interpolated(tmp_path):
+    folder = tum(tmp_path / "desk")
+    rows = "9.49 0 0 0 0 0 0 1\n9.51 0.1 0 0 0 0 0 1\n10 0 0 0 0 0 0 1\n10.04 9 0 0 0 0 0 1\n"
+    (folder / "groundtruth.txt").write_text(rows)
+    (sequence,) = find_sequences(folder)
+    assert [None if f.pose is None else f.pose[0, 3] for f in sequence.frames] == [0.05, None, None]
+    assert sequence.unposed.endswith("or its poses contradict each other (50 m/s)")
+
+
+@pytest.mark.parametrize("file", ["poses.txt", "../traj.txt", "CameraTrajectory.csv"])
+def test_poses_in_a_file_that_is_not_read_are_lost(file, tmp_path):
+    folder = tmp_path / "kitchen/results"
+    folder.mkdir(parents=True)
+    write_depth_png(folder / "0.png", DEPTH, 1000.0)
+    write_intrinsics(folder, CAMERA)
+    (folder / file).write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    (sequence,) = find_sequences(folder)
+    assert sequence.lost == 1
+    assert sequence.unposed.endswith(f"; {file.rpartition('/')[2]} is not read")
+
+
 @pytest.mark.parametrize(
     ("image", "pose"),
     [

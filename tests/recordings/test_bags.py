@@ -253,6 +253,17 @@ def test_the_stamp_counts_and_not_the_time_of_recording(container, tmp_path, ros
         np.testing.assert_allclose(frame.pose, T @ ros.camera, atol=1e-9)
 
 
+def test_frames_without_a_stamp_get_the_time_of_recording_and_a_note(tmp_path, ros, depth):
+    def fill(writer):
+        writer.camera_info(0.0)
+        writer.late = ros.start
+        writer.image(-ros.start, depth(0))  # the stamp is 0
+
+    sequence = only(ros.write(tmp_path, fill))
+    assert [frame.timestamp for frame in sequence.frames] == [ros.start]
+    assert "1 frames have no time stamp, and get the time of recording" in sequence.note
+
+
 def test_a_map_comes_before_odometry_and_either_can_be_chosen(tmp_path, ros, walk, depth):
     T_map_odom = ros.transform(5, 6, 0, 0, 0, 1, 1)
 
@@ -333,7 +344,7 @@ def one_image(ros, folder, topic="/camera/depth/image_raw", **info):
         ((0.1, -0.2, 0.001, 0.002, 0.03), "plumb_bob", (0.1, -0.2, 0.001, 0.002, 0.03)),
         ((0.1, 0.2, 0, 0, 0.3, 0, 0, 0), "rational_polynomial", (0.1, 0.2, 0, 0, 0.3)),
         ((1, 2, 0, 0, 3, 4, 0, 5, 0, 0, 0, 0), "rational_polynomial", (1, 2, 0, 0, 3, 4, 0, 5)),
-        ((0, 0, 0, 0), "equidistant", ()),
+        ((0, 0, 0, 0), "none", ()),
     ],
 )
 def test_lenses(d, model, expected, tmp_path, ros):
@@ -347,6 +358,7 @@ def test_lenses(d, model, expected, tmp_path, ros):
     [
         ({"d": (0.1, *[0] * 10, 0.2), "model": "rational_polynomial"}, "thin prisms"),
         ({"d": (0.1, 0.2, 0.3, 0.4), "model": "equidistant"}, "'equidistant' with 4"),
+        ({"d": (0, 0, 0, 0), "model": "Kannala_Brandt4"}, "'Kannala_Brandt4' with 4"),
         ({"binning": 2}, "binning of 2"),
         ({"k": (70.0, 71.0, float("nan"), 29.5)}, "principal point"),
     ],
@@ -450,6 +462,8 @@ def test_several_topics_are_listed(tmp_path, ros, depth):
             only(path, RecordingOptions(**options))
     outline = bag_outline(path, RecordingOptions())
     assert [one.topic.name for one in outline.frames] == ["/camera/depth/image_raw", "/points"]
+    uses = {topic.name: outline.use_of(topic) for topic in outline.topics}
+    assert (uses["/imu"], uses["/camera/color/image_raw"]) == ("up", "no depth by its encoding")
     assert "--topic" in outline.problem
     assert outline.sequences == ()
 
@@ -479,3 +493,19 @@ def test_one_image_of_another_encoding_costs_no_other(tmp_path, ros, depth):
         second.read()
     assert first.read().depth.any()
     assert third.read().depth.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("run.bag.active", "was not closed. Run `rosbag reindex`"),
+        ("run.bag.orig.active", "was not closed. Run `rosbag reindex`"),
+        ("run.mcap.gz", "is compressed. Run `gunzip`"),
+        ("run.db3.zstd", "is compressed. Run `unzstd`"),
+    ],
+)  # fmt: skip
+def test_unfinished_and_compressed_recordings_are_refused_with_the_remedy(name, remedy, tmp_path):
+    (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
+    for path in (tmp_path, tmp_path / name):
+        with pytest.raises(DatasetError, match=remedy):
+            find_sequences(path)

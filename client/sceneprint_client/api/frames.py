@@ -90,7 +90,8 @@ class SampleRange(ApiRecord):
         return (
             f"{text}; a median of {self.median:.2g} m and a 5th percentile of {self.near:.2g} m "
             "are unusual for a depth camera: check that the images are depth, not infrared or "
-            "disparity, and specify the depth scale if the unit is not the millimetre"
+            "disparity, and specify the depth scale if the unit is not the millimetre; "
+            "floating-point samples must be metres"
         )
 
 

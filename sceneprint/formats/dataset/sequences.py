@@ -35,7 +35,7 @@ from sceneprint.formats.dataset.frame_reference import (
     Split,
     read_trajectory,
 )
-from sceneprint.formats.recording.bag import is_recording
+from sceneprint.formats.recording.bag import is_packed, is_recording
 from sceneprint.types import Floats, Floats32
 from sceneprint_client.files import data_lines, read_text
 from sceneprint_client.formats import format_named, is_cloud, titles_of
@@ -55,13 +55,17 @@ from sceneprint_client.sidecars import (
     find_camera,
     find_cloud_source,
 )
-from sceneprint_client.transforms import TOLERANCE_S
+from sceneprint_client.transforms import FASTEST, TOLERANCE_S, doubtful
 
 if TYPE_CHECKING:
     from sceneprint.formats.recording.selection import RecordingOptions
 
 _DEPTH_LIST, _TRAJECTORY = "depth.txt", "groundtruth.txt"
 _MAXIMUM_LIST_BYTES = 2**26
+#: Names of files with the poses of several frames, in formats that are not read.
+_OF_POSES = re.compile(
+    r"\w*(poses|traj|trajectory|odometry|groundtruth)\.(txt|csv|tum|log|json|npy)"
+)
 
 
 def list_folder(folder: Path) -> tuple[list[str], list[str]]:
@@ -200,6 +204,10 @@ def _tum(folder: Path, files: list[str], name: str) -> tuple[tuple[FrameReferenc
             f"{_TRAJECTORY} has no pose within {1000 * TOLERANCE_S:.0f} ms of their time stamps "
             f"(nearest: {_least_distance(trajectory, alone):.3g} s away)"
         )
+        doubts = doubtful(trajectory, stamps)
+        if any(doubts):
+            poses = [None if doubt else T for doubt, T in zip(doubts, poses, strict=True)]
+            unposed += f", or its poses contradict each other ({FASTEST:g} m/s)"
     return tuple(
         FrameReference(f"{name}/{Path(file).stem}", folder / file, camera, stamp, pose)
         for (stamp, file), pose in zip(listed, poses, strict=True)
@@ -465,6 +473,7 @@ def _walk(
             )
         files, folders = list_folder(folder)
         bags = [name for name in files if format_named(name, "recording")]
+        bags += [x for x in files if is_packed(Path(x)) and x.rpartition(".")[0] not in files]
         bags += [name for name in folders if is_recording(folder / name)]
         if bags:
             bags.sort(key=natural)
@@ -529,8 +538,10 @@ def _sequences_in(
         name = _name(path, root)
         frames, unposed = references(path, files, layout, name, camera)
         sequence = _make_sequence(path, layout, name, frames, unposed)
-        if _TRAJECTORY in files and all(frame.pose_source is None for frame in frames):
-            sequence = replace(sequence, lost=len(frames))  # the trajectory fits no frame
+        poses = _unread_poses(path, files)
+        if poses and all(frame.pose_source is None for frame in frames):
+            why = unposed if _TRAJECTORY in files else f"{unposed}; {poses} is not read"
+            sequence = replace(sequence, unposed=why, lost=len(frames))
         unread = _unread_folders(path) if layout in (Layout.PLAIN, Layout.CLOUDS) else {}
         if unread:
             names = ", ".join(list(unread)[:_MOST_NAMES])
@@ -540,6 +551,16 @@ def _sequences_in(
     if path.is_file():
         return exports.file_sequences(path, _name(path.with_suffix(""), root))
     return (exports.folder_sequence(path, layout, _name(path, root)),)
+
+
+def _unread_poses(folder: Path, files: list[str]) -> str:
+    """Return the name of a file beside frames, or above, that may contain their poses, or ""."""
+    if _TRAJECTORY in files:  # it fits no frame
+        return _TRAJECTORY
+    above: list[str] = []
+    with suppress(DatasetError):  # the folder is not readable
+        above = list_folder(folder.parent)[0]
+    return next((file for file in (*files, *above) if _OF_POSES.fullmatch(file.lower())), "")
 
 
 def _unread_folders(folder: Path) -> dict[str, int]:

@@ -56,11 +56,24 @@ _TRANSFORMS_FIELDS = "geometry_msgs/TransformStamped[] transforms"
 TYPES = (IMAGE, COMPRESSED, *CLOUDS, CAMERA, IMU, ODOMETRY, TRANSFORMS, OLD_TRANSFORMS)
 
 
+#: Commands that make unfinished and compressed recordings readable, by the last suffix.
+_REMEDIES = {
+    ".active": "rosbag reindex", ".gz": "gunzip", ".bz2": "bunzip2", ".xz": "unxz",
+    ".lz4": "unlz4", ".zst": "unzstd", ".zstd": "unzstd",
+}  # fmt: skip
+
+
+def is_packed(path: Path) -> bool:
+    """Return whether a file is an unfinished or compressed recording, such as run.bag.active."""
+    inner = path.name[: -len(path.suffix)].lower().removesuffix(".orig")
+    return path.suffix.lower() in _REMEDIES and format_named(inner, "recording") is not None
+
+
 def is_recording(path: Path) -> bool:
     """Return whether a path is a ROS recording: by its suffix, or as a folder with metadata."""
     if path.is_dir():
         return (path / _METADATA).is_file() and not (path / "intrinsics.json").is_file()
-    return format_named(path.name, "recording") is not None
+    return format_named(path.name, "recording") is not None or is_packed(path)
 
 
 @dataclass(frozen=True)
@@ -109,6 +122,13 @@ class Bag:
         self._lock = threading.RLock()
         if not path.exists():
             raise DatasetError(f"{path}: The file or folder does not exist. Check the path.")
+        if is_packed(path):
+            suffix = path.suffix.lower()
+            cause = "was not closed" if suffix == ".active" else "is compressed"
+            raise DatasetError(
+                f"{path}: The recording {cause}. Run `{_REMEDIES[suffix]}` on it, and remove "
+                f"{path.suffix} from its name."
+            )
         _types(ros1=is_bag)  # this limits rosbags before it opens the file
         with _dataset_errors(path):
             self._reader = _open_reader(path, ros1=is_bag)
@@ -202,20 +222,25 @@ class Bag:
             return self._types.deserialize_cdr(message.data, type_name)
 
     def stamp_ns(self, message: RawMessage) -> int:
-        """Return the measurement time of a message with a header, nanoseconds.
+        """Return the time in the header of a message, else the recording time, nanoseconds."""
+        stamp = self.header_ns(message)
+        return message.log_ns if stamp is None else stamp
 
-        If the header has no time, return the recording time. Only the header is decoded.
+    def header_ns(self, message: RawMessage) -> int | None:
+        """Return the measurement time of a message, nanoseconds; None if its header has no time.
+
+        Only the header is decoded.
         """
         head = message.data[:12]
         if len(head) < 12:
-            return message.log_ns
+            return None
         if self.is_ros1:
             seconds, nanoseconds = struct.unpack_from("<II", head, 4)
         else:
             order = "<" if head[1] & 1 else ">"
             seconds, nanoseconds = struct.unpack_from(f"{order}iI", head, 4)
         if seconds < 0 or not (seconds or nanoseconds) or nanoseconds >= 1_000_000_000:
-            return message.log_ns
+            return None
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 

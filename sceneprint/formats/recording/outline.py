@@ -5,6 +5,7 @@ path, RecordingOptions  --bag_outline-->  BagOutline, with `findings` as text
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,6 +23,17 @@ from sceneprint_client.api.frames import SampleRange, pooled_range
 from sceneprint_client.errors import printable
 from sceneprint_client.frame_files import meta_of
 
+#: Uses of topics without frames, by type.
+_USES = [
+    (re.compile(pattern), use)
+    for pattern, use in (
+        ("/TFMessage$|/tfMessage$|/Odometry$", "transforms"), ("/Imu$", "up"),
+        ("/Image$|/CompressedImage$", "no depth by its encoding"),
+        ("/Pose|/Path$|/TransformStamped$", "poses, not read: record /tf or odometry"),
+        ("Packet|/VelodyneScan$", "packets, not read: record the driver's PointCloud2"),
+        ("/LaserScan$|/MultiEchoLaserScan$", "a scan of one plane, not read"),
+    )
+]  # fmt: skip
 #: Number of frames that are read to determine the depth range of a recording.
 _SAMPLED = 9
 
@@ -74,7 +86,7 @@ class BagOutline:
             return "camera"
         frames = next((entry for entry in self.frames if entry.topic == topic), None)
         if frames is None:
-            return ""
+            return next((use for kind, use in _USES if kind.search(topic.type)), "")
         use = "not depth by its name" if frames.is_beside_depth else frames.encoding or "points"
         is_used = self.chosen is not None and topic == self.chosen.topic
         return f"{use}, used" if is_used else use

@@ -111,6 +111,7 @@ class BagScan:
     stamps_ns : measurement time of each frame, nanoseconds, in recording order
     places : recording time of each frame, nanoseconds, and its index among messages with that time
     damaged : number of messages that were skipped because they do not decode
+    stampless : indices of the frames without a measurement time
     fixed : values of each static transform, by parent and child; the last value counts
     """
 
@@ -119,6 +120,7 @@ class BagScan:
     stamps_ns: list[int] = field(default_factory=list)
     places: list[tuple[int, int]] = field(default_factory=list)
     damaged: int = 0
+    stampless: set[int] = field(default_factory=set)
     fixed: dict[tuple[str, str], list[list[float]]] = field(default_factory=dict)
 
     @property
@@ -255,7 +257,9 @@ class _Scanner:
 
     def _count_frame(self, message: RawMessage) -> None:
         scan = self._scan
-        stamp = self._bag.stamp_ns(message)
+        header = self._bag.header_ns(message)
+        stamp = message.log_ns if header is None else header
+        scan.stampless.update([] if header is not None else [len(scan.places)])
         self._part_at(message.topic, stamp)
         same = bool(scan.places) and scan.places[-1][0] == message.log_ns
         scan.places.append((message.log_ns, scan.places[-1][1] + 1 if same else 0))

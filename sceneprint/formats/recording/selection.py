@@ -347,6 +347,11 @@ def _compute_motion(
                 f"{parent} -> {child} is normalised: its quaternion has the length {length:.3g}"
             )
     motion.remarks += [
+        f"{stampless} frames have no time stamp, and get the time of recording"
+        for stampless in [sum(place in scan.stampless for place in places)]
+        if stampless
+    ]
+    motion.remarks += [
         f"{topic} is ignored because its child_frame_id is empty"
         for topic, samples in part.odometry.items()
         if not samples
@@ -364,6 +369,10 @@ def _compute_motion(
                 motion.unknown[place] = end
             else:
                 motion.poses[place] = pose
+    motion.remarks += [
+        f"{parent} -> {child} jumps by {step:.2g} m or rad, so poses before and after may not agree"
+        for (parent, child), step in sorted(tree.jumps.items())
+    ]
     if sensor != frame:
         within = tree.poses(frame, sensor, stamps)
         motion.cloud_poses = {
@@ -504,7 +513,7 @@ def _describe_selection(frames: FrameTopic, scan: BagScan, motions: list[_Motion
         f"of {total} frames{' in ' if worlds else ''}{', '.join(worlds)}"
     )
     if poses < total:
-        text += f"; {total - poses} without: {_describe_unknown(frames, motions)}"
+        text += f"; {total - poses} without: {_describe_unknown(frames, scan, motions)}"
     without = _count_without_pose(scan, motions)
     skipped = [
         f"{count} {reason}"
@@ -543,7 +552,7 @@ def _count_without_pose(scan: BagScan, motions: list[_Motion]) -> int:
     return len(scan.stamps_ns) - poses if is_left_out else 0
 
 
-def _describe_unknown(frames: FrameTopic, motions: list[_Motion]) -> str:
+def _describe_unknown(frames: FrameTopic, scan: BagScan, motions: list[_Motion]) -> str:
     whys = [why for motion in motions for why in motion.unknown.values()]
     reasons = []
     for (transform, disputed), count in Counter(
@@ -564,5 +573,14 @@ def _describe_unknown(frames: FrameTopic, motions: list[_Motion]) -> str:
     if not reasons:
         if not frames.frame:
             return "their messages do not name a coordinate frame (frame_id)"
-        return f"there are no transforms from {frames.frame} to a frame in which it moves"
+        reason = f"there are no transforms from {frames.frame} to a frame in which it moves"
+        if any(motion.is_broken for motion in motions):
+            return reason
+        trees = [part.tree for part in scan.parts]
+        moving = sorted({name for tree in trees for name in tree.frames() if tree.world_of(name)})
+        return (
+            f"{reason} (moving frames: {', '.join(moving[:5])}; is /tf_static recorded?)"
+            if moving
+            else f"{reason} (record /tf and /tf_static, or odometry)"
+        )
     return ", ".join(reasons)

@@ -235,7 +235,8 @@ def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
         raise DatasetError(
             f"{bag.path}: There is no topic of depth images ({_SUPPORTED}; not {OMITTED_IMAGES}) "
             f"or of points (PointCloud2, CustomMsg). Images are {_list_encodings(bag)}. "
-            "Select one with --topic. `sceneprint bag` lists all topics."
+            "Select one with --topic, or record depth or points; packets of a scanner and planar "
+            "scans are not read. `sceneprint bag` lists all topics."
         )
     if len(candidates) > 1:
         raise DatasetError(

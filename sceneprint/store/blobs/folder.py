@@ -44,7 +44,7 @@ class Locks(ABC):
 
     @abstractmethod
     def block_removals(self) -> AbstractContextManager[None]:
-        """Hold a shared lock that prevents removals; other processes may hold it too."""
+        """Hold the lock, which other processes that need all blobs may hold too."""
 
     @abstractmethod
     def removing(self) -> AbstractContextManager[bool]:
@@ -94,7 +94,7 @@ class FileLocks(Locks):
 
     @contextmanager
     def block_removals(self) -> Iterator[None]:
-        """Hold a lock that prevents removals. Raise UnusableStore if it cannot be acquired."""
+        """See `Locks`. Raise UnusableStore if the lock cannot be acquired."""
         try:
             descriptor = self._lock(fcntl.LOCK_SH)
         except OSError as error:
@@ -110,7 +110,7 @@ class FileLocks(Locks):
 
     @contextmanager
     def removing(self) -> Iterator[bool]:
-        """Acquire the exclusive lock without waiting; yield whether this succeeded."""
+        """See `Locks`."""
         try:
             descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:  # in use or not supported; blobs that remain are harmless
@@ -122,7 +122,7 @@ class FileLocks(Locks):
             os.close(descriptor)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
-        """Wait for a removal whose turn the database server ended early; see `Locks.wait`."""
+        """See `Locks`. A removal outlasts its turn if the database server ended the turn early."""
         until = time.monotonic() + seconds
         while True:
             try:
@@ -429,7 +429,7 @@ class FolderBlobs(Blobs):
         return self._folder.is_dir() and not os.access(self._folder, os.W_OK)
 
     def put(self, data: bytes) -> str:
-        """Store bytes durably, and return their digest; see `Blobs.put`."""
+        """See `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
         path = self.path(digest)
         try:  # replace an existing file too: it may be damaged, not durable, or about to be removed
@@ -442,7 +442,7 @@ class FolderBlobs(Blobs):
 
     @contextmanager
     def incoming(self) -> Iterator[IncomingBlob]:
-        """Yield a blob to write in chunks; see `Blobs.incoming`."""
+        """See `Blobs.incoming`."""
         part = self._folder / f".{secrets.token_hex(6)}.part"
         what = f"{self._folder}: A blob cannot be written"
         try:
@@ -474,7 +474,7 @@ class FolderBlobs(Blobs):
         return True
 
     def get(self, digest: str) -> bytes:
-        """Return the verified bytes of a blob; see `Blobs.get`."""
+        """See `Blobs.get`."""
         try:
             data = self.path(digest).read_bytes()
         except OSError as error:
@@ -490,23 +490,23 @@ class FolderBlobs(Blobs):
         return data
 
     def holds(self, digest: str) -> bool:
-        """Return whether a blob exists; see `Blobs.holds`."""
+        """See `Blobs.holds`."""
         self._locks.wait(digest, TURN_S)
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:
-        """Return the size of a blob in bytes, unverified; None if it is missing."""
+        """See `Blobs.size`."""
         try:
             return self.path(digest).stat().st_size
         except OSError:
             return None
 
     def open(self, digest: str) -> BinaryIO:
-        """Return an unverified blob as a seekable file; see `Blobs.open`."""
+        """See `Blobs.open`."""
         return self.path(digest).open("rb")
 
     def remove(self, *digests: str) -> None:
-        """Remove blobs without references; see `Blobs.remove`."""
+        """See `Blobs.remove`."""
         for digest in digests:
             self.path(digest).unlink(missing_ok=True)
         for folder in {self.path(digest).parent for digest in digests}:
@@ -514,7 +514,7 @@ class FolderBlobs(Blobs):
                 sync_folder(folder)  # otherwise, a power failure could restore deleted frames
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """Check a blob, and return its condition; see `Blobs.condition`."""
+        """See `Blobs.condition`."""
         if not DIGEST.fullmatch(digest):
             return "missing"
         try:
@@ -533,7 +533,7 @@ class FolderBlobs(Blobs):
         return "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """Move a damaged blob to a folder, and return its path; see `Blobs.quarantine`."""
+        """See `Blobs.quarantine`."""
         path, place = self.path(digest), folder / f"blob-{digest}"
         make_folder(folder)
         try:
@@ -550,11 +550,11 @@ class FolderBlobs(Blobs):
         return place
 
     def place(self, digest: str) -> str:
-        """Return the path or URL of a blob for messages."""
+        """See `Blobs.place`."""
         return str(self._folder / digest[:2] / digest)
 
     def digests(self) -> Iterator[str]:
-        """Yield the digests of all blobs in arbitrary order."""
+        """See `Blobs.digests`."""
         for folder in self._folder.iterdir():
             if folder.is_dir():
                 for name in os.listdir(folder):  # noqa: PTH208  (Path objects would take time)
@@ -562,7 +562,7 @@ class FolderBlobs(Blobs):
                         yield name
 
     def entries(self) -> Iterator[BlobEntry]:
-        """Yield all files in arbitrary order, except files removed meanwhile."""
+        """See `Blobs.entries`. Files that are removed meanwhile are skipped."""
         folders = [self._folder]
         while folders:
             with os.scandir(folders.pop()) as entries:

@@ -167,7 +167,7 @@ class ObjectBlobs(Blobs):
             self._claimed = BucketOwner(self.objects).claim(self._owner(), anew=anew)
 
     def put(self, data: bytes) -> str:
-        """Store bytes durably, and return their digest; see `Blobs.put`."""
+        """See `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
         with self._putting(digest):
             self.objects.put(_key(digest), data)
@@ -175,7 +175,7 @@ class ObjectBlobs(Blobs):
 
     @contextmanager
     def incoming(self) -> Iterator[IncomingBlob]:
-        """Yield a blob to write in chunks; see `Blobs.incoming`.
+        """See `Blobs.incoming`.
 
         The blob is a nameless temporary file until its digest is known, because stores cannot
         rename objects larger than 5 GB.
@@ -208,7 +208,7 @@ class ObjectBlobs(Blobs):
                 self._put.popitem(last=False)
 
     def get(self, digest: str) -> bytes:
-        """Return the verified bytes of a blob; see `Blobs.get`."""
+        """See `Blobs.get`."""
         require_digest(digest)
         try:
             data = self.objects.get(_key(digest))
@@ -225,12 +225,12 @@ class ObjectBlobs(Blobs):
         return data
 
     def open(self, digest: str) -> BinaryIO:
-        """Return an unverified blob as a seekable file; see `Blobs.open`."""
+        """See `Blobs.open`."""
         require_digest(digest)
         return self.objects.open(_key(digest))
 
     def holds(self, digest: str) -> bool:
-        """Return whether a blob exists; see `Blobs.holds`.
+        """See `Blobs.holds`.
 
         If this process stored the blob, and no blob has been removed since, this does not contact
         the object store, because other writers are waiting.
@@ -238,7 +238,7 @@ class ObjectBlobs(Blobs):
         return self._holds(digest, TURN_S)
 
     def ensure(self, digest: str, data: bytes) -> None:
-        """Store a blob again if it was removed; see `Blobs.ensure`."""
+        """See `Blobs.ensure`."""
         if not self._holds(digest, REMOVAL_S):
             self.put(data)
 
@@ -254,12 +254,12 @@ class ObjectBlobs(Blobs):
         return self.objects.size(_key(digest)) is not None
 
     def size(self, digest: str) -> int | None:
-        """Return the size of a blob in bytes, unverified; None if it is missing."""
+        """See `Blobs.size`."""
         require_digest(digest)
         return self.objects.size(_key(digest))
 
     def remove(self, *digests: str) -> None:
-        """Remove blobs without references; see `Blobs.remove`."""
+        """See `Blobs.remove`."""
         for digest in digests:
             require_digest(digest)
         self.claim()
@@ -273,7 +273,7 @@ class ObjectBlobs(Blobs):
             raise
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """Check a blob, and return its condition; see `Blobs.condition`."""
+        """See `Blobs.condition`."""
         if not DIGEST.fullmatch(digest):
             return "missing"
         size, hashed = self.objects.size(_key(digest)), hashlib.sha256()
@@ -308,11 +308,11 @@ class ObjectBlobs(Blobs):
         return place
 
     def place(self, digest: str) -> str:
-        """Return the path or URL of a blob for messages."""
+        """See `Blobs.place`."""
         return f"{self.objects.url}/{_key(digest)}"
 
     def digests(self) -> Iterator[str]:
-        """Yield the digests of all blobs in arbitrary order."""
+        """See `Blobs.digests`."""
         return (entry.digest for entry in self.entries() if entry.digest is not None)
 
     def entries(self) -> Iterator[BlobEntry]:
@@ -328,7 +328,7 @@ class ObjectBlobs(Blobs):
             yield BlobEntry(place, name if own else None, entry.changed_at)
 
     def check(self) -> None:
-        """Raise UnusableStore if the store is unreachable; see `Blobs.check`."""
+        """See `Blobs.check`."""
         if self._checking.acquire(blocking=False):
             try:
                 if time.monotonic() - self._answered > CHECK_S:
