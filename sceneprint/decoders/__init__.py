@@ -59,19 +59,19 @@ class LocalDecoders:
 
     @contextmanager
     def place(self) -> Iterator[Decoder]:
-        """See Decoders."""
+        """Wait until fewer than `count` uploads are in progress; yield this decoder."""
         with self._places:
             yield self
 
     def samples(self, data: bytes) -> Samples:
-        """See Decoder."""
+        """Return the samples of a depth image; see `decode_samples`."""
         return decode_samples(data)
 
     def points(
         self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
         units_per_metre: float,
     ) -> ReadPoints:  # fmt: skip
-        """See Decoder."""
+        """Return the points of a cloud; see `read_points`."""
         return read_points(data, file_format, viewpoint, units_per_metre)
 
     def start(self) -> None:

@@ -293,7 +293,7 @@ class _Slot:
         self.process: DecoderProcess | None = None
 
     def samples(self, data: bytes) -> Samples:
-        """See Decoder."""
+        """Return the samples of a depth image; see `decode_samples`."""
         if len(data) > MAXIMUM_IMAGE_BYTES:  # `decode_samples` rejects it without decoding
             return decode_samples(data)
 
@@ -310,7 +310,7 @@ class _Slot:
         self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
         units_per_metre: float,
     ) -> ReadPoints:  # fmt: skip
-        """See Decoder."""
+        """Return the points of a cloud; see `read_points`."""
         position = viewpoint.value if isinstance(viewpoint, Unsaid) else viewpoint
         request = {
             "task": "points", "format": file_format, "viewpoint": position,
@@ -420,7 +420,7 @@ class DecoderPool:
 
     @contextmanager
     def place(self) -> Iterator[_Slot]:
-        """See Decoders. Raise Busy if no decoder becomes free in time."""
+        """Reserve a free decoder; raise Busy if none becomes free in time."""
         tenant = self._whose()
         if not self._turns.acquire(tenant, _WAIT_S):
             raise errors.Busy(

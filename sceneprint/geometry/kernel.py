@@ -94,7 +94,7 @@ class Kernel:
 
     @property
     def stamp(self) -> str:
-        """Return the stamp of valid code on disk; "" if numba does not compile."""
+        """Return the stamp that valid code on disk carries; "" if compilation is disabled."""
         _ = self.compiler
         return self._stamp
 
@@ -283,7 +283,7 @@ class Cores:
 
     @contextmanager
     def shared(self) -> Iterator[None]:
-        """Occupy a core during the `with` block, in which `run_both` may use another free core."""
+        """Occupy a core during the `with` block; there, `run_both` may use a second, free core."""
         with self._lock:
             self._busy += 1
         token = _cores.set(self)

@@ -1,4 +1,4 @@
-"""The cache of the kernels' machine code, in numba's folders or in those of a wheel or image.
+"""Cache of the kernels' machine code, in numba's folder or shipped in a wheel or image.
 
 numba stores code under the name of the processor on which it was compiled. Code that is shipped
 with an installation is compiled for `TARGET`, and lies in numba's folder or beside the sources. The
@@ -37,7 +37,7 @@ class DisjointCompiler(Compiler):
 def _prefetch_row(_context: Any, table: Any, row: Any) -> Any:
     """Prefetch the first 128 bytes (two cache lines) of a row of a C-contiguous table.
 
-    The arguments are numba types. The result is the signature, and the code generator of a call.
+    Take numba types; return the signature of a call and its code generator.
     """
     signature = types.void(table, row)
 

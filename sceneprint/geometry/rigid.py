@@ -96,7 +96,7 @@ def are_near(transforms: Floats, T: Floats, metres: float, radians: float) -> ND
 
 @kernel
 def _is_near(T: Floats, U: Floats, metres: float, cosine: float) -> bool:
-    """Return whether two transforms differ by at most `metres` and an angle with this cosine."""
+    """Return whether two transforms are within `metres` and within the angle with this cosine."""
     square, trace = 0.0, 0.0
     for a in range(3):
         square += (T[a, 3] - U[a, 3]) ** 2
@@ -246,7 +246,7 @@ def apply_rotation(R: Floats, omega: Floats, result: Floats) -> None:
 
 @kernel
 def solve_positive(A: Floats, b: Floats, x: Floats) -> bool:
-    """Solve A x = b by Cholesky decomposition; return whether A is positive definite.
+    """Solve A x = b into `x` by Cholesky decomposition; return False if A is not positive definite.
 
     The symmetric matrix A (n, n) is overwritten.
     """

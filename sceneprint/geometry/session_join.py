@@ -397,7 +397,7 @@ class JoiningParameters:
     least_frames: int = 2  #: minimum number of frames of the agreeing votes, in each run
     view_m: float = 0.1  #: maximum distance between two frames of a viewpoint, metres
     view_rad: float = math.radians(6.0)  #: maximum angle between two frames of a viewpoint, radians
-    rival: float = 0.5  #: minimum share of the support with which another transform prevents a join
+    rival: float = 0.5  #: share of the support at which another transform prevents a join
     strong_votes: int = 10  #: minimum number of agreeing votes of a strong join
     strong_frames: int = 5  #: minimum number of their frames in each run
     strong_share: float = 0.5  #: minimum share of agreeing votes among all votes
@@ -538,7 +538,7 @@ def _best_vote(
     votes: Votes, weights: Floats, chosen: NDArray[np.intp], among: NDArray[np.bool_],
     p: JoiningParameters,
 ) -> int:  # fmt: skip
-    """Return the vote of `chosen` with which votes of the greatest weight agree; ties by order."""
+    """Return the vote of `chosen` whose agreeing votes have the largest weight; ties by order."""
     support = [
         float(weights[_agreement_mask(votes, votes.transforms[i], p) & among].sum()) for i in chosen
     ]

@@ -57,19 +57,19 @@ class AnswerObjects:
         self._objects = objects
 
     def put(self, query_id: str, data: bytes) -> None:
-        """See `AnswerFolder.put`."""
+        """Store the bytes of an answer."""
         self._objects.put(f"queries/{query_id}", data)
 
     def get(self, query_id: str) -> bytes:
-        """See `AnswerFolder.get`."""
+        """Return the bytes of an answer; raise FileNotFoundError if it is missing."""
         return self._objects.get(f"queries/{query_id}")
 
     def delete(self, query_ids: Sequence[str]) -> None:
-        """See `AnswerFolder.delete`."""
+        """Remove answers, and ignore missing answers."""
         self._objects.delete(*(f"queries/{query_id}" for query_id in query_ids))
 
     def list(self) -> Iterator[tuple[str, float]]:
-        """See `AnswerFolder.list`."""
+        """Yield the name and modification time (seconds since 1970) of every answer."""
         for entry in self._objects.list("queries/"):
             yield entry.key.removeprefix("queries/"), entry.changed_at
 

@@ -130,7 +130,7 @@ def list_lines(
 def surplus_lines(
     connection: Connection, before: float, limit: int, most_lines: int = MAXIMUM_LINES
 ) -> list[int]:
-    """Return the row numbers of lines to remove: expired lines or, without any, surplus lines.
+    """Return the row numbers of lines to remove: the expired lines or, failing that, surplus lines.
 
     Parameters
     ----------

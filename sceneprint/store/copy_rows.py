@@ -98,7 +98,7 @@ def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame
     Parameters
     ----------
     connection : writing transaction
-    copies : frames whose ids the map does not have, or has only for deleted frames
+    copies : frames whose ids are unused in the map, or used only by deleted frames
     """
     deleted = select(frames.c.id).where(
         frames.c.map_number == row.number, frames.c.id.in_([copy.id for copy in copies])

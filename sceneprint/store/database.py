@@ -41,10 +41,9 @@ if TYPE_CHECKING:
 
 
 _FOLDER = Path(migrations.__file__).parent
-#: Lines of a file in `migrations/versions` that state its revision and its predecessor.
+#: Pattern of the lines of a migration that state its revision and its predecessor.
 _REVISIONS = re.compile(r'^(revision|down_revision) = (?:"(\w+)"|None)$', re.MULTILINE)
-#: Connection option: whether the transaction writes to single maps, concurrently with other
-#: writers.
+#: Connection option of a transaction that writes to single maps, concurrently with others.
 MAPS_OPTION = "sceneprint_maps"
 #: Maximum number of concurrent writers of single maps in a process.
 MAP_WRITERS = 8

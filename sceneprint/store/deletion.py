@@ -165,7 +165,7 @@ def oldest_tombstones(connection: Connection, map_number: int) -> list[tuple[int
 
 
 def make_room(connection: Connection, row: MapRow, size: int, *, new: bool = True) -> list[str]:
-    """Check the quota of a map; if tombstones exceed it, purge the oldest ones.
+    """Check the quota of a map; if its tombstones exceed it, purge the oldest of them.
 
     Parameters
     ----------
@@ -380,7 +380,7 @@ def maps_with_ended(connection: Connection, before: float) -> list[MapRow]:
 
 
 def remove_ended(connection: Connection, map_number: int, before: float, limit: int) -> int:
-    """Remove rows and jobs of frames deleted or redundant before a time; raise `pruned_revision`.
+    """Remove rows and jobs of frames deleted or redundant before a time; update `pruned_revision`.
 
     The rows of restorable frames, of frames in a surface, and of frames with an unfinished job
     remain.
@@ -431,7 +431,7 @@ def _ended(
 
 
 def _unreferred() -> list[ColumnElement[bool]]:
-    """Return the conditions for rows of frames that are no longer needed."""
+    """Return the SQL conditions for rows of frames that are no longer needed."""
     unfinished = select(jobs.c.number).where(
         jobs.c.frame_number == frames.c.number,
         jobs.c.state.in_((JobState.QUEUED, JobState.RUNNING)),

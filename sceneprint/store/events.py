@@ -218,7 +218,7 @@ def newest_number(connection: Connection) -> int:
 
 
 def newest_selected(connection: Connection, criteria: EventFilter) -> int:
-    """Return the number of the newest event of the selected maps, of any kind, or 0.
+    """Return the number of the newest event, of any kind, of the selected maps; 0 without events.
 
     It serves as a position in the list, because it does not reveal hidden events.
     """
@@ -279,7 +279,7 @@ def _beginnings(connection: Connection, criteria: EventFilter) -> dict[str, int]
 
 
 def _of_maps(names: Collection[str], beginnings: Mapping[str, int]) -> ColumnElement[bool]:
-    """Return the condition for events of some maps, after their `_beginnings`."""
+    """Return the SQL condition for events of some maps, after their `_beginnings`."""
     whole = events.c.map.in_(sorted(set(names) - beginnings.keys()))
     if len(beginnings) > _MOST_BEGINNINGS:
         last = max(beginnings.values())
@@ -404,7 +404,7 @@ def _names(connection: Connection) -> list[str]:
 
 
 def _of(name: str | None) -> ColumnElement[bool]:
-    """Return the condition for events of a map; None selects the events of no existing map."""
+    """Return the SQL condition for events of a map; None selects events without an existing map."""
     if name is not None:
         return events.c.map == name
     return or_(events.c.map.is_(None), events.c.map.not_in(select(maps.c.name)))

@@ -63,7 +63,7 @@ class CapturePosition:
 
 
 def _after_capture(last: CapturePosition) -> ColumnElement[bool]:
-    """Return the condition for frames after a position in `CAPTURE_ORDER`."""
+    """Return the SQL condition for frames after a position in `CAPTURE_ORDER`."""
     after: ColumnElement[bool] = frames.c.number > last.number
     for column, value in (
         (frames.c.sequence, last.sequence),
@@ -130,7 +130,7 @@ def _common_conditions(
 def _conditions(
     map_number: int, criteria: Filter, origin: QueryOrigin
 ) -> list[ColumnElement[bool]]:
-    """Return the conditions of a filter."""
+    """Return the SQL conditions of a filter."""
     conditions = _common_conditions(criteria, criteria.tags)
     if criteria.not_within_s is not None:
         conditions.append(_elsewhere(origin, criteria.not_within_s))
@@ -238,7 +238,7 @@ def _is_narrow(criteria: FrameListing) -> bool:
 
 
 def _listing_conditions(map_number: int, criteria: FrameListing) -> list[ColumnElement[bool]]:
-    """Return the conditions on the frames of a list."""
+    """Return the SQL conditions on the frames of a list."""
     c, conditions = frames.c, _common_conditions(criteria, criteria.tag)
     if criteria.received_after is not None:
         conditions.append(c.received_at >= criteria.received_after.timestamp())
@@ -260,20 +260,20 @@ def _listing_conditions(map_number: int, criteria: FrameListing) -> list[ColumnE
 
 
 def _begins_any(map_number: int, prefix: str) -> ColumnElement[bool]:
-    """Return the condition for frames whose id, name or session starts with a prefix."""
+    """Return the SQL condition for frames whose id, name or session starts with a prefix."""
     own = frames.c.map_number == map_number
     ways = [
         select(frames.c.number).where(own, *_begins(column, prefix)).correlate(None)
         for column in (frames.c.id, frames.c.name)
     ]
-    # include the state, with which the index of sessions starts
+    # include the state, the first column of the index of sessions
     living = frames.c.state.in_(_LIVING)
     ways.append(select(frames.c.number).where(own, living, *_begins(frames.c.session, prefix)))
     return frames.c.number.in_(union(*ways))
 
 
 def _begins(column: Column[Any], prefix: str) -> list[ColumnElement[bool]]:
-    """Return conditions for texts that start with a prefix, as a range that indexes support."""
+    """Return SQL conditions for texts that start with a prefix, as a range that indexes support."""
     head = prefix.rstrip(_LAST)
     if not head:
         return [column >= prefix]
@@ -434,7 +434,7 @@ def poses_of_run(
 
 
 def _posed(map_number: int, run: Run) -> list[ColumnElement[bool]]:
-    """Return the conditions for frames of a run with a pose in the parent frame of the run."""
+    """Return the SQL conditions for frames of a run with a pose in the parent frame of the run."""
     return [
         *_of_session(map_number, run),
         frames.c.pose_parent == run.parent_frame,

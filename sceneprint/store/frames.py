@@ -36,7 +36,7 @@ from sceneprint_client.api import FrameState
 
 
 def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
-    """Return a failed frame to the state `received`, with new values such as its upload."""
+    """Reset a failed frame to `received`, with new values such as its upload; return its row."""
     _update_usage(connection, number, FrameState.RECEIVED, values["bytes"])
     connection.execute(
         update(frames)
@@ -92,7 +92,7 @@ def delete_frame(
 
 
 def not_purged() -> ColumnElement[bool]:
-    """Return the condition for frames that exist or that can be restored."""
+    """Return the SQL condition for frames that exist or that can be restored."""
     return or_(frames.c.state != FrameState.DELETED, frames.c.deletion.is_not(None))
 
 
@@ -173,7 +173,7 @@ def relax_novelty(connection: Connection, number: int, novelty: float | None) ->
 def write_frame(
     connection: Connection, row: MapRow, frame: FrameRow, values: Mapping[str, Any]
 ) -> FrameRow:
-    """Change metadata of a frame, and its tags; record an event, and the edit of its surface.
+    """Change metadata and tags of a frame; record an event and the edit; return the new row.
 
     If no value differs, nothing is written.
 
@@ -203,7 +203,7 @@ _LIMITS = ("quota_frames", "quota_bytes", "retention_days")
 
 
 def write_map(connection: Connection, row: MapRow, values: Mapping[str, Any]) -> MapRow:
-    """Change title, quotas, retention or up of a map, and record an event; ignore equal values."""
+    """Change values of a map, and record an event, unless all are equal; return the new row."""
     changed = {name: new for name, new in values.items() if getattr(row, name) != new}
     if not changed:
         return row

@@ -194,7 +194,7 @@ def _count_frame() -> ReturningUpdate[tuple[int]]:
 
 
 def _room_conditions(n: Any, size: Any) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
-    """Return the conditions for maps with room for `n` more frames and `size` more bytes."""
+    """Return the SQL conditions for maps with room for `n` more frames and `size` more bytes."""
     return (
         or_(maps.c.quota_frames.is_(None), maps.c.used_frames + n <= maps.c.quota_frames),
         or_(maps.c.quota_bytes.is_(None), maps.c.used_bytes + size <= maps.c.quota_bytes),
@@ -347,7 +347,7 @@ def _insert_rows(
     of: str, tables: _Tables, fixed: dict[str, Any], lacking: CTE, source: FromClause,
     *conditions: ColumnElement[bool], **more: ColumnElement[Any],
 ) -> Insert:  # fmt: skip
-    """Return the INSERT of one row into a table for each frame of a source, in record order."""
+    """Return a statement that inserts a row for each frame of `source`, in record order."""
     table, names = tables[of]
 
     def value(name: str) -> ColumnElement[Any]:

@@ -52,7 +52,7 @@ def find_joins(connection: Connection, map_number: int) -> dict[str, ParentJoin]
     steps = {row.parent: (row.towards, np.array(row.transform)) for row in rows}
     joins = {}
     for parent, (root, T) in steps.items():
-        while root in steps:  # ends, because joins have no cycles
+        while root in steps:  # terminates, because joins have no cycles
             root, onwards = steps[root]
             T = onwards @ T
         joins[parent] = ParentJoin(parent, root, T)
@@ -91,9 +91,9 @@ def posed_runs(connection: Connection, map_number: int) -> list[ParentRun]:
 def count_poses(
     connection: Connection, map_number: int | None = None
 ) -> dict[int, tuple[int, int]]:
-    """Return the number of indexed frames with a pose and of their parent frames by map number.
+    """Count the indexed frames with a pose, and their parent frames, by map number.
 
-    The result contains the maps that have such frames; `map_number` selects one.
+    Maps without such frames are omitted; `map_number` selects one map.
     """
     c = frames.c
     statement = select(c.map_number, func.count(c.pose_x), func.count(c.pose_parent.distinct()))
@@ -138,7 +138,7 @@ def join_parent(connection: Connection, map_number: int, join: ParentJoin, job_i
         return False
     c = parent_joins.c
     ends = c.map_number == map_number, c.parent == join.parent, c.towards == join.root
-    connection.execute(delete(parent_joins).where(*ends))  # an undone join
+    connection.execute(delete(parent_joins).where(*ends))  # a join that was undone earlier
     connection.execute(
         insert(parent_joins).values(
             map_number=map_number, parent=join.parent, towards=join.root, transform=join.T.tolist(),

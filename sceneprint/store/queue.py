@@ -24,8 +24,8 @@ not delay uploads. Locks of the row of the job order them:
 - a renewal, and any of these: the UPDATE of the row with its token waits for the other transaction,
   and then changes the row or matches none.
 
-Claims and writers with a turn lock the job before its frame, which rules out deadlocks. Times are
-those of the database (`now`), since the clocks of hosts may differ by hours.
+Claims and writers with a turn lock the job before its frame, which rules out deadlocks. Times come
+from the clock of the database (`now`), since those of hosts may differ by hours.
 """
 
 from __future__ import annotations
@@ -369,7 +369,7 @@ def _latest(*turns: int | None) -> int:
 
 
 def _is_upkeep(tenant: str, priority: int) -> bool:
-    """Return whether a job is upkeep, which has precedence over no other job."""
+    """Return whether a job is upkeep, which yields to all other jobs."""
     return tenant == NOBODY and priority <= UPKEEP
 
 
@@ -437,7 +437,7 @@ def has_waiting_before(connection: Connection, held: JobRow) -> bool:
 
 
 def _waiting(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions for queued jobs that are due."""
+    """Return the SQL conditions for queued jobs that are due."""
     # "+ 0.0" makes SQLite use the sorted index instead of sorting all due jobs
     due_at = jobs.c.run_after + 0.0
     return jobs.c.state == JobState.QUEUED, or_(due_at <= at, due_at > at + LONGEST_PAUSE_S)
@@ -557,7 +557,7 @@ def _hold(connection: Connection, held: JobRow, **values: object) -> None:
 
 
 def _own(held: JobRow) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions under which a worker still holds a job."""
+    """Return the SQL conditions under which a worker still holds a job."""
     return (
         jobs.c.number == held.number,
         jobs.c.token == held.token,
@@ -633,7 +633,7 @@ def fail_dead_worker(
 
 
 def _out_of_tries(at: ColumnElement[float]) -> tuple[ColumnElement[bool], ...]:
-    """Return the conditions for jobs whose worker stopped responding in the last attempt."""
+    """Return the SQL conditions for jobs whose worker stopped responding in the last attempt."""
     return (
         jobs.c.state == JobState.RUNNING,
         _lease_over(at),

@@ -282,7 +282,7 @@ def _deletion_conditions(map_number: int, revision: int) -> tuple[ColumnElement[
 
 
 def stored_vector(connection: Connection, number: int, model_id: str) -> bytes | None:
-    """Return the signature of a frame or None. Raise DamagedSignature if it is damaged."""
+    """Return the signature of a frame, None if missing. Raise DamagedSignature if it is damaged."""
     own = (signatures.c.frame_number == number) & (signatures.c.model_id == model_id)
     statement = select(signatures.c.vector, signatures.c.checksum).where(own)
     row = connection.execute(statement).first()

@@ -582,7 +582,7 @@ def blocks(numbers: Iterable[int]) -> Iterator[list[int]]:
 def among(
     connection: Connection, column: Column[int], numbers: Sequence[int]
 ) -> ColumnElement[bool]:
-    """Return the condition that the value of a column is in `numbers`.
+    """Return the SQL condition that the value of a column is in `numbers`.
 
     PostgreSQL receives an array, which takes a tenth of the time of 10,000 parameters.
     """
@@ -617,7 +617,7 @@ def rows_of_statement(
 
 
 def among_numbers(dialect: str, column: Column[int]) -> ColumnElement[bool]:
-    """Return the condition of `among` for the parameter `numbers` of a cached statement."""
+    """Return the SQL condition of `among` for the parameter `numbers` of a cached statement."""
     if dialect == "postgresql":
         return column == any_(bindparam("numbers", type_=ARRAY(BigInteger)))
     return column.in_(bindparam("numbers", expanding=True))

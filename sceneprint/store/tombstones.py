@@ -39,7 +39,7 @@ class Deletion:
 def _restorable(
     connection: Connection, map_number: int, seconds: float
 ) -> list[ColumnElement[bool]]:
-    """Return the conditions for tombstones that are younger than `seconds`."""
+    """Return the SQL conditions for tombstones that are younger than `seconds`."""
     c = frames.c
     return [
         c.map_number == map_number, c.deletion.is_not(None), c.deleted_from.is_not(None),

@@ -144,7 +144,7 @@ class Listener:
         self._open()
 
     def wait(self, timeout_s: float, *others: int) -> bool:
-        """See `Listening.wait`."""
+        """Wait for a ring, a readable descriptor or the timeout; see `Listening.wait`."""
         if self._fifo < 0:
             timeout_s = min(timeout_s, DEAF_S)
         rung = self._fifo in wait_for(timeout_s, self._fifo, *others)
@@ -233,7 +233,7 @@ class Notices(Wakeup):
         return [name.removeprefix(LISTENS) for name in names]
 
     def listen(self) -> AbstractContextManager[Listening]:
-        """See `Wakeup.listen`."""
+        """Listen for rings of all hosts; see `Wakeup.listen`."""
         return closing(NoticeListener(self._database))
 
     def close(self) -> None:
@@ -278,7 +278,7 @@ class NoticeListener:
         self._connect()
 
     def wait(self, timeout_s: float, *others: int) -> bool:
-        """See `Listening.wait`."""
+        """Wait for a ring, a readable descriptor or the timeout; see `Listening.wait`."""
         self._connect()
         if self._missed:
             self._missed = False

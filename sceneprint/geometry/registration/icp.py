@@ -119,7 +119,7 @@ def _nearest_in_line(
     points: Floats32, width: int, column: Ints32, line: Ints32, beside: int,
     x: Floats, y: Floats, z: Floats, count: int, nearest: Floats, best: Ints32,
 ) -> None:  # fmt: skip
-    """Update each point's nearest pixel from three pixels, `beside` lines away from its own line.
+    """Compare each point with three pixels, `beside` lines from its own; update its nearest pixel.
 
     `nearest` are squared distances, and `best` indices of pixels in row-major order.
     """
@@ -561,7 +561,7 @@ def transform_covariance(covariance: Floats, R: Floats, lever: Floats) -> Floats
     * (identity, R t_b_d) for T_a_b T_b_d
     * (R^T, -R^T t) for the inverse T_b_a
 
-    The transforms T_c_a and T_b_d are exact.
+    T_c_a and T_b_d are assumed to be exact.
     """
     A = adjoint(R, lever)
     moved: Floats = A @ covariance @ A.T
@@ -588,7 +588,7 @@ def pair_covariance(
     """
     p = p or CovarianceParameters()
     information, squares = [], []
-    # `there` has errors at the match's origin; `back` has errors in the query's axes, negated
+    # `there` has its errors at the match's origin; those of `back` are negated, in the query's axes
     for refinement, R, lever in (
         (there, np.eye(3), -T[:3, 3]), (back, T[:3, :3].T, np.zeros(3))
     ):  # fmt: skip
@@ -633,7 +633,7 @@ def free_directions(
 def fuse_votes(
     average: PoseAverage, poses: Floats, covariances: Floats, inflations: Floats
 ) -> tuple[PoseAverage, Floats]:
-    """Return the most likely pose of the votes that agree, and its covariance (6, 6).
+    """Fuse the votes that agree into the most likely pose; return it and its covariance (6, 6).
 
     All votes share the query, so only half of each covariance is independent. The spread of the
     votes is added, because it reflects the errors of the map's poses.

@@ -8,11 +8,11 @@ Points are projected into the target's camera. A point in front of the target's 
 free space, because the target would have observed it. If the target has no viewpoint, points are
 looked up by position, and free space is unknown.
 
-Unordered points are stored in a hash table of cubes. Each is divided into small cubes, of which
-only one point is stored, so the number of points in a cube is bounded.
+Unordered points are stored in a hash table of cubes. Each cube is divided into small cubes that
+store at most one point, which bounds the number of points in a cube.
 
 A floor may fill half of a frame, but the coincidence of two floors is weak evidence for a
-transform. Therefore, all patches in one plane share the weight of one.
+transform. Therefore, all patches in a plane together count as one patch.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class LookupTarget(NamedTuple):
     points, normals : (h, w, 3); (1, N, 3) if unordered
     camera : (7,) result of `camera_of`; if unordered, the third number is the reach, and the fourth
         is the secret of the hash table
-    heads, chain : index of the first point in each slot, and of the point after each point in its
-        slot; -1 if none
+    heads, chain : index of the first point in each slot, and of the next point in the same slot; -1
+        if none
     """
 
     points: Floats32
@@ -135,9 +135,10 @@ def nearest_alike(
 def _first_in_cubes(
     points: Floats32, cube: np.float32, secret: int, table: Ints32, cells: Ints64, firsts: Ints32
 ) -> int:
-    """Write the indices of the points that are the first in their cubes; return how many there are.
+    """Write the index of the first point in each cube; return the number of indices.
 
-    `table` has a power of two of slots, all -1; `cells` (N, 3) receives the cube of each point.
+    The number of slots of `table` is a power of two, and all contain -1; `cells` (N, 3) receives
+    the cube of each point.
     """
     mask, count = len(table) - 1, 0
     for n in range(len(points)):
@@ -247,7 +248,7 @@ class OverlapParameters:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Counts of a source's points by whether they agree with a target."""
+    """Numbers of a source's points that agree with a target and that violate its free space."""
 
     points: int  #: total number of points
     inliers: int  #: points on the target's surface with similar normals
@@ -449,7 +450,7 @@ def weigh_overlap(
     source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, T: Floats, tolerances: Floats,
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the weights of the points (N, 6) that agree with and that violate a target under T."""
+    """Return the total weights of points (N, 6) that agree with a target and violate it under T."""
     out = np.empty((1, 2))
     _weigh_all(
         source, weights, points, normals, camera, heads, chain, T.reshape((1, 4, 4)), tolerances,
@@ -463,7 +464,7 @@ def _weigh_all(
     source: Floats32, weights: Floats32, points: Floats32, normals: Floats32, camera: Floats,
     heads: Ints32, chain: Ints32, transforms: Floats, tolerances: Floats, out: Floats,
 ) -> None:  # fmt: skip
-    """Write the weights of inliers and of violations (n, 2) under each of n transforms."""
+    """Write the total weights of inliers and of violations (n, 2) under each of n transforms."""
     transposed, verdicts = transpose_points(source, 1), np.empty(len(source), np.uint8)
     for k in range(len(transforms)):
         _look_up(
@@ -500,7 +501,7 @@ def agreements(
     p: OverlapParameters,
     weights: Floats32 | None = None,
 ) -> Floats:
-    """Return the weights of inliers and of violations, (n, 2), under n transforms: Sec. III-E.
+    """Return the total weights of inliers and violations, (n, 2), under n transforms: Sec. III-E.
 
     Parameters
     ----------

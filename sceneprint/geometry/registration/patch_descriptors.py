@@ -3,9 +3,9 @@
     Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
     descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
 
-The properties resemble those of Eq. (1) and have the same scale. For each other patch within reach,
-they are its distance in the plane of the patch, its height over that plane, and the angles of its
-normal to the patch's normal and to the direction in the plane from the patch to it. All are
+The properties resemble those of Eq. (1) and have the same scale. The properties of a neighbour
+within reach are its distance in the plane of the patch, its height over that plane, and the angles
+of its normal to the patch's normal and to the in-plane direction of the neighbour. All are
 invariant under rigid motion.
 
 Reading R10 (docs/paper.md): only the idea of the paper's patch matching is public. A random sample
@@ -86,8 +86,8 @@ class Compression:
         return np.ascontiguousarray(self.matrix.T)
 
 
-#: Maximum absolute value of a component of a unit vector, which few of 128 components reach; larger
-#: values are clipped, so that no component, such as that of floors, outweighs all others.
+#: Limit of the absolute components of a unit vector, which few of 128 components reach. Clipping
+#: prevents one component, such as that of floors, from outweighing all others.
 RANGE = 0.25
 
 
@@ -102,7 +102,7 @@ def _squared_distances(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> 
 
 @disjoint_kernel
 def _select_near(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
-    """Write the indices, except `but`, of the squared distances below a limit; return the count."""
+    """Write the indices of squares below a limit, except index `but`; return their number."""
     selected = 0
     for j in range(count):
         places[selected] = j
@@ -149,7 +149,7 @@ def _spread(
     lies: Floats, places: Ints32, count: int, radius: float, n_flat: int, n_high: int,
     n_angles: int, weights: Floats, starts: Ints32,
 ) -> None:  # fmt: skip
-    """Write the weights (4, n) of patches in distance and height bins, and where the bins start."""
+    """Write the weights (4, n) of patches in their distance and height bins, and bin offsets."""
     flat, height, area = lies[1], lies[2], lies[5]
     for k in range(count):
         i = np.uint64(places[k])
@@ -387,7 +387,7 @@ def _match_nearest(
 
 @dataclass(frozen=True, eq=False)
 class SlopeGate:
-    """A gate that admits only pairs of patches whose normals have similar angles to up.
+    """A gate that admits only pairs of patches whose normals form similar angles with up.
 
     Parameters
     ----------

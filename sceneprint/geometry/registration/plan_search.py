@@ -5,10 +5,10 @@
     ScanPlan, ScanPlan, T  --slice_correlation-->  correlation
 
 Scans from distant viewpoints have few patches with similar surroundings in common, so
-correspondences may yield no correct transform although the plans of the scans fit. Upright surfaces
-of each scan are drawn, with their normals, into an image as seen from above. One image is rotated
-through all yaws and correlated with the other. Level surfaces determine the height. This method is
-not part of the paper.
+correspondences may yield no correct transform although the plans of the scans match. The upright
+surfaces of each scan are drawn, with their normals, into an image seen from above. One image is
+rotated through all yaws and correlated with the other. Level surfaces determine the height. This
+method is not part of the paper.
 
 In streets, few surfaces are as large as the walls of a hall, and the normals of trees and cars are
 unreliable. Therefore, the points above the ground are also drawn without normals, in three slices
@@ -29,8 +29,8 @@ from sceneprint.geometry.registration.overlap import first_per_cube
 from sceneprint.geometry.rigid import select_distinct
 from sceneprint.types import Bytes, Floats, Floats32, Ints32, Sphere, Surface
 
-#: Minimum cosine to a candidate for up at which a normal votes for it, and maximum cosine at which
-#: a normal counts as perpendicular and gives half a vote.
+#: Minimum cosine between a candidate for up and a normal that votes for it, and maximum cosine of a
+#: perpendicular normal, which gives half a vote.
 _ALONG, _ACROSS = math.cos(math.radians(6.0)), math.sin(math.radians(4.0))
 #: The same two limits, for the normals that refine up.
 _NEAR, _LEVEL = math.cos(math.radians(8.0)), math.sin(math.radians(8.0))
@@ -49,7 +49,7 @@ class PlanParameters:
 
     cell: float = 0.1  #: width of a cell of the plan image, metres
     side: int = 128  #: width of the plan image, cells
-    voxel: float = 0.08  #: width of the cubes of which one point each is drawn, metres
+    voxel: float = 0.08  #: width of the cubes; one point of each is drawn, metres
     tilt: float = math.radians(50.0)  #: maximum angle between up and the scanner's axis
     n_yaws: int = 72  #: number of yaws
     kept_yaws: int = 24  #: number of yaws whose plans are correlated
@@ -64,10 +64,10 @@ class PlanParameters:
     n_sliced: int = 25  #: `n_kept` for slices
     slice_blur: float = 0.5  #: `blur` for slices
     slice_trend: float = 0.866  #: `blur` of the low frequencies that are subtracted from slices
-    slice_share: float = 0.7  #: minimum ratio of a transform's slice correlation to all others' for
+    slice_share: float = 0.7  #: minimum ratio of slice correlation at a transform to elsewhere for
     #: its refinement by the points in slices
     slice_margin: float = 1.4  #: minimum ratio for slices to support a transform
-    slice_distance: float = 16.0  #: minimum distance between scanners for both, cells
+    slice_distance: float = 16.0  #: minimum distance between scanners to use slices, cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ def draw_plan(
     Parameters
     ----------
     surface : surface with at least one valid point
-    axis : (3,) expected up, unused with `up`; None selects the scanner's axis
+    axis : (3,) expected up, ignored if `up` is not None; None selects the scanner's axis
     up : (3,) unit vector in the scanner's coordinates; None estimates it
     """
     shown = surface.fitted
@@ -184,7 +184,7 @@ def draw_plan(
 
 
 def other_plans(source: Surface, target: Surface, p: PlanParameters) -> Plans:
-    """Return pairs of plans that assume that scanners were not upright.
+    """Return pairs of plans for scanners that were not mounted upright.
 
     A pair assumes that only the source scanner was on its side or upside down, or that both
     scanners were mounted on the same side.
@@ -234,7 +234,7 @@ def _height_histograms(points: Floats, normals: Floats, p: PlanParameters) -> Fl
 
 
 def _height_offsets(source: ScanPlan, target: ScanPlan, p: PlanParameters) -> list[float]:
-    """Return up to `n_heights` heights of the source over the target that align level surfaces."""
+    """Return up to `n_heights` heights of the source above the target that align level surfaces."""
     scores = sum(
         np.correlate(b, a, "full") for a, b in zip(source.heights, target.heights, strict=True)
     )
@@ -283,9 +283,7 @@ def _draw(
 
 @kernel
 def _take_peaks(scores: Floats32, n: int, values: Floats, cells: Ints32) -> None:
-    """Write the n highest peaks of a torus (side, side), at least three cells apart, and their
-    cells.
-    """
+    """Write the values and cells of the n highest peaks of a torus, at least three cells apart."""
     side = len(scores)
     for k in range(n):
         best, line, column = scores[0, 0], 0, 0

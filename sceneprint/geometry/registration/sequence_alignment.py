@@ -227,7 +227,7 @@ def _cyclic_cost(
     if m == 0 or n == 0:
         return 1.0
     _replacement_costs(a, m, b, n, length, angle, costs)
-    # a fast lower bound excludes most pairs: it replaces or omits each neighbour
+    # a fast lower bound excludes most pairs: the cost of replacing or omitting each neighbour
     bound = 0.0
     for i in range(m):
         nearest = gap

@@ -65,7 +65,7 @@ def _accumulate(
 ) -> None:
     """Add up `sums` (G, 32): 12 first, 12 second, 1 zeroth; the rest fills a cache line.
 
-    `components` is the memory of the packed table as int16. The rows of the bins that contain
+    `components` is the packed table viewed as int16. The rows of the bins that contain
     pairs, a quarter of all, are scattered over a table that exceeds all caches, so they are
     prefetched.
     """

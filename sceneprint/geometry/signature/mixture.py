@@ -74,8 +74,8 @@ def posteriors(features: Floats, mixture: Mixture) -> Floats:
 def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[Mixture]:
     """Fit a mixture by expectation maximisation from a K-Means++ start (Sec. III-F).
 
-    To allow callers to show progress, yield the start and the mixture after each of `p.iterations`
-    iterations. The last mixture is the result.
+    Yield the initial mixture and the mixture after each of `p.iterations` iterations, so that
+    callers can show progress. The last mixture is the result.
 
     Parameters
     ----------
@@ -101,7 +101,8 @@ def fit_mixture(features: Floats, p: MixtureParameters, seed: int) -> Iterator[M
 def em_step(features: Floats, mixture: Mixture, p: MixtureParameters) -> Mixture:
     """Return the mixture after an iteration of expectation maximisation.
 
-    Features (M, 12) are processed in blocks, because the posteriors of all would fill gigabytes.
+    Features (M, 12) are processed in blocks, because the posteriors of all features would fill
+    gigabytes.
     """
     zeroth, first, second = moments(features, mixture)
     count = np.maximum(zeroth, 1e-9)[:, None]

@@ -46,9 +46,7 @@ class SegmentationParameters:
 def _spread_centres(
     centres: Floats32, row: int, shift: int, cells: Ints32, columns: int, out: Floats32
 ) -> None:
-    """Write to `out` (7, w) the centre that lies `shift` cells beside each pixel of a row of cells;
-    0 outside.
-    """
+    """Write to `out` (7, w) the centre `shift` cells beside each pixel of a cell row; 0 outside."""
     for x in range(len(cells)):
         column = cells[x] + shift
         if row < 0 or row * columns >= len(centres) or column < 0 or column >= columns:
@@ -63,7 +61,7 @@ def _assign_row(
     pixels: Floats32, y: int, centres: Floats32, normal_weight: np.float32, k: np.int32,
     cells: Ints32, labels: Ints32, nearest: Floats32,
 ) -> None:  # fmt: skip
-    """Assign the pixels of a row to the centres (7, w) beside them where these are nearer.
+    """Assign the pixels of a row to the centres (7, w) beside them if those are nearer.
 
     Unused centres get no pixels. `k` is the index of the centre beside the pixels of the first
     cell.
@@ -440,7 +438,7 @@ class WeightParameters:
 
 
 def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
-    """Return positive weights (P,) of patches, with mean 1; a pair weighs the product of two."""
+    """Return positive weights (P,) of patches, with mean 1; those of a pair are multiplied."""
     weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
     result: Floats = weights / weights.mean()
     return result
@@ -577,7 +575,7 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
             labels, n = _grow_patches(seen, seeds, spacing, least, p)
             if n <= most:
                 return labels[None]
-        spacing *= 1.03 * (n / most) ** 0.85  # faster than the root: slanted patches are long
+        spacing *= 1.03 * (n / most) ** 0.85  # exponent above 0.5: slanted patches are long
 
 
 def _seeds(seen: Voxels, spacing: float) -> Ints32:

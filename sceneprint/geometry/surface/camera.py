@@ -108,7 +108,7 @@ def select_inside(
 ) -> int:  # fmt: skip
     """Write the indices of points with columns in [left, right) and lines in [top, bottom).
 
-    Return how many there are.
+    Return their number.
     """
     column, line, n_inside = projected[0], projected[1], 0
     for i in range(count):
@@ -214,7 +214,7 @@ def _sources(intrinsics: Intrinsics) -> NDArray[np.int32]:
     c, k = intrinsics, _coefficients(intrinsics)
     sources = np.full(c.width * c.height, -1, dtype=np.int32)
     for block, x, y in _directions(c):
-        with np.errstate(all="ignore"):  # overflows have no sample
+        with np.errstate(all="ignore"):  # a direction that overflows has no sample
             x_seen, y_seen = _distort(x, y, k)
             u, v = c.fx * x_seen + c.cx, c.fy * y_seen + c.cy
             inside = (u >= -0.5) & (u < c.width - 0.5) & (v >= -0.5) & (v < c.height - 0.5)
@@ -308,7 +308,7 @@ def _unfolded(x: Floats, y: Floats, k: tuple[float, ...]) -> NDArray[np.bool_]:
 def _first_fold(k: tuple[float, ...]) -> float:
     """Return the smallest tan(angle to the axis) at which the radial function stops growing."""
     r = np.tan(np.linspace(0.0, math.radians(89.9), 4096))
-    with np.errstate(all="ignore"):  # poles of the quotient
+    with np.errstate(all="ignore"):  # the quotient may have poles
         radial, slope, below = _radial(r * r, k)
         grows = (radial + 2.0 * r * r * slope > 0.0) & (below > 0.0)
     return math.inf if grows.all() else float(r[max(int(np.argmin(grows)) - 1, 0)])

@@ -157,12 +157,12 @@ def principal_axes(points: Floats32) -> Floats:
     return axes
 
 
-#: Integer steps of a number from 0 to 1 in sums, so that sums of 5 million points are below 2^63.
+#: Number of integer steps from 0 to 1 in sums: sums over 5 million points stay below 2^63.
 _STEPS = 2.0**38
 #: Maximum number of cells per half axis of a cloud without a viewpoint: three coordinates must fit
 #: into one key.
 _REACH = 1 << 20
-#: Cells are enlarged if there are more than this multiple of the maximum number.
+#: Cells are enlarged if their number exceeds this multiple of the maximum.
 _ROOM = 4
 
 Ints64 = NDArray[np.int64]

@@ -51,7 +51,7 @@ def _near_axes(points: Floats32, least: np.float32, near: NDArray[np.int64]) -> 
 
 
 def pole_of(points: Floats32) -> int:
-    """Return the axis with the fewest points near it; z, then y, wins ties."""
+    """Return the axis with the fewest points near it; ties prefer z, then y."""
     near = np.zeros(3, np.int64)
     _near_axes(points, np.float32(_NEAR_POLE), near)
     return min((2, 1, 0), key=lambda axis: int(near[axis]))

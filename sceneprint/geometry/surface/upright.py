@@ -40,13 +40,13 @@ _LAYER = 0.02
 _LOW, _HIGH = 0.01, 0.99
 #: Weights of the usual axis relative to other axes, and of its usual end relative to its other end.
 _USUAL, _USUAL_SIGN = 1.8, 0.6
-#: Weights of an uneven distribution of mass along a direction, in favour of the direction, and of
-#: its end with more mass as the lower end.
+#: Weights of an uneven distribution of mass along a direction: in favour of that direction, and of
+#: its heavier end as the lower end.
 _LEAN_GAIN, _LEAN_WEIGHT = 8.0, 3.0
 #: Minimum cosine between up and the normals of level surfaces, maximum cosine for walls, and share
 #: of the height of a place that counts as its end.
 _LEVEL, _UPRIGHT, _END = 0.97, 0.3, 0.08
-#: Minimum evidence for an end, and minimum ratio of the two best scores, of a clear result.
+#: Minimum evidence for an end, and minimum ratio of the two best scores, for a result to be clear.
 _CLEAR_SIGN, _CLEAR = 0.4, 1.3
 
 

@@ -225,7 +225,7 @@ class Links:
 
 @kernel
 def _grid(cells: Ints64, order: Ints64, secret: int, table: Ints64, starts: Ints64) -> int:
-    """Insert the runs of points with equal cells into a hash table; return how many there are."""
+    """Insert the runs of points with equal cells into a hash table; return the number of runs."""
     mask = len(table) - 1
     n = 0
     for i in range(len(order)):

@@ -127,7 +127,7 @@ _IN_FREE_SPACE = "of the points lie where the other frame saw free space"
 def objection(e: Evidence, p: AcceptanceParameters, mode: Mode) -> tuple[Status, str] | None:
     """Return the status and the reason if a transform fails regardless of rivals, else None.
 
-    The status is "rejected" or, if the evidence leaves a choice, "ambiguous" (Sec. III-E). Mode
+    The status is "rejected" or, if the evidence is inconclusive, "ambiguous" (Sec. III-E). Mode
     "paper" checks the residual only.
     """
     if e.residual_m > p.residual_m or e.residual_rad > p.residual_rad:
@@ -229,7 +229,7 @@ def sliced_evidence_suffices(e: Evidence, p: AcceptanceParameters) -> bool:
 def belief(
     e: Evidence, ambiguity: float, p: AcceptanceParameters
 ) -> tuple[Status, Strength | None, str]:
-    """Return the status, strength and reason of a transform to which there is no `objection`."""
+    """Return the status, strength and reason for a transform without an `objection`."""
     most = min(p.ambiguous, p.ambiguous_share * e.plane_overlap)
     if e.violations is None:  # free space is unknown, so it refutes no rival
         most = p.blind_ambiguous_share * e.plane_overlap
@@ -337,7 +337,7 @@ def _write_turns(
     """Append quarter turns about the centres of the largest planes across an axis to `motions`.
 
     Planes consist of patches with positive areas; these areas are set to 0. `count` is the number
-    of motions in it before; return the number afterwards.
+    of motions already written; return the new number.
     """
     x, y, z = axis[0], axis[1], axis[2]
     offsets, R = x * means[0] + y * means[1] + z * means[2], np.empty((3, 3))
@@ -407,7 +407,7 @@ class Rival(NamedTuple):
     share : share of the frames that the rival explains, with equal weights for all planes, 0 to 1;
         0 if there is no rival
     T : (4, 4) transform; None if there is no rival
-    tilted : largest share that any transform explains that only `up` refutes
+    tilted : largest share explained by a transform that only `up` refutes
     """
 
     share: float

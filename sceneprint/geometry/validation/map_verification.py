@@ -121,7 +121,7 @@ class ScoredPose:
     starts: tuple[Floats, ...] = ()
 
     def is_of(self, T: Floats, p: MapParameters) -> bool:
-        """Return whether a pose (4, 4) is at this place, or near a pose that was refined to it."""
+        """Return whether a pose (4, 4) is at this place, or near one of its `starts`."""
         return bool(at_place(np.stack([self.T, *self.starts]), T, p).any())
 
 
@@ -400,7 +400,7 @@ def _refine_places(
     frames: Sequence[MapFrame], places: list[ScoredPose], views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> list[ScoredPose]:  # fmt: skip
-    """Refine places until there are `n_refined` different refined ones; return all, best first.
+    """Refine places until `n_refined` different places are refined; return all, best first.
 
     Poses that converge to the same result are the same place, and must not count as its rivals.
     """

@@ -3,9 +3,9 @@
     surfels  --find_floors-->  Floors
     Floors, parameters  --candidate_places-->  places (C, 3)
 
-All coordinates are in level axes with z upwards. The lowest surface that is level over a few metres
-is a floor, and so are further such surfaces, each at least a storey above the last. `lookout.py`
-checks whether a place is free.
+All coordinates are in level axes with z upwards. A floor is the lowest surface that is level over a
+few metres, or another such surface at least a storey above the previous floor. `lookout.py` checks
+whether a place is free.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ _REACH = 0.5
 _LEAST_HIT, _LEAST_AROUND, _LEAST_BESIDE = 0.45, 0.25, 0.25
 #: Minimum median depth of a camera's view, as a share of the range.
 _LEAST_DEPTH = 1.0 / 11.0
-#: Minimum share of directions that show a surface at a place that votes on the front of a mesh.
+#: Minimum share of directions that show a surface, for a place to vote on the front of a mesh.
 _INDOORS = 0.6
 #: Maximum share of surface seen from behind: in a camera's view of a mesh; in a scanner's view,
 #: which shows both sides of partitions; and in a view of a cloud, whose sides are estimated.
@@ -156,7 +156,8 @@ def _select_front(
 ) -> list[tuple[Floats, Sight]]:
     """Return the free places from which surfaces are seen from the front.
 
-    The sides of a mesh that is inside out are swapped. In a cloud, the views of a wall vote.
+    The sides of a mesh that is inside out are swapped. In a cloud, the views of each wall vote on
+    its front.
     """
     if pieces.one_sided:
         # a mesh that is inside out shows its back in all free space
@@ -221,9 +222,9 @@ def _cover(
 ) -> tuple[list[int], float]:  # fmt: skip
     """Select views greedily until gains are small; return their indices and the share covered.
 
-    The share is of the elements that any of `views` shows. The second view of an element also
-    gains, see `_WORTH`. Gains can only decrease during the selection, so most need not be
-    recomputed.
+    The share refers to the elements that at least one of `views` shows. The second view of an
+    element also gains, see `_WORTH`. Gains can only decrease during the selection, so most need not
+    be recomputed.
 
     Parameters
     ----------

@@ -44,7 +44,7 @@ class Locks(ABC):
 
     @abstractmethod
     def block_removals(self) -> AbstractContextManager[None]:
-        """Hold the lock, which other processes that need all blobs may hold too."""
+        """Hold a shared lock that prevents removals; other processes may hold it too."""
 
     @abstractmethod
     def removing(self) -> AbstractContextManager[bool]:
@@ -94,7 +94,7 @@ class FileLocks(Locks):
 
     @contextmanager
     def block_removals(self) -> Iterator[None]:
-        """See `Locks`. Raise UnusableStore if the lock cannot be acquired."""
+        """Hold a lock that prevents removals. Raise UnusableStore if it cannot be acquired."""
         try:
             descriptor = self._lock(fcntl.LOCK_SH)
         except OSError as error:
@@ -110,7 +110,7 @@ class FileLocks(Locks):
 
     @contextmanager
     def removing(self) -> Iterator[bool]:
-        """See `Locks`."""
+        """Acquire the exclusive lock without waiting; yield whether this succeeded."""
         try:
             descriptor = self._lock(fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:  # in use or not supported; blobs that remain are harmless
@@ -122,7 +122,7 @@ class FileLocks(Locks):
             os.close(descriptor)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
-        """See `Locks`. A removal outlasts its turn if the database server ended the turn early."""
+        """Wait for a removal whose turn the database server ended early; see `Locks.wait`."""
         until = time.monotonic() + seconds
         while True:
             try:
@@ -429,7 +429,7 @@ class FolderBlobs(Blobs):
         return self._folder.is_dir() and not os.access(self._folder, os.W_OK)
 
     def put(self, data: bytes) -> str:
-        """See `Blobs.put`."""
+        """Store bytes durably, and return their digest; see `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
         path = self.path(digest)
         try:  # replace an existing file too: it may be damaged, not durable, or about to be removed
@@ -442,7 +442,7 @@ class FolderBlobs(Blobs):
 
     @contextmanager
     def incoming(self) -> Iterator[IncomingBlob]:
-        """See `Blobs.incoming`."""
+        """Yield a blob to write in chunks; see `Blobs.incoming`."""
         part = self._folder / f".{secrets.token_hex(6)}.part"
         what = f"{self._folder}: A blob cannot be written"
         try:
@@ -474,7 +474,7 @@ class FolderBlobs(Blobs):
         return True
 
     def get(self, digest: str) -> bytes:
-        """See `Blobs.get`."""
+        """Return the verified bytes of a blob; see `Blobs.get`."""
         try:
             data = self.path(digest).read_bytes()
         except OSError as error:
@@ -490,23 +490,23 @@ class FolderBlobs(Blobs):
         return data
 
     def holds(self, digest: str) -> bool:
-        """See `Blobs.holds`."""
+        """Return whether a blob exists; see `Blobs.holds`."""
         self._locks.wait(digest, TURN_S)
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:
-        """See `Blobs.size`."""
+        """Return the size of a blob in bytes, unverified; None if it is missing."""
         try:
             return self.path(digest).stat().st_size
         except OSError:
             return None
 
     def open(self, digest: str) -> BinaryIO:
-        """See `Blobs.open`."""
+        """Return an unverified blob as a seekable file; see `Blobs.open`."""
         return self.path(digest).open("rb")
 
     def remove(self, *digests: str) -> None:
-        """See `Blobs.remove`."""
+        """Remove blobs without references; see `Blobs.remove`."""
         for digest in digests:
             self.path(digest).unlink(missing_ok=True)
         for folder in {self.path(digest).parent for digest in digests}:
@@ -514,7 +514,7 @@ class FolderBlobs(Blobs):
                 sync_folder(folder)  # otherwise, a power failure could restore deleted frames
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """See `Blobs.condition`."""
+        """Check a blob, and return its condition; see `Blobs.condition`."""
         if not DIGEST.fullmatch(digest):
             return "missing"
         try:
@@ -533,7 +533,7 @@ class FolderBlobs(Blobs):
         return "damaged"
 
     def quarantine(self, digest: str, folder: Path) -> Path | None:
-        """See `Blobs.quarantine`."""
+        """Move a damaged blob to a folder, and return its path; see `Blobs.quarantine`."""
         path, place = self.path(digest), folder / f"blob-{digest}"
         make_folder(folder)
         try:
@@ -550,11 +550,11 @@ class FolderBlobs(Blobs):
         return place
 
     def place(self, digest: str) -> str:
-        """See `Blobs.place`."""
+        """Return the path or URL of a blob for messages."""
         return str(self._folder / digest[:2] / digest)
 
     def digests(self) -> Iterator[str]:
-        """See `Blobs.digests`."""
+        """Yield the digests of all blobs in arbitrary order."""
         for folder in self._folder.iterdir():
             if folder.is_dir():
                 for name in os.listdir(folder):  # noqa: PTH208  (Path objects would take time)
@@ -562,7 +562,7 @@ class FolderBlobs(Blobs):
                         yield name
 
     def entries(self) -> Iterator[BlobEntry]:
-        """See `Blobs.entries`. Files that are removed meanwhile are skipped."""
+        """Yield all files in arbitrary order, except files removed meanwhile."""
         folders = [self._folder]
         while folders:
             with os.scandir(folders.pop()) as entries:

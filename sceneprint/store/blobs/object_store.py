@@ -167,7 +167,7 @@ class ObjectBlobs(Blobs):
             self._claimed = BucketOwner(self.objects).claim(self._owner(), anew=anew)
 
     def put(self, data: bytes) -> str:
-        """See `Blobs.put`."""
+        """Store bytes durably, and return their digest; see `Blobs.put`."""
         digest = hashlib.sha256(data).hexdigest()
         with self._putting(digest):
             self.objects.put(_key(digest), data)
@@ -175,7 +175,7 @@ class ObjectBlobs(Blobs):
 
     @contextmanager
     def incoming(self) -> Iterator[IncomingBlob]:
-        """See `Blobs.incoming`.
+        """Yield a blob to write in chunks; see `Blobs.incoming`.
 
         The blob is a nameless temporary file until its digest is known, because stores cannot
         rename objects larger than 5 GB.
@@ -208,7 +208,7 @@ class ObjectBlobs(Blobs):
                 self._put.popitem(last=False)
 
     def get(self, digest: str) -> bytes:
-        """See `Blobs.get`."""
+        """Return the verified bytes of a blob; see `Blobs.get`."""
         require_digest(digest)
         try:
             data = self.objects.get(_key(digest))
@@ -225,12 +225,12 @@ class ObjectBlobs(Blobs):
         return data
 
     def open(self, digest: str) -> BinaryIO:
-        """See `Blobs.open`."""
+        """Return an unverified blob as a seekable file; see `Blobs.open`."""
         require_digest(digest)
         return self.objects.open(_key(digest))
 
     def holds(self, digest: str) -> bool:
-        """See `Blobs.holds`.
+        """Return whether a blob exists; see `Blobs.holds`.
 
         If this process stored the blob, and no blob has been removed since, this does not contact
         the object store, because other writers are waiting.
@@ -238,7 +238,7 @@ class ObjectBlobs(Blobs):
         return self._holds(digest, TURN_S)
 
     def ensure(self, digest: str, data: bytes) -> None:
-        """See `Blobs.ensure`."""
+        """Store a blob again if it was removed; see `Blobs.ensure`."""
         if not self._holds(digest, REMOVAL_S):
             self.put(data)
 
@@ -254,12 +254,12 @@ class ObjectBlobs(Blobs):
         return self.objects.size(_key(digest)) is not None
 
     def size(self, digest: str) -> int | None:
-        """See `Blobs.size`."""
+        """Return the size of a blob in bytes, unverified; None if it is missing."""
         require_digest(digest)
         return self.objects.size(_key(digest))
 
     def remove(self, *digests: str) -> None:
-        """See `Blobs.remove`."""
+        """Remove blobs without references; see `Blobs.remove`."""
         for digest in digests:
             require_digest(digest)
         self.claim()
@@ -273,7 +273,7 @@ class ObjectBlobs(Blobs):
             raise
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
-        """See `Blobs.condition`."""
+        """Check a blob, and return its condition; see `Blobs.condition`."""
         if not DIGEST.fullmatch(digest):
             return "missing"
         size, hashed = self.objects.size(_key(digest)), hashlib.sha256()
@@ -308,11 +308,11 @@ class ObjectBlobs(Blobs):
         return place
 
     def place(self, digest: str) -> str:
-        """See `Blobs.place`."""
+        """Return the path or URL of a blob for messages."""
         return f"{self.objects.url}/{_key(digest)}"
 
     def digests(self) -> Iterator[str]:
-        """See `Blobs.digests`."""
+        """Yield the digests of all blobs in arbitrary order."""
         return (entry.digest for entry in self.entries() if entry.digest is not None)
 
     def entries(self) -> Iterator[BlobEntry]:
@@ -328,7 +328,7 @@ class ObjectBlobs(Blobs):
             yield BlobEntry(place, name if own else None, entry.changed_at)
 
     def check(self) -> None:
-        """See `Blobs.check`."""
+        """Raise UnusableStore if the store is unreachable; see `Blobs.check`."""
         if self._checking.acquire(blocking=False):
             try:
                 if time.monotonic() - self._answered > CHECK_S:

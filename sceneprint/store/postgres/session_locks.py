@@ -75,7 +75,7 @@ class SessionLocks(Locks):
 
     @contextmanager
     def block_removals(self) -> Iterator[None]:
-        """See `Locks`. Raise UnusableStore if the lock cannot be acquired, or is lost."""
+        """Hold a lock that prevents removals. Raise UnusableStore if it is unavailable or lost."""
         # use a separate connection, since a session does not block itself
         connection = self._database.driver_connection()
         try:
@@ -99,7 +99,7 @@ class SessionLocks(Locks):
 
     @contextmanager
     def removing(self) -> Iterator[bool]:
-        """See `Locks`."""
+        """Acquire the exclusive lock without waiting; yield whether this succeeded."""
         if not self._alone.acquire(blocking=False):
             yield False
             return
@@ -114,21 +114,21 @@ class SessionLocks(Locks):
             self._alone.release()
 
     def mark_uncertain(self) -> None:
-        """See `Locks`. For LONGEST_S seconds, no other removal begins."""
+        """Mark this removal as unfinished; for LONGEST_S seconds, no other removal begins."""
         self._uncertain = True
 
     @property
     def outlast_turns(self) -> bool:
-        """See `Locks`."""
+        """Return whether a removal may continue after its write turn."""
         return True
 
     def removals(self) -> int | None:
-        """See `Locks`."""
+        """Return the even counter of removals; None if unknown, or during a removal."""
         number = self._reader.query(_READ)
         return number if number is not None and number % 2 == 0 else None
 
     def wait(self, digest: str | None, seconds: float) -> None:
-        """See `Locks`."""
+        """Wait for a removal that continues after its write turn; see `Locks.wait`."""
         # only doomed blobs are removed after a turn
         if digest is not None and self._reader.query(_DOOMED, digest) == math.inf:
             return
