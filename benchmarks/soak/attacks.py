@@ -330,7 +330,7 @@ ATTACKS: dict[str, Callable[[Attack], None]] = {
     "queue at priority 10": _repeat(_frame, 4),
     "one frame, many Idempotency-Keys": _repeat(_same_frame),
     "archives": _repeat(_archive, 4),
-    "pages of 1000 rows": _repeat(_gets(f"{_FRAMES}?limit=1000")),
+    "pages of 200 rows": _repeat(_gets(f"{_FRAMES}?limit=200")),
     "all other lists": _repeat(
         _gets(
             "/v1/jobs?limit=1000", "/v1/events?after=0&limit=1000", "/v1/queries?limit=1000",

@@ -266,7 +266,7 @@ Record = TypeVar("Record", bound=BaseModel)
 Item = TypeVar("Item")
 
 #: Number of records on a page.
-PAGE = 500
+PAGE = 200
 #: Maximum number of attempts, and time after which no new attempt starts, seconds: long enough for
 #: a restart of the service.
 TRIES, LIMIT_S = 8, 30.0

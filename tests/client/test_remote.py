@@ -139,9 +139,9 @@ def test_pages_are_followed(scripted):
     with Client(server.url) as client:
         assert [one.frame_id for one in client.frames("m")] == ["a", "b", "c"]
     assert [path for _, path, _ in server.asked] == [
-        "/v1/maps/m/frames?limit=500",
-        "/v1/maps/m/frames?cursor=2&limit=500",
-        "/v1/maps/m/frames?cursor=3&limit=500",
+        "/v1/maps/m/frames?limit=200",
+        "/v1/maps/m/frames?cursor=2&limit=200",
+        "/v1/maps/m/frames?cursor=3&limit=200",
     ]
 
 

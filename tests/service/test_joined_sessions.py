@@ -107,7 +107,7 @@ def test_a_prior_in_a_joined_frame_is_one_in_the_root(rooms):
 def test_a_join_is_undone(rooms):
     """The last test of the map."""
     client, url = rooms.client, f"{rooms.path}/associations/{rooms.job['job_id']}"
-    of_bob = {"robot": "bob", "limit": 1000}
+    of_bob = {"robot": "bob", "limit": 200}
     moved = client.get(f"{rooms.path}/frames", params=of_bob).json()["items"]
     refused = client.delete(url)
     assert (refused.status_code, refused.json()["type"].rpartition("/")[2]) == (409, "join-stands")

@@ -106,7 +106,7 @@ class FramePage(FrameListing):
     """A page of a list of frames."""
 
     cursor: str | None = Field(default=None, description="`next_cursor` of the previous page.")
-    limit: Annotated[int, Field(ge=1, le=1000)] = 100
+    limit: Annotated[int, Field(ge=1, le=200)] = 100
 
 
 class Session(ApiRecord):
