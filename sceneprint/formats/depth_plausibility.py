@@ -19,7 +19,8 @@ of 7-Scenes, fr1_rpy of TUM, studyroom2 of SUN3D, a RealSense) and 60 images of 
         depth .13; rotated left by 3 bits .8 to 1
 
 Infrared images of surfaces without texture are as smooth as depth, and are accepted unless they
-have 8 bits or are overexposed.
+have 8 bits or are overexposed. They have no holes, but neither has filled or simulated depth. Of
+200 computed images of plain walls, 53 were refused, and the range of 78 was doubtful.
 """
 
 from __future__ import annotations
