@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from sceneprint import cli
+from sceneprint.cli.upload import Tally, summary_of
 from sceneprint.formats.dataset import find_sequences
 from sceneprint.models import save_model
 from sceneprint.pipeline import sign
@@ -271,3 +272,22 @@ def test_sites_are_written_as_clouds_with_poses(tmp_path):
         assert isinstance(cloud, Cloud)
         np.testing.assert_array_equal(cloud.points, one.points)
         np.testing.assert_allclose(cloud.pose, one.pose, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("unit", "notes"),
+    [
+        (1.0, []),
+        (1e3, ["poses of consecutive frames are 1e+03 m apart: check that they are in metres"]),
+    ],
+)
+def test_poses_in_millimetres_are_doubted(unit, notes, tmp_path):
+    (tmp_path / "intrinsics.json").write_text(json.dumps(CAMERA))
+    for i in range(3):
+        (tmp_path / f"{i}.png").write_bytes(b"")
+        pose = np.eye(4)
+        pose[0, 3] = i * unit
+        np.savetxt(tmp_path / f"{i}.pose.txt", pose)
+    (sequence,) = find_sequences(tmp_path)
+    frames = [(sequence, frame) for frame in sequence.frames]
+    assert summary_of(frames, Tally(), with_pose=True).left_out == notes

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -397,7 +398,22 @@ def summary_of(
             without["not indexed"] += 1
     sequences = dict.fromkeys(sequence for sequence, _ in frames)
     notes = [one_line(run.note) for run in sequences if run.note and not run.layout.is_export]
+    notes += _doubt_steps([frame for _, frame in frames if with_pose and frame.name not in failed])
     return upload_summary(len(frames), without, tally.ranges, notes)
+
+
+#: Maximum median distance between consecutive frames, as for poses in metres.
+_LONGEST_STEP_M = 5.0
+
+
+def _doubt_steps(frames: list[FrameReference]) -> list[str]:
+    """Return a note if the poses of depth images are too far apart for metres."""
+    places = [frame.pose[:3, 3] for frame in frames if frame.camera and frame.pose is not None]
+    steps = sorted(float(max(abs(b - a))) for a, b in pairwise(places))
+    step = steps[len(steps) // 2] if steps else 0.0
+    if step <= _LONGEST_STEP_M:
+        return []
+    return [f"poses of consecutive frames are {step:.2g} m apart: check that they are in metres"]
 
 
 def sequences_of(paths: list[Path], options: argparse.Namespace) -> list[FrameSequence]:
