@@ -259,11 +259,13 @@ class _Suggestions:
     T : (n, 4, 4) T_parent_query
     viewpoints : (n, 4, 4) T_parent_sensor of the candidates
     similarities : (n,) similarities between the candidates' signatures and the query's
+    distinctness : (n,) see PairValidation; 0 for all but each candidate's best pose
     """
 
     T: Floats
     viewpoints: Floats
     similarities: Floats
+    distinctness: Floats
 
 
 def _suggest_poses(
@@ -278,15 +280,16 @@ def _suggest_poses(
     ]
     most = max((len(hypotheses) for _, hypotheses in of_match), default=0)
     ranked = [
-        (hypotheses[rank], match)
+        (hypotheses[rank], match, 0.0 if rank else match.validation.distinctness)
         for rank in range(most)
         for match, hypotheses in of_match
         if rank < len(hypotheses)
     ]
     return _Suggestions(
-        np.array([T for T, _ in ranked]).reshape(-1, 4, 4),
-        np.array([poses[match.index] for _, match in ranked]).reshape(-1, 4, 4),
-        np.array([match.similarity for _, match in ranked]),
+        np.array([T for T, _, _ in ranked]).reshape(-1, 4, 4),
+        np.array([poses[match.index] for _, match, _ in ranked]).reshape(-1, 4, 4),
+        np.array([match.similarity for _, match, _ in ranked]),
+        np.array([distinctness for _, _, distinctness in ranked]),
     )
 
 
@@ -400,10 +403,11 @@ def _place_evidence(
     here = at_place(suggested.T, T, p.map)
     suggesting = len(distinct_viewpoints(suggested.viewpoints[here], p.map))
     similarity = float(suggested.similarities[here].max(initial=0.0))
+    distinctness = float(suggested.distinctness[here].max(initial=0.0))
     if pose is None:
         return PlaceEvidence(
             0.0, 0.0, 0.0, 0, 0, 1.0, weight, strong, accepted, suggesting, similarity,
-            1.0, rival_weight, views.mostly_rendered(()),
+            1.0, rival_weight, distinctness, views.mostly_rendered(()),
         )  # fmt: skip
     agreeing = np.unique([i for _, i in pose.views]).astype(np.intp)
     seen_from = len(distinct_viewpoints(views.poses[agreeing], p.map))
@@ -411,6 +415,6 @@ def _place_evidence(
     ratio = max(rival, 0.0) / pose.score if pose.score > 0 else 1.0
     return PlaceEvidence(
         pose.score, pose.share, pose.planes, len(agreeing), seen_from, excess, weight, strong,
-        accepted, suggesting, similarity, ratio, rival_weight,
+        accepted, suggesting, similarity, ratio, rival_weight, distinctness,
         views.mostly_rendered(agreeing),
     )  # fmt: skip

@@ -449,9 +449,11 @@ def test_frames_that_look_the_same_way_are_asked_first():
 def test_evidence_by_hand():
     matches = [
         *seen_at(0.0, [0, 1]), *seen_at(0.0, [2], "weak"), suggested_at(0.0, 3),
-        replace(seen_at(APART, [4], "weak")[0], similarity=0.9),  # of another place
+        *seen_at(APART, [4], "weak"),  # of another place
     ]  # fmt: skip
-    matches[1] = replace(matches[1], similarity=0.7)
+    for row, similarity, distinctness in ((1, 0.7, 1.7), (4, 0.9, 2.5)):
+        seen = replace(matches[row].validation, distinctness=distinctness)
+        matches[row] = replace(matches[row], similarity=similarity, validation=seen)
     here = [picture((40, SAME)), picture((30, SAME), (10, FARTHER)), picture((40, SAME))]
     found = judged(matches, here, [picture((10, SAME))])
     assert found.status == "found"
@@ -462,7 +464,8 @@ def test_evidence_by_hand():
     assert (evidence.score, evidence.excess) == pytest.approx((40 / 60, 0.0))
     assert (evidence.frames, evidence.viewpoints) == (3, 1)  # the frames stand at one place
     assert (evidence.weight, evidence.strong, evidence.suggested) == (pytest.approx(2.4), 2, 4)
-    assert (evidence.accepted, evidence.acceptance, evidence.similarity) == (3, 1.0, 0.7)
+    assert (evidence.accepted, evidence.acceptance) == (3, 1.0)
+    assert (evidence.similarity, evidence.distinctness) == (0.7, 1.7)
     assert (evidence.rival, evidence.rival_weight) == pytest.approx((10 / 40, 0.4))
     assert itself.support == 3
     assert found.evidence is evidence

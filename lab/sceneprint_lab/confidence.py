@@ -72,9 +72,8 @@ USUAL_STEP = 0.3
 
 
 def fit(
-    samples: Sequence[JudgedQuery], shares: Mapping[str, float], ridge: float = 1e-5,
-    lone: float = 0.0,
-) -> ConfidenceParameters:  # fmt: skip
+    samples: Sequence[JudgedQuery], shares: Mapping[str, float], ridge: float = 1e-5
+) -> ConfidenceParameters:
     """Fit a conditional logistic model with penalties that never decrease with worse evidence.
 
     Parameters
@@ -83,8 +82,6 @@ def fit(
     shares : share of queries at each kind of place; confidences are probabilities for this mixture,
         however many samples there are of each kind
     ridge : weight of the squared differences between the steps and `USUAL_STEP`
-    lone : minimum amount by which the penalty for one view that suggests a pose exceeds that for
-        two
 
     Returns
     -------
@@ -114,9 +111,8 @@ def fit(
         return float(value), slope
 
     bounds = [(None, None), *[(0.0, None)] * X.shape[1]]
-    bounds[1 + 3 * list(KNOTS).index("suggested") + 1] = (lone, None)  # the step from two to one
     result = minimize(
-        loss, np.full(1 + X.shape[1], max(0.5, lone)), jac=True, bounds=bounds, method="L-BFGS-B",
+        loss, np.full(1 + X.shape[1], 0.5), jac=True, bounds=bounds, method="L-BFGS-B",
         options={"maxiter": 2000},
     )  # fmt: skip
     curves = {

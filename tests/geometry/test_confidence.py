@@ -16,7 +16,7 @@ from sceneprint.geometry.validation.confidence import (
     weakest_evidence,
 )
 
-BEST = PlaceEvidence(0.9, 0.95, 40.0, 12, 12, 0.0, 5.0, 5, 5, 8, 0.9, 0.0, 0.0)
+BEST = PlaceEvidence(0.9, 0.95, 40.0, 12, 12, 0.0, 5.0, 5, 5, 8, 0.9, 0.0, 0.0, 3.0)
 P = ConfidenceParameters(best=6.0, **{name: Penalty(3.0, 2.0, 1.0) for name in KNOTS})
 #: Rendered views cost one kind of evidence more, and another nothing.
 VIEWS = replace(P, excess=Penalty(0.0, 0.0, 0.0), rival=Penalty(9.0, 6.0, 3.0))

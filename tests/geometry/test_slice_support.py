@@ -4,11 +4,18 @@ import math
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from sceneprint.geometry.registration.plan_search import PlanParameters, ScanPlan, slice_correlation
+from sceneprint.geometry.registration.plan_search import (
+    PlanParameters,
+    ScanPlan,
+    slice_correlation,
+    slice_hypotheses,
+)
 from sceneprint.geometry.registration.slice_support import (
+    measure_distinctness,
     refine_by_points,
     refine_by_slices,
     split_correlations,
@@ -111,7 +118,7 @@ def test_points_that_do_not_correspond_refine_nothing():
         assert refine_by_points(plan_of(a), plan_of(a + np.array(shift)), np.eye(4), P) is None
 
 
-def test_a_transform_is_supported_if_points_correlate_much_better_than_elsewhere():
+def test_distinctness_compares_a_transform_with_all_others():
     points = np.random.default_rng(3).uniform(-40, 40, (400, 3)) * [1, 1, 0.1]
     true = shifted(9, 0.4, 0.2, 3)
     source, target = plan_of(points), plan_of(points @ true[:3, :3].T + true[:3, 3])
@@ -123,28 +130,34 @@ def test_a_transform_is_supported_if_points_correlate_much_better_than_elsewhere
 
     exact = slice_correlation(source, target, true, P)
     assert exact > 2  # above the values below, which are those of the nearest yaw
-    refined, supported = refine(0.75 * exact / 1.41, exact / 1.41)
-    assert supported
-    np.testing.assert_allclose(refined, true, atol=1e-3)
-    refined, supported = refine(0.75 * exact / 1.39, exact / 1.39)
-    assert not supported
-    np.testing.assert_allclose(refined, true, atol=1e-3)
-    assert refine(1.41 * exact, exact)[1]
-    refined, supported = refine(0.69, 1.0)  # much less than elsewhere
-    assert (refined is first, supported) == (True, False)
+    for elsewhere in (exact / 1.41, 0.99 * exact):
+        refined, distinctness = refine(0.75 * elsewhere, elsewhere)
+        np.testing.assert_allclose(refined, true, atol=1e-3)
+        assert distinctness == pytest.approx(exact / elsewhere, rel=0.01)
+    assert refine(1.41 * exact, exact)[1] == pytest.approx(1.41)
+    refined, distinctness = refine(0.69, 1.0)  # much less than elsewhere
+    assert (refined is first, distinctness) == (True, 0.0)
     # the hypothesis is near the transform, but not near what that is refined to
     near = np.stack([shifted(5, -0.5), shifted(-20)])
-    refined, supported = refine_by_slices(
+    refined, distinctness = refine_by_slices(
         source, target, shifted(8.4, 0.2, 0.0, 2.5), near, np.array([2 * exact, exact]), P
     )
     np.testing.assert_allclose(refined, true, atol=1e-3)
-    assert not supported
+    assert distinctness == pytest.approx(0.5, rel=0.01)
     apart = replace(P, slice_distance=19.0)  # 9.5 m
-    refined, supported = refine(1.0, 0.1, p=apart)
-    assert (refined is first, supported) == (True, False)
+    refined, distinctness = refine(1.0, 0.1, p=apart)
+    assert (refined is first, distinctness) == (True, 0.0)
+    measured = measure_distinctness(source, target, true, P)
+    hypotheses, values = slice_hypotheses(source, target, P)
+    places = hypotheses[:, :2, 3]
+    elsewhere = np.linalg.norm(places - true[:2, 3], axis=1) > 4
+    elsewhere &= np.linalg.norm(places, axis=1) >= 5  # at close scanners, all points correlate
+    assert measured == pytest.approx(exact / values[elsewhere].max())
+    assert measure_distinctness(source, target, shifted(-20), P) == 0.0
+    assert measure_distinctness(source, target, true, apart) == 0.0
     nowhere = shifted(9, z=50)  # no points correspond
-    refined, supported = refine(1.0, 0.1, T=nowhere)
-    assert (refined is nowhere, supported) == (True, False)
+    refined, distinctness = refine(1.0, 0.1, T=nowhere)
+    assert (refined is nowhere, distinctness) == (True, 0.0)
 
 
 A = AcceptanceParameters()
@@ -175,6 +188,7 @@ def test_distant_scans_of_a_street_are_accepted_by_their_points_above_the_ground
     numbers = model.parameters.validation
     result = validate(query, match, 0, numbers)
     assert (result.status, result.strength) == ("accepted", "weak")
+    assert result.distinctness > numbers.alignment.plan.slice_margin
     assert "points above the ground" in result.reason
     metres, radians = pose_difference(result.T_match_query, true)
     assert metres < 0.2  # measured: .03

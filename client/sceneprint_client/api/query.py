@@ -320,6 +320,13 @@ class EvidenceRecord(ApiRecord):
     rival_weight: float = Field(
         description="Maximum weight of the matches that vote for another place."
     )
+    distinctness: float = Field(
+        default=0.0,
+        description="Maximum, over the candidates that suggest the pose, of the ratio of the "
+        "correlation of both scans' points above the ground at the pose to their correlation "
+        "anywhere else; 0 if unknown. It is computed for scans that see all around and are some "
+        "metres apart.",
+    )
     rendered: bool = Field(
         default=False,
         description="Whether most of the frames that agree are rendered views of an imported map. "

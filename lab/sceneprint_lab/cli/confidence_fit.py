@@ -44,9 +44,6 @@ TIMES = {"rooms": 3, "sites": 3, "unmapped": 2}
 FLAWS = {"depth": MapFlaws(0.5, 0.01, 0.004), "lidar": MapFlaws(0.9, 0.0, 0.0)}
 #: Flaws of maps whose frames are fused into a surface, which has fewer gaps.
 SURFACE_FLAWS = {"depth": MapFlaws(0.3, 0.01, 0.004), "lidar": MapFlaws(0.3, 0.0, 0.0)}
-#: Minimum penalty of a pose that a single view suggests. Without it, a fit to 1,200 queries found
-#: fewer poses in recordings of scanners; neither fit found a wrong pose.
-LONE = {"depth": 0.0, "lidar": 2.5}
 
 
 def collect(
@@ -122,7 +119,7 @@ def main() -> None:
                 for query in judged_queries(answers):
                     file.write(json.dumps(asdict(query)) + "\n")
     samples = read_samples(options.evidence)
-    parameters = fit(samples, SHARES[sensor], lone=0.0 if options.views else LONE[sensor])
+    parameters = fit(samples, SHARES[sensor])
     own = replace(model.answer.confidence, **{"views" if options.views else "frames": parameters})
     confidences = [c for query in samples for c in compute_confidences(query.evidence, own)]
     measured = calibration(confidences, [right for query in samples for right in query.right])

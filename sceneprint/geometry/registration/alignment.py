@@ -478,7 +478,8 @@ class Alignment:
     refined : result of the last refinement; None if it failed
     search : source of the transform
     proposed : (n, 4, 4) all hypotheses before refinement, best first; for scans only
-    supported : whether the points in height slices support T much more than any other transform
+    distinctness : ratio of the correlation of height slices under T to that under any other
+        transform; 0 if unknown
     """
 
     T: Floats
@@ -487,7 +488,7 @@ class Alignment:
     refined: Refinement | None
     search: Search = "correspondences"
     proposed: Floats = field(default_factory=lambda: np.empty((0, 4, 4)))
-    supported: bool = False
+    distinctness: float = 0.0
 
 
 def align(
@@ -577,14 +578,14 @@ def align_scans(
     order = _rank(query, match, transforms, p, overlap_p)
     T, others = transforms[order[0]], transforms[order[1:]]
     search: Search = "plans" if is_planned[order[0]] else "correspondences"
-    supported = False
+    distinctness = 0.0
     if len(sliced):
         plans = query.plan(p.plan), match.plan(p.plan)
-        T, supported = refine_by_slices(*plans, T, sliced, values, p.plan)
+        T, distinctness = refine_by_slices(*plans, T, sliced, values, p.plan)
     there = _refine_finally(query, match, T, others, p, search)
     back = _refine_finally(match, query, inverse(T), inverses(others), p, search)
     proposed = hypotheses[np.argsort(-scores, kind="stable")]
-    return replace(there, proposed=proposed, supported=supported), back
+    return replace(there, proposed=proposed, distinctness=distinctness), back
 
 
 def _search_plans(

@@ -1,6 +1,7 @@
 """Support for a transform between two scans by their points above the ground (Sec. III-E).
 
-    ScanPlan, ScanPlan, T, slice hypotheses  --refine_by_slices-->  T_target_source, supported
+    ScanPlan, ScanPlan, T, slice hypotheses  --refine_by_slices-->  T_target_source, distinctness
+    ScanPlan, ScanPlan, T  --measure_distinctness-->  distinctness
 
 In streets, distant scans share few planes, and the shared part of the ground is rarely plane, so
 that planes neither confirm a transform nor determine its tilt. But a transform is unlikely to be
@@ -17,6 +18,7 @@ from sceneprint.geometry.registration.plan_search import (
     PlanParameters,
     ScanPlan,
     slice_correlation,
+    slice_hypotheses,
 )
 from sceneprint.geometry.rigid import are_near, nearest_rotation
 from sceneprint.types import Floats, Floats32, Ints32
@@ -35,8 +37,8 @@ _LEAST_WEIGHT = 20.0
 def refine_by_slices(
     source: ScanPlan, target: ScanPlan, T: Floats, hypotheses: Floats, values: Floats,
     p: PlanParameters,
-) -> tuple[Floats, bool]:  # fmt: skip
-    """Refine a transform by the points in slices, and decide whether they support it.
+) -> tuple[Floats, float]:  # fmt: skip
+    """Refine a transform by the points in slices, and measure how distinct it is from all others.
 
     A transform that correlates much less than others is not refined. Neither is one between
     scanners that are close to each other: similar places may then correlate as well as the same
@@ -50,19 +52,39 @@ def refine_by_slices(
 
     Returns
     -------
-    (4, 4) refined or unchanged T_target_source, and whether it is supported
+    T_target_source : (4, 4) refined or unchanged transform
+    distinctness : ratio of its slice correlation to the highest elsewhere; 0 if not refined
     """
     if np.linalg.norm(T[:3, 3]) < p.slice_distance * p.cell:
-        return T, False
+        return T, 0.0
     near, elsewhere = split_correlations(T, hypotheses, values, target.R[2], p)
     if near <= p.slice_share * elsewhere:
-        return T, False
+        return T, 0.0
     refined = refine_by_points(source, target, T, p)
     if refined is None:
-        return T, False
-    near, elsewhere = split_correlations(refined, hypotheses, values, target.R[2], p)
-    near = max(near, slice_correlation(source, target, refined, p))
-    return refined, near >= p.slice_margin * elsewhere
+        return T, 0.0
+    return refined, _compare(source, target, refined, hypotheses, values, p)
+
+
+def measure_distinctness(source: ScanPlan, target: ScanPlan, T: Floats, p: PlanParameters) -> float:
+    """Return the ratio of the slice correlation under T_target_source to the highest elsewhere.
+
+    The result is 0 if the transform correlates much less than others, or if the scanners are close
+    to each other; see `refine_by_slices`.
+    """
+    if np.linalg.norm(T[:3, 3]) < p.slice_distance * p.cell:
+        return 0.0
+    distinctness = _compare(source, target, T, *slice_hypotheses(source, target, p), p)
+    return distinctness if distinctness > p.slice_share else 0.0
+
+
+def _compare(
+    source: ScanPlan, target: ScanPlan, T: Floats, hypotheses: Floats, values: Floats,
+    p: PlanParameters,
+) -> float:  # fmt: skip
+    """Return the ratio of the slice correlation under T to the highest elsewhere."""
+    near, elsewhere = split_correlations(T, hypotheses, values, target.R[2], p)
+    return max(near, slice_correlation(source, target, T, p)) / max(elsewhere, 1e-9)
 
 
 def split_correlations(

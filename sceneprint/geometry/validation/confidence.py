@@ -45,6 +45,8 @@ class PlaceEvidence:
     rival : score of the best other place, relative to the score of this place; 0 if there is no
         other
     rival_weight : largest `weight` of any other place
+    distinctness : maximum over these candidates of the ratio of the correlation of two scans'
+        points in height slices at the pose to that at any other; 0 if unknown
     rendered : whether most of the agreeing frames are views that were rendered from a surface
     """
 
@@ -61,6 +63,7 @@ class PlaceEvidence:
     similarity: float
     rival: float
     rival_weight: float
+    distinctness: float = 0.0
     rendered: bool = False
 
     @property
@@ -105,6 +108,7 @@ KNOTS: Mapping[str, tuple[float, float, float, float]] = {
     "similarity": (0.05, 0.2, 0.4, 0.65),
     "rival": (1.0, 0.8, 0.5, 0.2),
     "rival_weight": (2.0, 1.0, 0.4, 0.0),
+    "distinctness": (0.0, 1.5, 2.0, 3.0),
 }
 
 
@@ -130,6 +134,7 @@ class ConfidenceParameters:
     similarity: Penalty = Penalty(0.0, 0.0, 0.0)
     rival: Penalty = Penalty(9.0, 5.0, 2.0)
     rival_weight: Penalty = Penalty(4.0, 2.0, 1.0)
+    distinctness: Penalty = Penalty(0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -196,4 +201,7 @@ def weakest_evidence(e: PlaceEvidence, p: ConfidenceModel) -> str:
         "similarity": "the frame is not similar to the frames of the map that suggest this pose",
         "rival": "another pose explains the frame equally well: the place repeats or is symmetric",
         "rival_weight": "the matches disagree: some vote for another pose",
+        "distinctness": "the points above the ground fit about as well elsewhere"
+        if e.distinctness
+        else "the points above the ground do not confirm this pose",
     }[name]

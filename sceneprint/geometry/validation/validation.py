@@ -51,6 +51,7 @@ from sceneprint.geometry.registration.overlap import (
     sample_points,
 )
 from sceneprint.geometry.registration.sequence_alignment import Matching
+from sceneprint.geometry.registration.slice_support import measure_distinctness
 from sceneprint.geometry.rigid import (
     NO_UPS,
     Ups,
@@ -145,6 +146,8 @@ class PairValidation:
     tilt_rad : tilt of the transform against `ups`; None if either is unknown
     contradicts_up : whether the surfaces support the transform, but it tilts too much
     predicted : (4, 4) T_match_query that the map's poses predict; None unless the match is guided
+    distinctness : ratio of the correlation of two scans' points in height slices under the
+        transform to that under any other transform; 0 if unknown
     """
 
     status: Status
@@ -172,6 +175,7 @@ class PairValidation:
     tilt_rad: float | None = None
     contradicts_up: bool = False
     predicted: Floats | None = None
+    distinctness: float = 0.0
 
     @property
     def guided(self) -> bool:
@@ -439,22 +443,27 @@ def _decide(
     )
     evidence = _collect_evidence(query, match, found_by, T, residual, seen, best, p)
     proposal = _Proposal(T, directions, found_by, *evidence)
+    distinctness = 0.0 if there is None else there.distinctness
+    around = _sees_around(query.geometry) and _sees_around(match.geometry)
+    is_partial = mode == "full" and not around and are_scans(query.geometry, match.geometry)
+    if is_partial and proposal.evidence.planes >= p.acceptance.sliced_planes:
+        plans = query.plan(p.alignment.plan), match.plan(p.alignment.plan)
+        distinctness = measure_distinctness(*plans, T, p.alignment.plan)
     verdict = _judge(query, match, proposal, there, back, p, mode)
     if verdict.status == "rejected" and mode == "full":
         sparse = _accept_sparse(query, match, proposal, there, back, p)
         proposal, verdict = sparse or (proposal, verdict)
-        if there is not None and there.supported:
+        if distinctness >= p.alignment.plan.slice_margin:
             verdict = _accept_sliced(proposal, (query.up, match.up), p) or verdict
     e, rival, ups = proposal.evidence, verdict.rival, (query.up, match.up)
     covariance = proposal.covariance(p) if verdict.status == "accepted" else None
     return PairValidation(
         verdict.status, verdict.strength, verdict.reason, proposal.T, e.residual_m, e.residual_rad,
         e.overlap, e.plane_overlap, e.violations, proposal.inliers, rival.share, rival.T, seed,
-        covariance, _sees_around(query.geometry) and _sees_around(match.geometry), e.planes,
-        e.plane_violations, found_by[0].search, proposal.directions,
+        covariance, around, e.planes, e.plane_violations, found_by[0].search, proposal.directions,
         others[0][1] if others else None,
         _collect_hypotheses(there, back, transforms, rival.T, p.n_hypotheses),
-        ups, tilt_of(proposal.T, ups),
+        ups, tilt_of(proposal.T, ups), distinctness=distinctness,
     )  # fmt: skip
 
 
