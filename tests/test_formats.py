@@ -4,9 +4,12 @@ from pathlib import Path
 from typing import get_args
 
 import numpy as np
+import pytest
 
 from sceneprint.decoders.child_process import array_samples, text_samples
+from sceneprint.errors import FrameError
 from sceneprint.formats.depth_file import decode_samples, encode_npy, encode_png, size_of
+from sceneprint.formats.points.cloud import decode_scan
 from sceneprint_client.formats import (
     FORMATS,
     CloudFormat,
@@ -48,3 +51,17 @@ def test_every_depth_format_is_recognised_measured_and_read():
 def test_every_cloud_format_but_one_is_recognised():
     for data, name in (*array_samples(), *text_samples()):
         assert format_of(data) == (None if name == "kitti" else name)
+
+
+@pytest.mark.parametrize(
+    ("start", "remedy"),
+    [
+        (b"version https://git-lfs.github.com/spec/v1", "Run `git lfs pull`"),
+        (b"\x1f\x8b\x08", "Decompress it"), (b"PK\x03\x04", "Extract it"),
+        (b"<!DOCTYPE html>", "Download the file itself"),
+    ],
+)  # fmt: skip
+def test_files_that_are_sent_by_mistake_are_named(start, remedy):
+    for decode in (decode_samples, decode_scan):
+        with pytest.raises(FrameError, match=remedy):
+            decode(start + bytes(99))

@@ -244,6 +244,21 @@ def format_at(head: bytes, *kinds: Kind) -> Format | None:
     return next((entry for entry in formats_of(*kinds) if entry.begins(head)), None)
 
 
+#: First bytes of other files that are sent as frames, and what to do.
+_FOREIGN = (
+    (b"version https://git-lfs", "This is a pointer of Git LFS. Run `git lfs pull`."),
+    (b"\x1f\x8b", "This is compressed by gzip. Decompress it."),
+    (b"PK\x03\x04", "This is a zip or NPZ archive. Extract it."),
+    (b"<!DOCTYPE", "This is a web page. Download the file itself."),
+    (b"<html", "This is a web page. Download the file itself."),
+)
+
+
+def foreign_file(head: bytes) -> str:
+    """Return what to do with a file that contains no frame, with a trailing space, or ""."""
+    return next((f"{text} " for start, text in _FOREIGN if head.startswith(start)), "")
+
+
 def format_named(file: str, *kinds: Kind) -> Format | None:
     """Return the format that the suffix of a file name indicates, or None.
 

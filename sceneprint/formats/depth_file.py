@@ -33,7 +33,7 @@ from sceneprint_client.files import (
     npy_header,
     read_bytes,
 )
-from sceneprint_client.formats import format_at, function_at, titles_of
+from sceneprint_client.formats import foreign_file, format_at, function_at, titles_of
 from sceneprint_client.poses import rigid_transform
 from sceneprint_client.ros_messages import TRANSPORT_BYTES, inverse_depth
 
@@ -464,9 +464,9 @@ def decode_samples(data: bytes) -> Samples:
     file_format = format_at(data, "depth")
     if file_format is None:
         raise UnreadableFrame(
-            f"The format is none of {titles_of('depth')}. Write the depth as a 16-bit greyscale "
-            "PNG, or with numpy.save as a float32 array in metres or a uint16 array in stored "
-            "units."
+            f"{foreign_file(data)}The format is none of {titles_of('depth')}. Write the depth as "
+            "a 16-bit greyscale PNG, or with numpy.save as a float32 array in metres or a uint16 "
+            "array in stored units."
         )
     samples: Samples = function_at(file_format.reader)(data)
     return samples

@@ -31,6 +31,7 @@ from sceneprint_client.files import (
 from sceneprint_client.formats import (
     HEAD,
     CloudFormat,
+    foreign_file,
     format_of,
     formats_of,
     function_at,
@@ -67,7 +68,7 @@ def read_kitti(data: bytes) -> FilePoints:
 
 
 #: Recognised row lengths, and minimum number of rows for a decision.
-_LENGTHS, _FEWEST_ROWS = range(3, 9), 500
+_LENGTHS, _FEWEST_ROWS = range(3, 9), 200
 _LEAST_SPREAD = 0.02  #: minimum column spread for a decision
 _LEAST_OF_BEST = 0.93  #: minimum column spread at length four, relative to the largest spread
 
@@ -78,7 +79,8 @@ def _row_length(data: bytes) -> int | None:
     With a wrong length, columns mix all fields and have similar means. Therefore, the variance of
     the column means, relative to the variance of all values, is maximal for the correct length. In
     57 scans of three sensors, written in rows of 3 to 8 numbers, the value for length four was at
-    least .99 of the maximum if four was correct, and at most .87 otherwise.
+    least .99 of the maximum if four was correct, and at most .87 otherwise. Of 10,944 parts of 100
+    to 1000 of their points in rows of four, none was estimated otherwise; of 60 points, 3 of 2,736.
     """
     values = np.frombuffer(data, "<f4", len(data) // 4)
     if len(values) < _FEWEST_ROWS * _KITTI_ROW // 4:
@@ -381,8 +383,8 @@ def _select_format(data: bytes, stated: CloudFormat | None) -> CloudFormat:
         raise UnreadableCloud("The file is empty. Copy or write it again.")
     if stated is None and recognised is None:
         raise UnreadableCloud(
-            f"According to its first bytes, the format is none of {titles_of('cloud')}. Write one "
-            "of these; for a KITTI scan, specify the format kitti."
+            f"{foreign_file(data)}According to its first bytes, the format is none of "
+            f"{titles_of('cloud')}. Write one of these; for a KITTI scan, specify the format kitti."
         )
     chosen = stated or recognised
     assert chosen is not None
