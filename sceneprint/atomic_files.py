@@ -41,7 +41,7 @@ def public_mode(folder: Path) -> int | None:
 
 
 def nearest_folder(folder: Path) -> Path:
-    """Return the folder or its nearest existing parent, on whose disk it will be.
+    """Return the folder or its nearest existing parent, to examine the disk of a future folder.
 
     Raises
     ------

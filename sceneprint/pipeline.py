@@ -209,7 +209,7 @@ def validate(
     ----------
     query, match : geometry artifacts of one model
     seed : seed of the random choices; the result contains it
-    p : parameters; None selects those of the artifacts' model
+    p : parameters; None selects the parameters of the artifacts' model
     mode : "full", or "paper" to apply only the paper's test
     matching : "histograms", or "sequence" for the paper's slower matching
     ups : (3,) unit vectors, up in the query's and in the match's coordinates; None if unknown
@@ -303,7 +303,7 @@ def _require_same_model(a: Signature | Geometry, b: Signature | Geometry | Model
         )
 
 
-#: Default number of accepted matches per query, to which confidences are fitted.
+#: Default number of accepted matches per query; confidences are fitted for this number.
 VERDICT_MATCHES = 5
 
 #: Function that returns the parent frame and T_parent_sensor (4, 4) of a database row; None if the

@@ -344,7 +344,7 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
-        """Refuse misspelt names of settings, which would be ignored."""
+        """Refuse misspelt names of settings, since pydantic would ignore them."""
         settings = [name.upper() for name in type(self).model_fields]
         for variable in os.environ:
             prefix, _, name = variable.partition("_")

@@ -20,8 +20,8 @@ Waiter = TypeVar("Waiter")
 #: Seconds after its latest request for which a tenant counts as present, so that others leave turns
 #: for it.
 PRESENT_S = 60.0
-#: Seconds after its latest request for which a tenant counts as active, so that others rest. A rest
-#: is never longer.
+#: Seconds after its latest request for which a tenant counts as active, so that others rest; also
+#: the maximum rest.
 ACTIVE_S = 1.0
 
 
@@ -60,7 +60,7 @@ class TurnOrder(Generic[Waiter]):
     def enter(self, tenant: str, waiter: Waiter, weight: int = 1) -> int:
         """Add a waiter for `weight` turns (at most half of all) at once; return their number."""
         weight = min(weight, max(self._count // 2, 1))
-        self.see(tenant)
+        self.record_request(tenant)
         self._waiting.setdefault(tenant, deque()).append((weight, waiter))
         return weight
 
@@ -107,7 +107,7 @@ class TurnOrder(Generic[Waiter]):
         if not self._held[tenant]:
             del self._held[tenant]
             now, began = self._clock(), self._began.pop(tenant)
-            if self._rest and self._is_beside(tenant, now):
+            if self._rest and self._others_are_active(tenant, now):
                 self._resting[tenant] = now + min(self._rest * (now - began), ACTIVE_S)
 
     def rest_s(self) -> float | None:
@@ -122,19 +122,19 @@ class TurnOrder(Generic[Waiter]):
         until = self._resting.get(tenant)
         if until is None:
             return False
-        if until <= now or not self._is_beside(tenant, now):
+        if until <= now or not self._others_are_active(tenant, now):
             del self._resting[tenant]
             return False
         return True
 
-    def _is_beside(self, tenant: str, now: float) -> bool:
+    def _others_are_active(self, tenant: str, now: float) -> bool:
         """Return whether another tenant sent a request within the last ACTIVE_S."""
         others = (seen for other, (seen, _) in reversed(self._seen.items()) if other != tenant)
         latest = next(others, None)
         return latest is not None and latest > now - ACTIVE_S
 
-    def see(self, tenant: str) -> None:
-        """Record a request of a tenant, also one that needs no turn: others then share and rest."""
+    def record_request(self, tenant: str) -> None:
+        """Record a request of a tenant, even without a turn, so that others share and rest."""
         now = self._clock()
         self._seen[tenant] = now, self._seen.pop(tenant, (now, 0))[1]
         while True:

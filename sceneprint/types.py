@@ -249,7 +249,7 @@ class Geometry:
     model_id: str
 
 
-#: Kinds of cameras; NOWHERE stands for unordered points, which have none.
+#: Kinds of cameras; NOWHERE stands for unordered points without a camera.
 PINHOLE, SPHERE, NOWHERE = 0, 1, 2
 
 

@@ -213,7 +213,7 @@ async def _admit(request: Request, here: Service, tenant: str) -> None:
         is_number = length.isascii() and length.isdigit()
         here.spool.require_room(tenant, int(length) if is_number else 0)
         request.state.body.charge(here.spool, tenant)
-    here.reads.order.see(tenant)
+    here.reads.order.record_request(tenant)
     endpoint = getattr(request.scope.get("route"), "endpoint", None)
     if not iscoroutinefunction(endpoint):
         await hold_read(request, here, tenant)

@@ -127,7 +127,7 @@ def test_a_request_without_a_turn_makes_others_share_and_rest():
     order = TurnOrder(4, 1, lambda: clock.now, rest=2.0)
     order.enter("a", "a1")
     order.enter("a", "a2")
-    order.see("b")
+    order.record_request("b")
     assert order.admit() == ["a1"]
     clock.now = 0.25
     order.release("a")

@@ -51,7 +51,7 @@ THREADS = 8
 _BATCH = 256
 #: Size, in bytes, above which blobs are streamed instead of read into memory.
 LARGE = 8 << 20
-#: Callback that receives the number of finished rows and blobs, and the number of all.
+#: Callback that receives the number of finished rows and blobs, and their total number.
 Progress = Callable[[int, int], None]
 #: Columns of a list of blobs: digest, size in bytes, and reason why the blob is not in the bundle.
 BLOB_COLUMNS = ("digest", "bytes", "lost")

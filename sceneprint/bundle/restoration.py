@@ -163,7 +163,7 @@ class _Restoration:
         return sorted(str(row[columns.index("name")]) for row in rows)
 
     def secrets(self) -> list[Row]:
-        """Return the rows of the table of secrets, which identify a store."""
+        """Return the rows of the table of secrets; they identify a store."""
         columns = [column.name for column in secrets.columns]
         return list(
             decoded_rows([*secrets.columns], self._read_table(secrets.name, columns, counts=False))
@@ -327,7 +327,7 @@ def _write_file(path: Path, reading: _Restoration, *, keep_keys: bool = True) ->
 
 
 def _publish(work: Path, folder: Path) -> None:
-    """Move the blobs to the data folder, and then the database, which makes the folder a store."""
+    """Move the blobs to the data folder, and then the database, to complete the store."""
     try:
         (work / _BLOBS).rename(folder / _BLOBS)
         put_new(work / _DATABASE, folder / _DATABASE)

@@ -54,7 +54,7 @@ Row = Sequence[Any]
 
 
 def tables() -> list[Table]:
-    """Return the tables of a bundle; a table follows those to which it refers.
+    """Return the tables of a bundle; a table follows all tables to which it refers.
 
     The table of pending events is omitted: `read_table` yields its rows as events.
     """
@@ -202,7 +202,7 @@ def _encoder(column: Column[Any]) -> Callable[[Any], Any] | None:
         return lambda value: base64.b64encode(value).decode()
     if isinstance(column.type, Boolean):
         return bool
-    if isinstance(column.type, JSON):  # SQLite returns a document that is a number as a number
+    if isinstance(column.type, JSON):  # SQLite returns numbers in JSON as numbers
         return lambda value: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
     return None
 

@@ -46,7 +46,7 @@ _compiler_lock = threading.RLock()
 
 
 class Kernel:
-    """A loop over arrays that is compiled, or whose code is loaded, on its first call.
+    """A loop over arrays that is compiled, or loaded from disk, on its first call.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ class Kernel:
         return self.compiler(*arguments)
 
     def __reduce__(self) -> str:
-        """Return the name of the kernel, from which pickle restores it."""
+        """Return the name of the kernel, so that pickle can restore it by name."""
         return self.function.__qualname__
 
     def __getattr__(self, name: str) -> Any:

@@ -375,7 +375,7 @@ class GravityParameters:
     gate: float = math.radians(15.0)  #: maximum difference of two corresponding patches' slopes
     proposed_tilt: float = math.radians(20.0)  #: maximum tilt of an unrefined hypothesis
     refined_tilt: float = math.radians(10.0)  #: maximum tilt of a refined pose
-    rival_tilt: float = math.radians(20.0)  #: tilt from which a transform cannot be a rival
+    rival_tilt: float = math.radians(20.0)  #: minimum tilt of a transform that cannot be a rival
     floor_tilt: float = math.radians(30.0)  #: maximum angle between a floor's normal and `up`
     floor_stride: int = 7  #: stride of the pixels that are examined for the floor
 

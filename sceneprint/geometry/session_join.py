@@ -132,7 +132,7 @@ class CycleParameters:
     close_m: float = 0.07  #: maximum residual of a loop of length zero, metres
     close_rad: float = math.radians(4.0)  #: maximum residual of a loop of length zero, radians
     drift: float = 0.05  #: drift of odometry within a loop, metres per metre, radians per radian
-    most_drift: float = 0.2  #: maximum plausible drift between any two frames of a run
+    most_drift: float = 0.2  #: maximum plausible drift between two frames of a run
     reach_m: float = 1.0  #: maximum path length between the edges of a loop, metres
     reach_rad: float = math.radians(60.0)  #: maximum rotation between the edges of a loop, radians
     view_m: float = 0.1  #: maximum distance between two frames of a viewpoint, metres
@@ -267,7 +267,7 @@ def _loops(
 def _are_elsewhere(
     poses: Floats, firsts: Ints64, seconds: Ints64, p: CycleParameters
 ) -> NDArray[np.bool_]:
-    """Return a mask (M,) of the pairs of poses, of (n, 4, 4), whose viewpoints differ."""
+    """Return a mask (M,) of the index pairs of poses (n, 4, 4) with different viewpoints."""
     a, b = poses[firsts], poses[seconds]
     metres = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
     cosines = (np.einsum("nij,nij->n", a[:, :3, :3], b[:, :3, :3]) - 1.0) / 2.0
@@ -300,7 +300,7 @@ def _count_pairs(ways: Floats, limits: Floats) -> int:
 def _loop_residual(
     here: Floats, there: Floats, transforms: Floats, i: int, j: int
 ) -> tuple[float, float]:
-    """Return the residual of the loop over edges i and j at the source of j: metres, radians."""
+    """Return the residual (metres, radians) of the loop of edges i and j at the source of j."""
     # each edge predicts the position of j's source frame in the target's parent frame
     R, t = np.zeros((2, 3, 3)), np.zeros((2, 3))
     for k in range(2):
@@ -397,7 +397,7 @@ class JoiningParameters:
     least_frames: int = 2  #: minimum number of frames of the agreeing votes, in each run
     view_m: float = 0.1  #: maximum distance between two frames of a viewpoint, metres
     view_rad: float = math.radians(6.0)  #: maximum angle between two frames of a viewpoint, radians
-    rival: float = 0.5  #: share of the support at which another transform prevents a join
+    rival: float = 0.5  #: minimum support of a rival that prevents a join, as a share of the best
     strong_votes: int = 10  #: minimum number of agreeing votes of a strong join
     strong_frames: int = 5  #: minimum number of their frames in each run
     strong_share: float = 0.5  #: minimum share of agreeing votes among all votes

@@ -1,7 +1,7 @@
 """FAISS indexes that compare all signatures by squared Euclidean distance.
 
 Tests show that this type of FAISS index is correct; some other types return wrong results or abort
-the process. Its codes are the signatures, so its distances equal those of `geometry.retrieval` as
+the process. It stores the signatures themselves, so its distances equal `geometry.retrieval` as
 long as single precision represents them exactly.
 """
 

@@ -87,7 +87,7 @@ class IndexManifest(StrictRecord):
 
     Parameters
     ----------
-    number : number of the version, larger than that of the previous version
+    number : number of the version, larger than the previous number
     revision : revision of the map up to which the index contains its frames
     model_id : id of the model that signed the frames
     dimension : D, length of a signature in bytes

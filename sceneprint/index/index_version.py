@@ -362,8 +362,9 @@ def publish(
     """Publish the version that follows `previous`.
 
     Only one process builds in a folder at a time. All versions except `previous` and the new one
-    are removed; readers that have mapped them can still use them. Only new frames, and the segments
-    with which they are merged, are written. Memory holds the signatures of one segment at a time.
+    are removed; readers that have mapped them can still use them. Only segments with new frames,
+    merged with some earlier segments, are written. Memory holds the signatures of one segment at a
+    time.
 
     Parameters
     ----------
@@ -447,14 +448,14 @@ def _is_overtaken(folder: Path, previous: IndexVersion) -> bool:
     return version is None or version.number != previous.number
 
 
-def clear(folder: Path, but: int | None = None) -> bool:
-    """Remove all versions of an index except number `but`; return False during a build.
+def clear(folder: Path, keep: int | None = None) -> bool:
+    """Remove all versions of an index except number `keep`; return False during a build.
 
     Readers may still use the removed versions.
     """
     with folder_turn(folder) as mine:
         if mine:
-            keep_only(folder, () if but is None else (but,))
+            keep_only(folder, () if keep is None else (keep,))
         return mine
 
 

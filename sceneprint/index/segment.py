@@ -185,7 +185,7 @@ class Segment:
         keys and distances of the candidates; whether all searchable frames were compared; and the
         number of compared frames
         """
-        free = self._free_rows(gone, among)
+        free = self._searchable_mask(gone, among)
         count = len(self.keys) if free is None else int(np.count_nonzero(free))
         rows: NDArray[np.int64] | None = None  # None selects all searchable rows
         if free is not None and count < len(free) // FEW:
@@ -201,7 +201,7 @@ class Segment:
         distant = distances(query, self.vectors, metric, rows)
         return (self.keys[rows], distant), len(rows) == count, len(rows)
 
-    def _free_rows(self, gone: Keys, among: Keys | None) -> NDArray[np.bool_] | None:
+    def _searchable_mask(self, gone: Keys, among: Keys | None) -> NDArray[np.bool_] | None:
         """Return a mask (N,) of the searchable rows; None if all are searchable."""
         rows = self.places.matches(gone)
         if among is None and len(rows) == len(self.gone) == 0:

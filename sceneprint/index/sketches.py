@@ -29,7 +29,7 @@ from sceneprint.types import Bytes, Floats32
 if TYPE_CHECKING:
     from faiss import IndexBinaryFlat
 
-#: Maximum number of frames from which means are computed.
+#: Maximum number of frames in the computation of means.
 MEASURED = 1 << 16
 #: Minimum number of frames that a search selects: absolute, and as a multiple of its results.
 LEAST_SELECTED, TIMES_WANTED = 256, 4
@@ -93,7 +93,7 @@ def draw(n: int, limit: int, seed: int) -> NDArray[np.int64]:
     """Select at most `limit` of n rows: a random row from each of `limit` equal intervals.
 
     Intervals represent all places of a map equally. Random selection avoids aliasing with periodic
-    orders of frames, such as those of alternating robots.
+    orders of frames, such as from alternating robots.
     """
     if n <= limit:
         return np.arange(n)

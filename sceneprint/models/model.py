@@ -49,7 +49,7 @@ from sceneprint.types import Floats32
 #: id depends on its version. Raise a version if a change of code changes signatures of such models.
 SCHEMA_VERSION, PSI_SCHEMA_VERSION = 3, 2
 
-#: Groups of which files and ids omit parameters that have the default value. Therefore, new
+#: Groups of parameters; files and ids omit those with the default value. Therefore, new
 #: parameters preserve the ids of existing models, but defaults must not change.
 SPARSE = ("cloud", "validation")
 
@@ -238,7 +238,7 @@ def parse_parameters(values: Any) -> ModelParameters:
 
 
 def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
-    """Convert parsed JSON that has exactly the fields of a parameter record to the record.
+    """Convert parsed JSON with exactly the fields of a parameter record to this record.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def from_mapping(kind: type[T], values: Any, where: str, **groups: Any) -> T:
 
 
 def differences(record: Any, default: Any = None) -> dict[str, Any]:
-    """Return the values of a record that differ from those of another record, by group.
+    """Return the values of a record that differ from another record, by group.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ __all__ = [
 log = logging.getLogger(__name__)
 
 
-#: Ratio between the memory of a cached geometry and that of its arrays: derived samples, plane
+#: Ratio of the memory of a cached geometry to the size of its arrays: derived samples, plane
 #: weights and symmetries add up to 20 %.
 _OVERHEAD = 1.25
 

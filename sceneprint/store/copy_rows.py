@@ -1,4 +1,4 @@
-"""Rows of map copies: read from the store of the original, and written to that of the copy."""
+"""Reading of the rows of a map, and writing of these rows to a copy in another store."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from sqlalchemy import Column, Connection, Row, insert, select, update
 
-from sceneprint.store.maps import add_usage, find_map, free_id, next_revision, position
+from sceneprint.store.maps import add_usage, find_map, next_revision, position, replace_id
 from sceneprint.store.signatures import StoredSignature, put_signatures
 from sceneprint.store.tables import (
     FrameRow,
@@ -71,7 +71,7 @@ def living_rows(connection: Connection, row: MapRow) -> dict[str, FrameRow]:
     return {frame["id"]: frame_row(frame) for frame in rows}
 
 
-def date_map(connection: Connection, row: MapRow, created_at: float) -> MapRow:
+def set_creation_time(connection: Connection, row: MapRow, created_at: float) -> MapRow:
     """Set the creation time of a map to `created_at`, and return the map."""
     own = update(maps).where(maps.c.number == row.number)
     connection.execute(own.values(created_at=created_at))
@@ -104,7 +104,7 @@ def add_copied(connection: Connection, row: MapRow, copies: Sequence[CopiedFrame
         frames.c.map_number == row.number, frames.c.id.in_([copy.id for copy in copies])
     )
     for frame_id in connection.execute(deleted).scalars().all():
-        free_id(connection, row.number, frame_id)
+        replace_id(connection, row.number, frame_id)
     last = next_revision(connection, row.number, len(copies))
     rows = [
         {

@@ -222,7 +222,7 @@ def migrate(database: Database) -> None:
                 connection.exec_driver_sql("SELECT version_num FROM alembic_version FOR UPDATE")
             with _migrating:
                 command.upgrade(config, "head")
-            # check foreign keys, which `unchecked` has turned off
+            # check foreign keys, since `unchecked` has turned them off
             if (
                 database.is_sqlite
                 and connection.exec_driver_sql("PRAGMA foreign_key_check").first() is not None
@@ -344,7 +344,7 @@ class Database:
         Raise UnusableStore if another process writes to a read-only file in the meantime.
         """
         before = None if self._sealed is None else self._sealed.state()
-        with self.explained(), self._readers.connect() as connection:
+        with self.translate_errors(), self._readers.connect() as connection:
             yield connection
             if self._sealed is not None:
                 self._sealed.check(before)
@@ -389,7 +389,7 @@ class Database:
             wait_s = postgres.MIGRATION_S
         with (
             self._take_thread_turn(self._turns if map_number is None else self._map_turns, wait_s),
-            self.explained(),
+            self.translate_errors(),
             self._writers.connect() as connection,
         ):
             if single and map_number is not None:
@@ -419,7 +419,7 @@ class Database:
         self.require_writable()
         turn_s = postgres.HELD_S if self._held else BUSY_S
         # take no turn among the threads of this process: the statement would wait for their maps
-        with self._note_locks(), self.explained(), self._writers.connect() as connection:
+        with self._note_locks(), self.translate_errors(), self._writers.connect() as connection:
             with self._write_single(connection, map_numbers, turn_s, wait_s) as writing:
                 yield writing
             postgres.require_synchronous(writing)
@@ -443,7 +443,7 @@ class Database:
         """Run a transaction without a turn on PostgreSQL."""
         # lock the schema, for which a migration waits
         checks = (f"{postgres.SCHEMA} FOR KEY SHARE",) if self._guarded else ()
-        with self.explained(), self._writers.begin() as connection:
+        with self.translate_errors(), self._writers.begin() as connection:
             row = postgres.begin(connection, *checks)
             if row is not None:
                 self._check_schema(row)
@@ -506,22 +506,22 @@ class Database:
         """Empty SQLite's log, which may contain deleted data; return False if the log is in use."""
         if not self.is_sqlite or self.read_only:
             return True
-        with self.explained():
+        with self.translate_errors():
             connection = self._engine.raw_connection()
             try:
                 return shrink_log(connection.driver_connection)
             finally:
                 connection.close()
 
-    def explained(self) -> AbstractContextManager[None]:
+    def translate_errors(self) -> AbstractContextManager[None]:
         """Translate errors of the database within the context to errors of the store."""
-        return explained(self._engine)
+        return translate_errors(self._engine)
 
     def driver_connection(self) -> psycopg.Connection[Any]:
         """Return a new connection to PostgreSQL that commits each statement immediately.
 
         The connection is for session state, such as LISTEN and session locks. The caller must close
-        it, and execute statements within `explained`.
+        it, and execute statements within `translate_errors`.
 
         Raises
         ------
@@ -532,7 +532,7 @@ class Database:
             raise ValueError(f"{self.shown} has no sessions")
         import psycopg
 
-        with self.explained():
+        with self.translate_errors():
             args, named = self._engine.dialect.create_connect_args(self._engine.url)
             options = {**postgres.connect_options(self._engine.url), **named}
             connection = psycopg.connect(*args, **options, autocommit=True)
@@ -612,7 +612,7 @@ def open_database(url: str) -> Database:
 
 
 @contextmanager
-def explained(engine: Engine) -> Iterator[None]:
+def translate_errors(engine: Engine) -> Iterator[None]:
     """Translate errors of a database within the context to errors of the store."""
     try:
         yield

@@ -212,7 +212,7 @@ def remove_map(connection: Connection, row: MapRow) -> list[str]:
         ),
     )
     blobs = sorted({blob for query in statements for blob in connection.execute(query).scalars()})
-    doom_found(connection, *statements)
+    doom_selected(connection, *statements)
     connection.execute(delete(signatures).where(signatures.c.frame_number.in_(own)))
     tiles = select(surface_tiles.c.number).where(surface_tiles.c.map_number == row.number)
     connection.execute(delete(surface_touches).where(surface_touches.c.tile_number.in_(tiles)))
@@ -268,7 +268,7 @@ def remove_in_blocks(
 def doom(connection: Connection, blobs: Iterable[str]) -> float:
     """Record up to a few thousand blobs as doomed, that is, to be removed if unreferenced.
 
-    Existing records get the new time, so that the process that wrote them does not clear them.
+    Existing records get the new time, so that an earlier writer does not clear them.
 
     Returns
     -------
@@ -285,7 +285,7 @@ def _replace_time(new: Any) -> Any:
     return new.on_conflict_do_update(index_elements=["blob"], set_={"at": new.excluded.at})
 
 
-def doom_found(connection: Connection, *statements: Select[tuple[str]]) -> None:
+def doom_selected(connection: Connection, *statements: Select[tuple[str]]) -> None:
     """Record as doomed all blobs that the statements select; see `doom`."""
     blobs = union(*statements).subquery()
     # WHERE is necessary: otherwise, SQLite would parse ON CONFLICT as the condition of a join

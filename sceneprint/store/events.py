@@ -94,7 +94,7 @@ def record_events(
     )  # fmt: skip
 
 
-#: Kinds of events without an audit line: the actor who reads a frame does not cause them.
+#: Kinds of events without an audit line: they are not caused by the actor, who only reads.
 _DISCOVERIES = frozenset(("frame.damaged",))
 
 
@@ -190,7 +190,7 @@ class EventFilter:
     Parameters
     ----------
     maps : names of the selected maps; None selects all maps, and events without a map
-    kinds : prefixes of kinds, of which one must match; empty selects all kinds
+    kinds : prefixes of kinds, one of which must match; empty selects all kinds
     of_maps : whether to exclude events without a map
     since : time of the first access by the caller, seconds since 1970. Events of maps deleted
         earlier are hidden, even if another map has the same name. None hides no events
@@ -311,7 +311,7 @@ def removal_floors(connection: Connection, most_events: int) -> dict[str | None,
         return {}
     numbers: dict[str | None, int] = {}
     for name in (*_names(connection), None):
-        condition = _of(name)
+        condition = _events_of(name)
         least, most = (
             connection.execute(select(end(events.c.number)).where(condition)).scalar()
             for end in (func.min, func.max)
@@ -352,10 +352,10 @@ def removal_floor(
 
 
 def _former_floors(connection: Connection, names: Collection[str], floor: int) -> Iterator[int]:
-    """Yield 0, and the removal floor of each deleted map.
+    """Yield 0, and the number up to which the events of each deleted map may have been removed.
 
-    Events of deleted maps have a common floor, but the last event of a map limits it for readers of
-    that map.
+    The events of all deleted maps are removed up to the same number, `floor`; the result for a map
+    does not exceed its last event.
     """
     yield 0
     for name in names:
@@ -381,7 +381,7 @@ def surplus_events(
     """
     numbers: list[int] = []
     for name, floor in removal_floors(connection, most_events).items():
-        old = select(events.c.number).where(_of(name), events.c.number <= floor)
+        old = select(events.c.number).where(_events_of(name), events.c.number <= floor)
         stay = {number for number in anchors if number <= floor}
         if name is not None:
             stay.add(floor)
@@ -403,7 +403,7 @@ def _names(connection: Connection) -> list[str]:
     return list(connection.execute(select(maps.c.name)).scalars())
 
 
-def _of(name: str | None) -> ColumnElement[bool]:
+def _events_of(name: str | None) -> ColumnElement[bool]:
     """Return the SQL condition for events of a map; None selects events without an existing map."""
     if name is not None:
         return events.c.map == name

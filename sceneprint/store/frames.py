@@ -35,7 +35,7 @@ from sceneprint.store.tables import (
 from sceneprint_client.api import FrameState
 
 
-def renew_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
+def reset_frame(connection: Connection, number: int, values: dict[str, Any]) -> FrameRow:
     """Reset a failed frame to `received`, with new values such as its upload; return its row."""
     _update_usage(connection, number, FrameState.RECEIVED, values["bytes"])
     connection.execute(
@@ -116,7 +116,7 @@ def referred_blobs(connection: Connection, blobs: Sequence[str]) -> set[str]:
 
 
 def count_states(connection: Connection, map_number: int | None = None) -> dict[str, int]:
-    """Count the frames of a map by state; None counts those of all maps."""
+    """Count the frames of a map, or of all maps, by state."""
     counts = select(frames.c.state, func.count()).group_by(frames.c.state).order_by(frames.c.state)
     if map_number is not None:
         counts = counts.where(frames.c.map_number == map_number)

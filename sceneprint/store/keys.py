@@ -33,7 +33,7 @@ from sceneprint_client.api.admin import Scope
 if TYPE_CHECKING:
     from sceneprint.store.database import Database
 
-#: Prefix of secrets, by which scanners recognise leaked keys.
+#: Prefix of secrets, so that scanners recognise leaked keys.
 PREFIX = "sp_"
 
 

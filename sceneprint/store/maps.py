@@ -269,7 +269,7 @@ def add_frame(
     if frame_id is None:
         frame_id = uuid.uuid4().hex
     else:
-        free_id(connection, map_number, frame_id)
+        replace_id(connection, map_number, frame_id)
     new = insert(frames).values(received_values(connection, map_number, frame_id, values))
     row = frame_row(connection.execute(new.returning(frames)).mappings().one())
     add_usage(connection, map_number, 1, values["bytes"])
@@ -287,7 +287,7 @@ def received_values(
 
 
 def position(pose: Sequence[Sequence[float]] | None) -> dict[str, float | None]:
-    """Return the columns of a frame for its position, by which searches select frames."""
+    """Return the columns pose_x, pose_y and pose_z of a pose (4, 4), metres; None without one."""
     return {f"pose_{axis}": None if pose is None else pose[i][3] for i, axis in enumerate("xyz")}
 
 
@@ -342,7 +342,7 @@ def _frames_of_numbers(dialect: str) -> Select[Any]:
     return select(*FRAME_COLUMNS).where(frames.c.state != FrameState.DELETED, among)
 
 
-def free_id(connection: Connection, map_number: int, frame_id: str) -> None:
+def replace_id(connection: Connection, map_number: int, frame_id: str) -> None:
     """Assign a new id to a deleted frame, so that its id can be reused.
 
     The frame can then no longer be restored.

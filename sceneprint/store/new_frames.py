@@ -206,7 +206,7 @@ def _usage_after(n: Any, size: Any) -> dict[str, Any]:
 
 
 # Statement for many frames on PostgreSQL. Its records have keys such as `frame_<column>`. Values
-# that the server can derive are not sent, which saves a fifth of the time.
+# that the server can derive are not sent, to save a fifth of the time.
 
 #: Columns with the time of the statement.
 _STAMPED = frozenset(("frame_received_at", "job_run_after", "job_created_at"))
@@ -305,7 +305,7 @@ def _kind(kind: TypeEngine[Any]) -> TypeEngine[Any]:
 
 
 def _lacking(records: TableValuedAlias, *, result: bool) -> CTE:
-    """Return the records whose content is not stored, and whose key has no result.
+    """Select the records with content that is not stored, and a key without a result.
 
     Each lookup reads the next entry of one index: a cached plan may date from a time when the
     tables were empty, and all indexes seemed equally good.

@@ -167,7 +167,7 @@ def undo_joins(connection: Connection, map_number: int, job_id: str) -> bool:
 
 
 def _move_frames(connection: Connection, map_number: int, before: Mapping[str, ParentJoin]) -> None:
-    """Recompute the poses of all frames whose root has changed, and note these edits."""
+    """Recompute the poses of all frames with a changed root, and record these edits."""
     now = find_joins(connection, map_number)
     changed = [name for name in {*before, *now} if _root(before, name) != _root(now, name)]
     f = frames.c

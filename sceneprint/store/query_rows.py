@@ -173,7 +173,7 @@ def _event(query: NewQuery) -> dict[str, Any]:
             "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
         }
     own = query.frame_id if query.frame_map == query.map else None
-    # the time of the event, by which events are sorted, not the time of the query
+    # the time of the event, not of the query, because events are sorted by time
     return {
         "at": time.time(), "kind": EVENT, "map": query.map, "frame_id": own, "job_id": None,
         "data": data,
@@ -187,7 +187,7 @@ class WantedQueries:
     Parameters
     ----------
     map_numbers : numbers of the selected maps; None selects all maps
-    statuses : statuses, of which one must match; empty matches all
+    statuses : statuses, one of which must match; empty matches all
     robot : sender; None matches all
     since, until : half-open interval of the time of arrival, seconds since 1970
     kept : whether only queries with permanent answers match
@@ -255,7 +255,7 @@ def find_query(connection: Connection, query_id: str) -> QueryRow | None:
     return None if row is None else QueryRow(**row)
 
 
-def read_kept(connection: Connection, number: int) -> bytes | None:
+def read_permanent_answer(connection: Connection, number: int) -> bytes | None:
     """Return the permanent answer to a query; None if it is not permanent."""
     answer: bytes | None = connection.execute(select(_c.answer).where(_c.number == number)).scalar()
     return answer
@@ -300,7 +300,7 @@ def release_answer(connection: Connection, number: int) -> None:
 
 
 def count_kept(connection: Connection, map_name: str) -> tuple[int, int]:
-    """Return the number of permanent answers of a map, and the total bytes of those of all maps."""
+    """Return the number of permanent answers of a map, and their total bytes over all maps."""
     counts = func.count(), func.coalesce(func.sum(_c.bytes), 0)
     statement = select(*counts).where(_c.kept_at.is_not(None))
     of_map = select(maps.c.number).where(maps.c.name == map_name).scalar_subquery()
@@ -381,7 +381,7 @@ def drop_answers(connection: Connection, numbers: Sequence[int]) -> list[str]:
     return stored
 
 
-def stored_among(connection: Connection, query_ids: Sequence[str]) -> set[str]:
+def stored_answer_ids(connection: Connection, query_ids: Sequence[str]) -> set[str]:
     """Return the query ids, among up to a thousand, whose answers are stored in files."""
     statement = select(_c.id).where(_c.id.in_(query_ids), _STORED, _c.kept_at.is_(None))
     return set(connection.execute(statement).scalars())

@@ -1,8 +1,8 @@
-"""Queue of jobs, a table of the database, so that a frame and its job are stored in one commit.
+"""Queue of jobs: a table of the database, so that one commit stores a frame and its job.
 
     enqueue  -->  queued  --claim-->  running  --finish | fail-->  over, or queued again
 
-Tenants take turns: a claim selects the tenant whose last claim is oldest, and its due job with the
+Tenants take turns: a claim selects the tenant with the oldest latest claim, and its due job of
 highest priority. Upkeep without a tenant, such as the re-encoding of a map, waits for all other
 jobs.
 
@@ -95,7 +95,7 @@ def list_jobs(
     before : number of the last job of the previous page
     limit : maximum number of jobs
     state, kind : conditions; None matches all jobs
-    map_names : names of the selected maps, which excludes jobs without a map; None selects all jobs
+    map_names : names of the selected maps, excluding jobs without a map; None selects all jobs
     """
     last = _later_job().scalar_subquery()
     statement = (
@@ -452,7 +452,7 @@ def _last_turn(connection: Connection) -> int:
 
 def renew(connection: Connection, held: JobRow, lease_s: float) -> None:
     """Renew a lease for `lease_s` seconds. Raise LostLease if the job is no longer held."""
-    _hold(connection, held, leased_until=now(connection) + lease_s)
+    _update_held(connection, held, leased_until=now(connection) + lease_s)
 
 
 def check_held(connection: Connection, held: JobRow) -> None:
@@ -463,7 +463,7 @@ def check_held(connection: Connection, held: JobRow) -> None:
     LostLease : If another worker holds the job, or the job is over.
     """
     # lock the job until the commit, so that no other worker claims it if the lease has expired
-    own = select(jobs.c.number).where(*_own(held)).with_for_update()
+    own = select(jobs.c.number).where(*_held_conditions(held)).with_for_update()
     if connection.execute(own).first() is None:
         raise _lost(held)
 
@@ -478,7 +478,7 @@ def finish(
     ------
     LostLease : See `renew`.
     """
-    _hold(
+    _update_held(
         connection, held, state=state, error=error, traceback=traceback, leased_until=None,
         finished_at=now(connection), **values,
     )  # fmt: skip
@@ -500,7 +500,7 @@ def requeue_slice(
     LostLease : If another worker holds the job, or the job is over.
     """
     # one attempt, not zero, so that the job does not precede later jobs
-    _hold(
+    _update_held(
         connection, held, state=JobState.QUEUED, attempts=1, failures=0,
         leased_until=None, worker=None, run_after=now(connection) + after_s, progress=progress,
     )  # fmt: skip
@@ -519,7 +519,7 @@ def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> Jo
     if failures >= MAXIMUM_FAILURES or held.attempts >= MAXIMUM_ATTEMPTS:
         finish(connection, held, JobState.DEAD, error, traceback)
         return JobState.DEAD
-    _hold(
+    _update_held(
         connection, held, state=JobState.QUEUED, error=error, traceback=traceback,
         failures=failures, leased_until=None, run_after=now(connection) + pause_s(failures),
     )  # fmt: skip
@@ -543,20 +543,20 @@ def release_job(connection: Connection, held: JobRow, after_s: float = 0.0) -> N
     ------
     LostLease : See `renew`.
     """
-    _hold(
+    _update_held(
         connection, held, state=JobState.QUEUED, attempts=held.attempts - 1,
         leased_until=None, worker=None, run_after=now(connection) + after_s,
     )  # fmt: skip
 
 
-def _hold(connection: Connection, held: JobRow, **values: object) -> None:
+def _update_held(connection: Connection, held: JobRow, **values: object) -> None:
     """Change columns of a job. Raise LostLease if the worker no longer holds the job."""
-    changed = connection.execute(update(jobs).where(*_own(held)).values(**values))
+    changed = connection.execute(update(jobs).where(*_held_conditions(held)).values(**values))
     if changed.rowcount != 1:
         raise _lost(held)
 
 
-def _own(held: JobRow) -> tuple[ColumnElement[bool], ...]:
+def _held_conditions(held: JobRow) -> tuple[ColumnElement[bool], ...]:
     """Return the SQL conditions under which a worker still holds a job."""
     return (
         jobs.c.number == held.number,
@@ -581,7 +581,7 @@ def has_exhausted(connection: Connection) -> bool:
 
 
 def dead_letter(connection: Connection) -> list[JobRow]:
-    """Mark jobs as dead whose workers stopped responding in all attempts; return these jobs."""
+    """Mark jobs as dead if their workers stopped responding in all attempts; return these jobs."""
     at = now(connection)
     rows = connection.execute(
         update(jobs)

@@ -1,4 +1,4 @@
-"""Read-only access to databases and blobs for inspection, which creates and writes nothing."""
+"""Read-only access to databases and blobs for inspection, without creating or writing files."""
 
 from __future__ import annotations
 

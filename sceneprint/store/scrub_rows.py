@@ -1,8 +1,8 @@
 """Progress of the scrub, which verifies all stored bytes: one row for all workers.
 
 A pass reads all frames in slices, in the order of their numbers. A worker that claims a slice sets
-the time at which the next slice is due, which limits the rate of all workers together. If the
-worker dies, another worker repeats the slice.
+the time of the next slice, to limit the total rate of all workers. If the worker dies, another
+worker repeats the slice.
 """
 
 from __future__ import annotations

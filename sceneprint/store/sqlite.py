@@ -208,7 +208,7 @@ def _begin_immediate(connection: Connection, wait_s: float) -> None:
 
 
 class WriterLine:
-    """Line of writing processes, of which only the first waits for the lock of SQLite.
+    """Line of writing processes; only the first in line waits for the lock of SQLite.
 
     Without the line, a service that writes continuously would usually get the lock, and a worker
     would wait for seconds. Processes that do not use the line are safe, but not fair.

@@ -90,7 +90,7 @@ def find_surface(connection: Connection, map_number: int) -> SurfaceRow | None:
 
 
 def add_surface(connection: Connection, row: MapRow) -> SurfaceRow:
-    """Insert a surface without a model, which its first job sets."""
+    """Insert a surface, and return its row; the first job sets its model."""
     new = SurfaceRow(
         map_number=row.number, model_id="", cell_m=0.0, wanted=True, job_number=None,
         revision=-1, edits=0, pose_edits=0, scale=0, taken_from=None, taken_step_s=1.0,
@@ -220,7 +220,7 @@ def count_fused(connection: Connection, map_number: int) -> dict[str, int]:
     return {row[0]: row[1] for row in connection.execute(counts)}
 
 
-def count_left(connection: Connection, surface: SurfaceRow) -> int:
+def count_unprocessed(connection: Connection, surface: SurfaceRow) -> int:
     """Count the frames to fuse or to remove."""
     return _count(connection, _unfused(surface)) + _count(connection, _outdated(surface))
 
@@ -289,7 +289,7 @@ def fused_range(connection: Connection, map_number: int) -> tuple[float | None, 
     return first, last
 
 
-def spread_fused(connection: Connection, map_number: int, parent: str, most: int) -> list[int]:
+def sample_fused(connection: Connection, map_number: int, parent: str, most: int) -> list[int]:
     """Return the numbers of up to `most` evenly spaced fused frames in a parent frame."""
     c = surface_frames.c
     own = (c.map_number == map_number) & (c.parent == parent)
@@ -333,7 +333,7 @@ def tiles_at(
 ) -> dict[TilePlace, TileRow]:
     """Return the tiles that exist at some places of a parent frame and level, by place."""
     c = surface_tiles.c
-    # one statement per row and floor, which is faster than a list of many tuples
+    # one statement per row and floor is faster than a list of many tuples
     columns: dict[tuple[int, int], list[int]] = {}
     for x, y, z in sorted(set(places)):
         columns.setdefault((y, z), []).append(x)
@@ -422,7 +422,7 @@ def level_totals(connection: Connection, map_number: int) -> list[LevelTotals]:
 
 
 def tiles_to_rebuild(connection: Connection, map_number: int, most: int) -> list[TileRow]:
-    """Return up to `most` of the tiles to rebuild, only those whose rebuild is most advanced."""
+    """Return up to `most` tiles to rebuild, only those with the most advanced rebuild."""
     c = surface_tiles.c
     own = c.map_number == map_number, c.rebuilt_to.is_not(None)
     statement = select(surface_tiles).where(*own).order_by(c.rebuilt_to.desc(), c.number)
@@ -448,7 +448,7 @@ def forget_scale(
     Parameters
     ----------
     connection, map_number, parent : see `tiles_at`
-    factor : width of the coarser tile, as a multiple of that of the finest tiles
+    factor : width of the coarser tile, in widths of the finest tiles
     """
     c = surface_tiles.c
     within = [

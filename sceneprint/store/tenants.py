@@ -99,7 +99,7 @@ def unknown_tenant(name: str) -> UnknownTenant:
 def save_turns(connection: Connection, *names: str) -> None:
     """Store the latest turns of some tenants, or of all tenants, in the table of tenants.
 
-    Call this before removing jobs: otherwise, a tenant that deletes its maps would always be next.
+    Call this before removing jobs: a tenant could otherwise delete its maps to be served next.
     """
     last = (
         select(func.max(jobs.c.turn))

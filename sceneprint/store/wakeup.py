@@ -1,8 +1,8 @@
 """Signals that wake workers after a job is committed: FIFOs with SQLite, NOTIFY of PostgreSQL.
 
 Each waiting worker creates a FIFO in a folder, and a ring writes a byte to each FIFO. Rings are
-only hints: workers also poll, because a file system may not support FIFOs, or a worker may be on
-another machine. Functions of this module therefore raise no errors.
+only hints: workers also poll, because a file system may lack FIFOs, and a worker may run on another
+machine. Functions of this module therefore raise no errors.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Listening(Protocol):
 
 
 def process_name() -> str:
-    """Return the name of this process, `host:pid`, which is unique among all hosts."""
+    """Return the name of this process, `host:pid`, unique among all hosts."""
     return f"{socket.gethostname()[-HOST:]}:{os.getpid()}"
 
 
@@ -256,7 +256,7 @@ class Notices(Wakeup):
                         connection = self._database.driver_connection()
                         # do not wait for disk and standby, since rings may be lost
                         connection.execute("SET synchronous_commit = off")
-                    with self._database.explained():
+                    with self._database.translate_errors():
                         connection.execute(f"NOTIFY {CHANNEL}")
                     break
                 except SceneprintError as error:
@@ -303,7 +303,7 @@ class NoticeListener:
         connection = None
         try:
             connection = self._database.driver_connection()
-            with self._database.explained():
+            with self._database.translate_errors():
                 statement = "SELECT set_config('application_name', %s, false)"
                 connection.execute(statement, [LISTENS + process_name()])
                 connection.execute(f"LISTEN {CHANNEL}")
@@ -319,7 +319,7 @@ class NoticeListener:
             return False
         rung = False
         try:
-            with self._database.explained():
+            with self._database.translate_errors():
                 self._connection.pgconn.consume_input()
                 while self._connection.pgconn.notifies() is not None:
                     rung = True

@@ -98,7 +98,7 @@ def test_every_change_of_a_frame_is_counted(empty, uploads):
             elif kind == 2:
                 stored.set_state(connection, one.number, FrameState.REDUNDANT)
             elif kind == 3 and one.state == FrameState.REDUNDANT:
-                stored.renew_frame(connection, one.number, {"bytes": size})
+                stored.reset_frame(connection, one.number, {"bytes": size})
             elif kind == 4:
                 stored.renew_upload(connection, one.number, "ab" * 32, size, None)
             elif kind == 5 and one.state != FrameState.DELETED:

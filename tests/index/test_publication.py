@@ -117,7 +117,7 @@ def test_two_versions_are_kept_and_only_our_files_removed(walk, published, tmp_p
     assert kinds == ["faiss"] * 4 + ["json"] * 2 + ["keys"] * 4
     assert newest_number(folder) == 6
     (folder / left[2]).write_bytes(b"left")
-    assert clear(folder, but=5)
+    assert clear(folder, keep=5)
     assert newest_number(folder) == 5
     assert clear(folder)
     assert files(folder) == {".lock", "notes.txt"}

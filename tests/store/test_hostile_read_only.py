@@ -149,6 +149,6 @@ def test_a_disk_that_turns_read_only_is_said(tmp_path, monkeypatch):
         fault = sqlite3.OperationalError("disk I/O error")  # of a write to a file that is open
         fault.sqlite_errorcode = sqlite3.SQLITE_IOERR_WRITE
         said = "disk I/O error. The disk is mounted read-only"
-        with pytest.raises(ReadOnlyStore, match=said), store.database.explained():
+        with pytest.raises(ReadOnlyStore, match=said), store.database.translate_errors():
             raise OperationalError("COMMIT", {}, fault)
     store.close()

@@ -29,7 +29,7 @@ from sceneprint.engine.upkeep import garbage_collection, repair
 from sceneprint.formats.sample_range import sample_range
 from sceneprint.store.deletion import make_room
 from sceneprint.store.events import record_event
-from sceneprint.store.frames import relax_novelty, renew_frame
+from sceneprint.store.frames import relax_novelty, reset_frame
 from sceneprint.store.keys import IdempotentRequest, Overtaken
 from sceneprint.store.maps import add_frame, find_map, frames_of_content, living_frame, require_room
 from sceneprint.store.new_frames import NewFrame, receive_frames
@@ -574,7 +574,7 @@ def _store_single(
         frame = add_frame(connection, row.number, ready.columns, upload.frame_id)
     else:
         unused.append(frame.blob)  # the new blob may have another file format
-        frame = renew_frame(connection, frame.number, ready.blob_columns)
+        frame = reset_frame(connection, frame.number, ready.blob_columns)
     job = enqueue(connection, "sign", frame.number, upload.priority)
     record_event(connection, "frame.received", row.name, frame.id, job.id)
     return UploadResult(_added(frame, job.id), new=True)

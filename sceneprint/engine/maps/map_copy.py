@@ -32,9 +32,9 @@ from sceneprint.store.copy_rows import (
     CopiedFrame,
     add_copied,
     copied_rows,
-    date_map,
     has_artifact,
     living_rows,
+    set_creation_time,
 )
 from sceneprint.store.deletion import BLOCK, delete_frames, remove_map
 from sceneprint.store.frames import write_frame, write_map
@@ -355,7 +355,7 @@ def _prepare_map(store: Store, connection: Connection, head: MapCopy, blobs: lis
         blobs += remove_map(connection, before)
     if row is None:
         added = add_map(connection, head.name, head.title, head.model_id)
-        row = date_map(connection, added, head.created_at)
+        row = set_creation_time(connection, added, head.created_at)
     return write_map(connection, row, {"title": head.title, "up": head.up})
 
 

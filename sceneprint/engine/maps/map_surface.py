@@ -365,7 +365,8 @@ def begin_job(connection: Connection, row: MapRow, surface: SurfaceRow) -> tuple
     if surface.is_current(row):
         return False, []
     is_done = not (
-        stored.count_left(connection, surface) or stored.count_unfinished(connection, surface)
+        stored.count_unprocessed(connection, surface)
+        or stored.count_unfinished(connection, surface)
     )
     if surface.model_id == row.model_id and is_done:
         stored.write_surface(
@@ -520,7 +521,7 @@ def _surface_record(connection: Connection, row: MapRow, surface: SurfaceRow | N
     elif not surface.is_current(row):
         of_model = surface.model_id == row.model_id
         frames_left = (
-            stored.count_left(connection, surface)
+            stored.count_unprocessed(connection, surface)
             if of_model
             else stored.count_posed(connection, row)
         )

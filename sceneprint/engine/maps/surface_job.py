@@ -168,7 +168,7 @@ class SurfaceHandler:
         if progress.get("total") is None:
             progress |= {"done": 0, "after": 0, "checked": False}
             with self._store.database.read() as connection:
-                progress["total"] = stored.count_left(connection, surface)
+                progress["total"] = stored.count_unprocessed(connection, surface)
         if not progress["checked"]:  # remove frames first, so that each tile is rebuilt only once
             return self._remove_frames(surface, progress)
         with self._store.database.read() as connection:
@@ -330,7 +330,7 @@ class SurfaceHandler:
             now = stored.find_surface(connection, row.number)
             if (
                 now is None
-                or stored.count_left(connection, surface)
+                or stored.count_unprocessed(connection, surface)
                 or stored.count_unfinished(connection, surface)
             ):
                 return SliceResult(False, progress | {"total": None})
@@ -497,7 +497,7 @@ def parent_records(
     for name in names:
         record = earlier.get(name)
         if record is None:
-            some = stored.spread_fused(connection, row.number, name, 200)
+            some = stored.sample_fused(connection, row.number, name, 200)
             view = parent_axes(connection, row, some)
             record = {
                 "parent_frame": name, "axes": view.axes.tolist(), "up_from": view.up_from,

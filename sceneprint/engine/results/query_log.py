@@ -50,12 +50,12 @@ from sceneprint.store.query_rows import (
     old_queries,
     oldest_answers,
     queries_of_map,
-    read_kept,
+    read_permanent_answer,
     release_answer,
     remove_queries,
     set_title,
     shown_frames,
-    stored_among,
+    stored_answer_ids,
     stored_bytes,
     surplus_queries,
     unpurged_frames,
@@ -310,7 +310,7 @@ class QueryLog:
         """Return the encoded answer to a query; raise UnknownQuery if it is lost."""
         if row.kept_at is not None:
             with self._store.database.read() as connection:
-                data = read_kept(connection, row.number)
+                data = read_permanent_answer(connection, row.number)
         else:
             try:
                 data = self._files.get(row.id)
@@ -443,7 +443,7 @@ class QueryLog:
         names = iter([name for name, at in self._files.list() if at < before])
         while batch := list(islice(names, BLOCK)):
             with self._store.database.read() as connection:
-                needed = stored_among(connection, batch)
+                needed = stored_answer_ids(connection, batch)
             self._files.delete([name for name in batch if name not in needed])
 
     def _remove(

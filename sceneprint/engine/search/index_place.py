@@ -213,7 +213,7 @@ class IndexPlace:
             return True
         manifest = None if head is None or not manifests(folder) else self.sync(row)
         # clear it even without other versions: a failed or killed removal may have left parts
-        return clear(folder, but=None if manifest is None else manifest.number)
+        return clear(folder, keep=None if manifest is None else manifest.number)
 
     def sweep(self, *, now: bool = False) -> None:
         """Remove indexes of deleted maps from the object store, at intervals, on one host at a
@@ -375,7 +375,7 @@ class IndexPlace:
         stale_before = self._stale.get(folder.name, frozenset())
         is_outdated = bool(stale and (stale & stale_before or len(manifests(folder)) > 1))
         # this also removes parts that no version lists
-        clear(folder, but=None if is_outdated else number)
+        clear(folder, keep=None if is_outdated else number)
         self._stale[folder.name] = stale
 
     def _make_room(self, size: int, keep: Path) -> bool:

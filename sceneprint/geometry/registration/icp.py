@@ -64,7 +64,7 @@ class RefinementParameters:
     normal_cosine: float = 0.7  #: minimum cosine between corresponding normals
     reference_depth: float = 5.0**0.5  #: gates grow by max(1, (z / reference_depth)^growth)
     minimum_points: int = 20  #: minimum number of corresponding points
-    growth: int = 2  #: exponent with which noise grows: 2 for a depth sensor, 1 or 0 for a scanner
+    growth: int = 2  #: exponent of noise growth: 2 for a depth sensor, 1 or 0 for a scanner
     weight_depth: float = 1.0  #: depth at which weights start to fall as 1 / z^4, metres
     nearest: float = 0.1  #: minimum depth of a point in the target's camera, metres
     reach: float = 0.25  #: maximum distance to a point of an unordered target, metres
@@ -512,7 +512,7 @@ class CovarianceParameters:
     """Parameters of covariances; docs/uncertainty.md describes how they were tuned."""
 
     independent: float = 5.3  #: effective number of independent points per direction
-    least_square: float = 1e-7  #: minimum mean weighted square: that of the most accurate sensor
+    least_square: float = 1e-7  #: minimum mean weighted square, of the most accurate sensor
     most: float = 10.0  #: maximum deviation, reached in free directions, metres and radians
     lever: float = 1.0  #: length that counts as one radian, metres
     free: float = 30.0  #: minimum ratio of a free direction's deviation to the smallest deviation
@@ -588,7 +588,8 @@ def pair_covariance(
     """
     p = p or CovarianceParameters()
     information, squares = [], []
-    # `there` has its errors at the match's origin; those of `back` are negated, in the query's axes
+    # errors of `there` are about the match's origin; errors of `back` are inverse, in the query's
+    # axes
     for refinement, R, lever in (
         (there, np.eye(3), -T[:3, 3]), (back, T[:3, :3].T, np.zeros(3))
     ):  # fmt: skip
@@ -643,7 +644,7 @@ def fuse_votes(
     average : result of `average_poses`
     poses : (n, 4, 4) poses that were averaged
     covariances : (n, 6, 6) covariances of the poses
-    inflations : (n,) factors by which the covariances are multiplied to weigh the votes
+    inflations : (n,) factors of the covariances in the weights of the votes
     """
     members, own = poses[average.members], covariances[average.members]
     information = np.linalg.inv(own) / inflations[average.members, None, None]

@@ -78,7 +78,7 @@ class LookupTarget(NamedTuple):
 
 @kernel
 def _slot(i: int, j: int, k: int, slots: int, secret: int) -> int:
-    """Return the slot of a cube in a table whose number of slots is a power of two."""
+    """Return the slot of a cube (i, j, k) in a table with `slots` slots, a power of two."""
     return hash_key((((i << 21) + j) << 21) + k, secret) & (slots - 1)
 
 
@@ -242,7 +242,7 @@ class OverlapParameters:
     reference_depth: float = 5.0**0.5  #: depth from which tolerances grow, metres
     edge_px: int = 2  #: minimum distance of a violating point from a pixel that agrees, pixels
     stride: int = 5  #: stride of the pixels that are looked up
-    growth: int = 2  #: exponent with which noise grows: 2 for a depth sensor, 1 or 0 for a scanner
+    growth: int = 2  #: exponent of noise growth: 2 for a depth sensor, 1 or 0 for a scanner
     nearest: float = 0.1  #: minimum depth of a point in the target's camera, metres
 
 
@@ -412,7 +412,7 @@ def _look_up_near(
 ) -> None:  # fmt: skip
     """Write AGREES or UNKNOWN for each of the points (N, 6) under T; the target is unordered.
 
-    `camera` is that of `LookupTarget`.
+    `camera` is the field of `LookupTarget`.
     """
     at, facing = np.empty(3), np.empty(3)
     for i in range(len(source)):

@@ -3,7 +3,7 @@
     Patches (P)  --patch_descriptors-->  (P, D) float32  --compress-->  (P, d) uint8
     descriptors (S, d), (P, d)  --correspondences-->  pairs (M, 2)
 
-The properties resemble those of Eq. (1) and have the same scale. The properties of a neighbour
+The properties resemble Eq. (1), on the same scale. The properties of a neighbour
 within reach are its distance in the plane of the patch, its height over that plane, and the angles
 of its normal to the patch's normal and to the in-plane direction of the neighbour. All are
 invariant under rigid motion.
@@ -86,8 +86,8 @@ class Compression:
         return np.ascontiguousarray(self.matrix.T)
 
 
-#: Limit of the absolute components of a unit vector, which few of 128 components reach. Clipping
-#: prevents one component, such as that of floors, from outweighing all others.
+#: Maximum absolute value of the components of a unit vector; few of 128 components reach it.
+#: Clipping prevents one component, such as for floors, from outweighing all others.
 RANGE = 0.25
 
 
@@ -101,12 +101,12 @@ def _squared_distances(x: Floats, y: Floats, z: Floats, i: int, out: Floats) -> 
 
 
 @disjoint_kernel
-def _select_near(squares: Floats, count: int, but: int, limit: float, places: Ints32) -> int:
-    """Write the indices of squares below a limit, except index `but`; return their number."""
+def _select_near(squares: Floats, count: int, excluded: int, limit: float, places: Ints32) -> int:
+    """Write the indices of squares below a limit, except index `excluded`; return their number."""
     selected = 0
     for j in range(count):
         places[selected] = j
-        selected += 1 if (squares[j] < limit) & (j != but) else 0
+        selected += 1 if (squares[j] < limit) & (j != excluded) else 0
     return selected
 
 
@@ -268,7 +268,7 @@ _BINS = 256
 def _project(histograms: Floats32, matrix: Floats32, offset: Floats32, out: Floats32) -> None:
     """Write `histograms` @ `matrix` (D, d), minus the offset; most bins of a histogram are empty.
 
-    Bins are added in order, four at a time, which reduces reads and writes of a row by 75 %.
+    Bins are added in order, four at a time, to reduce reads and writes of a row by 75 %.
     """
     places = np.empty(_BINS, np.int32)
     for i in range(len(histograms)):

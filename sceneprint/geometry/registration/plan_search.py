@@ -29,8 +29,8 @@ from sceneprint.geometry.registration.overlap import first_per_cube
 from sceneprint.geometry.rigid import select_distinct
 from sceneprint.types import Bytes, Floats, Floats32, Ints32, Sphere, Surface
 
-#: Minimum cosine between a candidate for up and a normal that votes for it, and maximum cosine of a
-#: perpendicular normal, which gives half a vote.
+#: Minimum cosine between a candidate for up and a normal that votes for it. A normal below the
+#: maximum cosine counts as perpendicular and casts half a vote.
 _ALONG, _ACROSS = math.cos(math.radians(6.0)), math.sin(math.radians(4.0))
 #: The same two limits, for the normals that refine up.
 _NEAR, _LEVEL = math.cos(math.radians(8.0)), math.sin(math.radians(8.0))
@@ -401,10 +401,10 @@ def slice_hypotheses(
 ) -> tuple[Floats, Floats]:
     """Return T_target_source (n, 4, 4) that align the points in the height slices, best first.
 
-    Their correlations (n,) are returned too.
+    Also return their correlations (n,).
 
-    Only the `sliced_yaws` pairs of opposite yaws at which the azimuths agree best are tried. A half
-    turn of an image conjugates its spectrum, so both yaws of a pair share a spectrum.
+    Only the `sliced_yaws` pairs of opposite yaws with the best agreement of azimuths are tried. A
+    half turn of an image conjugates its spectrum, so both yaws of a pair share a spectrum.
     """
     half = p.n_yaws // 2
     agreement = _yaw_agreement(source, target)
@@ -439,7 +439,7 @@ def slice_correlation(source: ScanPlan, target: ScanPlan, T: Floats, p: PlanPara
 
 
 def _slice_target(target: ScanPlan, p: PlanParameters) -> NDArray[np.complex64]:
-    """Return the filtered spectrum with which the spectra of source slices are correlated."""
+    """Return the filtered spectrum of a target's slices, for correlation with those of sources."""
     spectrum = _slice_spectrum(target, 0.0, p)
     return _blur(spectrum, p.slice_blur) - _blur(spectrum, p.slice_trend)
 

@@ -45,7 +45,7 @@ def scan(
     ----------
     queries : (Q, n) uint8, in C order
     database : (N, n) uint8, in C order
-    rows : (r,) row indices of the database, which are not checked
+    rows : (r,) row indices of the database, not checked for validity
     squared : whether to sum squares
     half : whether to compute only entries (q, i) with q < i; all other entries are undefined
     """
@@ -310,11 +310,10 @@ def rank(distances: Ints64, size: int, unrelated_distance: float) -> Ranking:
 def ranking_size(n_map: int) -> int:
     """Return |R| for a map of `n_map` frames: 40 % of them, but at least 50 and at most 200.
 
-    In a denser map, a fixed number of ranks would contain only near-duplicates, from which no
-    diverse selection is possible: among the nearest 50 of 300 frames of a room, diversification
-    increased the observed volume by 10 %, and among the nearest 125 by 27 % (Sec. III-D). The upper
-    limit bounds the cost of pairwise distances; larger maps have more places, not more views of
-    each place.
+    In a dense map, a fixed number of ranks would contain only near-duplicates and allow no diverse
+    selection: among the nearest 50 of 300 frames of a room, diversification increased the observed
+    volume by 10 %, and among the nearest 125 by 27 % (Sec. III-D). The upper limit bounds the cost
+    of pairwise distances; larger maps have more places, not more views of each place.
 
     Raises
     ------

@@ -55,7 +55,7 @@ class LevelStatistics:
     total: float
 
 
-#: Number of table rows by which the prefetch runs ahead, to hide the memory latency.
+#: Number of table rows to prefetch in advance, to hide the memory latency.
 _AHEAD = 16
 
 
@@ -186,7 +186,7 @@ class WhiteningParameters:
     """Parameters of the stored signature."""
 
     dimension: int = 448  #: d, number of bytes of a stored signature
-    exponent: float = 1.0  #: power of the standard deviation by which an axis is divided
+    exponent: float = 1.0  #: exponent of the standard deviation in the divisor of an axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +199,7 @@ class Whitening:
     ----------
     levels : (h,) ascending indices of the levels in psi; 0 is the finest level
     basis : (d, D) int8, axes of psi, by descending variance
-    scales : (d,) float64, factors by which the products of the axes with psi are whitened
+    scales : (d,) float64, factors that whiten the products of the axes with psi
     offsets : (d,) float64, products of the axes with the mean psi
     unrelated_distance : d0, median squared distance between signatures of unrelated frames
     """
@@ -250,7 +250,7 @@ def whiten(psi: Floats, whitening: Whitening) -> Bytes:
 
     Raises
     ------
-    ValueError : If the length of psi differs from that of the axes
+    ValueError : If psi and the axes differ in length
     """
     if psi.shape != whitening.basis.shape[1:]:
         raise ValueError(

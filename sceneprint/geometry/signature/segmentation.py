@@ -183,7 +183,7 @@ def segment(surface: Surface, p: SegmentationParameters) -> Ints32:
 
     Returns
     -------
-    labels : (h, w) int32, 0 to P - 1 in the order in which they occur in the image; -1 for pixels
+    labels : (h, w) int32, 0 to P - 1 in the order of occurrence in the image; -1 for pixels
         without a patch
     """
     height, width = surface.valid.shape
@@ -364,7 +364,7 @@ def _reassign(
 def _k_means(
     patches: Floats, areas: Floats, n_clusters: int, scale: float, weight: float, iterations: int
 ) -> Ints32:
-    """Cluster positions and normals (6, P); return labels, in which empty clusters do not occur.
+    """Cluster positions and normals (6, P); return labels without gaps for empty clusters.
 
     Bounds for blocks of neighbouring patches make 95 % of the distances unnecessary.
     """
@@ -438,7 +438,7 @@ class WeightParameters:
 
 
 def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
-    """Return positive weights (P,) of patches, with mean 1; those of a pair are multiplied."""
+    """Return positive weights (P,) of patches, with mean 1, to be multiplied for each pair."""
     weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
     result: Floats = weights / weights.mean()
     return result
@@ -506,7 +506,7 @@ def _grow(
     points: Floats32, normals: Floats32, offsets: Ints64, indices: Ints32, centres: Floats,
     normal_weight: float, labels: Ints32, out: Ints32,
 ) -> None:  # fmt: skip
-    """Assign each voxel to the nearest centre: its own or that of a voxel that touches it."""
+    """Assign each voxel to the nearest of its own centre and the centres of touching voxels."""
     for i in range(len(labels)):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]

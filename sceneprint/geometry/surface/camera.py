@@ -145,7 +145,7 @@ def depth_at(camera: Floats, points: Floats32, line: int, column: int) -> float:
 
 @kernel
 def growth_at(depth: float, reference: float, power: float) -> float:
-    """Return the factor by which lengths grow at a depth: (depth / reference)^power, at least 1.
+    """Return the growth of lengths at a depth, (depth / reference)^power, but at least 1.
 
     The power is 0, 1 or 2.
     """

@@ -30,7 +30,7 @@ _CUBED = 2.0**13
 class CloudParameters:
     """Parameters for clouds; the defaults suit indoor depth sensors.
 
-    Do not change a default: models whose file lacks these parameters depend on it.
+    Do not change a default: model files that omit these parameters depend on it.
     """
 
     minimum_range: float = 0.3  #: minimum range of a point, metres
@@ -170,7 +170,7 @@ Ints64 = NDArray[np.int64]
 
 @kernel
 def direction_cell(x: float, y: float, z: float, angle: float) -> int:
-    """Return the cell of a direction on a cube whose faces are divided into equal angles."""
+    """Return the key of the cell of a direction, on a cube with faces divided into equal angles."""
     n = int(np.ceil(np.pi / 2 / angle))
     ax, ay, az = abs(x), abs(y), abs(z)
     if az >= ax and az >= ay:
@@ -189,7 +189,7 @@ def direction_cell(x: float, y: float, z: float, angle: float) -> int:
 
 @kernel
 def metric_cell(x: float, y: float, z: float, size: float) -> int:
-    """Return the cell of a position in a grid of cubes."""
+    """Return the key of the cell of a position in a grid of cubes."""
     a = min(max(int(np.floor(x / size)), -_REACH), _REACH - 1) + _REACH
     b = min(max(int(np.floor(y / size)), -_REACH), _REACH - 1) + _REACH
     c = min(max(int(np.floor(z / size)), -_REACH), _REACH - 1) + _REACH

@@ -133,9 +133,9 @@ def first_views(mesh: TriangleMesh, views: Sequence[DepthFrame], tolerance: floa
 
 
 def added_areas(mesh: TriangleMesh, first: Ints32, views: int) -> Floats:
-    """Return the area (V,) that each view adds to that of the preceding views, square metres.
+    """Return the area (V,) that each view adds to the preceding views, square metres.
 
-    A triangle counts for the first view that sees one of its corners; the areas sum to that of the
+    A triangle counts for the first view that sees one of its corners; the sum is the area of the
     mesh.
 
     Parameters

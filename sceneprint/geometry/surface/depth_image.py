@@ -96,7 +96,7 @@ def halvings(intrinsics: Intrinsics, p: DepthParameters) -> int:
 def inverse_depth(frame: DepthFrame, p: DepthParameters) -> tuple[Floats32, Intrinsics]:
     """Compute the inverse depth of an image, reduced to the resolution of the model.
 
-    Of each 2 x 2 block, a halving averages only the inverse depths on the nearest surface, so it
+    A halving averages only the inverse depths on the nearest surface in each 2 x 2 block, so it
     does not invent points between an edge and its background.
 
     Parameters
@@ -187,7 +187,7 @@ def _double(depth: Floats32, same_surface: float) -> Floats32:
 def double_resolution(frame: DepthFrame) -> DepthFrame:
     """Return the frame at twice the width and height, interpolated within surfaces.
 
-    Code that reads the nearest pixel gets slopes instead of steps.
+    Lookups of the nearest pixel then see slopes instead of steps.
     """
     k = frame.intrinsics
     camera = replace(

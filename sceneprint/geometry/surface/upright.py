@@ -26,12 +26,12 @@ _EDGES, _CELL_POINTS = (1 / 256, 1 / 128, 1 / 64, 1 / 32, 1 / 16), 12.0
 _FEWEST, _NO_LINE, _FLAT = 6, 0.05, 0.1
 #: Number of directions on the hemisphere, and of pieces that vote for them.
 _DIRECTIONS, _VOTERS = 1500, 6000
-#: Minimum cosine to a direction at which a piece votes for it, and at which the piece votes for no
-#: other direction.
+#: Minimum cosine between a piece's normal and a direction for the piece to vote for it, and for the
+#: piece to vote for no other direction.
 _NEAR, _EXCLUSIVE = math.cos(math.radians(12.0)), math.cos(math.radians(25.0))
 #: Maximum number of dominant directions, and minimum share of the votes for each.
 _MOST_PEAKS, _LEAST_SHARE = 5, 0.03
-#: Minimum cosine at which an estimate snaps to the usual axis, and to another axis of the file. The
+#: Minimum cosine for an estimate to snap to the usual axis, and to another axis of the file. The
 #: tolerances allow for sloping ground.
 _SNAP_USUAL, _SNAP = math.cos(math.radians(7.0)), math.cos(math.radians(3.0))
 #: Thickness of a floor, as a share of the extent.

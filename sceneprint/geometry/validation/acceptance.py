@@ -48,8 +48,8 @@ class AcceptanceParameters:
     support the transform.
     """
 
-    residual_m: float = 0.08  #: epsilon_val: maximum residual of the composed directions, metres
-    residual_rad: float = math.radians(5.0)  #: maximum residual of the composed directions, radians
+    residual_m: float = 0.08  #: epsilon_val: maximum residual of both directions composed
+    residual_rad: float = math.radians(5.0)  #: the same for the rotation, radians
     violation_weight: float = 5.0  #: evidence = overlap - violation_weight * violations
     evidence: float = 0.2  #: minimum evidence
     plane_overlap: float = 0.15  #: minimum plane overlap
@@ -63,8 +63,8 @@ class AcceptanceParameters:
     plane_violations: float = 1.0  #: maximum share of violations, with equal weights for planes
     worst_violations: float = 0.05  #: maximum share of violations in either direction
     strong: float = 0.3  #: minimum evidence of a strong match
-    weak: float = 0.05  #: ambiguity from which an accepted match is weak
-    ambiguous: float = 0.14  #: ambiguity from which no match is accepted
+    weak: float = 0.05  #: minimum ambiguity of an accepted match that is weak
+    ambiguous: float = 0.14  #: minimum ambiguity at which no match is accepted
     ambiguous_share: float = 0.5  #: maximum ambiguity as a share of `plane_overlap`
     stiffness: float = 1e-5  #: minimum `stiffness` of the evidence
     blind_evidence: float = 0.4  #: minimum evidence
@@ -173,8 +173,8 @@ def sparse_evidence_suffices(
     Two frames that share a tenth of their surfaces cannot reach the overlap that `objection`
     requires, and one of the searches may miss the transform. For such a transform, the refinements
     in both directions and several planes must agree, almost no points may lie in the free space of
-    either frame, and the surfaces must constrain it well. If the two refinements differ by a few
-    centimetres, as those of a correct transform do under distorted depth, many planes must agree.
+    either frame, and the surfaces must constrain it well. Distorted depth can separate the two
+    refinements of a correct transform by a few centimetres; then many planes must agree.
 
     Parameters
     ----------

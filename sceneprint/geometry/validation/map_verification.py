@@ -45,7 +45,7 @@ class MapParameters:
     around_reach: float = 4.0  #: `reach` if a sensor may look in any direction, metres
     same_surfaces: float = 8.0  #: maximum distance between sensors with common surfaces, metres
     near: float = 2.0  #: radius of the first search for frames of the map, metres
-    cell: float = 1.0  #: maximum distance between poses that share a search, metres
+    cell: float = 1.0  #: poses closer than this share a search for frames, metres
     start_shift: float = 0.5  #: maximum distance between an initial pose and its prior, metres
     least_agreeing: float = 0.03  #: minimum share of agreeing points for a view to count
     violation_weight: float = 2.0  #: weight of the violations of either side in the score
@@ -105,9 +105,9 @@ class ScoredPose:
     planes : mean number of distinct planes of a query frame that agree
     violations : violations as a share of agreements and violations, for the query's surface
     hidden : share of the map's surfaces that violate the query's free space
-    noise : violations among the map's frames at the pose; 0 if unmeasured
+    noise : share of violations among the map's frames at the pose; 0 if unmeasured
     views : indices (query frame, map frame) of the pairs that agree, by descending agreement
-    starts : (4, 4) poses from which refinement led to this pose or to its place
+    starts : (4, 4) initial poses whose refinement led to this pose or its place
     """
 
     T: Floats
@@ -272,7 +272,7 @@ def score_pose(
 def map_noise(
     pose: ScoredPose, views: MapViews, p: MapParameters, overlap_p: OverlapParameters
 ) -> float:
-    """Return the median violations among the map's frames that agree with a pose.
+    """Return the median share of violations among the map frames that agree with a pose.
 
     Drift of poses, and moved objects, cause violations even at correct poses.
     """
@@ -307,15 +307,15 @@ def median_contradiction(
     frames: Iterable[tuple[Geometry, Floats]], views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> float:  # fmt: skip
-    """Return the median share of surfaces on which frames contradict the map at their poses.
+    """Return the median share of frames' surfaces that contradict the map at their poses.
 
     Between two places that look alike, some pairs of frames agree, but most frames show surfaces
     where the other place has free space. Poses are refined first, because maps drift.
 
     Parameters
     ----------
-    frames : geometries with their poses (4, 4) in the parent frame of `views`; frames with which no
-        frame of the map agrees are ignored
+    frames : geometries with their poses (4, 4) in the parent frame of `views`; a frame that agrees
+        with no frame of the map is ignored
 
     Returns
     -------

@@ -111,7 +111,7 @@ def _tiles(blob: Column[str]) -> Select[Any]:
     )
 
 
-# Repairs of references to lost blobs, and to damaged blobs, which were moved to quarantine.
+# Repairs of references to lost blobs, and to damaged blobs after their move to quarantine.
 
 
 def _note_loss(connection: Connection, reference: BlobReference, condition: Condition) -> str:
@@ -247,7 +247,7 @@ def check_blobs(folder: Folder, kind: str, numbers: list[int]) -> Iterator[Findi
 
 
 def _is_recovered(reference: BlobReference, condition: Condition) -> bool:
-    """Return whether an upload is sound although the reason of its frame states its loss."""
+    """Return whether an upload is sound, but its frame's reason still reports it as lost."""
     return reference.kind == "upload" and condition == "sound" and is_known_loss(reference.reason)
 
 

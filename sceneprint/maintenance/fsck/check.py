@@ -32,7 +32,7 @@ from sceneprint.maintenance.fsck.findings import (
     Finding,
     Folder,
     Progress,
-    is_of_rows,
+    is_data_damage,
 )
 from sceneprint.maintenance.fsck.indexes import check_indexes
 from sceneprint.settings import Settings
@@ -55,7 +55,7 @@ def _check_all_frames(folder: Folder) -> Iterator[Finding]:
         yield from check_frames(folder, numbers)
 
 
-#: Checks in order; files precede frames, since repairs of frames doom blobs, which would be
+#: Checks in order; files precede frames, since repairs of frames doom blobs and these would be
 #: reported as unreferenced.
 _CHECKS: tuple[Callable[[Folder], Iterator[Finding]], ...] = (
     check_database, check_models, check_counts, check_files, _check_all_frames, check_products,
@@ -76,7 +76,7 @@ def fsck(
     repair : whether to repair the findings
     quick : whether to check only that blobs and rows exist, without reading their content
     grace_s : age, in seconds, below which unreferenced files are ignored
-    counts : counter to which the numbers of checked objects are added
+    counts : counter that receives the numbers of checked objects
 
     Yields
     ------
@@ -108,7 +108,7 @@ def _findings_of(check: Callable[[Folder], Iterator[Finding]], folder: Folder) -
     try:
         yield from check(folder)
     except (ValueError, TypeError, KeyError, UnusableStore) as error:
-        if not is_of_rows(error):
+        if not is_data_damage(error):
             raise
         yield damaged_database(f"{type(error).__name__}: {error}")
 

@@ -143,7 +143,7 @@ def read_rows(
         with folder.store.database.read() as connection:
             rows = read(connection, numbers)
     except (ValueError, TypeError, KeyError, UnusableStore) as error:
-        if not is_of_rows(error):
+        if not is_data_damage(error):
             raise
         if len(numbers) == 1:
             yield numbers[0], error
@@ -155,7 +155,7 @@ def read_rows(
         yield from read_rows(folder, [number], read)
 
 
-def is_of_rows(error: Exception) -> bool:
+def is_data_damage(error: Exception) -> bool:
     """Return whether an error is caused by damaged data, not by the machine."""
     if not isinstance(error, UnusableStore):
         return True

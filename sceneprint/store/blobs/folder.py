@@ -67,7 +67,7 @@ class Locks(ABC):
 
         Parameters
         ----------
-        digest : blob whose removal to wait for; None waits for all removals
+        digest : blob that is being removed; None waits for all removals
         seconds : maximum duration of the wait
 
         Raises
@@ -413,7 +413,7 @@ class FolderBlobs(Blobs):
     """
 
     def __init__(self, folder: Path, *, make: bool = True) -> None:
-        # lock the folder itself, which avoids a lock file
+        # lock the folder itself, to avoid a lock file
         super().__init__(FileLocks(folder))
         self._folder = folder
         self._durable: set[str] = set()  # names of subfolders that are known to be durable

@@ -160,7 +160,7 @@ class Objects:
         if len(data) > PART and not create:
             self.put_file(key, io.BytesIO(data))
             return True
-        with self._explained(f"{key} cannot be written"):
+        with self._translate_errors(f"{key} cannot be written"):
             try:
                 obstore.put(
                     self._small if len(data) < 1 << 20 else self._large, key, data,
@@ -188,7 +188,7 @@ class Objects:
         place = file.tell()
         size = file.seek(0, os.SEEK_END) - place
         file.seek(place)
-        with self._explained(f"{key} cannot be written"):
+        with self._translate_errors(f"{key} cannot be written"):
             obstore.put(
                 self._large, key, file, use_multipart=size > PART,
                 chunk_size=max(PART, -(-size // MOST_PARTS)), max_concurrency=AT_ONCE,
@@ -199,7 +199,7 @@ class Objects:
         """Return the bytes under a key. Raise FileNotFoundError if there is no object."""
         import obstore
 
-        with self._explained(f"{key} cannot be read"):
+        with self._translate_errors(f"{key} cannot be read"):
             answer = obstore.get(self._small, key)
             size = answer.meta["size"]
             if size <= 1 << 20:
@@ -222,7 +222,7 @@ class Objects:
         """
         import obstore
 
-        with self._explained(f"{key} cannot be read"):
+        with self._translate_errors(f"{key} cannot be read"):
             data = obstore.get_range(self._large, key, start=start, length=length)
         if len(data) != length:
             raise UnusableStore(
@@ -266,7 +266,7 @@ class Objects:
         """Return the properties of an object; None if it does not exist."""
         import obstore
 
-        with self._explained(f"{key} cannot be inspected"):
+        with self._translate_errors(f"{key} cannot be inspected"):
             try:
                 meta = obstore.head(self._small, key)
             except FileNotFoundError as error:
@@ -286,7 +286,7 @@ class Objects:
 
         pages = iter(obstore.list(self._small, prefix, chunk_size=1000))
         while True:
-            with self._explained(f"{prefix} cannot be listed"):
+            with self._translate_errors(f"{prefix} cannot be listed"):
                 page = next(pages, None)
             if page is None:
                 return
@@ -312,7 +312,7 @@ class Objects:
         until = time.monotonic() + seconds
         for start in range(0, len(keys), MOST_KEYS):
             block = keys[start : start + MOST_KEYS]
-            with self._explained(f"{block[0]} cannot be removed"):
+            with self._translate_errors(f"{block[0]} cannot be removed"):
                 if start and time.monotonic() > until:
                     raise self._error(block[0], "too slow", StoreAway)
                 try:
@@ -338,7 +338,7 @@ class Objects:
             sync_folder(path)
 
     @contextmanager
-    def _explained(self, what: str) -> Iterator[None]:
+    def _translate_errors(self, what: str) -> Iterator[None]:
         """Translate errors of the library; during the pause after a failure, raise StoreAway."""
         from obstore.exceptions import BaseError
 

@@ -249,7 +249,7 @@ class ObjectBlobs(Blobs):
         now = self._locks.removals()
         if before is not None and before == now:
             return True
-        if now is None:  # during a removal, which may remove the blob
+        if now is None:  # a removal is running, and may remove the blob
             self._locks.wait(digest, seconds)
         return self.objects.size(_key(digest)) is not None
 

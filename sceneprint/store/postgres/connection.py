@@ -94,7 +94,7 @@ _OLDEST = 14
 _WARNED, _USED = "sceneprint_warned", "sceneprint_used"
 #: Connection option: the transaction is a single statement.
 SINGLE = "sceneprint_single"
-#: Connection option: the message has several statements, of which the last returns rows.
+#: Connection option: the message has several statements, and the last returns rows.
 _MESSAGE = "sceneprint_message"
 
 
@@ -103,7 +103,7 @@ def open_postgres(url: URL) -> Engine:
     engine = create_engine(
         url,
         connect_args=connect_options(url),
-        isolation_level="READ COMMITTED",  # statements of a writer see all commits
+        isolation_level="READ COMMITTED",  # each statement of a writer sees all earlier commits
         pool_recycle=_OLD_S,
         pool_size=IDLE_CONNECTIONS,
         max_overflow=MOST - IDLE_CONNECTIONS,
@@ -180,7 +180,7 @@ def timeline_of(connection: Any) -> str | None:
 def _texts() -> type[Any]:
     """Return a psycopg dumper that replaces NUL characters, which PostgreSQL cannot store.
 
-    The API refuses NUL in most texts, but not in unvalidated texts such as those of the audit log.
+    The API refuses NUL in most texts, but not in unvalidated texts such as audit data.
     """
     from psycopg.types.string import StrDumperUnknown
 
@@ -274,7 +274,7 @@ class SingleStatement:
             self._send(cursor, statement, parameters)
 
     def _send(self, cursor: Any, statement: str, parameters: Any) -> None:
-        """Send the waits for the turn and the maps, the schema check and the statement."""
+        """Send, in one message, the locks of turn and maps, the schema check and the statement."""
         import psycopg
 
         connection = cursor.connection
@@ -305,11 +305,11 @@ class SingleStatement:
             raise MapsInUse from error
 
 
-#: Query of the schema of a store, and of the oldest revision whose processes may write to it.
+#: Query of the schema revision of a store, and of the oldest revision that may write to it.
 SCHEMA = "SELECT version_num, least_revision FROM alembic_version, schema_range"
 #: Query that locks maps in the order of their numbers.
 _MAPS, _NUMBERS = "SELECT pg_advisory_xact_lock(%s, number)", "FROM unnest(%s::integer[]) AS number"
-#: Query that also divides by zero if the schema has changed, which aborts the transaction. During
+#: Query that aborts the transaction by a division by zero if the schema has changed. During
 #: the turn of this process, the schema cannot change.
 _MAPS_AND_SCHEMA = (
     f"{_MAPS}, (SELECT 1 / count(*) FROM alembic_version, schema_range"

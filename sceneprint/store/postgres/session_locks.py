@@ -36,7 +36,7 @@ _COUNTER = "sceneprint_removals"
 _MAKE = f"CREATE SEQUENCE IF NOT EXISTS {_COUNTER}"
 _READ = f"SELECT CASE WHEN is_called THEN last_value ELSE 0 END FROM {_COUNTER}"
 #: Query that increments the sequence; only the holder of the lock uses it. After a crash, `nextval`
-#: could skip up to 32 numbers, which would confuse odd and even numbers.
+#: could skip up to 32 numbers, and confuse odd and even numbers.
 _NEXT = (
     f"SELECT setval('{_COUNTER}', CASE WHEN is_called THEN last_value ELSE 0 END + 1)"
     f" FROM {_COUNTER}"
@@ -79,7 +79,7 @@ class SessionLocks(Locks):
         # use a separate connection, since a session does not block itself
         connection = self._database.driver_connection()
         try:
-            with self._database.explained():
+            with self._database.translate_errors():
                 connection.execute(_SHARE, (LOCKS, BLOBS))
             yield
             self._require(connection)
@@ -135,7 +135,7 @@ class SessionLocks(Locks):
         # use a separate connection, since other threads use the shared one in `removals`
         connection = self._database.driver_connection()
         try:
-            with self._database.explained():
+            with self._database.translate_errors():
                 connection.execute(_WAIT, (f"{seconds * 1e3:.0f}", LOCKS, BLOBS))
         finally:
             connection.close()
@@ -158,7 +158,7 @@ class SessionLocks(Locks):
             self._remover.close()
             return False
         # count the removal, so that writers of the same blobs notice it
-        for _ in range(2):  # twice if the number is odd, since a removing process has died
+        for _ in range(2):  # twice if the number is odd because a removing process has died
             number = self._remover.query(_NEXT, same=True)
             if number is None:  # connection and lock are lost
                 break
@@ -225,7 +225,7 @@ def index_turn(database: Database, map_number: int) -> Iterator[Callable[[], Non
             ) from error
 
     try:
-        with database.explained():
+        with database.translate_errors():
             values = (INDEX_LOCKS, map_number & LOCK_BITS)
             mine = bool(_scalar(connection, _TAKE, values))
         yield require if mine else None

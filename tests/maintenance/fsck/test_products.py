@@ -18,7 +18,7 @@ from sceneprint.store.query_rows import (
     add_queries,
     keep_answer,
     list_queries,
-    read_kept,
+    read_permanent_answer,
 )
 from sceneprint.store.queue import files_of, find_job
 from sceneprint_client.api import CameraIntrinsics, FrameMeta, NewMap
@@ -68,7 +68,7 @@ def test_a_backup_has_all_that_is_kept_and_can_be_restored(tmp_path):
             assert [(one.id[0], one.kept_at, one.bytes) for one in rows] == [
                 ("b", None, 0), ("a", 1.0, 9)
             ]  # fmt: skip
-            assert read_kept(connection, rows[1].number) == b"an answer"
+            assert read_permanent_answer(connection, rows[1].number) == b"an answer"
             count = connection.exec_driver_sql("SELECT count(*) FROM queries").scalar_one()
             assert count == 2  # not the one that was stored only to look at its answer
         assert engine.tombstones.restore("hall", deletion).frames == 1
