@@ -47,3 +47,11 @@ def test_axes_are_eigenvectors_signed_by_skew():
     assert np.abs(off).max() < 1e-3 * moments.max()
     assert (np.diff(np.diag(moments)) < 0).all()
     assert ((points @ axes[:2].T) ** 3).sum(axis=0).min() > 0
+
+
+def test_defaults_never_change():
+    """Shipped models without these numbers in their files were made with them."""
+    assert CloudParameters() == CloudParameters(
+        0.3, 10.0, 64, 1 / 146, 0.02, 5.2, 8.2, 1200, 600, 76800, 0.03, 3, 0.05, 0.006, 0.006,
+        9, 0.3, 0.12, 1 / 146, 3, 6, 0.95,
+    )  # fmt: skip

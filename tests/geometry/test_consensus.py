@@ -67,6 +67,29 @@ def test_graph_equals_the_oracle(n):
     assert n < 10 or 0.05 < matrix.mean() < 0.9
 
 
+@pytest.mark.parametrize("n", [3, 63, 64, 65, 200])
+def test_common_neighbours_equal_the_product_of_the_matrix(n):
+    rng = np.random.default_rng(n)
+    matrix = rng.random((n, n)) < 0.7
+    matrix = np.triu(matrix, 1) | np.triu(matrix, 1).T
+    bits = np.zeros((n, (n + 63) // 64 * 64), np.uint8)
+    bits[:, :n] = matrix
+    packed = np.packbits(bits, axis=1, bitorder="little").view(np.uint64)
+    common = np.zeros((n, n), np.int32)
+    module._count_common(packed, common)
+    np.testing.assert_array_equal(common, np.where(matrix, matrix.astype(int) @ matrix, 0))
+
+
+@pytest.mark.parametrize("most", [1, 16, 40])
+def test_largest_are_in_the_order_of_a_stable_sort(most):
+    rng = np.random.default_rng(most)
+    for _ in range(50):
+        row = rng.integers(0, 12, 40).astype(np.int32)
+        order = np.empty(most, np.int32)
+        module._write_largest(row, order)
+        np.testing.assert_array_equal(order, np.argsort(-row, kind="stable")[:most])
+
+
 def test_fit_equals_scipys():
     rng = np.random.default_rng(1)
     for _ in range(30):
