@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sceneprint.geometry.signature import segmentation as module
 from sceneprint.geometry.signature.segmentation import (
     SegmentationParameters,
     extract_patches,
@@ -100,3 +101,40 @@ def test_patches_of_equals_the_loop():
         np.testing.assert_allclose(patches.normals[k], normal / np.linalg.norm(normal), atol=1e-6)
         assert patches.areas[k] == pytest.approx(area, rel=1e-6)
         assert patches.sizes[k] == size
+
+
+def naive_assignment(pixels, centres, spacing, weight, columns):
+    """The nearest of nine centres of each pixel, one after the other, the first of equals."""
+    _, height, width = pixels.shape
+    rows = len(centres) // columns
+    labels = np.full((height, width), -1, np.int32)
+    for y, x in np.ndindex(height, width):
+        px, py, pz, nx, ny, nz = pixels[:, y, x]
+        nearest = np.float32(np.inf)
+        for n in range(9):
+            row = min(int(y / spacing), rows - 1) + n // 3 - 1
+            column = min(int(x / spacing), columns - 1) + n % 3 - 1
+            if not (0 <= row < rows and 0 <= column < columns):
+                continue
+            cx, cy, cz, mx, my, mz, scale = centres[row * columns + column]
+            dx, dy, dz = px - cx, py - cy, pz - cz
+            cosine = nx * mx + ny * my + nz * mz
+            cost = (dx * dx + dy * dy + dz * dz) * scale + weight * (np.float32(1) - cosine)
+            if scale > 0 and cost < nearest:
+                labels[y, x], nearest = row * columns + column, cost
+    return labels
+
+
+@pytest.mark.parametrize(("height", "width", "spacing"), [(31, 23, 4.3), (9, 40, 9.0), (20, 20, 1)])
+def test_pixels_get_the_nearest_of_nine_centres(height, width, spacing):
+    rng = np.random.default_rng(height)
+    rows, columns = max(round(height / spacing), 1), max(round(width / spacing), 1)
+    pixels = rng.normal(size=(6, height, width)).astype(np.float32)
+    centres = rng.normal(size=(rows * columns, 7)).astype(np.float32)
+    centres[:, 6] = rng.uniform(0.5, 2, len(centres)) * (rng.random(len(centres)) < 0.8)
+    valid = rng.random((height, width)) < 0.9
+    labels, weight = np.zeros((height, width), np.int32), np.float32(6)
+    module._assign(pixels, valid, centres, spacing, weight, columns, labels)
+    expected = naive_assignment(pixels, centres, spacing, weight, columns)
+    np.testing.assert_array_equal(labels, np.where(valid, expected, -1))
+    assert len(np.unique(labels)) > 0.4 * len(centres)
