@@ -86,8 +86,8 @@ class Vista:
 
 def vista_of(surface: Surface) -> Vista:
     """Return the picture of a surface from its camera or around its viewpoint.
-    Unordered points are viewed along the axis in which their extent is smallest, which is vertical
-    in most buildings.
+
+    Unordered points are viewed along the axis of their smallest extent, vertical in most buildings.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def project_labels(vista: Vista, surface: Surface, points: Floats32, labels: Int
 
 
 def _along_least_extent(points: Floats, valid: NDArray[np.bool_]) -> Vista:
-    """Return a view of points (N, 3) along the axis in which their extent is smallest.
+    """Return a view of points (N, 3) along the axis of their smallest extent.
     This axis is vertical for a room, and horizontal for a single wall. Each pixel shows the point
     that is farthest along it.
     """

@@ -239,7 +239,7 @@ class Latencies:
         self._bins: Counter[int] = Counter()
 
     def add(self, seconds: float) -> None:
-        """Add a time."""
+        """Count a time, seconds."""
         self._bins[bin_of(seconds)] += 1
 
     def as_json(self) -> dict[str, int]:

@@ -42,7 +42,7 @@ def is_ours(name: str) -> bool:
 
 
 def unfinished(folder: Path) -> Path:
-    """Return a new path for an unfinished file."""
+    """Return an unused path in a folder for an unfinished file; create no file."""
     return folder / f".{secrets.token_hex(6)}.part"
 
 

@@ -102,7 +102,7 @@ class GeometryCache:
         return geometry
 
     def forget(self, digests: Iterable[str]) -> None:
-        """Remove the entries of deleted frames."""
+        """Remove the entries of these artifacts, whose frames were deleted."""
         with self._lock:
             for digest in digests:
                 self._remove(digest)

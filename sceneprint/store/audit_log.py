@@ -161,5 +161,5 @@ def surplus_lines(
 
 
 def remove_lines(connection: Connection, numbers: Sequence[int]) -> None:
-    """Remove lines; see `surplus_lines`."""
+    """Remove the audit lines with these row numbers; see `surplus_lines`."""
     connection.execute(delete(audit).where(among(connection, audit.c.number, numbers)))

@@ -394,7 +394,7 @@ def surplus_events(
 
 
 def remove_events(connection: Connection, numbers: Sequence[int]) -> None:
-    """Remove events; see `surplus_events`."""
+    """Remove the events with these numbers; see `surplus_events`."""
     for block in blocks(numbers):
         connection.execute(delete(events).where(among(connection, events.c.number, block)))
 

@@ -542,7 +542,7 @@ def numbers_of_runs(
 
 
 def path_frames(connection: Connection, numbers: Iterable[int]) -> dict[int, PathFrame]:
-    """Return the indexed frames among some frames, by number."""
+    """Return the frames with these numbers that are indexed, by number."""
     statement = select(
         frames.c.number, frames.c.id, frames.c.robot, frames.c.session, frames.c.captured_at,
         frames.c.pose_parent, frames.c.pose, frames.c.cloud.is_not(null()), frames.c.name,

@@ -358,7 +358,7 @@ def _first(connection: Connection, *conditions: ColumnElement[bool]) -> FrameRow
 
 
 def write_tags(connection: Connection, number: int, tags: Iterable[str]) -> None:
-    """Insert the tags of a frame that has none yet."""
+    """Insert the tags of a frame without tags."""
     if rows := [{"frame_number": number, "tag": tag} for tag in sorted(set(tags))]:
         connection.execute(insert(frame_tags), rows)
 
@@ -460,7 +460,7 @@ class FrameViewpoint:
 
 
 def viewpoints_among(connection: Connection, numbers: Iterable[int]) -> list[FrameViewpoint]:
-    """Return the viewpoints of some frames, except frames without a pose."""
+    """Return the viewpoints of the frames with these numbers, except frames without a pose."""
     return [
         FrameViewpoint(number, of_map, parent, _pose_of_text(pose), is_cloud)
         for number, of_map, parent, pose, is_cloud in rows_of_statement(

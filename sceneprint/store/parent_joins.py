@@ -105,7 +105,7 @@ def count_poses(
 
 
 def root_columns(connection: Connection, frame: FrameRow) -> dict[str, Any]:
-    """Return the pose columns of a frame after joins that were not yet applied; {} without any."""
+    """Return a frame's pose columns after all joins; {} if its stored pose is up to date."""
     if frame.pose is None or frame.pose_parent is None or frame.sent_parent is not None:
         return {}  # the joins have already been applied
     join = find_joins(connection, frame.map_number).get(frame.pose_parent)

@@ -527,7 +527,7 @@ def fail(connection: Connection, held: JobRow, error: str, traceback: str) -> Jo
 
 
 def pause_s(failures: int) -> float:
-    """Return the pause, in seconds, before the next attempt at a job after some failures."""
+    """Return the pause, in seconds, before the next attempt at a job with this many failures."""
     return BACKOFF_S * 4.0 ** (failures - 1)
 
 
@@ -654,7 +654,7 @@ def cancel(connection: Connection, job: JobRow) -> None:
 
 
 def cancel_jobs(connection: Connection, *which: ColumnElement[bool]) -> None:
-    """Cancel the queued and running jobs that satisfy some conditions."""
+    """Cancel the queued and running jobs that satisfy all conditions in `which`."""
     connection.execute(
         update(jobs)
         .where(*which, jobs.c.state.in_(PENDING))
@@ -751,7 +751,7 @@ def jobs_with_files(connection: Connection, kind: str) -> list[JobRow]:
 
 
 def finished_with_file(connection: Connection, name: str) -> list[int]:
-    """Return the numbers of finished jobs that have a file of a name."""
+    """Return the numbers of finished jobs that have a file with this name."""
     over = jobs.c.state.in_([state for state in JobState if state.over])
     statement = (
         select(jobs.c.number)

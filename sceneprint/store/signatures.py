@@ -344,7 +344,7 @@ def remove_signature(connection: Connection, number: int, model_id: str) -> list
 
 
 def stale_jobs(connection: Connection, row: MapRow) -> list[int]:
-    """Return the numbers of some unfinished jobs for models that a map does not use."""
+    """Return the numbers of a block of unfinished jobs for models that a map does not use."""
     numbers = connection.execute(
         select(jobs.c.number)
         .join(frames, frames.c.number == jobs.c.frame_number)

@@ -126,11 +126,11 @@ def add_sample(connection: Connection, kind: str, process: str, data: dict[str, 
 
 
 def samples_since(connection: Connection, kind: str, at: float) -> list[Sample]:
-    """Return the samples of all processes since a time, oldest first."""
+    """Return the samples of all processes since time `at`, oldest first."""
     of_kind = select(samples.c.at, samples.c.data).where(samples.c.kind == kind, samples.c.at >= at)
     return [Sample(*row) for row in connection.execute(of_kind.order_by(samples.c.at))]
 
 
 def count_samples(connection: Connection, kind: str, at: float) -> int:
-    """Count the samples of a kind since a time."""
+    """Count the samples of a kind since time `at`, seconds since 1970."""
     return count_rows(connection, samples.c.kind == kind, samples.c.at >= at)

@@ -235,7 +235,7 @@ def frames_to_fuse(
 
 
 def frames_to_remove(connection: Connection, surface: SurfaceRow, limit: int) -> list[int]:
-    """Return the numbers of fused frames that were deleted or edited."""
+    """Return the numbers of up to `limit` fused frames that were deleted or edited."""
     outdated = _outdated(surface).order_by(surface_frames.c.frame_number).limit(limit)
     return list(connection.execute(outdated).scalars())
 
@@ -243,7 +243,7 @@ def frames_to_remove(connection: Connection, surface: SurfaceRow, limit: int) ->
 def fused_frames(
     connection: Connection, surface: SurfaceRow, numbers: Iterable[int]
 ) -> list[FusedFrame]:
-    """Return some frames in the order of their numbers, except those without pose or artifact."""
+    """Return the frames with these numbers, ascending, except frames without pose or artifact."""
     c = frames.c
     statement = (
         _posed(surface.map_number, surface.model_id)
@@ -331,7 +331,7 @@ class TileRow:
 def tiles_at(
     connection: Connection, map_number: int, parent: str, level: int, places: Iterable[TilePlace]
 ) -> dict[TilePlace, TileRow]:
-    """Return the tiles that exist at some places of a parent frame and level, by place."""
+    """Return the existing tiles at `places` of a parent frame and level, by place."""
     c = surface_tiles.c
     # one statement per row and floor is faster than a list of many tuples
     columns: dict[tuple[int, int], list[int]] = {}
@@ -581,7 +581,7 @@ def frames_seeing(
     connection: Connection, surface: SurfaceRow, parent: str, places: Iterable[TilePlace],
     spot: Sequence[float], beyond: tuple[float, int] | None, limit: int,
 ) -> list[SightingFrame]:  # fmt: skip
-    """Return frames that overlap any of some tiles, sorted by distance from a spot.
+    """Return frames that overlap a tile at one of `places`, sorted by distance from a spot.
 
     Parameters
     ----------

@@ -67,7 +67,7 @@ def delete_tenant(connection: Connection, name: str) -> None:
 
 
 def join_tenant(connection: Connection, key_name: str, tenant: str | None) -> str:
-    """Return the tenant of a new key: `tenant`, or one of the key's name, created if missing.
+    """Return the tenant of a new key: `tenant`, or a tenant named `key_name`, created if missing.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def unknown_tenant(name: str) -> UnknownTenant:
 
 
 def save_turns(connection: Connection, *names: str) -> None:
-    """Store the latest turns of some tenants, or of all tenants, in the table of tenants.
+    """Store the latest turns of the tenants `names`, or of all tenants, in the table of tenants.
 
     Call this before removing jobs: a tenant could otherwise delete its maps to be served next.
     """

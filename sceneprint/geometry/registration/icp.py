@@ -588,8 +588,7 @@ def pair_covariance(
     """
     p = p or CovarianceParameters()
     information, squares = [], []
-    # errors of `there` are about the match's origin; errors of `back` are inverse, in the query's
-    # axes
+    # `there` has errors about the match's origin, `back` inverse errors in the query's axes
     for refinement, R, lever in (
         (there, np.eye(3), -T[:3, 3]), (back, T[:3, :3].T, np.zeros(3))
     ):  # fmt: skip

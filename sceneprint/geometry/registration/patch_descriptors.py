@@ -172,7 +172,7 @@ def _add_shares(
     lies: Floats, bins: Ints32, places: Ints32, count: int, weights: Floats, starts: Ints32,
     histogram: Floats32,
 ) -> None:  # fmt: skip
-    """Add the 16 shares of each patch to the histogram, patch by patch."""
+    """Add the 16 weighted shares of each patch's area to its bins of the histogram."""
     for k in range(count):
         i = np.uint64(places[k])
         fe, fg = lies[3, i], lies[4, i]

@@ -241,7 +241,7 @@ def _cyclic_cost(
     for turn in range(n):
         cost = _edit_cost(costs, m, n, turn, gap, swap, best, rows)
         best = min(best, cost)
-    # limit / whole can round to less than `most`, and would then displace an equal cost
+    # without this test, rounding could make an equal cost smaller than `most` and replace it
     return best / whole if best < limit else 1.0
 
 

@@ -469,7 +469,7 @@ def _pair_bins(
 def _add(
     there: Ints32, back: Ints32, i: int, weights: Floats32, counts: Floats32, total: float
 ) -> tuple[int, float]:
-    """Add the weights of pairs to their bins; return the number of pairs and the new `total`."""
+    """Add pair weights to `counts`; return the number of pairs, and `total` plus their weights."""
     count, own = 0, weights[i]
     for j in range(i + 1, len(there)):
         weight = own * weights[j]

@@ -266,7 +266,7 @@ class AmbiguityParameters:
     first: RefinementParameters = QUICK  #: refinement of all rivals
     hopeful_share: float = 0.04  #: minimum share that a rival explains after the first refinement
     hopeful_violations: float = 0.15  #: maximum share of a rival's violations after it
-    then: RefinementParameters = COARSE  #: refinement of the remaining rivals
+    then: RefinementParameters = COARSE  #: refinement of rivals that remain hopeful
     refuted: float = 0.02  #: share of violations that refutes a rival, unless T has more
     rival_m: float = 0.25  #: minimum difference of a rival from the transform, metres
     rival_rad: float = math.radians(15.0)  #: or minimum rotation relative to it, radians

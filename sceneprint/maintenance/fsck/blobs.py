@@ -191,7 +191,7 @@ _KINDS = {
 
 
 def _read(kind: str, connection: Connection, numbers: list[int]) -> list[BlobReference]:
-    """Read the references of some rows, in the order of their numbers."""
+    """Read the blob references of the rows with these numbers, in ascending order."""
     number = _KINDS[kind].table.c.number
     return [
         BlobReference(kind, *row)

@@ -187,7 +187,7 @@ class _CheckedFrame:
 
 
 def check_rows(folder: Folder, numbers: list[int]) -> Iterator[Finding]:
-    """Check the rows of some frames, and yield findings for inconsistent or damaged rows."""
+    """Check the rows of the frames with these numbers; yield findings for damaged rows."""
     for row in read_rows(folder, numbers, partial(_read_frames, folder)):
         folder.counts["frames"] += 1
         if isinstance(row, tuple):
@@ -219,7 +219,7 @@ def _repair_row(folder: Folder, number: int, fault: _Fault) -> str:
 
 
 def _read_frames(folder: Folder, connection: Connection, numbers: list[int]) -> list[_CheckedFrame]:
-    """Read some frames; if `folder.quick` is set, do not verify their signatures."""
+    """Read the frames with these numbers; if `folder.quick` is set, skip signature checks."""
     here = frames.c.number.in_(numbers)
     own = select(maps).where(maps.c.number.in_(select(frames.c.map_number).where(here)))
     map_rows = {row["number"]: map_row(row) for row in connection.execute(own).mappings()}

@@ -123,7 +123,7 @@ class SessionLocks(Locks):
         return True
 
     def removals(self) -> int | None:
-        """Return the even counter of removals; None if unknown, or during a removal."""
+        """Return the counter of removals, an even number; None if unknown, or during a removal."""
         number = self._reader.query(_READ)
         return number if number is not None and number % 2 == 0 else None
 
