@@ -27,7 +27,7 @@ from sceneprint.types import (
 )
 from sceneprint_client.api.results import WIDTHS
 
-#: Colour of unknown pixels: a dark grey that stands for no normal and no depth.
+#: Colour of unknown pixels: a dark grey that represents no normal and no depth.
 UNKNOWN = 40
 
 

@@ -293,7 +293,7 @@ def frame_verdicts(
     """Return a frame's verdicts on cells, (N,) uint8.
 
     AGREES: the cell is on the surface, regardless of its normal. VIOLATES: the frame sees through
-    the cell; unordered points never do. UNKNOWN: the cell is outside the view, behind the surface,
+    the cell; never for unordered points. UNKNOWN: the cell is outside the view, behind the surface,
     near an edge, or not measured.
 
     Parameters

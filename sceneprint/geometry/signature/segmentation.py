@@ -438,7 +438,7 @@ class WeightParameters:
 
 
 def patch_weights(patches: Patches, p: WeightParameters) -> Floats:
-    """Return positive weights (P,) of patches, with mean 1, to be multiplied for each pair."""
+    """Return positive weights (P,) of patches, with mean 1. A pair's weight is their product."""
     weights = patches.sizes**p.size_exponent * patches.coherences**p.coherence_exponent
     result: Floats = weights / weights.mean()
     return result
@@ -575,7 +575,7 @@ def supervoxels(seen: Voxels, spacing: float, most: int, p: SegmentationParamete
             labels, n = _grow_patches(seen, seeds, spacing, least, p)
             if n <= most:
                 return labels[None]
-        spacing *= 1.03 * (n / most) ** 0.85  # exponent above 0.5: slanted patches are long
+        spacing *= 1.03 * (n / most) ** 0.85  # sqrt is too slow for long, slanted patches
 
 
 def _seeds(seen: Voxels, spacing: float) -> Ints32:

@@ -48,7 +48,7 @@ class AcceptanceParameters:
     support the transform.
     """
 
-    residual_m: float = 0.08  #: epsilon_val: maximum residual of both directions composed
+    residual_m: float = 0.08  #: epsilon_val: maximum residual of T_ab T_ba, metres
     residual_rad: float = math.radians(5.0)  #: the same for the rotation, radians
     violation_weight: float = 5.0  #: evidence = overlap - violation_weight * violations
     evidence: float = 0.2  #: minimum evidence

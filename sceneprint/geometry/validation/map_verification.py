@@ -307,7 +307,7 @@ def median_contradiction(
     frames: Iterable[tuple[Geometry, Floats]], views: MapViews, p: MapParameters,
     overlap_p: OverlapParameters,
 ) -> float:  # fmt: skip
-    """Return the median share of frames' surfaces that contradict the map at their poses.
+    """Return the median share of a frame's surfaces that contradict the map at its pose.
 
     Between two places that look alike, some pairs of frames agree, but most frames show surfaces
     where the other place has free space. Poses are refined first, because maps drift.

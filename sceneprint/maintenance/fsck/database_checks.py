@@ -142,7 +142,7 @@ def _put_preset(folder: Folder, model_id: str, source: str) -> str:
 
 
 def check_counts(folder: Folder) -> Iterator[Finding]:
-    """Yield findings for maps with a wrong stored usage; quotas depend on it."""
+    """Yield findings for maps whose stored usage, used for quotas, is wrong."""
     with folder.store.database.read() as connection:
         rows = list_maps(connection)
     for row in rows:
