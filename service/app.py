@@ -137,7 +137,7 @@ async def warm_up(context: Context) -> AsyncIterator[None]:
         yield
     finally:
         stop.set()
-        await task  # before the store closes
+        await task  # finish before the store closes
 
 
 def _warm(context: Context, stop: threading.Event) -> None:
@@ -158,7 +158,7 @@ def _warm(context: Context, stop: threading.Event) -> None:
 
 @asynccontextmanager
 async def housekeeping(service: Service) -> AsyncIterator[None]:
-    """Write metrics and uses of keys at intervals, and drop cached data of deleted frames."""
+    """Write metrics and the last use of keys at intervals; drop cached data of deleted frames."""
     database, sampler = service.context.store.database, service.metrics.sampler
     purging = MemoryPurging(service.context)
 

@@ -298,7 +298,7 @@ Guest = Annotated[Caller | None, Depends(guest)]
 
 
 def requires_key(request: Request, here: Here) -> bool:
-    """Return whether a request needs a key: whether it may come from another machine."""
+    """Return whether a request needs a key, because it may come from another machine."""
     return here.keys or request.state.forwarded is not None
 
 

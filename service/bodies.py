@@ -468,7 +468,7 @@ async def read_json(request: Request) -> Any:
     if not body:
         raise MalformedBody("The body is empty. Send a JSON object.")
     try:
-        return from_json(bytes(body))  # refuses lone surrogates, unlike `json`
+        return from_json(bytes(body))  # unlike `json`, it refuses lone surrogates
     except ValueError as error:
         raise MalformedBody(f"The body is not JSON ({error}). Send a JSON object.") from error
 
@@ -583,7 +583,7 @@ class FormFrames:
         ]
 
     def faults(self) -> list[str]:
-        """Return a text with index and error for each frame with invalid metadata."""
+        """Return the index and the error, as text, of each frame with invalid metadata."""
         return [
             f"{i} {meta}" for i, meta in enumerate(self.metas) if not isinstance(meta, FrameMeta)
         ]
@@ -686,7 +686,7 @@ IdempotencyKey = Annotated[
 
 
 def idempotent_request(caller: Caller, key: str | None, *parts: object) -> IdempotentRequest | None:
-    """Return the idempotent request of an idempotency key; None without a key.
+    """Return the idempotent request of an idempotency key; None if there is no key.
 
     Parameters
     ----------

@@ -50,7 +50,7 @@ _FORWARDING = (b"forwarded", b"x-forwarded", b"x-real-ip", b"via")
 
 
 def forwarded(headers: Mapping[bytes, bytes]) -> str | None:
-    """Return the name of the first header that a proxy has added; None without a proxy.
+    """Return the name of the first header that a proxy has added; None if there is none.
 
     The value of the header is not used, because any client can send it.
     """
@@ -82,7 +82,7 @@ def foreign_request_error(
                 "other machines, listen on another address with `sceneprint serve --host`."
             )
         if name == b"origin" and not (_is_here(text.partition("://")[2]) or allows(value)):
-            return ForeignOrigin(  # also for the origin `null`
+            return ForeignOrigin(  # the origin `null` is refused too
                 f"A page of {text!r:.80} sent this request, but this service requires no key, so "
                 "it accepts requests only from pages on its own machine. Serve the page from "
                 "localhost, or add its origin to SCENEPRINT_CORS_ORIGINS."

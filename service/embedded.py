@@ -83,7 +83,7 @@ class LocalService(httpx.BaseTransport):
 
     def handle_request(self, request: httpx.Request) -> httpx.Response:
         """Send a request to the application, and return a streaming response."""
-        request.headers["Host"] = "localhost"  # replaces the host name in the URL of the client
+        request.headers["Host"] = "localhost"  # replace the host name in the URL of the client
         request.extensions = {}  # no timeouts, because this process computes the response
         return self._transport.handle_request(request)
 
@@ -139,7 +139,7 @@ class _Server(uvicorn.Server):
         self.opened.set_result(self._app.state.service.context)
 
     async def on_tick(self, counter: int) -> bool:
-        """Return whether to stop, also if the main thread has ended without closing the client."""
+        """Return whether to stop; True if the main thread ended without closing the client."""
         return await super().on_tick(counter) or not threading.main_thread().is_alive()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

@@ -126,7 +126,7 @@ class Feed:
         first, place, last = await to_thread.run_sync(
             begin, self._database, criteria, self._retained, after
         )
-        yield first, last  # also if empty, because the reader needs its position
+        yield first, last  # even an empty list, since the reader needs its position
         clock = asyncio.get_running_loop().time
         due = clock() + ALIVE_S
         while not self._closed:

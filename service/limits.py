@@ -52,7 +52,7 @@ class Holdings:
         return True
 
     def allows(self, tenant: str, amount: int, room: int) -> bool:
-        """Return whether the share of a tenant of `room` allows `amount` more."""
+        """Return whether a tenant may use `amount` more within its share of `room`."""
         return tenant == NOBODY or self._held[tenant] + amount <= share(room)
 
     def by_tenant(self) -> dict[str, int]:
@@ -157,7 +157,7 @@ class Gate:
     waiting : maximum number of requests that wait for their bodies or for a turn
     longest_s : maximum wait for a turn, seconds
     beside : maximum number of running calls of a tenant while others wait; default: half
-    rest : rest of tenants between turns; see TurnOrder
+    rest : pause of a tenant between turns; see TurnOrder
     """
 
     def __init__(
@@ -186,12 +186,12 @@ class Gate:
             self._taken.give(tenant, 1)
 
     async def enter(self, do: Callable[[], T]) -> T:
-        """Run a function while holding a place; see `place` and `run`."""
+        """Return the result of a function, run while holding a place; see `place` and `run`."""
         async with self.place():
             return await self.run(do)
 
     async def run(self, do: Callable[[], T], *, patient: bool = False) -> T:
-        """Wait for a turn, and run a function in a thread. The caller must hold a place.
+        """Return the result of a function, run in a thread after a wait for a turn. Needs a place.
 
         Parameters
         ----------
@@ -210,7 +210,7 @@ class Gate:
 
 
 async def take_turn(turns: Turns, tenant: str, longest_s: float | None, weight: int = 1) -> int:
-    """Call `Turns.acquire`; raise Busy if no turn becomes free within `longest_s` seconds."""
+    """Return the result of `Turns.acquire`; raise Busy if it takes over `longest_s` seconds."""
     try:
         with anyio.fail_after(longest_s):
             return await turns.acquire(tenant, weight)
@@ -231,7 +231,7 @@ def too_many_requests(most: int) -> RateLimited:
 
 #: Cost of a query, in requests, and number of rows of a list that cost one more request.
 QUERY_COST, ROWS_PER_COST = 5.0, 50
-#: Number of rows of a list without a limit in the request.
+#: Number of rows of a list if the request sets no limit.
 _USUAL_ROWS = 100
 _QUERIES = re.compile(r"/(queries|queries/records|localize|localize/sequence|similarity)$")
 

@@ -151,7 +151,7 @@ METRICS = {
     ),
     "disk_free_bytes": MetricFamily("gauge", "Free space on the disk of the data folder."),
     "scrub_bytes": MetricFamily("gauge", "Size of the data that this scrub has read."),
-    "scrub_damaged": MetricFamily("gauge", "Number of lost or damaged objects this scrub found."),
+    "scrub_damaged": MetricFamily("gauge", "Number of lost or damaged objects in this scrub."),
     "tenant_requests_total": MetricFamily(
         "counter", f"Number of answered requests of each tenant. The first {MOST_TENANTS} tenants "
         f"of a process have their own series; all others share `{OTHERS}`.", ("tenant", "status"),

@@ -73,7 +73,7 @@ class RequestMiddleware:
         sent_id = headers.get(b"x-request-id", b"")
         request_id = sent_id.decode() if _ID.fullmatch(sent_id) else uuid.uuid4().hex
         name_request(request_id)
-        set_tenant(NOBODY)  # until `auth.authenticate` checks the key
+        set_tenant(NOBODY)  # no tenant until `auth.authenticate` checks the key
         set_actor(None)
         own: Headers = [(b"x-request-id", request_id.encode())]
         own += self._origins.headers(headers.get(b"origin"))

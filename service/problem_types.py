@@ -89,8 +89,8 @@ PROBLEM_TYPES = {
         429, "Wait as long as `Retry-After` says, and repeat.", retry_after_s=1
     ),
     "SceneprintError": ProblemType(500, "Find the request's id in the log, and report it."),
-    "DamagedBlob": ProblemType(500, "The operator runs `sceneprint fsck --repair`."),
-    "DamagedSignature": ProblemType(500, "The operator runs `sceneprint fsck --repair`."),
+    "DamagedBlob": ProblemType(500, "Ask the operator to run `sceneprint fsck --repair`."),
+    "DamagedSignature": ProblemType(500, "Ask the operator to run `sceneprint fsck --repair`."),
     "InternalError": ProblemType(
         500, "Report it with the traceback that the log has under the request's id.",
         "The service failed; nothing was partially written."
@@ -115,18 +115,18 @@ PROBLEM_TYPES = {
         f"not have been stored; it is safe to send it again. {_LOG} Retry later.",
     ),
     "ReadOnlyStore": ProblemType(
-        503, "The operator makes the data folder writable, and restarts the service.",
+        503, "The operator must make the data folder writable, and restart the service.",
         retry_after_s=60,
         detail="The service's store is read-only, so nothing was stored. Queries still work. "
         f"{_LOG} Make the data folder writable there, and restart the service.",
     ),
     "NewerSchema": ProblemType(
-        503, "The operator starts the version that migrated the database.", retry_after_s=60,
+        503, "The operator must start the version that migrated the database.", retry_after_s=60,
         detail="A later version of sceneprint has migrated the service's store, so this process "
         f"stored nothing. {_LOG} Stop the process, and start the later version.",
     ),
     "StoreFull": ProblemType(
-        507, "The operator frees disk space. Queries still work.", retry_after_s=30,
+        507, "The operator must free disk space. Queries still work.", retry_after_s=30,
         detail="The service's disk is full, so nothing was stored. Queries still work. "
         f"{_LOG} Free some space there, and send the request again.",
     ),

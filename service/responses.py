@@ -116,7 +116,7 @@ async def send_output(
 
 
 def safe(name: str) -> str:
-    """Replace characters of an id that are not allowed in headers."""
+    """Return an id with `_` for each character that is not allowed in headers."""
     return "".join(c if c.isascii() and c.isprintable() and c not in '"\\/' else "_"
                    for c in name)  # fmt: skip
 
@@ -192,7 +192,7 @@ def send_product_file(
             return send_file(
                 request, lambda: blobs.open(file.blob), file.media_type, file.blob, name
             )
-    find()  # raises if the job was deleted
+    find()  # raise an error if the job was deleted
     raise DamagedBlob(f"{file.name} of the job is damaged. Delete the job, and start another.")
 
 

@@ -37,8 +37,8 @@ T = TypeVar("T")
 UPLOADS = 12
 #: Number of separate threads that look up keys.
 LOOKUPS = 4
-#: Maximum number of concurrent requests in shared threads, such as lists: of all tenants, and of
-#: one tenant while others wait; and its rest (see TurnOrder): a turn is half of a request's work.
+#: Maximum number of concurrent requests in shared threads, such as lists, of all tenants, and of
+#: one tenant while others wait; and pause of a tenant after a turn (see TurnOrder).
 READS, READS_BESIDE, READS_REST = 8, 1, 2.0
 #: Maximum age of the result of `/readyz`, seconds.
 READY_S = 1.0
@@ -114,8 +114,8 @@ class Service:
         return row
 
     async def run(self, do: Callable[..., T], *arguments: object, patient: bool = False) -> T:
-        """Wait for a turn of the tenant, and run a function in a shared thread. Do not call this
-        during another turn.
+        """Return the result of a function, run in a shared thread after a wait for a turn. Do not
+        call this during another turn.
 
         Parameters
         ----------

@@ -59,7 +59,7 @@ class Connection(H11Protocol):
     _checking: asyncio.TimerHandle | None = None
     _unread_before = math.inf
     silent_since = 0.0
-    #: Transport below TLS; None without TLS.
+    #: Transport below TLS; None for plain HTTP.
     wire: asyncio.Transport | None = None
 
     @property
@@ -128,7 +128,7 @@ class Connection(H11Protocol):
         handle = self.transport.get_extra_info("socket")
         try:
             (kernel,) = struct.unpack("i", fcntl.ioctl(handle, termios.TIOCOUTQ, bytes(4)))
-        except (OSError, TypeError):  # closed
+        except (OSError, TypeError):  # the socket is closed
             kernel = 0
         return self.transport.get_write_buffer_size() + carried + int(kernel)
 
@@ -159,7 +159,7 @@ def tls_context(settings: Settings) -> ssl.SSLContext | None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.options |= ssl.OP_NO_RENEGOTIATION  # costs the server more than the client
+    context.options |= ssl.OP_NO_RENEGOTIATION  # it costs the server more than the client
     context.set_alpn_protocols(["http/1.1"])
     try:
         # Without a password function, OpenSSL would prompt for the password of an encrypted key.
@@ -201,7 +201,7 @@ class Handshake(asyncio.Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the handshake."""
         self.transport, self.silent_since = transport, time.monotonic()
-        transport.pause_reading()  # start_tls resumes it
+        transport.pause_reading()  # start_tls resumes reading
         self._connections.add(self)
         close_oldest(self._connections, self)
         self._task = asyncio.get_running_loop().create_task(self._agree())
@@ -256,16 +256,16 @@ log = logging.getLogger(__name__)
 #: loop would wait too long for a dozen threads, and so would a query, which acquires the lock a
 #: hundred times.
 SWITCH_S = 0.0001
-#: Seconds for requests in progress after the signal to stop.
+#: Grace period for requests in progress after the signal to stop, seconds.
 GRACE_S = 20
 
 
 def listen(settings: Settings) -> socket.socket:
-    """Open a listening socket on the configured address. Raise UnusableStore if the address is in
-    use or does not belong to this machine.
+    """Return a socket that listens on the configured address. Raise UnusableStore if the address is
+    in use or does not belong to this machine.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-    # Only with a protocol does asyncio disable Nagle's algorithm, which delays responses by 40 ms.
+    # asyncio disables Nagle's algorithm, a delay of 40 ms, only if the protocol is specified.
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -292,7 +292,7 @@ def run(settings: Settings, ready: Callable[[str, bool], None]) -> None:
     UnusableStore, NewerSchema : If the store cannot be opened or the address is not available.
     """
     context = tls_context(settings)
-    listening = listen(settings)  # before a data folder is created
+    listening = listen(settings)  # listen before a data folder is created
     try:
         read_only = _require_store(settings)
     except BaseException:

@@ -45,7 +45,7 @@ class Front:
             return
         if self.app is None:
             if self._is_harmless(scope):
-                content = {"status": "ok", "version": __version__}  # as in the application
+                content = {"status": "ok", "version": __version__}  # the application sends the same
                 response = JSONResponse(content, headers={"X-Request-Id": uuid.uuid4().hex})
                 response.raw_headers += security_headers(response.raw_headers)
                 await response(scope, receive, send)

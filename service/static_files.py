@@ -56,7 +56,7 @@ def read_file(path: Path) -> StaticFile:
 
 
 def pack_file(suffix: str, plain: bytes) -> StaticFile:
-    """Compress bytes to a static file; `suffix` is in `KINDS`."""
+    """Return bytes as a static file, compressed; `suffix` is in `KINDS`."""
     tag = hashlib.sha256(plain).hexdigest()[:20]
     return StaticFile(KINDS[suffix], plain, gzip.compress(plain, 9, mtime=0), tag)
 

@@ -92,7 +92,7 @@ class Worker:
         self._listener, self._trace, self._stop = listener, trace, stop
         self.name = process_name()
         self.unsound = False  # whether an unexpected error has occurred
-        # Sign first: if housekeeping kills workers, each still signs frames for a while.
+        # Sign first, so that each worker signs some frames even if housekeeping kills it.
         self._upkeep_at = time.monotonic() + UPKEEP_S
         starter = multiprocessing.parent_process()
         self._wakers = (stop.descriptor, -1 if starter is None else int(starter.sentinel))
@@ -134,7 +134,7 @@ class Worker:
 
     def _run_upkeep(self) -> bool:
         """Run housekeeping and the scrub until a wake-up; return whether there was one."""
-        self._upkeep_at = time.monotonic() + UPKEEP_S  # before housekeeping, in case of an error
+        self._upkeep_at = time.monotonic() + UPKEEP_S  # set it first, in case housekeeping fails
         woken = False
 
         def is_quiet() -> bool:
@@ -155,7 +155,7 @@ class Worker:
         due_s = self._jobs.due_in_s()
         pause_s = LONGEST_S if due_s is None else min(due_s, LONGEST_S)
         pause_s = min(pause_s, self._upkeep_at - time.monotonic())
-        return max(pause_s, SHORTEST_S * random.uniform(1, 2))  # spreads the reads of workers
+        return max(pause_s, SHORTEST_S * random.uniform(1, 2))  # spread the reads of workers
 
 
 # Traces: the current job of a worker, and the traceback of its death.

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 GRACE_S = 20.0
 #: Seconds before a worker that died without a job is replaced, in case it cannot start.
 RESTART_S = 1.0
-#: Signals that are not caused by the current job.
+#: Signals that other processes send, which the current job does not cause.
 _FROM_OUTSIDE = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
@@ -79,7 +79,7 @@ class Supervisor:
                     for ready in wait([stopped, *busy], min(free, default=None)):
                         if isinstance(ready, int) and ready in busy:
                             self._replace(busy[ready])
-        finally:  # also if a worker cannot start
+        finally:  # even if a worker cannot start
             self.stop()
 
     def stop(self) -> None:

@@ -320,7 +320,7 @@ def read_livox_scan(data: bytes, *, ros1: bool = False) -> SerializedCloud:
     reader.align(8)
     reader.bytes(8)  # timebase, which the stamp of the header repeats
     declared = reader.word()
-    reader.bytes(4)  # lidar_id and rsvd
+    reader.bytes(4)  # skip lidar_id and rsvd
     count = reader.word()
     # CDR pads a point to whole words, except the last one.
     step = _LIVOX_POINT if ros1 else _LIVOX_POINT + 1
@@ -344,7 +344,7 @@ def _is_encapsulated(data: bytes) -> bool:
 
 def _read_header(reader: _Reader) -> SerializedHeader:
     if reader.is_ros1:
-        reader.word()  # seq
+        reader.word()  # skip seq
     seconds, nanoseconds = reader.word(), reader.word()
     if nanoseconds >= 1_000_000_000:
         raise UnreadableCloud(
@@ -418,7 +418,7 @@ class _Reader:
 
 @contextmanager
 def naming(subject: str) -> Iterator[None]:
-    """Prefix the messages of errors in the block with a subject, such as a path."""
+    """Prefix messages of SceneprintErrors raised in the block with a subject, such as a path."""
     try:
         yield
     except SceneprintError as error:

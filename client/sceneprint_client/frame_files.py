@@ -222,7 +222,7 @@ def _is_npy_of_points(file: Path) -> bool:
 
 
 def _head(file: Path) -> bytes:
-    """Return the first `HEAD` bytes of a file; none if it cannot be read: later errors say why."""
+    """Return the first `HEAD` bytes of a file, or b"" if it cannot be read."""
     try:
         with file.open("rb") as opened:
             return opened.read(HEAD)

@@ -91,13 +91,13 @@ def frame_bytes(
     up: Sequence[float] | None = None,
 ) -> tuple[bytes, FrameMeta]:  # fmt: skip
     """Return the bytes and metadata of a frame; see `frame_files.sendable`."""
-    from sceneprint_client.frame_files import sendable  # loads numpy
+    from sceneprint_client.frame_files import sendable  # this import loads numpy
 
     return sendable(frame, meta, with_pose=with_pose, up=up)
 
 
 def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
-    """Return the arguments of a request that sends a frame."""
+    """Return the keyword arguments of an httpx request that sends a frame."""
     return {
         "files": {"frame": ("frame", data, "application/octet-stream")},
         "data": {"meta": json.dumps(meta_json(meta))},
@@ -105,7 +105,7 @@ def frame_form(data: bytes, meta: FrameMeta) -> dict[str, Any]:
 
 
 def frames_form(frames: Sequence[FrameInput], metas: Sequence[MetaInput | None]) -> dict[str, Any]:
-    """Return the arguments of a request that sends several frames with their poses."""
+    """Return the keyword arguments of an httpx request that sends frames with their poses."""
     uploads = [frame_bytes(*pair, with_pose=True) for pair in zip(frames, metas, strict=True)]
     return {
         "files": [("frame", ("frame", data, "application/octet-stream")) for data, _ in uploads],
@@ -245,7 +245,7 @@ def query_json(query: Query) -> dict[str, Any]:
 
 
 def query_form(data: bytes, meta: FrameMeta, query: Query) -> dict[str, Any]:
-    """Return the arguments of a request that sends a frame and the options of a query."""
+    """Return the keyword arguments of an httpx request that sends a frame and query options."""
     form = frame_form(data, meta)
     form["data"] |= {name: form_text(value) for name, value in query_json(query).items()}
     return form
@@ -364,7 +364,7 @@ class ServiceConnection:
             await http.aclose()
 
     async def _run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that blocks; an asynchronous client runs it in another thread."""
+        """Return the result of a blocking call, which an asynchronous client runs in a thread."""
         if self._is_blocking:
             return function(*args, **kwargs)
         return await asyncio.to_thread(function, *args, **kwargs)
@@ -704,7 +704,7 @@ class StreamPosition:
 
 
 async def _lines(response: httpx.Response) -> AsyncIterator[str]:
-    """Yield the lines of a response of either class of httpx."""
+    """Yield the lines of a response to a blocking or an asynchronous client."""
     if isinstance(response.stream, httpx.SyncByteStream):
         for line in response.iter_lines():
             yield line
@@ -718,7 +718,7 @@ _PAUSES_S = (0.02, 0.5)
 
 
 def growing_pauses(until: float) -> Iterator[float]:
-    """Yield increasing pauses, seconds, until `until` on the clock of `time.monotonic`."""
+    """Yield increasing pauses, seconds; stop when `time.monotonic` reaches `until`."""
     pause, longest = _PAUSES_S
     while (remaining := until - time.monotonic()) > 0:
         yield min(pause, remaining)

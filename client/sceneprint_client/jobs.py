@@ -62,7 +62,7 @@ class JobMethods(ServiceConnection):
 
     @Call
     async def cancel_job(self, job_id: str) -> Job:
-        """Cancel a job that has not ended; its frame becomes `failed`.
+        """Cancel a job that has not ended, and return it; its frame becomes `failed`.
 
         Raise UnknownJob if the job does not exist. Raise JobOver if the job has ended.
         """
@@ -129,7 +129,7 @@ class JobMethods(ServiceConnection):
         waiting = list(dict.fromkeys(order))
         total, until = len(waiting), time.monotonic() + timeout_s
         for pause in growing_pauses(until):
-            while waiting:  # do not pause as long as a job in the window has ended
+            while waiting:  # pause only if no job in the window has ended
                 window = waiting[:_WINDOW]
                 latest |= {job_id: await self.job(job_id) for job_id in window}
                 unfinished = [job_id for job_id in window if not latest[job_id].state.over]
@@ -330,7 +330,7 @@ class JobMethods(ServiceConnection):
 
     @Call
     async def undo_join(self, map_name: str, job_id: str) -> Association:
-        """Undo the join of an association: its frames regain their uploaded poses.
+        """Undo the join of an association and return it; its frames regain their uploaded poses.
 
         The effects of other joins on these frames remain. The sessions are not joined again
         automatically.
@@ -427,7 +427,7 @@ class JobMethods(ServiceConnection):
         NotIndexed : If the job has not succeeded.
         Refused : If the service sends another version of the format.
         """
-        from sceneprint_client.surface_encoding import decode_points  # loads numpy
+        from sceneprint_client.surface_encoding import decode_points  # this import loads numpy
 
         path = f"{product_path(Difference, map_name, job_id)}/points"
         return decode_points(await self._bytes(path))

@@ -145,7 +145,7 @@ def _is_jump(positions: Floats, seconds: Floats) -> bool:
 
 
 def _moved_points(points: Floats, seconds: Floats, times: Floats, poses: Floats) -> Floats:
-    """Transform each point (N, 3) by the pose at its time, interpolated in K poses (K, 4, 4)."""
+    """Return points (N, 3) transformed by the poses at their times, interpolated in (K, 4, 4)."""
     before = np.clip(np.searchsorted(times, seconds, "right") - 1, 0, len(times) - 2)
     share = ((seconds - times[before]) / (times[before + 1] - times[before]))[:, None]
     ends = [

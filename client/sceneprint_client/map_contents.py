@@ -56,7 +56,7 @@ class MapMethods(ServiceConnection):
         self, /, name: str, title: str | None = None, model: str = "depth",
         up: Sequence[float] | None = None, **limits: float | None,
     ) -> Map:  # fmt: skip
-        """Create a map, or confirm that it exists with the same properties.
+        """Create and return a map, or return the existing map with the same properties.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class MapMethods(ServiceConnection):
 
     @Call
     async def reencode(self, map_name: str, model: str) -> Map:
-        """Sign a map again with another model; the map switches when all frames are signed.
+        """Start to sign a map with another model; return the map, which switches at the end.
 
         Parameters
         ----------
@@ -126,7 +126,7 @@ class MapMethods(ServiceConnection):
 
     @Call
     async def cancel_reencoding(self, map_name: str) -> Map:
-        """Cancel a re-encoding: the map keeps its model.
+        """Cancel the re-encoding of a map, which keeps its model; return the map.
 
         Raise UnknownMap if the map does not exist. Raise Conflict if no re-encoding is in progress.
         """
@@ -187,7 +187,7 @@ class MapMethods(ServiceConnection):
         self, map_name: str, frame_id: str, changes: Mapping[str, Any],
         if_match: str | None = None,
     ) -> Frame:  # fmt: skip
-        """Edit the metadata of a frame; filters use the new values immediately.
+        """Edit the metadata of a frame, which filters use immediately; return the edited frame.
 
         Parameters
         ----------
@@ -211,7 +211,7 @@ class MapMethods(ServiceConnection):
 
     @Call
     async def restore_frame(self, map_name: str, frame_id: str) -> Frame:
-        """Restore a deleted frame, within ten minutes by default.
+        """Restore and return a deleted frame, within ten minutes by default.
 
         Raises
         ------
@@ -291,7 +291,7 @@ class MapMethods(ServiceConnection):
 
     @Call
     async def restore_deletion(self, map_name: str, deletion_id: str) -> FramesRestored:
-        """Restore the frames of a deletion, within ten minutes by default.
+        """Restore the frames of a deletion, within ten minutes by default; return the total counts.
 
         Parameters
         ----------
@@ -452,7 +452,7 @@ class MapMethods(ServiceConnection):
         map_name, frame_id, within : see `cloud`
         limit : maximum number of points; a larger cloud always yields the same subset
         """
-        from sceneprint_client.surface_encoding import decode_points  # loads numpy
+        from sceneprint_client.surface_encoding import decode_points  # this import loads numpy
 
         path = f"{frame_path(map_name, frame_id)}/points"
         return decode_points(await self._bytes(path, params={"frame": within, "limit": limit}))
@@ -534,7 +534,7 @@ def _run(
 
 
 def _run_request(map_name: str, run: Run, accept: str) -> dict[str, Any]:
-    """Return the arguments of a request for a trajectory of the media type `accept`."""
+    """Return the keyword arguments of an httpx request for a trajectory of type `accept`."""
     parameters = run.model_dump(mode="json", exclude_none=True)
     path = f"{map_path(map_name)}/trajectory"
     return {"path": path, "params": parameters, "headers": {"Accept": accept}}
@@ -557,7 +557,7 @@ class SurfaceMethods(ServiceConnection):
 
     @Call
     async def begin_surface(self, map_name: str) -> MapSurface:
-        """Build the surface of a map immediately, or add new frames to it.
+        """Start to build the surface of a map, or to add new frames to it; return its state.
 
         Workers do this automatically unless `SCENEPRINT_BUILD_SURFACES` is `on_request`.
 

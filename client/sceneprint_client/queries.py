@@ -245,7 +245,7 @@ class QueryMethods(ServiceConnection):
 
     @Call
     async def keep_answer(self, query_id: str, title: str | None = None) -> QueryRecord:
-        """Keep an answer until it is released, or change the title of a kept answer.
+        """Keep an answer until it is released, or retitle a kept answer; return its record.
 
         Parameters
         ----------
@@ -278,7 +278,7 @@ class QueryMethods(ServiceConnection):
     @Call
     async def query_points(self, query_id: str, limit: int = MOST_DRAWN) -> SurfacePoints:
         """Return at most `limit` points of `query_cloud` as arrays."""
-        from sceneprint_client.surface_encoding import decode_points  # loads numpy
+        from sceneprint_client.surface_encoding import decode_points  # this import loads numpy
 
         path = f"{query_path(query_id)}/points"
         return decode_points(await self._bytes(path, params={"limit": limit}))
@@ -351,7 +351,7 @@ def _as_text(at: datetime | str | None) -> str | None:
 
 
 def _query_request(frame: QueryFrame, query: Query, robot: str | None) -> dict[str, Any]:
-    """Return the arguments of a request for a query with a stored or a new frame."""
+    """Return the keyword arguments of an httpx request for a query with a stored or a new frame."""
     if isinstance(frame, NamedFrame):
         named = {"frame_id": frame.frame_id, **without_none(robot=robot)}
         return {"json": {**named, **query_json(query)}}

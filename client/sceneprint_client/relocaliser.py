@@ -361,7 +361,7 @@ class Relocaliser:
             self.counts["queried"] += 1
 
     def _join(self, arrival: _Arrival) -> bool:
-        """Join a scan to the earlier ones; return False if the odometry does not cover it."""
+        """Join a scan, if any, to earlier ones; return False if odometry does not cover it."""
         if arrival.scan is None:
             return True
         sensor = frame_name(arrival.message.header.frame_id)

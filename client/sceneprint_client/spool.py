@@ -360,7 +360,7 @@ class Spool:
         if_novel: float | bool | None = None, patience_s: float = 120.0,
         progress: Callable[[int, int], None] | None = None,
     ) -> SyncReport:  # fmt: skip
-        """Upload the waiting frames, oldest first; a frame leaves the spool once it is uploaded.
+        """Upload the waiting frames, oldest first, and remove them from the spool; return counts.
 
         After an error or a crash call it again: the service recognises frames that the map already
         has, so no frame is lost or duplicated. A frame that the service rejects (409, 413, 415,
@@ -534,7 +534,7 @@ class Spool:
 
     @contextmanager
     def _transaction(self, *, write: bool = True) -> Iterator[sqlite3.Connection]:
-        """Run a transaction: commit it at the end of the block, or roll it back after an error."""
+        """Yield the database in a transaction, which is rolled back after an error."""
         with self._lock, self._translated_errors():
             self._database.execute("BEGIN IMMEDIATE" if write else "BEGIN")
             try:
@@ -689,7 +689,7 @@ def _is_about_content(error: errors.SceneprintError) -> bool:
 
 
 def _persist(target: _Target, send: Callable[[], T]) -> T:
-    """Call `send`, and repeat the call while the service is busy and time is left."""
+    """Return the result of `send`; repeat the call while the service is busy and time is left."""
     while True:
         try:
             return send()

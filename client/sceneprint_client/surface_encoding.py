@@ -39,7 +39,7 @@ class SurfacePoints:
     normals : (N, 3) unit normals, rounded to 1/127; None if not requested
     patches : (N,) index of the validation patch, -1 for none; None if not requested
     residuals : (N,) bytes, see docs/reference.md; None if not requested
-    tolerance_m : distance that a residual of 250 represents, metres; 0 without residuals
+    tolerance_m : distance that a residual of 250 represents, metres; 0 if there are none
     total : number of points before subsampling
     """
 

@@ -133,7 +133,7 @@ class Tracker:
             return self._core.state()
 
     def reset(self, reason: str = "it was reset") -> State:
-        """Forget the pose, as after a motion that odometry does not measure, such as a lift.
+        """Forget the pose, as after a lift, which odometry does not measure; return the state.
 
         The clock and the odometry may restart, and answers to earlier frames are ignored.
         """

@@ -287,7 +287,7 @@ class TrackerCore:
         return self.state()
 
     def reset(self, reason: str = "it was reset") -> State:
-        """Forget the pose, as after a motion that odometry does not measure, such as a lift.
+        """Forget the pose, as after a lift, which odometry does not measure; return the state.
 
         The clock and the odometry may restart. Do not pass answers to earlier frames afterwards.
         """
@@ -436,7 +436,7 @@ class TrackerCore:
         return float(vote.weight * 0.5**halves)
 
     def _first_fix(self, mark: _Mark, observation: Observation) -> tuple[TrackerStatus, str]:
-        """Return the verdict without a belief; set the belief if a place leads clearly."""
+        """Return status and reason without a belief; set the belief if a place leads clearly."""
         p = self.parameters
         own = [i for i, vote in enumerate(self._votes) if vote.number == self._answers]
         if not own:
@@ -548,7 +548,7 @@ class TrackerCore:
         )
 
     def _track(self, mark: _Mark) -> tuple[TrackerStatus, str]:
-        """Return the verdict on the belief, and drop a belief that is no longer supported."""
+        """Return the status, and its reason, of the belief; drop a belief that lost its support."""
         p, belief = self.parameters, self._belief
         if belief is None:
             return self._verdict

@@ -43,8 +43,8 @@ WORLDS = ("map", "odom", "world")
 FASTEST = 50.0
 #: Tolerance for the distance between two samples, metres or radians.
 _JITTER = 0.1
-#: Maximum jump, metres or radians, and maximum acceleration, per second^2, within one motion; and
-#: maximum time between a jump and its reversal that indicate two publishers, seconds.
+#: Maximum jump (metres or radians) and acceleration (the same per second^2) of one motion, and
+#: maximum seconds between a jump and its reversal that indicate two publishers.
 _JUMP, _HARDEST, _BACK_S = 0.5, 10.0, 2.0
 
 
@@ -81,7 +81,7 @@ class TransformTree:
     """Transforms between named frames over time."""
 
     def __init__(self) -> None:
-        self._edges: dict[str, dict[str, _Edge]] = {}  # by child, then by parent
+        self._edges: dict[str, dict[str, _Edge]] = {}  # edges by child, then by parent
         self._count = 0
         self._origin_ns: int | None = None
         #: Reason and number of ignored samples, by (parent, child).
@@ -113,7 +113,7 @@ class TransformTree:
         """
         parent, child = frame_name(parent), frame_name(child)
         row = np.asarray(sample, np.float64)
-        length = math.hypot(*row[3:])  # does not overflow
+        length = math.hypot(*row[3:])  # `hypot` does not overflow
         far = float(np.abs(row[:3]).max())
         if parent == child:
             return False
@@ -245,7 +245,7 @@ class TransformTree:
             chain.append(max(parents, key=lambda name: (len(parents[name].samples), name)))
 
     def path(self, ancestor: str, child: str) -> list[str] | None:
-        """Return the frames from a child up to an ancestor, both included; None without a path."""
+        """Return the frames on the path from a child to an ancestor, inclusive, or None."""
         ancestor, child = frame_name(ancestor), frame_name(child)
         came: dict[str, str] = {child: ""}
         waiting = [child]
@@ -304,8 +304,8 @@ class TransformTree:
     def world_of(self, sensor: str) -> str | None:
         """Return the parent frame of a sensor's poses.
 
-        It is the ancestor `map`, else `odom`, else `world`, else the root. Without the former three
-        and without a moving transform, it is None.
+        It is the ancestor `map`, else `odom`, else `world`, else the root if a transform moves,
+        else None.
         """
         up = self.ancestors(sensor)
         moves = [

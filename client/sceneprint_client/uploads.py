@@ -98,7 +98,7 @@ class UploadMethods(ServiceConnection):
         meta: MetaInput | None = None, *, wait_s: float | None = None, priority: int = 0,
         if_novel: float | bool | None = None, up: Sequence[float] | None = None,
     ) -> Added:  # fmt: skip
-        """Upload a frame under an id of your own; a repetition has no further effect.
+        """Upload a frame under your own id; return the upload. A repetition has no further effect.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class UploadMethods(ServiceConnection):
         if not 1 <= len(frames) <= MOST_OF_BATCH or (metas and len(metas) != len(frames)):
             raise InvalidRequest(
                 f"The batch has {len(frames)} frames. Pass 1 to {MOST_OF_BATCH} frames, and one "
-                "`meta` for all or for each.",
+                "`meta` for all or one for each.",
                 (("frames", "too many or too few"),),
             )
         meta_list = [None] * len(frames) if metas is None else metas

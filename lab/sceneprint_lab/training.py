@@ -134,7 +134,7 @@ def _lidar() -> ModelParameters:
         p.cloud,
         minimum_range=0.6,
         maximum_range=60.0,
-        voxel_angle=1 / 40,  # connects rings 1.4 degrees apart
+        voxel_angle=1 / 40,  # large enough to connect rings 1.4 degrees apart
         seed_px=4.4,
         maximum_patches=1000,
         validation_seed_px=6.9,
@@ -225,7 +225,7 @@ def train(
     references: Sequence[tuple[str, FrameReference]] = (), jobs: int = 1,
     report: Report | None = None,
 ) -> Model:  # fmt: skip
-    """Train a model; the result depends on the arguments, but not on the number of processes.
+    """Return a trained model, which does not depend on the number of processes.
 
     Parameters
     ----------

@@ -63,7 +63,7 @@ class Command(NamedTuple):
 
 
 def own_command(name: str) -> Command:
-    """Return a command of this package."""
+    """Return the command `name` of COMMANDS."""
     module, line = COMMANDS[name]
     return Command(f"sceneprint.cli.{module}:add_{name}", line)
 

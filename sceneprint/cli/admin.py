@@ -70,8 +70,8 @@ def add_keys(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--overlap", metavar="TIME",
         type=lambda text: timedelta() if text == "0" else duration(text),
-        help="how long the old secret still works, such as 30m or 7d, up to 30d; 0 ends it at once "
-        "(default: 1h)",
+        help="time for which the old secret still works, such as 30m or 7d, up to 30d; 0 ends it "
+             "at once (default: 1h)",
     )  # fmt: skip
     add_data_option(command)
     command.set_defaults(run=run_keys)

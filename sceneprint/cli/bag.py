@@ -74,7 +74,7 @@ def recording_options(options: argparse.Namespace) -> Iterator[RecordingOptions]
 
 
 def with_depth_scale(sequence: FrameSequence, scale: float | None) -> FrameSequence:
-    """Set the depth scale of a sequence; return recordings unchanged, and any sequence for None.
+    """Return a sequence with a depth scale; unchanged if it is a recording, or the scale is None.
 
     Raise InvalidRequest if the frames are clouds, or their files define the unit.
     """

@@ -43,7 +43,7 @@ class Check:
 
 
 def disk_check(subject: str, free: int) -> Check:
-    """Check that a disk with `free` bytes has room for more frames."""
+    """Return a check that a disk with `free` bytes has room for more frames."""
     text = f"{free / 1e9:.1f} GB free; a frame takes approximately 0.25 MB"
     if free < LEAST_FREE:
         return Check("WRONG", subject, f"{text}. Free some space, or uploads will be rejected.")
@@ -103,7 +103,7 @@ def service_checks(client: Client, url: str) -> Iterator[Check]:
 
 
 def version_check(url: str, status: Status) -> Check:
-    """Compare the versions of the service and of this command."""
+    """Return a check that compares the versions of the service and of this command."""
     text = f"{url} answers, version {status.version}"
     if status.frames is not None:
         text += f", {sum(status.frames.values())} frames"
@@ -113,7 +113,7 @@ def version_check(url: str, status: Status) -> Check:
 
 
 def ready_check(status: Status) -> Check:
-    """Check that the service accepts uploads."""
+    """Return a check that the service accepts uploads; a note if it is read-only."""
     if status.read_only:
         text = "read-only: it answers queries but refuses uploads. Make its data folder writable"
         return Check("note", "ready", f"{text}.")
@@ -121,7 +121,7 @@ def ready_check(status: Status) -> Check:
 
 
 def clock_check(before: float, there: float, after: float) -> Check:
-    """Compare the clocks of this machine and of the service."""
+    """Return a check that compares the clocks of this machine and of the service."""
     apart = seconds_apart(before, there, after)
     text = f"the service's clock differs from this machine's by {apart:.1f} s"
     if apart > APART_S:
@@ -131,7 +131,7 @@ def clock_check(before: float, there: float, after: float) -> Check:
 
 
 def store_check(stats: Stats) -> Check:
-    """Report the sizes of the database, the blobs and the indexes."""
+    """Return a check with the sizes of the database, the blobs and the indexes."""
     sizes = stats.bytes
     # Responses do not contain the address of the database.
     place = "database" if sizes.database is None else f"database of {sizes.database / 1e6:.1f} MB"
@@ -140,7 +140,7 @@ def store_check(stats: Stats) -> Check:
 
 
 def scrub_check(stats: Stats) -> Check:
-    """Report the progress of the scrub: a note if nothing was verified, or data is damaged."""
+    """Return the progress of the scrub; a note if nothing was verified, or data is damaged."""
     scrub = stats.scrub
     if scrub is None:
         return Check("note", "scrub", "no stored data has been verified yet")
@@ -158,7 +158,7 @@ def scrub_check(stats: Stats) -> Check:
 
 
 def worker_check(stats: Stats, *, read_only: bool) -> Check:
-    """Check that workers are running."""
+    """Return a check that workers are running."""
     workers = stats.workers or []
     busy = sum(worker.job_id is not None for worker in workers)
     if workers or read_only:
@@ -171,7 +171,7 @@ def worker_check(stats: Stats, *, read_only: bool) -> Check:
 
 
 def queue_check(stats: Stats) -> Check:
-    """Report the waiting jobs, and the jobs that have failed permanently."""
+    """Return the number of waiting jobs, with a note if jobs have failed permanently."""
     jobs = "1 job" if stats.waiting == 1 else f"{stats.waiting} jobs"
     text = f"{jobs} waiting, {stats.jobs.get('running', 0)} running"
     if stats.oldest_waiting_s:
@@ -183,7 +183,7 @@ def queue_check(stats: Stats) -> Check:
 
 
 def model_check(maps: Iterable[Map], models: Iterable[ModelInfo]) -> Check:
-    """Report the models of the maps; the result is a note if a preset is outdated."""
+    """Return the models of the maps, with a note if a preset is outdated."""
     presets = {model.name: model for model in models if model.preset}
     by_model: dict[str, list[str]] = defaultdict(list)
     older = []

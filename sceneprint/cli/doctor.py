@@ -47,7 +47,7 @@ _CHECK = "Check SCENEPRINT_DATABASE_URL, or the data folder."
 
 
 def database(settings: Settings) -> Check:
-    """Check the URL and the schema of the database, and the file of a SQLite database."""
+    """Return a check of the URL and schema of the database, and of the file of SQLite."""
     from sqlalchemy import make_url
     from sqlalchemy.exc import SQLAlchemyError
 
@@ -79,7 +79,7 @@ def database(settings: Settings) -> Check:
 
 
 def _sqlite_file(settings: Settings, url: URL) -> Check:
-    """Check a SQLite file without writing to it."""
+    """Return a check of a SQLite file, which is not written."""
     from sqlalchemy import NullPool, create_engine
 
     from sceneprint.store.database import schema_range_of
@@ -130,7 +130,7 @@ def _path_of(url: URL) -> Path | None:
 
 
 def _schema_check(schema: SchemaRange | None, place: str) -> Check:
-    """Compare the schema of a database with that of this version."""
+    """Return a check that compares the schema of a database with that of this version."""
     from sceneprint.store.database import known_revisions
 
     head, revisions = known_revisions()
@@ -338,7 +338,7 @@ def _kernels() -> Check:
 
 
 def _decoders(settings: Settings) -> Check:
-    """Check that a decoder starts and is confined."""
+    """Return a check that a decoder starts and is confined."""
     if settings.decoders == 0:
         text = "uploads are decoded in service and workers (SCENEPRINT_DECODERS is 0)"
         return Check("note", "decoders", text)

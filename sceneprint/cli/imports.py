@@ -76,7 +76,7 @@ class TimeLimit:
 
 
 def unsigned_reason(client: Client, jobs: Iterable[str]) -> str:
-    """Explain why jobs have not ended, from the statistics of the service."""
+    """Return the reason why jobs have not ended, from the statistics of the service."""
     from sceneprint_client.api import JobState
 
     if is_starting(client):
@@ -212,7 +212,7 @@ def _count(client: Client, map_name: str, job: Job, tally: Tally) -> None:
         if item.status == 200:  # an existing frame, possibly signed already
             try:
                 state = client.frame(map_name, item.frame_id).state
-            except UnknownFrame:  # deleted
+            except UnknownFrame:  # the frame was deleted
                 continue
         added = Added(frame_id=item.frame_id, job_id=item.job_id, state=state, reason=None)
         tally.count(item.name, added, item.status == 202)
@@ -351,7 +351,7 @@ def lines_of(name: str, map_name: str, result: MapImportResult) -> list[str]:
         f"({how.get(r.up_from, r.up_from)})",
     ]
     if any(offset := (r.offset.x, r.offset.y, r.offset.z)):
-        stated = ",".join(f"{x:.12g}" for x in offset)  # in the format of --offset
+        stated = ",".join(f"{x:.12g}" for x in offset)  # write it in the format of --offset
         lines.append(f"offset: {stated} m; add it to poses to get coordinates of the file")
     lines += r.notes
     if r.coverage is not None:

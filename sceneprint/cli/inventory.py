@@ -411,7 +411,7 @@ def _limit(kind: type[int] | type[float]) -> Any:
     def read(text: str) -> float | str:
         return NONE if text == NONE else kind(text)
 
-    read.__name__ = "number"  # appears in messages of argparse
+    read.__name__ = "number"  # argparse shows this name in errors
     return read
 
 

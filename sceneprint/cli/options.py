@@ -60,7 +60,7 @@ def add_filter_options(command: argparse.ArgumentParser) -> None:
 
 
 def filter_of(options: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the filter options as a JSON object; None without a filter.
+    """Return the filter options as a JSON object; None if none is set.
 
     Raise InvalidRequest if only one of --region and --region-frame is present.
     """
@@ -113,7 +113,7 @@ def base_of(text: str) -> GivenBase:
 
 
 def mounting_of(options: argparse.Namespace) -> GivenBase | None:
-    """Return the mounting pose in `--base` and `--base-frame`; None without `--base`."""
+    """Return the mounting pose in `--base` and `--base-frame`; None if `--base` is absent."""
     base: GivenBase | None = options.base
     if base is None or options.base_frame is None:
         return base
@@ -231,7 +231,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
         return Settings(**fields)
     except ValidationError as error:
         first = error.errors()[0]
-        if not first["loc"]:  # of no single setting
+        if not first["loc"]:  # the error concerns several settings
             raise InvalidRequest(str(first["ctx"]["error"])) from error
         name = str(first["loc"][0])
         # Do not print URLs, which may contain a password.

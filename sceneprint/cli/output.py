@@ -17,7 +17,7 @@ Row = TypeVar("Row", bound="BaseModel")
 
 
 def one_line(text: str) -> str:
-    """Escape a text that contains line breaks or control characters."""
+    """Return a text, escaped if it contains line breaks or control characters."""
     return text if text.isprintable() else ascii(text)[1:-1]
 
 
@@ -83,7 +83,7 @@ def progress_bar(
 
 
 def waiting_reason(stats: Stats | None, own: int = 0) -> str:
-    """Explain why jobs wait, and what to do.
+    """Return a text that explains why jobs wait, and what to do.
 
     Parameters
     ----------

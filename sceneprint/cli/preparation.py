@@ -42,7 +42,7 @@ def open_signer_of(options: argparse.Namespace, settings: Settings, *, psi: bool
     camera = Intrinsics(256, 192, 300, 300, 127.5, 95.5)  # halved once, like most images
     wall = DepthFrame(np.full((192, 256), 2.0, np.float32), camera)
     with suppress(FrameError):  # the wall may be outside of the model's range
-        sign(wall, signer)  # loads everything, so that the first frame takes no extra time
+        sign(wall, signer)  # load everything, so that the first frame takes no extra time
     return signer
 
 

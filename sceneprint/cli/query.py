@@ -295,7 +295,7 @@ _DECIDED = {
 
 
 def _grounds(there: Location | Localization) -> str:
-    """Describe the votes, the verification and the evidence for a pose."""
+    """Return the votes, the verification and the evidence for a pose as text."""
     if there.support == 0:
         voted = "no match votes for it"
     elif there.support == 1:
@@ -309,7 +309,7 @@ def _grounds(there: Location | Localization) -> str:
 
 
 def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
-    """Describe the evidence for a pose; `expected`: only places near the prior are rivals."""
+    """Return the evidence for a pose as text; `expected`: only places near a prior are rivals."""
     if e is None:
         return "not compared with other places"
     place = "place that the prior expects" if expected else "place"
@@ -322,7 +322,7 @@ def _evidence(e: EvidenceRecord | None, *, expected: bool = False) -> str:
 
 
 def _percent(confidence: float | None) -> str:
-    """Return a confidence as a suffix of a status; empty without a confidence."""
+    """Return a confidence as a suffix of a status; empty for None."""
     return "" if confidence is None else f" {percent(confidence)}"
 
 
@@ -367,7 +367,7 @@ def _degrees(transform: Transform | None) -> str:
 
 
 def _explanation_lines(answer: Answer) -> list[str]:
-    """Return lines with the explanations in an answer; empty without explanations."""
+    """Return the explanations in an answer as lines of text; there may be none."""
     lines = [
         f"  {e.rank:4}  {frame_label(e.frame_id, e.name)}  {e.similarity:4.2f}  "
         f"{e.stage}: {e.outcome.replace('_', ' ')}; {one_line(e.reason)}"
@@ -457,7 +457,7 @@ def _localize(
     client: Client, options: argparse.Namespace, every: list[FrameReference],
     reference: FrameReference, fields: dict[str, Any],
 ) -> Localization:  # fmt: skip
-    """Query a frame together with earlier frames, or alone if the service refuses the sequence."""
+    """Return the pose of a frame, queried with earlier frames, or alone if these are refused."""
     before = _frames_before(options, every, reference)
     if before:
         try:
@@ -495,7 +495,7 @@ def _frames_before(
 
 
 def _pose_or_none(reference: FrameReference) -> Floats | None:
-    """Return the pose of a frame; None without a valid pose."""
+    """Return the pose of a frame; None if it has no valid pose."""
     try:
         return reference.pose
     except InvalidPose:

@@ -102,7 +102,7 @@ def _opener() -> SceneOpener:
 
 @contextmanager
 def open_scene(options: argparse.Namespace, client: Client) -> Iterator[Scene | None]:
-    """Open the scene file of `--mcap`; yield None without the option."""
+    """Open the scene file of `--mcap`; yield None if the option is absent."""
     if options.mcap is None:
         yield None
         return

@@ -39,7 +39,7 @@ def run_serve(options: argparse.Namespace) -> int:
     """Run the HTTP service and its workers. No configuration is required; every option can also be
     set in the environment (SCENEPRINT_HOST, _PORT, _WORKERS, _DATA_DIR).
     """
-    gc.disable()  # until imports are done, to start faster
+    gc.disable()  # skip collection during imports, to start faster
     from sceneprint.process import log_as_json
     from service.server import run as serve
 

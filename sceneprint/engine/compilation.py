@@ -39,7 +39,7 @@ _compiling = threading.Lock()
 
 
 def missing(parts: Sequence[str] = DEPTH) -> tuple[str, ...]:
-    """Return the parts that are not compiled for this processor and version."""
+    """Return the parts whose kernels are not compiled for this processor and version."""
     return tuple(part for part in parts if not code_folder(_LAST[part])[1])
 
 
@@ -86,7 +86,7 @@ def _run(
     commands: Mapping[str, Sequence[str]], environment: Mapping[str, str], compiled: IO[bytes],
     report: Callable[[str], None], stop: threading.Event | None,
 ) -> bool:  # fmt: skip
-    """Run compiling processes, and report progress; return whether `stop` was set."""
+    """Run commands that compile kernels, and report progress; return whether `stop` ended them."""
     running: dict[str, subprocess.Popen[bytes]] = {}
     try:
         for part, arguments in commands.items():

@@ -48,7 +48,7 @@ class Context:
 def open_context(
     settings: Settings, patience_s: float = 0.0, may_go_on: Callable[[float], bool] | None = None
 ) -> Iterator[Context]:
-    """Open a context, and close it at the end.
+    """Yield an open context, and close it at the end.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def _enter(stack: ExitStack, settings: Settings) -> Context:
             settings.decoder_timeout_s,
             current_tenant,
         )
-    with ExitStack() as opened:  # closes the objects if a later step fails
+    with ExitStack() as opened:  # close the objects if a later step fails
         store = open_store(
             settings.database, settings.blobs, settings.geometry_cache_bytes, decoders
         )

@@ -132,7 +132,7 @@ def warm_signing(signer: Signer) -> bytes:
 
 def warm_validation(geometry: Geometry, p: ValidationParameters) -> bool:
     """Validate a geometry against itself, and draw it; return whether it was accepted."""
-    drawn = sample_points(geometry.surface, 1)  # as the dashboard does
+    drawn = sample_points(geometry.surface, 1)  # the dashboard draws all points
     patches_at(drawn, geometry.patches)
     residuals(drawn, geometry.surface, np.eye(4), p.agreement)
     return validate(geometry, geometry, p=p).status == "accepted"

@@ -85,7 +85,7 @@ class ArchiveEntry:
 
 
 class UnusableName(Exception):
-    """A member's name cannot be a relative path. The message is the reason."""
+    """Error for a member's name that is not a relative path; the message states the reason."""
 
 
 def parts_of(name: str) -> tuple[str, ...]:
@@ -345,7 +345,6 @@ class Inflater:
         self._stream: _Stream | None = None
         self._streams = 0
         self._start = b""  # first bytes of the tar
-        #: Number of received bytes, and number of returned bytes
         self.bytes_in, self.bytes_out = 0, 0
 
     def pieces(self, chunk: bytes) -> Iterator[bytes]:
@@ -547,7 +546,7 @@ class Archive:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.touch(exist_ok=False)
             except OSError as error:
-                if error.errno not in _CLASHES:  # an error such as a full disk
+                if error.errno not in _CLASHES:  # another error, such as a full disk
                     raise
                 self._refuse(member, "its name conflicts with the name of another member")
                 continue
@@ -559,7 +558,7 @@ class Archive:
             elif role == "text":
                 budget -= self._unpack(path, member, budget)
         for parts in self._omitted:
-            with suppress(FileExistsError, NotADirectoryError):  # a member has the name
+            with suppress(FileExistsError, NotADirectoryError):  # a member already has this name
                 above.joinpath(*parts).mkdir(parents=True, exist_ok=True)
         root = above / tops.pop() if single else above
         if root.is_dir():
@@ -631,7 +630,7 @@ class Archive:
 
 @contextmanager
 def open_archive(file: BinaryIO, folder: Path, name: str = DEFAULT_NAME) -> Iterator[Archive]:
-    """Open an archive, and find its sequences.
+    """Yield an open archive with the sequences in it.
 
     Parameters
     ----------
@@ -691,7 +690,7 @@ def _is_hidden(parts: tuple[str, ...]) -> bool:
 
 
 def _omitted_folder(parts: tuple[str, ...]) -> tuple[str, ...] | None:
-    """Return the path of a member's first folder whose name indicates colour or infrared, if any.
+    """Return the path of a member's first folder named after colour or infrared images, or None.
 
     The topmost folder is skipped, because it may be the packed data set, whose name is arbitrary.
     """

@@ -215,7 +215,7 @@ def pack_image(surface: Surface, most: int = MOST) -> tuple[Packed, float]:
 def unpack_image(
     packed: Packed, scale: float, camera: Intrinsics | Sphere, most: int = MOST
 ) -> Surface:
-    """Unpack a surface from `pack_image`; areas are computed again.
+    """Return the surface that `pack_image` packed; areas are computed again.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def pack_points(surface: Surface, most: int = MOST) -> tuple[Packed, Floats, flo
 
 
 def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST) -> Surface:
-    """Unpack a surface from `pack_points`: an image of one row, without areas."""
+    """Return the surface that `pack_points` packed, as an image of one row, without areas."""
     points = (packed[:, :3] * step + corner).astype(np.float32)
     normals = np.zeros((len(packed), 3), np.float32)
     _unpack_normals(packed[:, 3:], float(most), normals)
@@ -263,7 +263,7 @@ def unpack_points(packed: Packed, corner: Floats, step: float, most: int = MOST)
     )
 
 
-# Artifacts as bytes, with which a frame can be validated without its upload.
+# Artifacts as bytes, which suffice to validate a frame without its upload.
 #
 #     Geometry  --write_geometry-->  bytes  --read_geometry-->  Geometry
 #
@@ -309,7 +309,7 @@ _PATCH = np.dtype(
 
 
 def write_geometry(geometry: Geometry) -> bytes:
-    """Serialize a geometry artifact; equal artifacts have equal bytes.
+    """Return a geometry artifact as bytes; equal artifacts have equal bytes.
 
     `geometry`: artifact whose model id has 64 hexadecimal digits; more than MAXIMUM_POINTS
     unordered points are thinned.

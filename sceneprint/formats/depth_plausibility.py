@@ -39,7 +39,7 @@ _LEAST_SHARE = 0.1  #: minimum share of samples with two valid neighbours
 _LEAST_VARYING = 0.25  #: minimum share of varying triples; with fewer, edges would dominate
 _SWAPPED = 0.9  #: maximum share of differing neighbours that are closer with their bytes swapped
 _ROUGH, _SMOOTH = 0.05, 0.025  #: maximum median bend of depth, and of depth with restored bits
-_DENSE = 0.98  #: share of valid samples from which an image has no holes
+_DENSE = 0.98  # share of valid samples above which an image counts as free of holes
 _SATURATED = 0.02  #: maximum share of samples with the maximum of a number of bits
 _STEEPEST = 20.0  #: maximum tangent of the angle between a ray and the optical axis
 _SHIFTED = 0.8  #: maximum share of multiples of 8; in depth images, it is about one eighth
@@ -159,7 +159,7 @@ def _is_of_bytes(rows: Rows) -> bool:
 
 
 def _saturation(rows: Rows) -> int | None:
-    """Return the maximum if it is that of 10 to 15 bits, and a fiftieth of the valid samples."""
+    """Return the largest sample if it occurs often and is the maximum of 10 to 15 bits, or None."""
     valid = rows[_valid(rows)]
     limit = int(valid.max(initial=0))
     is_limit = 10 <= limit.bit_length() <= 15 and limit & (limit + 1) == 0
@@ -167,8 +167,8 @@ def _saturation(rows: Rows) -> int | None:
 
 
 def _is_textured(rows: Rows, bend: float) -> bool:
-    """Return whether an image has almost no holes, and bends over many columns more than surfaces
-    do, and more than by the noise that `bend` of neighbours shows.
+    """Return whether an image has almost no holes, and is rougher over many columns than surfaces
+    are, and than noise is whose roughness between neighbours is `bend`.
     """
     step = max(1, rows.shape[1] // 40)
     return float(_valid(rows).mean()) > _DENSE and _bend(rows, step) > max(_ROUGH, 2.0 * bend)

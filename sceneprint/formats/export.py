@@ -15,7 +15,7 @@ The bytes for web pages are little-endian. The header has 48 bytes:
     28 3 x f32  extent, metres
     40 u32      number of points before thinning
     44 f32      distance of a residual of 250 at short range, metres (the tolerance of
-                the model's validation, which grows with distance); 0 without residuals
+                the model's validation, which grows with distance); 0 if there are none
 
 12 bytes per point follow:
 
@@ -133,7 +133,7 @@ def _require_indices(values: Ints, width: int, n: int) -> Ints:
 
 
 def _escape(comment: str) -> str:
-    """Escape a comment to one line of ASCII: names of frames are arbitrary."""
+    """Escape a comment to one line of ASCII, since names of frames are arbitrary."""
     return comment.encode("unicode_escape").decode("ascii")
 
 
@@ -191,7 +191,7 @@ def thinned(count: int, limit: int) -> Indices:
     """Return sorted indices of a fixed pseudorandom subset of at most `limit` of `count` points."""
     if count <= limit:
         return np.arange(count)
-    keys = np.arange(1, count + 1, dtype=np.uint64)  # SplitMix64
+    keys = np.arange(1, count + 1, dtype=np.uint64)  # hash by SplitMix64
     keys *= np.uint64(0x9E3779B97F4A7C15)
     keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -15,7 +15,7 @@ _SAMPLES = 20_000
 
 
 def sample_range(frame: AnyFrame) -> SampleRange:
-    """Estimate percentiles of a frame's depths or distances from a subset of its samples."""
+    """Return estimated percentiles of a frame's depths or distances, and its sample count."""
     if isinstance(frame, Cloud):
         points = frame.points[:: max(1, len(frame.points) // _SAMPLES)]
         return _range_of(np.linalg.norm(points, axis=1), len(frame.points), None)

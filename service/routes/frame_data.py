@@ -157,7 +157,7 @@ def _upload(request: Request, here: Service, output: Output[bytes], frame_id: st
                 kind, suffix = upload_type(file.read(HEAD))
             name = safe(f"{frame_id}{suffix}")
             return send_file(request, lambda: blobs.open(blob), kind, output.tag, name)
-    output.make()  # raises the error of the blob
+    output.make()  # raise the error of the blob
     raise DamagedBlob(f"The upload of frame {frame_id} has just been restored. Try again.")
 
 
@@ -224,7 +224,7 @@ async def get_match_points(
     here: Here,
     caller: Sender,
     map_name: MatchMap = None,
-    side: Annotated[PointsSide, Query(description="Which of the two frames to return.")] = "query",
+    side: Annotated[PointsSide, Query(description="Frame to return, query or match.")] = "query",
     transform: Annotated[
         OverlayTransform,
         Query(

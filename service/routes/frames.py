@@ -216,7 +216,7 @@ async def _add_frame(
 
 
 def _wait(prefer: str | None) -> float:
-    """Return the wait in seconds from the header `Prefer` (RFC 7240); 0 if it is not valid."""
+    """Return the seconds to wait, from the header `Prefer` (RFC 7240); 0 if it is not valid."""
     match = re.search(r"(?:^|[,;\s])wait\s*=\s*\"?(\d{1,6})", prefer or "", re.IGNORECASE)
     return min(float(match[1]), LONGEST_WAIT_S) if match else 0.0
 

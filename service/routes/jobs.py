@@ -186,7 +186,7 @@ async def events(
     last = after if last_event_id is None else last_event_id
 
     def read_filter() -> tuple[EventFilter, int | None]:
-        seals.row("event", cursor)  # validates the cursor, although a stream has no pages
+        seals.row("event", cursor)  # validate the cursor, although a stream has no pages
         criteria = _filter(here, caller, map_name, kind)
         return criteria, None if last is None else seals.event(last, place)
 

@@ -177,9 +177,9 @@ _Overlap = Annotated[float, Query(ge=0.0, le=1.0, description="Minimum overlap o
     "/{job_id}/join", responses=refusals(404, 409), dependencies=[Depends(may_write)]
 )
 def undo_join(map_name: str, job_id: str, here: Here) -> Association:
-    """Undo the join of an association. Poses are reset to the uploaded ones, or to the parent frame
-    of other joins. If there is no active join, nothing changes. Workers join the parent frames
-    again only if you request an association.
+    """Undo the join of an association. Poses return to their uploaded values, or to the parent
+    frame of the remaining joins. If there is no active join, nothing changes. Workers join the
+    parent frames again only if you request an association.
     """
     return here.associations.undo_join(map_name, job_id)
 

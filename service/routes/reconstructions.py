@@ -60,7 +60,7 @@ async def get_mesh(job_id: str, request: Request, here: Here, caller: Sender) ->
     succeeded.
     """
     await here.run(_find_reconstruction, here, caller, job_id)
-    async with here.gate.place():  # limits memory, since the whole file is read
+    async with here.gate.place():  # limit memory, since the whole file is read
         find = partial(here.reconstructions.file, None, job_id, MESH)
         name = f"{job_id[:12]}-{MESH}"
         return await here.gate.run(partial(send_product_file, request, here, find, name))

@@ -25,7 +25,7 @@ from service.running_service import Here
 router = v1_router("/maps/{map_name}/surface", "surface", may_read)
 
 _PNG, _BYTES = "image/png", "application/octet-stream"
-#: Cache header for content with a digest, which never changes.
+#: Cache header for content that is addressed by digest, and therefore never changes.
 _FOREVER = "private, max-age=31536000, immutable"
 Parent = Annotated[
     Label | None, Query(description="Parent frame; default: the parent frame with the most frames.")
@@ -175,7 +175,7 @@ def _numbers(name: str, text: str, count: int) -> list[float]:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) != count or not all(abs(x) <= FARTHEST_M for x in numbers):  # false for NaN
+    if len(numbers) != count or not all(abs(x) <= FARTHEST_M for x in numbers):  # excludes NaN
         raise InvalidRequest(
             f"`{name}` is {text!r:.80}. Specify {count} numbers in metres, separated by commas.",
             ((name, f"not {count} numbers"),),

@@ -96,7 +96,7 @@ def test_each_bag_of_a_folder_is_a_session(sceneprint, bags, service_url):
     done = sceneprint("localize", "days", bags, *options, "--frame", 0)
     assert done.stdout.startswith("first/000000: found")
     done = sceneprint("bag", bags, *options)
-    assert done.stdout.count(" frames of /camera/depth/image_raw taken, poses of ") == 2
+    assert done.stdout.count(" frames of /camera/depth/image_raw used, poses of ") == 2
 
 
 def test_bags_beside_other_frames_are_an_error(sceneprint, bags, folder, tmp_path):
@@ -123,7 +123,7 @@ def test_what_a_bag_holds(sceneprint, recording):
     assert head == f"{recording}: ROS 2, 25 messages of 4 topics, 1.4 s from 2023-11-14T22:13:20Z"
     table = [re.sub(" +", " ", line.strip()) for line in lines]
     assert table[1] == "/camera/depth/image_raw sensor_msgs/msg/Image 8 5.7 Hz 16UC1, used"
-    assert table[4].startswith("8 of 8 frames of /camera/depth/image_raw taken, poses of 8 of 8")
+    assert table[4].startswith("8 of 8 frames of /camera/depth/image_raw used, poses of 8 of 8")
     assert table[7] == "mounting: at 0.210 -0.050 0.930 m in base_link"
 
 

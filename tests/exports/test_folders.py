@@ -308,7 +308,7 @@ def test_scans_of_an_e57_file_are_frames(room, tmp_path):
     path = e57(tmp_path / "hall.e57", room)
     [sequence] = find_sequences(path)
     assert (sequence.layout, sequence.name, sequence.note) == (
-        Layout.E57, "hall", "3 of 3 scans taken",
+        Layout.E57, "hall", "3 of 3 scans used",
     )  # fmt: skip
     for reference, T in zip(sequence.frames, room.poses(), strict=True):
         cloud = reference.read()

@@ -152,7 +152,7 @@ def test_points_of_all_versions_lie_on_the_walls(room, tmp_path, version, packed
         meta = meta_of(reference)
         assert np.array(meta.T_base_sensor.matrix) == pytest.approx(LOCAL, abs=1e-6)
         assert meta.captured_at is not None
-    assert sequence.note.startswith("3 frames taken, odometry poses, because the database has no")
+    assert sequence.note.startswith("3 frames used, odometry poses, because the database has no")
     moved = pickle.loads(pickle.dumps(sequence.frames[0]))
     assert moved.read_bytes() == sequence.frames[0].read_bytes()
 

@@ -154,7 +154,7 @@ def test_interpolation_by_hand(tmp_path, ros, depth):
     np.testing.assert_allclose(poses[0.985][:3, 3], (1.3, 0, 0.5), atol=1e-9)
     np.testing.assert_allclose(poses[2.015][:3, 3], (4.3, 0, 0.5), atol=1e-9)
     assert sequence.note == (
-        "4 of 7 frames of /camera/depth/image_raw taken, poses of 4 of 7 frames in odom; 3 "
+        "4 of 7 frames of /camera/depth/image_raw used, poses of 4 of 7 frames in odom; 3 "
         "without: no sample of odom -> base_link within 20 ms (nearest 0.03 s); skipped: 3 "
         "without a pose"
     )
@@ -432,7 +432,7 @@ def test_images_that_are_no_depth_by_name_must_be_named(tmp_path, ros, depth):
 
     both = ros.write(tmp_path / "both", fill_both)
     sequence = only(both, RecordingOptions(camera_info="/camera/depth/camera_info"))
-    assert "1 of 1 frames of /ir_camera/depth/image_raw taken" in sequence.note
+    assert "1 of 1 frames of /ir_camera/depth/image_raw used" in sequence.note
 
 
 def test_several_topics_are_listed(tmp_path, ros, depth):

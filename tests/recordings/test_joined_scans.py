@@ -87,7 +87,7 @@ def test_scans_are_joined_without_their_motion(kind, container, tmp_path, ros):
     (sequence,) = find_sequences(path, JOINED)
     median = np.median([min(one.sequence + 1, 21) for one in sequence.frames])
     assert sequence.note == (
-        f"{len(sequence.frames)} of 30 frames of /livox/lidar taken, poses of 30 of 30 frames in "
+        f"{len(sequence.frames)} of 30 frames of /livox/lidar used, poses of 30 of 30 frames in "
         f"odom; skipped: {30 - len(sequence.frames)} between keyframes; each frame joins the scans "
         f"of 2.05 m (a median of {median:g} scans), corrected for motion"
     )
@@ -125,14 +125,14 @@ def test_what_cannot_be_joined_is_refused(tmp_path, ros):
     def alone(writer):
         writer.livox(0.0, wall(0), np.zeros(20))
 
-    with pytest.raises(DatasetError, match="Scans are joined by odometry: omit --join-m"):
+    with pytest.raises(DatasetError, match="Joining scans requires odometry: omit --join-m"):
         find_sequences(ros.write(tmp_path / "alone", alone), JOINED)
 
     def images(writer):
         writer.camera_info(0.0)
         writer.image(0.0, np.full((60, 80), 2000))
 
-    with pytest.raises(DatasetError, match="has depth images, and only scans are joined"):
+    with pytest.raises(DatasetError, match="but --join-m joins only scans"):
         find_sequences(ros.write(tmp_path / "images", images), JOINED)
 
 

@@ -55,7 +55,7 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
     ]
     assert [one.name for one in found[1].frames] == ["run.part2/000004", "run.part2/000005"]
     assert found[0].note == (
-        "10 of 13 frames of /camera/depth/image_raw taken, poses of 10 of 13 frames in odom; 3 "
+        "10 of 13 frames of /camera/depth/image_raw used, poses of 10 of 13 frames in odom; 3 "
         "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); skipped: 3 without "
         "a pose; split into 3 parts, because stamps jump back"
     )
@@ -104,7 +104,7 @@ def test_two_publishers_that_contradict_each_other(period, order, tmp_path, ros)
     with pytest.raises(DatasetError) as caught:
         sequences(ros, tmp_path, fill, MOUNTING)
     assert (
-        "0 of 35 frames of /camera/depth/image_raw taken, poses of 0 of 35 frames; 35 without: "
+        "0 of 35 frames of /camera/depth/image_raw used, poses of 0 of 35 frames; 35 without: "
         "samples of odom -> base_link contradict each other (two publishers, or 50 m/s)"
     ) in str(caught.value)
     assert str(caught.value).endswith("select another frame with --pose-frame.")

@@ -260,7 +260,7 @@ class _Drawing:
     def _place_of_match(
         self, match: Match, frame: Frame, name: str
     ) -> tuple[EntityPath | None, Placement | None]:
-        """Return the path and the placement of a match; None if it cannot be placed."""
+        """Return path and placement of a match (None in the query's space), or None, None."""
         if frame.pose is not None:
             space = self._space(match.map, frame.pose.parent_frame)
             child = space_name(match.map, frame.pose.child_frame, several=self._several)

@@ -82,7 +82,7 @@ class _OutputFile:
 
 @contextmanager
 def mcap_file(path: Path) -> Iterator[McapWriter]:
-    """Yield a writer for an MCAP file, which replaces `path` at the end unless it is empty.
+    """Yield a writer for an MCAP file. At the end, the file replaces `path`, unless it is empty.
 
     Raise OSError if the file cannot be written. No partial file remains.
     """
@@ -122,7 +122,7 @@ class McapWriter:
         self._frames: dict[EntityPath, str] = {}
 
     def write(self, moment: Moment, gone: Collection[SceneEntity]) -> None:
-        """Write a moment; see `SceneWriter`."""
+        """Write a moment; permanent entities wait until the first moment with an index."""
         if moment.index is not None:
             stamp = moment.stamp_ns
             self._log_time = moment.index * STEP_NS if stamp is None else stamp

@@ -64,7 +64,7 @@ class SceneFile:
 
 @contextmanager
 def open_scene_file(path: Path, client: Client, map_frames: int) -> Iterator[SceneFile]:
-    """Open an MCAP file for drawing; it is created at the end unless nothing was drawn.
+    """Yield an MCAP file for drawing, which is created at the end unless nothing was drawn.
 
     Raise OSError if the file cannot be written. No partial file remains.
     """

@@ -463,7 +463,7 @@ KINDS = {
     "coverage.measured": "A measurement of a map's coverage has ended; `data` is its result.",
     "difference.found": "A comparison of two sessions has ended; `data` is its result.",
     "key.created": "A key was created. The event belongs to no map.",
-    "key.rotated": "A key has a new secret, and the old one expires soon. It belongs to no map.",
+    "key.rotated": "A key got a new secret; the old one expires soon. The event belongs to no map.",
     "key.revoked": "A key was revoked and no longer works. The event belongs to no map.",
 }
 #: Kind of the event that replaces expired events in a stream. It is not stored.

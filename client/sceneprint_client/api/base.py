@@ -627,7 +627,7 @@ def novelty_of(value: bool | float | str | None) -> float | None:
         share = float(value)
     except (TypeError, ValueError):
         share = -1.0
-    if not 0 < share <= 1:  # also rejects NaN
+    if not 0 < share <= 1:  # NaN is rejected too
         raise InvalidRequest(
             f"`if_novel` is {value!r:.40}. Specify true, or a number above 0 and up to 1, the "
             "share of the distance between unrelated frames.",

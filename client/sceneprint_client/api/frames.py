@@ -63,7 +63,7 @@ class SampleRange(ApiRecord):
 
     @property
     def is_doubtful(self) -> bool:
-        """Return whether the range is unusual for a depth camera, or a scanner."""
+        """Return whether the range is unusual for a sensor of its kind, a camera or a scanner."""
         if self.valid is None:
             return not _SCANNED_M[0] < self.median < _SCANNED_M[1]
         return not (
@@ -448,7 +448,7 @@ def camera_fields(text: str) -> dict[str, float]:
 
 
 def offset_fields(text: str) -> dict[str, float]:
-    """Return the fields of an offset in the format `x,y,z`.
+    """Return the fields x, y and z, metres, of an offset such as `10,0,0`.
 
     Raise InvalidRequest if the text is not three numbers.
     """

@@ -212,7 +212,7 @@ def parsed(value: object) -> object:
 
 
 _Several = Annotated[list[Label], Field(min_length=1, max_length=100)]
-#: One name, or several names of which one must match.
+#: A name, or a list of names, any of which may match.
 Names = Annotated[_Several, BeforeValidator(_as_list, json_schema_input_type=Label | _Several)]
 
 

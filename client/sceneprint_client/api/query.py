@@ -232,7 +232,7 @@ class Match(ApiRecord):
     rank: int = Field(description="Position in the ranking R, from 1.")
     distance: int = Field(description="Distance between the signatures.")
     similarity: float = Field(
-        description="1 - distance / distance between unrelated frames, 0 to 1."
+        description="Similarity, 0 to 1: 1 - distance / distance between unrelated frames."
     )
     selected: bool | None = Field(
         description="Whether the match is in the diverse selection C; null if that stage was not "

@@ -203,8 +203,8 @@ class Similarities(ApiRecord):
         default=[], description="Names of the files of `frames`, in the same order."
     )
     similarity: list[list[float]] = Field(
-        description="1 - distance / distance between unrelated frames, 0 to 1. The first row and "
-        "column belong to the query, and the others to `frames`, in the same order."
+        description="Similarities, 0 to 1: 1 - distance / distance between unrelated frames. The "
+        "first row and column belong to the query, and the others to `frames`, in order."
     )
 
 
@@ -305,7 +305,7 @@ class Similarity(ApiRecord):
         description="Distance between the signatures (squared L2, or L1 if psi itself is stored)."
     )
     similarity: float = Field(
-        description="1 - distance / distance between unrelated frames, 0 to 1."
+        description="Similarity, 0 to 1: 1 - distance / distance between unrelated frames."
     )
     model: str
     a: FrameName | None = Field(description="Stored frame a; null for an upload.")

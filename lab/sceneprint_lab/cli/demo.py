@@ -91,7 +91,7 @@ def _write_room(folder: Path, number: int) -> None:
 
 #: Without split files: share of each sequence for the map, and share for the gap after it.
 DATABASE_SHARE, GAP_SHARE = 0.60, 0.05
-#: Maximum number of database frames and of query frames, so that the demo takes minutes only.
+#: Maximum number of database frames and of query frames, so that the demo takes only minutes.
 MOST_DATABASE, MOST_QUERIES = 300, 180
 
 
@@ -213,7 +213,7 @@ _OF_FRAME = (FrameError, FrameConflict)
 
 @dataclass(frozen=True, eq=False)
 class DemoQuery:
-    """A query, its answers without and with diversification, and the duration of the latter, s."""
+    """A query, its answers without and with diversification, and the seconds for the second."""
 
     chosen: DemoFrame
     ranked: Answer
@@ -278,7 +278,7 @@ def fill(client: Client, model: str, choice: Choice) -> dict[str, DemoFrame]:
 
 
 def run_queries(client: Client, choice: Choice) -> list[DemoQuery]:
-    """Send each query frame (no pose), without and with diversification; skip refused ones."""
+    """Query each frame (no pose), without and with diversification; return the answered queries."""
     answered, begun = [], time.perf_counter()
     for frame in tqdm(choice.queries, desc="query", unit="frame", disable=None):
         meta = meta_of(frame.reference, with_pose=False)  # a lost robot has no pose
@@ -455,7 +455,7 @@ def _first_line(pipe: IO[bytes]) -> str:
                     f"The service did not start within {START_S:g} s. "
                     "Run `sceneprint doctor` to see what is missing, or try again."
                 )
-            more = os.read(pipe.fileno(), 4096)  # returns a partial line at once
+            more = os.read(pipe.fileno(), 4096)  # `read` returns a partial line at once
             if not more:
                 break
             data += more

@@ -363,7 +363,7 @@ def _add_drawing(command: argparse.ArgumentParser) -> None:
 
 
 def _frames(text: str) -> int:
-    """Return a whole number from 2 to _MOST."""
+    """Parse a whole number from 2 to _MOST."""
     number = positive(text)
     if not 2 <= number <= _MOST:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 2 to {_MOST}")
@@ -371,7 +371,7 @@ def _frames(text: str) -> int:
 
 
 def _limit(text: str) -> float:
-    """Return a number above 0 and up to 180."""
+    """Parse a number above 0 and up to 180."""
     return number_within(text, lambda number: 0 < number <= 180, "a number above 0, up to 180")
 
 

@@ -27,7 +27,7 @@ from sceneprint_lab.evaluation.sites import SiteAnswer, ask_site, kinds_of
 from sceneprint_lab.synth.lookalike_surveys import SURVEYED_KINDS
 from sceneprint_lab.synth.lookalikes import KINDS, ORDINARY
 
-#: Number of queries per site with --absent, which requires thousands of queries in all.
+#: Number of queries per site with --absent, which requires thousands of queries in total.
 ABSENT_BLOCK = 100
 #: Columns of the table, and the key of each in the result of `measures.answers`.
 SHARES = {

@@ -175,7 +175,7 @@ def features(points: Floats, scale: float = 1.0) -> Floats32:
         cloud, search(radius=FEATURES * scale, max_nn=100)
     )
     histograms = np.maximum(np.asarray(fpfh.data).T, 0.0).reshape(-1, 3, 11)
-    total = histograms.sum(axis=2, keepdims=True)  # the sum is 0 without neighbours
+    total = histograms.sum(axis=2, keepdims=True)  # the sum is 0 if there are no neighbours
     shares = np.divide(histograms, total, out=np.zeros_like(histograms), where=total > 0)
     rooted: Floats32 = np.sqrt(shares).reshape(-1, 33).astype(np.float32)
     return rooted
@@ -399,7 +399,7 @@ class Compared:
     ----------
     reason : reason why the baseline cannot be used; empty if it can be
     rankings : database indices for each query, nearest first
-    first : validated pair of each query with its nearest frame; None without a ranking
+    first : validated pair of each query with its nearest frame; None if there is no ranking
     milliseconds : median processor time per query to `describe` it, to `sign` it and to `rank` the
         database
     """
@@ -415,7 +415,7 @@ def compare(
     baseline: Baseline, prepared: Prepared, store: FrameStore, allowed: NDArray[np.bool_],
     signer: Signer, seed: int, watch: Watch = unwatched,
 ) -> Compared:  # fmt: skip
-    """Rank the database for every query by a baseline, and measure the time, in one thread.
+    """Return the rankings of a baseline for all queries, and its time in one thread.
 
     Parameters
     ----------
@@ -492,7 +492,7 @@ def registered(
 def timed(
     baseline: Baseline, prepared: Prepared, store: FrameStore, signer: Signer
 ) -> dict[str, float]:
-    """Return the median processor times to describe and to sign a query, milliseconds.
+    """Return the median processor times to `describe` and to `sign` a query, milliseconds.
 
     Evenly spaced queries are described and signed in alternation, so that conditions are equal.
     """

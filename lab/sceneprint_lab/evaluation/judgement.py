@@ -170,7 +170,7 @@ def views_to_average(pairs: Sequence[ValidatedPair]) -> list[ValidatedPair]:
 
 
 def judge(judging: Judge, task: QueryTask) -> Judged:
-    """Validate a query against all candidates, average and estimate its pose, and compute errors.
+    """Validate a query against its candidates, and estimate its pose; return results and errors.
 
     The bound of registration (the error after refinement from the reference pose) is computed for
     the first match of VDR and for the averaged views of C.
@@ -350,7 +350,7 @@ def refined_from_truth(judging: Judge, task: QueryTask, candidate: Candidate) ->
 def _average(
     task: QueryTask, of: dict[int, Candidate], transforms: dict[int, Floats | None]
 ) -> Error:
-    """Return the error of the average pose of transforms, by match; infinite without views."""
+    """Return the error of the poses averaged over candidates; infinite if no transform is known."""
     poses = [of[match].pose @ T for match, T in transforms.items() if T is not None]
     if not poses or any(of[match].scene != task.scene for match in transforms):
         return Error()
@@ -418,7 +418,7 @@ def rank(
     for i, (row, spent) in enumerate(watch(rows, "rank", len(queries))):
         start = time.perf_counter()
         index = np.flatnonzero(allowed[i])
-        order = np.argsort(row[index], kind="stable")  # ties by index
+        order = np.argsort(row[index], kind="stable")  # sort ties by index
         ranking = index[order[: ranking_size(len(index))]]
         ms = {"rank": spent + 1e3 * (time.perf_counter() - start)}
         start = time.perf_counter()

@@ -101,7 +101,7 @@ def upper_bound(seen: int, of: int, confidence: float = CONFIDENCE) -> float | N
     if of == 0:
         return None
     low, high = seen / of, 1.0
-    while (middle := (low + high) / 2) not in (low, high):  # until no number lies between them
+    while (middle := (low + high) / 2) not in (low, high):  # stop when no number lies between them
         low, high = (middle, high) if _at_most(seen, of, middle) > 1 - confidence else (low, middle)
     return high
 
@@ -172,7 +172,7 @@ def roc(scores: Floats, right: NDArray[np.bool_]) -> Roc | None:
     n_right, n_wrong = int(right.sum()), int((~right).sum())
     if not n_right or not n_wrong:
         return None
-    values, place = np.unique(-scores, return_inverse=True)  # descending, without duplicates
+    values, place = np.unique(-scores, return_inverse=True)  # scores are descending and distinct
     good = np.bincount(place[right], minlength=len(values)).cumsum()
     bad = np.bincount(place[~right], minlength=len(values)).cumsum()
     true = np.concatenate([[0], good]) / n_right
@@ -230,7 +230,7 @@ def bound_of(outcome: QueryOutcome) -> Error:
 
 
 def accuracy(errors: Sequence[Error]) -> Figures:
-    """Return the shares of errors within each of two limits, and medians; null without errors.
+    """Return the shares of errors within each of two limits, and medians; null if there are none.
 
     The error of a failure is infinite; an infinite median is null.
     """
@@ -260,13 +260,13 @@ def overlap_figures(five: Sequence[Sequence[float]]) -> Figures:
 
 
 def retrieval(outcomes: Sequence[QueryOutcome], of: str) -> Figures:
-    """Return `overlap_figures` of a row, and the share of its first matches in the right scene."""
+    """Return `overlap_figures` of a row, and the share `right_scene` of its first matches."""
     figures = overlap_figures([[p.overlap_mean for p in o.views(of)[:5]] for o in outcomes])
     return figures | {"right_scene": _share([o.views(of)[0].same_scene for o in outcomes])}
 
 
 def oracle_and_random(outcomes: Sequence[QueryOutcome]) -> dict[str, Figures]:
-    """Return the figures of the best database frame, and the expected figures of a random frame."""
+    """Return the overlap figures of the best frame (`oracle`) and expected of a `random` frame."""
     here = [o for o in outcomes if o.present]
     of_any: Figures = {
         "top1_overlap_50": _mean([float((o.overlap_mean >= 0.5).mean()) for o in here]),
@@ -326,7 +326,7 @@ def validation_of(pairs: Sequence[ValidatedPair]) -> dict[str, float | int | Non
 def absent(outcomes: Sequence[QueryOutcome]) -> dict[str, float | int | None]:
     """Return the shares of queries that are accepted although their scene is not in the database.
 
-    `accepted_strong` and `accepted_weak` refer to VDR's first match; null without such queries.
+    `accepted_strong` and `accepted_weak` refer to VDR's first match; null if there are none.
     """
     away = [o for o in outcomes if not o.present]
     answers = [o.views("VDR")[0].validation.strength if o.views("VDR") else None for o in away]
@@ -453,19 +453,19 @@ PLACES = (
 
 
 def lost(outcomes: Sequence[QueryOutcome]) -> dict[str, int]:
-    """Return the number of queries with each outcome; see `place_of`."""
+    """Return the number of queries with each outcome of PLACES; see `place_of`."""
     counts = Counter(place_of(outcome) for outcome in outcomes)
     return {place: counts[place] for place in PLACES}
 
 
 def place_of(outcome: QueryOutcome) -> str:
-    """Return the outcome of a query: the first of the following that applies.
+    """Return the outcome of a query, one of PLACES.
 
-    With an accepted match: `found`, VDR's answer is right within 10 cm and 10 degrees; `near`,
-    within 20 cm and 20 degrees; else `wrongly_accepted`. Without an accepted match:
-    `nothing_overlaps`, no database frame overlaps the query by 30 % (smaller direction, within
-    10 cm), which is always the case for absent scenes; `not_in_r`, no such frame is in R;
-    `not_in_c`, no such frame is in C; `ambiguous`, such a frame in C is ambiguous; else `rejected`.
+    If a match is accepted: `found` if the error of VDR is within 10 cm and 10 degrees, `near`
+    within 20 cm and 20 degrees, else `wrongly_accepted`. Otherwise, the first that applies:
+    `nothing_overlaps` if no database frame overlaps the query by 30 % (smaller direction, within 10
+    cm), as in absent scenes; `not_in_r` or `not_in_c` if no such frame is in R or in C; `ambiguous`
+    if such a frame in C is ambiguous; `rejected`.
     """
     answers = outcome.views("VDR")
     if answers:
@@ -599,7 +599,7 @@ def _of_scene(outcome: QueryOutcome, of: str) -> list[ValidatedPair]:
 def _translation(
     rows: Sequence[tuple[QueryOutcome, list[ValidatedPair]]], poses: Sequence[Floats]
 ) -> dict[str, float | None]:
-    """Return the mean and deviation of the distances between queries and views; see `diversity`."""
+    """Return `mean_m` and `std_m` of the distances between queries and views; see `diversity`."""
     if not rows:
         return {"mean_m": None, "std_m": None}
     distances = [

@@ -270,7 +270,7 @@ def _of_scene(
     own: Sequence[int], tried: Sequence[Tried], seconds: Sequence[Second | None],
     limits: tuple[float, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the figures of the pairs of one scene, including its negatives."""
+    """Return `bins`, `same_scene`, `validation` and `support` for the pairs of one scene."""
     pairs, theirs = [tried[i] for i in own], [seconds[i] for i in own]
     return {
         "bins": bins(pairs, theirs, limits),
@@ -384,7 +384,7 @@ def negatives(evaluation: PairEvaluation) -> dict[str, Any]:
 
 
 def rate(tried: Sequence[Tried]) -> dict[str, float | int | None]:
-    """Count the accepted pairs among pairs without overlap; `upper` is the rate's `upper_bound`."""
+    """Return counts and the accepted share of pairs without overlap; `upper`: see `upper_bound`."""
     accepted = [trial.pair for trial in tried if trial.pair.accepted]
     return {
         "pairs": len(tried),
@@ -429,9 +429,9 @@ def baselines(tried: Sequence[Tried], limits: tuple[float, float]) -> dict[str, 
 def why(trial: Tried) -> str | None:
     """Return the kind of failure of a pair; None if it is not a failure.
 
-    `wrongly_accepted`: a wrong transform was accepted. If none was accepted: `not_believed`, the
-    transform was right; `near`, its error was up to twice the limits; `not_found`, the error was
-    larger or there was no transform, although the frames overlap.
+    `wrongly_accepted`: a wrong transform was accepted. If the pair was not accepted:
+    `not_believed`, the transform was right; `near`, its error was up to twice the limits;
+    `not_found`, the error was larger or there was no transform, although the frames overlap.
     """
     pair = trial.pair
     if pair.accepted:

@@ -361,7 +361,7 @@ class Tried:
     pair : validated pair, with `bound` if the frames overlap
     others : results of the baselines, by method; empty if there are too few points; None without
         baselines or without overlap
-    milliseconds : time of our method, including the features of both frames; None without `others`
+    milliseconds : time of our method, with the features of both frames; None if `others` is None
     """
 
     drawn: Drawn
@@ -378,7 +378,7 @@ class Bench:
     ----------
     model : model whose parameters the baselines use
     limits : maximum error of a right transform, metres and degrees
-    o3d : the Open3D module; None without baselines
+    o3d : the Open3D module; None if there are no baselines
     """
 
     judging: Judge
@@ -399,7 +399,7 @@ def open_bench(
 
 
 def attempt(bench: Bench, task: tuple[Drawn, SignedFrame, SignedFrame]) -> Tried:
-    """Validate a pair; if its frames overlap, also compute the bound and run the baselines."""
+    """Return the validation of a pair and, if its frames overlap, the bound and the baselines."""
     drawn, query, match = task
     candidate = Candidate.of(match, drawn.match, drawn.overlap_mean, drawn.overlap_least)
     query_task = QueryTask(query.number, query.scene, query.pose, [], [], (candidate,))
@@ -453,7 +453,7 @@ def peer_points(frame: AnyFrame, model: Model) -> Floats:
 def refined_by_us(
     query: Geometry, match: Geometry, T: Floats, p: AlignmentParameters
 ) -> Floats | None:
-    """Refine a baseline's transform by our method, first coarsely, then finely; None on failure."""
+    """Return a baseline's transform after our coarse and fine refinements; None if they fail."""
     coarse = refine_all(query.surface, match.surface, T[None], p.coarse)
     return refine_transform(query, match, coarse[0] if len(coarse) else T, p.fine)
 
@@ -517,7 +517,7 @@ def evaluate_pairs(
     paths: Sequence[Path], signer: Signer, store: FrameStore, settings: PairSettings,
     watch: Watch = unwatched,
 ) -> PairEvaluation:  # fmt: skip
-    """Sample pairs by true overlap, validate them, and compute their errors.
+    """Sample pairs by true overlap, validate them, and return the results with their errors.
 
     Parameters
     ----------

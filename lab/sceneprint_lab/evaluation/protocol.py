@@ -158,7 +158,7 @@ class JudgedAnswer:
     ----------
     status : "found", "ambiguous" or "not_found"
     strength : "strong" or "weak"; None unless found
-    error : error of the pose; infinite without a pose, or if it is in another parent frame
+    error : error of the pose; infinite if there is no pose, or if it is in another parent frame
     milliseconds : time for the answer, without the ranking
     places : candidate places, most likely first
     limits : maximum error of a right pose, metres and degrees; the default is for depth cameras
@@ -329,7 +329,7 @@ def points_at(frame: DepthFrame, y: NDArray[np.intp], x: NDArray[np.intp]) -> Fl
 
 
 def view_of(frame: AnyFrame) -> AnyView:
-    """Prepare a frame for computing overlaps; raise ValueError if it has no pose."""
+    """Return a frame as a view for `overlap`; raise ValueError if it has no pose."""
     if frame.pose is None:
         raise ValueError(f"{frame.name} has no pose. Pass frames with poses.")
     if isinstance(frame, Cloud):
@@ -353,7 +353,7 @@ def _cloud_view(cloud: Cloud, pose: Floats) -> CloudView:
 
 @kernel
 def _count_seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tuple[int, int]:
-    """Return how many of the points (N, 3) a depth image sees, for both tolerances."""
+    """Return how many points (N, 3) a depth image sees, within the loose and strict tolerance."""
     height, width = depth.shape
     loose = strict = 0
     for i in range(len(points)):
@@ -373,7 +373,7 @@ def _count_seen(points: Floats, depth: Floats32, k: Floats, pose: Floats) -> tup
 
 
 def _count_near(points: Floats, cloud: CloudView) -> tuple[int, int]:
-    """Return how many of the points (N, 3) a cloud sees, for both tolerances."""
+    """Return how many points (N, 3) a cloud sees within the loose and the strict tolerance."""
     wide = np.zeros(len(points))
     if cloud.viewpoint is not None:
         wide = RELATIVE_TOLERANCE * np.linalg.norm(points - cloud.viewpoint, axis=1)
@@ -382,7 +382,7 @@ def _count_near(points: Floats, cloud: CloudView) -> tuple[int, int]:
 
 
 def _shares(points: Floats, view: AnyView) -> tuple[float, float]:
-    """Return the share of the points (N, 3) that a frame sees, for both tolerances."""
+    """Return the shares of points (N, 3) that a frame sees, loosely and strictly."""
     if not len(points):
         return 0.0, 0.0
     if isinstance(view, CloudView):
@@ -822,7 +822,7 @@ class Prepared:
     ----------
     queries, database : frames in the order of the protocol
     left_out : (name, reason) of unusable frames
-    milliseconds : median time to sign a frame and to compute its geometry; None without frames
+    milliseconds : median time to sign a frame and compute its geometry; None without frames
     validation, metric, answer, unrelated_distance : parameters of the model
     """
 
@@ -856,7 +856,7 @@ def prepare_all(
     levels: int | None = None, jobs: int = 1, cache_dir: Path | None = None,
     watch: Watch = unwatched,
 ) -> Prepared:  # fmt: skip
-    """Read, sign and store all frames.
+    """Read, sign and store all frames; return the signed ones, and the reasons for the others.
 
     Frames without a pose are omitted, because errors cannot be computed for them, except database
     frames of scenes without queries, which are wrong for any query.

@@ -54,7 +54,7 @@ def recalls(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def baseline_rows(evaluation: Evaluation) -> dict[str, dict[str, Any]]:
-    """Return the figures of each baseline, by name: those of row R without `right_scene`, and more.
+    """Return the figures of each baseline, by name: those of row R except `right_scene`, and more.
 
     `recall`: see `recall`. `milliseconds`: see Compared. `ratio`: time to describe a query and to
     rank the database, divided by the time for these with the signature. A baseline that cannot be
@@ -98,7 +98,7 @@ class Judgement:
 
     Parameters
     ----------
-    first : error of each row's first match, and of `pose_average`; infinite without a pose
+    first : error of each row's first match, and of `pose_average`; infinite if there is no pose
     spread : mean and standard deviation of the distances between the query and each row's first
         five frames, metres; None if fewer than two of them are in the query's parent frame
     """
@@ -147,7 +147,7 @@ def answer_rows(judged: Sequence[Judgement]) -> dict[str, Figures]:
 
 
 def _first(matches: Sequence[Match], truth: FramePlace, places: Mapping[str, FramePlace]) -> Error:
-    """Return the error of the first match; infinite without a match in the query's parent frame."""
+    """Return the error of the first match; infinite if no match is in the query's parent frame."""
     for match in matches[:1]:
         place = places[match.frame_id]
         if match.transform is not None and place.parent == truth.parent:

@@ -154,7 +154,7 @@ def evaluate(
     protocol: EvaluationProtocol, signer: Signer, store: FrameStore, settings: EvaluationSettings,
     watch: Watch = unwatched,
 ) -> Evaluation:  # fmt: skip
-    """Sign all frames, answer all queries, and compute the errors of the answers.
+    """Sign all frames, answer all queries, and return the outcomes with their errors.
 
     Parameters
     ----------
@@ -258,7 +258,7 @@ def overlaps_of(prepared: Prepared, store: FrameStore, watch: Watch = unwatched)
 def _steps(
     prepared: Prepared, store: FrameStore
 ) -> Iterator[tuple[int, AnyView, int, list[AnyView]]]:
-    """Yield a query's index and view, and the first index and the views of a database block.
+    """Yield, for each query and database block: query index and view, first index and views.
 
     All pairs of a query and a block occur; at most two blocks of views are in memory.
     """

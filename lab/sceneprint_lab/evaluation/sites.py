@@ -31,7 +31,7 @@ ANSWERABLE = 0.3
 ANSWERABLE_M = 10.0
 #: Standard deviations of a prior, metres and degrees; PRIOR_DEG is also its maximum rotation error.
 PRIOR_M, PRIOR_DEG = 0.3, 10.0
-#: Minimum and maximum side of the voxels from which a site's map is fused, metres.
+#: Minimum and maximum edge of the voxels in which a site's map is fused, metres.
 CLOUD_VOXEL_M, MESH_VOXEL_M = (0.05, 0.2), (0.015, 0.03)
 #: Maximum number of views of the fused surface.
 VIEWS = 150

@@ -20,7 +20,7 @@ _FUSION = FusionParameters(most_blocks=400_000, farthest_m=4.0)
 
 
 def join_frames(frames: Sequence[AnyFrame], voxel_m: float, up: Floats) -> ReferenceSurface:
-    """Fuse frames with poses into a surface.
+    """Return the surface fused from frames with poses.
 
     Parameters
     ----------

@@ -53,7 +53,7 @@ def synthesise_room(
     seed: int, index: int, views: int, *, along_path: bool = False, step: int = 1,
     noise: KinectNoise | None = KINECT_V1, intrinsics: Intrinsics = KINECT,
 ) -> SynthRoom:  # fmt: skip
-    """Generate a furnished room and render depth frames in it.
+    """Generate a furnished room, and return depth frames rendered in it.
 
     The result depends only on the arguments, so rooms can be generated in any order and process.
 
@@ -170,7 +170,7 @@ def synthesise_survey(
     seed: int, index: int, views: int, *, along_path: bool = False, kind: str | None = None,
     sensor: Spinning | None = None, perfect: bool = False,
 ) -> Survey:  # fmt: skip
-    """Generate a site, and scan it.
+    """Generate a site, and return scans of it.
 
     The result depends only on the arguments, so sites can be generated in any order and process.
 

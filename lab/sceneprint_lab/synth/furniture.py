@@ -407,7 +407,7 @@ def _pillow(w: float, d: float, h: float, soft: float) -> SyntheticMesh:
 
 
 def _leaning(mesh: SyntheticMesh, slope: float, at: tuple[float, float, float]) -> SyntheticMesh:
-    """Tilt a mesh backwards (+y) by `slope` radians about z = 0, then move it by `at`."""
+    """Return a mesh tilted backwards (+y) by `slope` radians about z = 0, then moved by `at`."""
     return mesh.turned(rotation_x(-slope), at)
 
 

@@ -411,7 +411,7 @@ def _building(half: Floats, main: float, site: Site) -> list[SyntheticMesh]:
     place = PiecePose(x, y, yaw)
     if not site.floor.claim(place, w + 1.0, d + 1.0, 0.1):
         return []
-    corners = np.array([(-w, -d), (-w, d), (w, d), (w, -d)]) / 2  # clockwise: walls face outward
+    corners = np.array([(-w, -d), (-w, d), (w, d), (w, -d)]) / 2  # clockwise, so walls face outward
     top = Ceiling(h, np.zeros(2))
     rise, deep = float(rng.uniform(2.7, 3.8)), float(rng.uniform(0.1, 0.4))
     walls = [wall_mesh(facade(wall, h, rise, deep, rng), top) for wall in walls_of(corners)]

@@ -119,7 +119,7 @@ class SurveyPlan(NamedTuple):
 def synthesise_lookalike_survey(
     kind: str, seed: int, index: int, *, queries: int = 12, perfect: bool = False
 ) -> LookalikeSite[Cloud]:
-    """Generate an ambiguous site, and scan it.
+    """Generate an ambiguous site, and return its map and queries, which are scans.
 
     The result depends only on the arguments. If the poses of the map drift, the pose of a query
     drifts like that of the nearest scan of the map.
@@ -170,7 +170,7 @@ def synthesise_lookalike_survey(
 
 
 def _thinned(stops: list[Stop], rng: np.random.Generator) -> list[Stop]:
-    """Remove a sixth of the stops, in one stretch, and one in ten of the others."""
+    """Return the stops without one stretch of a sixth of them, and one in ten of the others."""
     gap = len(stops) // 6
     start = int(rng.integers(1, len(stops) - gap))
     return [
@@ -198,7 +198,7 @@ def with_drift(poses: Floats, rng: np.random.Generator) -> Floats:
 
 
 def _drifted_pose(T: Floats, true: Floats, recorded: Floats) -> Floats:
-    """Return a true pose with the drift of the map's nearest scan."""
+    """Return the pose `T` with the drift of the nearest scan, from `true` to `recorded`."""
     nearest = int(np.linalg.norm(true[:, :3, 3] - T[:3, 3], axis=1).argmin())
     placed: Floats = recorded[nearest] @ inverse(true[nearest]) @ T
     return placed
@@ -348,7 +348,7 @@ def block(rng: np.random.Generator) -> Unit:
 def _house(w: float, d: float, rng: np.random.Generator) -> SyntheticMesh:
     """Return a house around the origin; its front, with steps or porches, faces -y."""
     h, rise, deep = rng.uniform((4.0, 2.7, 0.1), (14.0, 3.8, 0.4)).tolist()
-    corners = np.array([(-w, -d), (-w, d), (w, d), (w, -d)]) / 2  # clockwise: walls face outward
+    corners = np.array([(-w, -d), (-w, d), (w, d), (w, -d)]) / 2  # clockwise, so walls face outward
     top = Ceiling(h, np.zeros(2))
     walls = [wall_mesh(facade(wall, h, rise, deep, rng), top) for wall in walls_of(corners)]
     parts = [*walls, roof(w, d, h, rng)]
@@ -361,7 +361,7 @@ def _house(w: float, d: float, rng: np.random.Generator) -> SyntheticMesh:
 def stand_about(
     menu: Menu, floor: Floor, rng: np.random.Generator, tries: int
 ) -> list[PlacedPiece]:
-    """Place pieces, almost aligned with the axes, at free places in at most `tries` tries."""
+    """Return pieces at free places, nearly aligned with the axes, after at most `tries` tries."""
     makers, weights = list(menu), np.array(list(menu.values()), float)
     placed = []
     for _ in range(tries):
@@ -481,7 +481,7 @@ def _is_second_variant(index: int) -> bool:
 
 
 def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
-    """Map all but the last of several similar rows of street blocks or bays; query the last row.
+    """Return a plan that maps all but the last of several similar rows, and queries the last.
 
     Queries are selected from three times as many stops; see `_most_different`.
     """
@@ -513,7 +513,7 @@ def _unmapped(rng: np.random.Generator, index: int, queries: int, sensor: Scanne
 
 
 def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:
-    """Map a hall with one to three details, or one half of a hall whose details distinguish it."""
+    """Return a plan that maps a hall with some details, or one half of a hall with more details."""
     hall = _with_details(symmetric_hall(rng), rng)
     if not _is_second_variant(index):
         return _plan_walk(hall, rng, queries)
@@ -536,7 +536,7 @@ def _halls(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
-    """Add up to three objects to a hall, and mark their places as occupied in both halves."""
+    """Return a hall with up to three more objects, whose places are claimed in both halves."""
     menu: Menu = {pile: 2, person: 1, cabin: 2, screen: 2, tank: 1, machine: 1}
     things = furnish(stand_about(menu, hall.floor, rng, 3), 0, Likeness(), rng)
     # A walkable place must also be walkable after half a turn.
@@ -545,7 +545,7 @@ def _with_details(hall: Premises, rng: np.random.Generator) -> Premises:
 
 
 def _plan_walk(premises: Premises, rng: np.random.Generator, queries: int) -> SurveyPlan:
-    """Map every second to fourth scan of a walk; query other scans, every third beside the walk."""
+    """Return a plan that maps every second to fourth scan of a walk, and queries other scans."""
     step = int(rng.integers(2, 5))
     poses = walk(premises, step * MAP_SCANS, rng)
     others = [k for k in range(len(poses)) if k % step]
@@ -575,7 +575,7 @@ def _sites(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) 
 
 
 def _absent(rng: np.random.Generator, index: int, queries: int, sensor: Scanner) -> SurveyPlan:  # noqa: ARG001
-    """Map a hall and a block, 200 m apart; query other sites."""
+    """Return a plan that maps a hall and a block, 200 m apart, and queries other sites."""
     places = [(make(rng), (200.0 * k, 0.0, 0.0)) for k, make in enumerate((make_hall, make_block))]
     of_map = [
         Stop(premises, T, origin)

@@ -117,7 +117,7 @@ def synthesise_lookalike(
     kind: str, seed: int, index: int, *, queries: int = 12, noise: KinectNoise | None = KINECT_V1,
     intrinsics: Intrinsics = KINECT,
 ) -> LookalikeSite[DepthFrame]:  # fmt: skip
-    """Generate an ambiguous site, and render depth frames of it.
+    """Generate an ambiguous site, and return its map and queries, which are depth frames.
 
     The result depends only on the arguments.
 
@@ -336,7 +336,7 @@ def _circled_object(rng: np.random.Generator, index: int, queries: int) -> Frame
 def _every_fourth(
     room: Room, poses: Sequence[Floats], queries: int, rng: np.random.Generator
 ) -> FramePlan:
-    """Use every fourth pose for the map, and `queries` of the others for queries."""
+    """Return a plan with every fourth pose in the map, and `queries` of the others as queries."""
     others = [k for k in range(len(poses)) if k % 4]
     chosen = sorted(rng.choice(others, min(queries, len(others)), replace=False).tolist())
     return FramePlan([(room, T) for T in poses[::4]], [(room, poses[k]) for k in chosen])
@@ -384,7 +384,7 @@ def arrange(
     walls: Sequence[Wall], floor: Floor, pieces: Sequence[Piece], middle: Piece | None,
     rng: np.random.Generator,
 ) -> list[PlacedPiece]:  # fmt: skip
-    """Place pieces side by side along walls, `middle` in the centre, and chairs and boxes anywhere.
+    """Return pieces placed along walls, `middle` in the centre, and chairs and boxes anywhere.
 
     The walls are those of a counter-clockwise rectangle. Pieces that do not fit are omitted.
     """
@@ -494,7 +494,7 @@ def equal_bays(count: int, likeness: Likeness, rng: np.random.Generator) -> tupl
 
 
 def _row(rng: np.random.Generator, index: int, queries: int) -> FramePlan:
-    """Map and query all rooms of a row or, if the index is odd, all bays of a hall."""
+    """Return a plan that maps and queries all rooms of a row or, for odd indexes, all bays."""
     likeness = Likeness(float(rng.uniform(0.0, 0.03)), float(rng.uniform(0.0, 0.02)))
     if index % 2:
         hall, _ = equal_bays(int(rng.integers(4, 7)), likeness, rng)
@@ -538,7 +538,7 @@ def difference_share(
 
 
 def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Map all rooms of a row except the last, and query the last.
+    """Return a plan whose map has all rooms of a row except the last, which is queried.
 
     Queries differ from views of the mapped rooms by DISTINCT_SHARE, because no method can tell an
     equal room from a mapped room in which a chair was moved.
@@ -559,7 +559,7 @@ def _unmapped_room(rng: np.random.Generator, index: int, queries: int) -> FrameP
 
 
 def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Map a kitchen, and query a larger kitchen with the same furniture in the same order."""
+    """Return a plan that maps a kitchen and queries a larger one with furniture in equal order."""
     pieces = [make(rng) for make in _KITCHEN]
     pieces += [pieces[2], kitchen_row(rng)][: int(rng.integers(1, 3))]
     middle = table(rng) if rng.random() < 0.7 else counter(rng)
@@ -577,7 +577,7 @@ def _second_kitchen(rng: np.random.Generator, index: int, queries: int) -> Frame
 
 
 def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Map one of two equal pieces, back to back, with different objects; query the other."""
+    """Return a plan that maps one of two equal pieces, back to back, and queries the other."""
     make = (desk, shelf, counter, table, cupboard)[int(rng.integers(0, 5))]
     piece = make(rng)
     w, d = piece.width, piece.depth
@@ -614,7 +614,7 @@ def _opposite_sides(rng: np.random.Generator, index: int, queries: int) -> Frame
 
 
 def _absent_places(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Map and query different rooms and objects."""
+    """Return a plan whose map and queries show different rooms and objects."""
 
     def views(rooms: int, per_room: int, around: int) -> list[tuple[Room, Floats]]:
         poses = []
@@ -633,7 +633,7 @@ def _absent_places(rng: np.random.Generator, index: int, queries: int) -> FrameP
 
 
 def _ordinary_rooms(rng: np.random.Generator, index: int, queries: int) -> FramePlan:  # noqa: ARG001
-    """Map three rooms side by side with 8 to 25 views each, and query them.
+    """Return a plan with 8 to 25 views of three adjacent rooms in the map, and queries of them.
 
     The queries show objects that were elsewhere or absent when the map was recorded.
     """

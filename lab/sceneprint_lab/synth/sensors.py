@@ -35,8 +35,8 @@ class RayHits:
     Parameters
     ----------
     distance : (R,) float32, in lengths of the ray's direction; inf without a hit
-    face : (R,) int32, index of the face; -1 without a hit
-    normal : (R, 3) float32, outward unit normals of the faces; 0 without a hit
+    face : (R,) int32, index of the face; -1 for a miss
+    normal : (R, 3) float32, outward unit normals of the faces; 0 for a miss
     """
 
     distance: Floats32
@@ -84,8 +84,8 @@ def cast_depth(
 
     Returns
     -------
-    depth : (H, W) float32, metres along the optical axis; 0 without a hit
-    cosine : (H, W) float32, |cos| between ray and normal, [0, 1]; 0 without a hit
+    depth : (H, W) float32, metres along the optical axis; 0 for a miss
+    cosine : (H, W) float32, |cos| between ray and normal, [0, 1]; 0 for a miss
 
     Raises
     ------
@@ -98,7 +98,7 @@ def cast_depth(
 def cast_faces(
     caster: Caster, T_world_camera: Floats, intrinsics: Intrinsics
 ) -> tuple[Floats32, Floats32, Ints32]:
-    """Return the result of `cast_depth`, and the indices of the faces (H, W), -1 without a hit."""
+    """Return the result of `cast_depth`, and the indices of the faces (H, W), -1 for a miss."""
     shape = (intrinsics.height, intrinsics.width)
     rays = pixel_rays(intrinsics) @ T_world_camera[:3, :3].T.astype(np.float32)
     origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), rays.shape)

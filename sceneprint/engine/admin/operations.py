@@ -74,13 +74,15 @@ class EventSlice(NamedTuple):
 def begin(
     database: Database, event_filter: EventFilter, minimum: int, after: int | None
 ) -> EventSlice:
-    """Start an event stream: return its first place, and a `missed` event if the reader missed
-    events that were removed, or that a restore of the database lost.
+    """Start an event stream at `after`, or with new events if `after` is None.
+
+    The result has no events, except a `missed` event if the reader missed events that were removed,
+    or that a restore of the database lost.
 
     Parameters
     ----------
     minimum : number of newest events per map that are never removed
-    after : number of the last event that the reader has received; None starts with new events
+    after : number of the last event that the reader has received
     """
     number_events(database)
     with database.read() as connection:
@@ -95,7 +97,7 @@ def begin(
 
 
 def next_events(database: Database, event_filter: EventFilter, place: int, most: int) -> EventSlice:
-    """Number pending events, and return up to `most` events of a stream after a place."""
+    """Assign numbers to pending events; return up to `most` events after `place`, oldest first."""
     number_events(database)
     with database.read() as connection:
         newest = newest_number(connection)
@@ -127,7 +129,7 @@ class Events:
         self._tidied = time.monotonic()
 
     def wanted(self, map_name: str | None = None, kinds: Sequence[str] = ()) -> EventFilter:
-        """Return the event filter of a request.
+        """Check the map and the kinds of a request, and return them as an event filter.
 
         Parameters
         ----------
@@ -201,7 +203,7 @@ class Events:
             return 0
 
     def remove_surplus(self) -> int:
-        """Remove surplus events of each map, except anchors of indexes; return their number."""
+        """Remove events beyond each map's limit, except anchors of indexes; return their number."""
         most_events, indexes = self._settings.events_per_map, Path(self._settings.indexes)
 
         def spent(connection: Connection, limit: int) -> list[int]:

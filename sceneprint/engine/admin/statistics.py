@@ -60,7 +60,7 @@ MOST = 200
 
 
 def index_state(connection: Connection, indexes: Path, row: MapRow) -> IndexState:
-    """Return the state of the newest readable index of a map; `version` is None without one."""
+    """Return the state of a map's newest readable index; `version` is None if none exists."""
     for _, path in manifests(index_folder(indexes, row)):
         manifest = _read(path)
         if manifest is not None and row.pruned_revision <= manifest.revision <= row.revision:
@@ -79,7 +79,7 @@ def index_states(connection: Connection, indexes: Path) -> list[IndexState]:
 
 
 def anchors(indexes: Path) -> frozenset[int]:
-    """Return the event numbers to which the indexes of this machine are anchored."""
+    """Return the numbers of the events that anchor the indexes of this machine to the database."""
     if not indexes.is_dir():
         return frozenset()
     folders = [folder for folder in indexes.iterdir() if is_index_folder(folder.name)]
@@ -238,7 +238,7 @@ class Figures:
 
     Parameters
     ----------
-    began : number of worker starts in the last hour
+    began : number of times a worker started in the last hour
     events : number of the newest event
     waiting : number of queued jobs by tenant
     """
@@ -275,7 +275,7 @@ class StoreCounts:
 
     @property
     def is_old(self) -> bool:
-        """Return whether to renew the counts: they are due, or the clock was set back."""
+        """Return whether the counts must be renewed, also because the clock was set back."""
         return not 0 <= time.time() - self.at < self.seconds / COUNTING
 
 
@@ -463,7 +463,7 @@ def _recent_counts(
     happened: Mapping[tuple[int, str], int], places: range,
     samples: list[store_counts.Sample] | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the fields of `Counted`, summed over the minutes `places`; see `_minutes`."""
+    """Return the fields of `Counted` for the minutes `places` together; see `_minutes`."""
     counts: dict[str, Any] = {
         outcome: sum(happened.get((place, f"frame.{outcome}"), 0) for place in places)
         for outcome in OUTCOMES

@@ -70,9 +70,9 @@ class Step:
 
 
 def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterator[Step]:
-    """Yield every `every`-th frame of each sequence of an archive, after the errors.
+    """Yield a step for each error of an archive, then for every `every`-th frame of each sequence.
 
-    The order is the same in each call. Without `session`, each sequence is a session of its own.
+    The order is the same in each call. Without `session`, each sequence becomes its own session.
     """
     for name, reason in archive.refused:
         yield Step(name, refused=errors.UnreadableArchive(reason))
@@ -82,7 +82,7 @@ def steps_of(archive: Archive, every: int, session: str | None = None) -> Iterat
 
 
 def next_block(archive: Archive, steps: Sequence[Step], done: int) -> Sequence[Step]:
-    """Return the block of at least one step that follows the first `done` steps."""
+    """Return the next steps to add in one commit, at least one; the first `done` are complete."""
     count = size = 0
     for step in steps[done : done + _AT_ONCE]:
         size += 0 if step.reference is None else archive.size_of(step.reference)
@@ -276,7 +276,7 @@ class Receiver:
 
 
 def states_of_import(connection: Connection, job: JobRow) -> Counter[str]:
-    """Count the frames of an import by state."""
+    """Return the number of frames of an import in each state."""
     items = queue.items_of(connection, job.number)
     ids = [item["frame_id"] for item in items if item["frame_id"] is not None]
     counts = Counter[str]()
@@ -320,7 +320,7 @@ class Imports:
 
     @contextmanager
     def receive(self, map_name: str, options: ImportOptions) -> Iterator[Receiver]:
-        """Receive a file in chunks; remove it unless `Receiver.end` is called.
+        """Yield a receiver for a file in chunks, which is removed unless `Receiver.end` is called.
 
         Received bytes count against the quota of the map until the context ends. Call `begin`
         within the context.
@@ -424,7 +424,7 @@ class Imports:
         return Page[ImportItem](items=[ImportItem(**row) for row in rows[:limit]], next_cursor=more)
 
     def handle(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice of an import: add at least one block of frames.
+        """Run a slice of an import, which adds at least one block of frames; return its results.
 
         Raise UnreadableArchive if the archive is missing, or is unreadable and was therefore
         removed.

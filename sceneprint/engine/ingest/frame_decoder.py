@@ -54,7 +54,7 @@ class Read:
 
 
 def read_upload(data: bytes, meta: FrameMeta, decoders: Decoders) -> Read:
-    """Decode an upload, and validate it except for checks that require signing.
+    """Return a decoded upload, validated except for checks that require signing.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def _read(data: bytes, meta: FrameMeta, decoder: Decoder) -> Read:
     if pose is not None and base is not None and meta.pose is not None and meta.pose.of == "base":
         pose = pose @ base[1]
     cloud_format = format_of(data)
-    # an NPY array with a camera is an image
+    # a camera distinguishes an image in NPY format from a cloud
     if meta.format or (cloud_format and (cloud_format != "npy" or meta.intrinsics is None)):
         return _read_cloud(data, meta, pose, decoder)
     _refuse(meta, "depth image", {"viewpoint": "file", "units_per_metre": 1.0, "format": None})

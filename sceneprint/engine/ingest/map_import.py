@@ -107,7 +107,7 @@ _NO_POSES: Floats = np.empty((0, 4, 4))
 
 
 class _Views:
-    """Renderer of the views of a job.
+    """Renderer of the views that a job adds to a map.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ class _Views:
         return Upload(view.data, meta, options.priority, options.if_novel, frame_id)
 
     def view(self, pose: Floats) -> Upload:
-        """Render a view at T_map_sensor (4, 4); the metadata does not contain the pose."""
+        """Return a view rendered at T_map_sensor (4, 4), without the pose in its metadata."""
         image, camera = self._renderer.view(pose), self._p.camera
         if not isinstance(camera, Intrinsics):
             return Upload(encode_npy(image), FrameMeta())
@@ -184,7 +184,7 @@ class MapImporter:
         }  # fmt: skip
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice: a phase of the import, or part of a phase."""
+        """Run a slice, which is a phase of the import or part of one; return its results."""
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
             file = queue.files_of(connection, task.job.number).get(ARCHIVE)
@@ -199,7 +199,7 @@ class MapImporter:
     def _read(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Decode the uploaded file in a confined process, and store its surface."""
+        """Decode the file in a confined process; return a slice that stores its surface."""
         del is_over, task
         axis = options.up if isinstance(options.up, str) else None
         surface_options = SurfaceOptions(units_per_metre=options.units_per_metre, up=axis)
@@ -228,7 +228,7 @@ class MapImporter:
     def _choose(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Choose the viewpoints, and store them with the surface."""
+        """Choose the viewpoints, and return a slice that stores them with the surface."""
         del is_over
         stored = self._stored(file)
         plan = choose_views(stored.surface, self._parameters(task.of_map, options))
@@ -250,7 +250,7 @@ class MapImporter:
     def _render(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Render and add at least one block of views."""
+        """Render and add at least one block of views; return the results of the slice."""
         stored = self._stored(file)
         views = self._views(task, options, stored)
         progress, items = dict(task.progress), list[dict[str, Any]]()
@@ -280,7 +280,7 @@ class MapImporter:
     def _await_signatures(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Check whether all views are signed; if not, schedule another check."""
+        """Return the progress of signing; schedule another slice unless all views are signed."""
         del options, file, is_over
         progress = dict(task.progress)
         states = self._states(task)
@@ -294,7 +294,7 @@ class MapImporter:
     def _test(
         self, task: LongJob, options: ImportOptions, file: queue.JobFile, is_over: IsOver
     ) -> SliceResult:
-        """Localise at least one held-out view; after the last, conclude the job."""
+        """Localise one or more held-out views; return the slice, which may conclude the job."""
         stored = self._stored(file)
         poses, progress = stored.held_out, dict(task.progress)
         outcomes = progress["outcomes"] = list(progress["outcomes"])
@@ -399,7 +399,7 @@ class MapImporter:
         counts = Counter(outcomes)
         names = ("points", "triangles", "units_per_metre", "units_from", "up_from", "notes")
         facts: dict[str, Any] = {name: progress[name] for name in names}
-        # no view is unchecked, since all have a pose in the parent frame of the map
+        # every view has a pose in the parent frame of the map, so no outcome is `unchecked`
         facts |= {name: counts[name] for name in COVERAGE_OUTCOMES if name != "unchecked"}
         return MapImportResult(
             **facts, up=direction(surface.up), offset=vector(surface.offset),
@@ -415,7 +415,7 @@ _FARTHEST_M = 20_000.0
 
 
 def _with_offset(surface: ReferenceSurface, offset: GivenVector, name: str) -> ReferenceSurface:
-    """Change the offset of a surface; raise InvalidRequest if a point is too far from it."""
+    """Return a surface with another offset; raise InvalidRequest if a point is too far from it."""
     to = np.array([offset.x, offset.y, offset.z])
     points = surface.points + (surface.offset - to)
     if not np.abs(points).max() <= _FARTHEST_M:

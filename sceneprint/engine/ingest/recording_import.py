@@ -44,7 +44,7 @@ class RecordingImporter:
         self._store, self._uploads = context.store, uploads
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice: scan the recording, or add at least one block of its frames."""
+        """Scan the recording, or add one or more blocks of its frames; return the slice."""
         require_rosbags()
         options = ImportOptions.model_validate(task.data)
         with self._store.database.read() as connection:
@@ -79,7 +79,7 @@ class RecordingImporter:
                 decoder.close()
 
     def _read(self, decoder: RecordingDecoder, options: ImportOptions) -> SliceResult:
-        """Scan the recording, and store its index; the progress contains the outline for users."""
+        """Scan the recording; return a slice with its index as file and outline as progress."""
         text, index = decoder.outline(options)
         progress = {
             "done": 0, "total": len(index.frames), "phase": "add", "received": 0, "there": 0,
@@ -106,7 +106,7 @@ class RecordingImporter:
         frame_s = math.inf  # seconds per frame of the last block
         while progress["done"] < len(frames) and (not items or not is_over()):
             start = time.monotonic()
-            # sizes and durations are unknown before the first block, which is a single frame
+            # the first block is a single frame, since sizes and durations are unknown
             room = _BYTES_AT_ONCE // (progress["largest"] or _BYTES_AT_ONCE)
             count = max(1, min(_AT_ONCE, room, int(SLICE_S / frame_s)))
             block = frames[progress["done"] :][:count]

@@ -166,7 +166,7 @@ def _earlier_results(
     connection: Connection, row: MapRow, once: IdempotentRequest | None
 ) -> list[UploadResult] | None:
     """Return the results of an earlier request with the key of `once`, with the current states of
-    its frames; None without such a request, or if one of its frames no longer exists.
+    its frames; None if there was no such request, or one of its frames no longer exists.
 
     Raise IdempotencyConflict if the earlier request was different.
     """
@@ -267,7 +267,7 @@ class _Request:
 
     @cached_property
     def blobs(self) -> dict[str, bytes]:
-        """Bytes of the blobs to write before the rows, by digest."""
+        """Contents of the blobs to write before the rows, by digest."""
         return {prepared.blob: prepared.upload.data for prepared in self.todo.values()}
 
     @property
@@ -332,7 +332,7 @@ class Uploads:
         self, map_name: str, uploads: Sequence[Upload], once: IdempotentRequest | None = None,
         fence: Callable[[Connection], None] | None = None,
     ) -> tuple[list[UploadResult], bool]:  # fmt: skip
-        """Store frames in a map in one commit; the results contain errors of single frames.
+        """Store frames in one commit; return (results, replayed) as `add`, with errors of frames.
 
         Parameters
         ----------
@@ -460,7 +460,7 @@ class Uploads:
     def _insert_single(self, row: MapRow, request: _Request) -> UploadResult | None:
         """Insert a new frame with a statement that concurrent uploads share, on PostgreSQL.
 
-        Return None without writing if the frame is not new or has a requested id, other uploads
+        Write nothing and return None if the frame is not new or has a requested id, other uploads
         wait for the map, or the database is SQLite.
         """
         [prepared] = request.todo.values()
@@ -479,7 +479,7 @@ class Uploads:
     def _store_all(
         self, row: MapRow, request: _Request, connection: Connection
     ) -> tuple[list[UploadResult | None], bool] | None:
-        """Store uploads in a transaction; return None if a blob or the map no longer exists."""
+        """Store uploads; return (results, replayed), or None if a blob or the map is gone."""
         if request.fence is not None:
             request.fence(connection)
         if not all(map(self._store.blobs.holds, request.blobs)):
@@ -527,7 +527,7 @@ class Uploads:
 
 
 def _new_frame(row: MapRow, ready: _Prepared, once: IdempotentRequest | None = None) -> NewFrame:
-    """Return a frame that is to be inserted if it does not exist.
+    """Return a frame that a statement inserts unless it exists.
 
     With `once` (PostgreSQL only), the statement also stores the result for the idempotency key.
     """
@@ -553,7 +553,7 @@ def _store_single(
 ) -> UploadResult:
     """Store an upload, and return its result; add blobs that may be unreferenced to `unused`."""
     upload = ready.upload
-    try:  # search again: another upload may have added the frame
+    try:  # another upload may have added the frame
         frame = find_duplicate(connection, row, ready.content, ready.metadata, upload.frame_id)
     except errors.FrameConflict as error:
         unused.append(ready.blob)

@@ -36,7 +36,7 @@ class _Waiting(Generic[W]):
     ----------
     leads : whether the thread of this write is the leader; see `_Group`
     ready : event that is set when the write is done, or its thread becomes the leader
-    left : whether the thread was interrupted and no longer waits
+    left : whether the thread was interrupted and has stopped waiting
     """
 
     def __init__(self, work: W) -> None:

@@ -57,7 +57,7 @@ class JobRunner:
             return queue.due_in_s(connection)
 
     def run(self, work: Work | LongJob, broke: Callable[[], None] | None = None) -> JobState | None:
-        """Run a claimed job or a slice of it; see `signature_job.run` and `Tasks.run`."""
+        """Run a claimed job or a slice of it; return its new state, or None for a lost lease."""
         context, settings = self._context, self._context.settings
         with work_of(work.job.tenant):  # jobs that this job creates belong to the same tenant
             if isinstance(work, LongJob):

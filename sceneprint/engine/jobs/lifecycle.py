@@ -58,7 +58,7 @@ class Outdated(Exception):
 
 
 def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
-    """Return a claimed job to the queue, due after `after_s` seconds; ignore a lost lease."""
+    """Return a claimed job to the queue, due in `after_s` seconds, unless the lease was lost."""
     writing = store.database.write(map_number=work.map.number)
     with suppress(LostLease), writing as connection:
         queue.release_job(connection, work.job, after_s)
@@ -69,7 +69,7 @@ def put_back(store: Store, work: Work, after_s: float = 0.0) -> None:
 def restart_job(store: Store, work: Work) -> JobState | None:
     """Queue a job whose map has switched models, or cancel it if its frame is signed again.
 
-    Return the state of the job; None if the lease was lost.
+    Return QUEUED or CANCELLED; None if the lease was lost.
     """
     if not work.again:
         put_back(store, work)
@@ -91,7 +91,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
     """Mark a job as failed, and its frame as rejected, after an error that a retry would repeat.
 
     A frame that is signed again (`work.again`) is not rejected. If the map has switched models, the
-    job is restarted; see `restart_job`. Return the state of the job; None if the lease was lost.
+    job is restarted. Return FAILED, or the result of `restart_job`; None if the lease was lost.
     """
     reason = str(error).removeprefix(f"{work.frame.id}: ")
     try:
@@ -112,7 +112,7 @@ def reject(store: Store, work: Work, error: FrameError) -> JobState | None:
 def break_down(store: Store, work: Work, error: Exception) -> JobState | None:
     """Queue a failed job for another attempt, or mark it as dead and its frame as failed.
 
-    Return the state of the job; None if the lease was lost.
+    Return QUEUED or DEAD; None if the lease was lost.
     """
     reason, trace = failure_texts(error)
     log.error("job raised an exception", extra=about(work, error=reason, traceback=trace))
@@ -289,7 +289,7 @@ def retry_dead(
     store: Store, bell: Wakeup, cursor: str | None = None, limit: int = 100,
     map_names: Collection[str] | None = None,
 ) -> RetriedJobs:  # fmt: skip
-    """Retry the dead jobs of a page, newest first; skip jobs that were already retried.
+    """Retry the dead jobs of a page, newest first, unless retried before; return the new jobs.
 
     Each retry is a transaction of its own, so an error does not undo earlier retries. Raise
     InvalidRequest if the service did not issue the cursor.
@@ -344,7 +344,7 @@ def fail_frame(connection: Connection, job: JobRow, reason: str | None) -> None:
 
 
 def _retry_task(connection: Connection, job: JobRow) -> tuple[Job, bool]:
-    """Queue a failed long job again, so that it resumes after its last slice; see `retry`."""
+    """Queue a failed long job again, to resume after its last slice; return it as `retry` does."""
     if not job.state.over:
         return _job_record(connection, job), False
     if job.state == JobState.SUCCEEDED:

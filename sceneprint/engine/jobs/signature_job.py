@@ -141,7 +141,7 @@ def run(
 
 
 def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> SigningResult:
-    """Sign a frame, and store its artifact; raise Outdated if the map no longer uses the model."""
+    """Sign a frame, and store its artifact; raise Outdated if the model is no longer in use."""
     if work.model_id not in models_of(work.map):
         raise lifecycle.Outdated
     signer = signers(work.model_id)
@@ -159,7 +159,7 @@ def _sign(store: Store, signers: Signers, work: lifecycle.Work) -> SigningResult
 def _store_patiently(
     store: Store, signers: Signers, readers: Readers, work: lifecycle.Work, result: SigningResult
 ) -> list[str]:
-    """Call `_store`; while the database is unreachable, retry for AWAY_S seconds.
+    """Store a result, and return blobs, as `_store` does; retry for AWAY_S seconds if necessary.
 
     If an earlier attempt was committed after all, a retry raises LostLease.
     """

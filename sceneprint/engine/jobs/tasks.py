@@ -194,7 +194,7 @@ class Tasks:
         self, task: LongJob, lease_s: float, longest_s: float,
         broke: Callable[[], None] | None = None,
     ) -> JobState | None:  # fmt: skip
-        """Run a slice of a claimed job; see `signature_job.run` for parameters and result."""
+        """Run a slice of a job, and store its results; return its state; None for a lost lease."""
         start, job = time.perf_counter(), task.job
         state: JobState | None
         try:
@@ -227,7 +227,7 @@ class Tasks:
         return state
 
     def _end_of_slice(self, job: JobRow) -> IsOver:
-        """Return the `IsOver` function of a slice that starts now."""
+        """Return a function that tells a slice that starts now to end; see IsOver."""
         until, look_at = time.monotonic() + SLICE_S, 0.0
 
         def is_over() -> bool:

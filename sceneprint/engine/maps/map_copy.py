@@ -62,7 +62,7 @@ _NAMES = [column.name for column in COLUMNS]
 
 
 def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes, int]]:
-    """Yield the digest, bytes and number of rows of each part of the indexed frames of a map."""
+    """Yield each part of the indexed frames of a map as its digest, bytes and number of rows."""
     for rows, _ in cut_rows(encoded_rows(COLUMNS, copied_rows(connection, row)), [0]):
         data = write_part(_NAMES, rows)
         yield hashlib.sha256(data).hexdigest(), data, len(rows)
@@ -143,7 +143,7 @@ class PulledMap:
     bytes: int
 
 
-#: Name of the file that marks a data folder of map copies, which `pull_map` may change.
+#: Name of the file that marks a data folder as one for map copies, which `pull_map` may change.
 _MARK = "map-copy.json"
 
 
@@ -183,7 +183,7 @@ def pull_map(
     client: Client, store: Store, map_name: str,
     progress: Callable[[int, int], None] | None = None,
 ) -> PulledMap:  # fmt: skip
-    """Create the copy of a map, or update it to the current state of the service.
+    """Create or update the copy of a map from the service; return the numbers of changes.
 
     Queries of the copy use its former state until the update is complete.
 
@@ -241,7 +241,7 @@ def pull_map(
 
 
 def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
-    """Return the rows of a map by part digest and frame id; empty if the map does not exist."""
+    """Return rows by frame id for each part digest of a map; empty if the map does not exist."""
     with store.database.read() as connection:
         row = next((record for record in list_maps(connection) if record.name == map_name), None)
         if row is None:
@@ -287,7 +287,7 @@ def _changed(map_name: str) -> Conflict:
 
 
 def _find_copy(connection: Connection, head: MapCopy) -> MapRow | None:
-    """Return the copy of a map; None without a copy, or if it copies a former map of this name."""
+    """Return the copy of a map; None if there is none, or it copies a former map of this name."""
     row = next((record for record in list_maps(connection) if record.name == head.name), None)
     if row is None or (row.created_at, row.model_id) != (head.created_at, head.model_id):
         return None

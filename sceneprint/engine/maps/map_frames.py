@@ -90,7 +90,7 @@ def find_indexed(store: Store, map_name: str, frame_id: str) -> IndexedFrame:
 
 
 def living(row: MapRow, frame: FrameRow) -> FrameRow:
-    """Return the frame; raise UnknownFrame if it was deleted."""
+    """Return `frame` unchanged; raise UnknownFrame if it was deleted."""
     if frame.state == FrameState.DELETED:
         raise errors.UnknownFrame(f"Frame {frame.id} of map {row.name!r} was deleted.")
     return frame
@@ -162,7 +162,7 @@ def get_frame(store: Store, map_name: str, frame_id: str) -> Frame:
 
 
 def _position_cursor(store: Store, last: FrameRow, listing: FrameListing) -> str:
-    """Return a cursor for the page after a frame; it contains the sort key besides the number."""
+    """Return a cursor for the page after a frame: its sealed number and, if needed, sort key."""
     sealed = store.seals.seal("frame", last.number)
     if listing.order != "taken":
         return sealed
@@ -254,7 +254,7 @@ def trajectory(store: Store, map_name: str, run: Run) -> Trajectory:
 
 
 def _why_empty(run: Run, total: int, *, posed: bool) -> str:
-    """Return the reason why a trajectory is empty."""
+    """Return an explanation of why a trajectory is empty."""
     if not total:
         part = run.captured_after is not None or run.captured_before is not None
         return f"the map has no frame of session {run.session!r:.140}{' in this period' * part}"
@@ -363,7 +363,7 @@ class Output(Generic[T]):
 def upload_type(data: bytes) -> tuple[str, str]:
     """Return the media type of an upload, and its file name suffix."""
     kind = format_at(data, "depth", "cloud")
-    if kind is None:  # a KITTI scan
+    if kind is None:  # KITTI scans have no magic bytes
         return BYTES, ".bin"
     return kind.media_type, next(iter(kind.suffixes), ".bin")
 
@@ -495,7 +495,7 @@ class FrameFiles:
         return Output(indexed.tag("vector", media_type), make)
 
     def upload(self, map_name: str, frame_id: str) -> Output[bytes]:
-        """Return the upload of a frame, byte for byte.
+        """Return the uploaded file of a frame, unchanged.
 
         Raises
         ------
@@ -515,7 +515,7 @@ class FrameFiles:
         return Output(tag_of("upload", blob), lambda: self._store.blobs.get(blob), blob)
 
     def _hierarchy(self, indexed: IndexedFrame) -> tuple[Surface, Hierarchy]:
-        """Compute surface and hierarchy of a frame from its upload, since stored points are
+        """Return surface and hierarchy of a frame, from its upload, since stored points are
         rounded.
         """
         p = self._signers(indexed.row.model_id).model.parameters
@@ -526,7 +526,7 @@ class FrameFiles:
         return surface, hierarchy_of(surface, p, indexed.frame.id)
 
     def _labels(self, indexed: IndexedFrame) -> Ints32:
-        """Return the label image of the finest patches; points of a cloud are projected into it."""
+        """Return the label image of the finest patches; points of clouds are projected into it."""
         surface, hierarchy = self._hierarchy(indexed)
         labels = hierarchy.labels[0]
         if isinstance(surface.camera, Intrinsics):

@@ -142,7 +142,7 @@ def edit_frame(
     store: Store, map_name: str, frame_id: str, patch: Mapping[str, Any],
     if_match: Collection[str] | None = None,
 ) -> Frame:  # fmt: skip
-    """Edit the metadata of a frame with a JSON merge patch (RFC 7396).
+    """Edit the metadata of a frame with a JSON merge patch (RFC 7396); return the frame.
 
     A pose in a joined parent frame is converted to the root frame.
 
@@ -178,8 +178,7 @@ def edit_map(
     store: Store, map_name: str, patch: Mapping[str, Any],
     if_match: Collection[str] | None = None, *, dry_run: bool = False,
 ) -> Map:  # fmt: skip
-    """Edit the title, the limits and the up vector of a map; see `edit_frame` for parameters and
-    errors.
+    """Edit the title, the limits and the up vector of a map; return the map. See `edit_frame`.
 
     The caller must check the permission to set quotas. With `dry_run`, nothing is stored.
     """
@@ -240,7 +239,7 @@ def _relative_transform(
 
 
 def _merge_transform(now: Mapping[str, Any] | None, change: Mapping[str, Any]) -> dict[str, Any]:
-    """Apply a patch to a transform; the result has only one of the two notations."""
+    """Return a transform after a patch; the result has only one of the two notations."""
     change = {ROS_NAMES.get(name, name): value for name, value in change.items()}
     old = dict(now or {})
     if "matrix" in old and ("translation" in change or "rotation" in change):
@@ -281,7 +280,7 @@ TIDY_S = 2.0
 
 
 def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Path | Model) -> Map:
-    """Start to re-encode a map with another model; if this has already started, retry failed jobs.
+    """Start to re-encode a map, or retry failed jobs if this has already started; return the map.
 
     Parameters
     ----------
@@ -317,7 +316,7 @@ def begin_reencoding(store: Store, bell: Wakeup, map_name: str, model: str | Pat
 
 
 def cancel_reencoding(store: Store, map_name: str) -> Map:
-    """Cancel the re-encoding of a map, and remove the signatures of the next model.
+    """Cancel the re-encoding of a map, remove signatures of the next model, and return the map.
 
     Raises
     ------

@@ -77,7 +77,7 @@ def coverage_plans(
     Returns
     -------
     plans : plans in the order of `queried`
-    cell_m : cell width, metres; a multiple of the requested width if that has too many cells
+    cell_m : cell width, metres; a multiple of the requested width if that needs too many cells
     """
     flat = {name: positions.get(name, np.empty((0, 3))) @ axes[name].axes.T for name in queried}
     flat_queried = {
@@ -144,7 +144,7 @@ def localisability(cell: CoverageCell) -> float:
 def plan_changes(
     before: Sequence[CoveragePlan], after: Sequence[CoveragePlan]
 ) -> list[PlanChanges]:
-    """Return the changes of the cells in which either of two comparable results queried frames."""
+    """Return the trends of the cells that have queried frames before or after, by parent frame."""
     names = dict.fromkeys(plan.parent_frame for plan in (*after, *before))
     changed = []
     for name in names:

@@ -136,7 +136,7 @@ class MapSurfaces:
         self, map_name: str, parent: str | None = None, level: int = 0,
         cursor: str | None = None, limit: int = 1000,
     ) -> Page[SurfaceTile]:  # fmt: skip
-        """Return a page of tiles, sorted by column, row and floor; it is empty without a surface.
+        """Return a page of tiles, sorted by column, row and floor; empty if there is no surface.
 
         Parameters
         ----------
@@ -405,7 +405,7 @@ def remove_block(store: Store, row: MapRow) -> bool:
 
 #: Seconds between checks of all maps, and maximum delay of a job while new frames arrive.
 LOOK_S, LONGEST_S = 5.0, 60.0
-#: Time of the first change, for a map without unhandled changes.
+#: Time of the first unhandled change of a map without such changes.
 _DONE = math.inf
 #: Maximum number of surface rows to insert in one check.
 _ROWS_AT_ONCE = 100
@@ -422,7 +422,7 @@ class SurfaceUpkeep:
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:
         self._store, self._bell, self._auto = store, bell, auto
         self._next = 0.0
-        # by map: revision and number of edits, and time of the first unhandled change
+        # for each map: revision and number of edits, and time of the first unhandled change
         self._seen: dict[int, tuple[tuple[int, int], float]] = {}
 
     def run(self) -> None:
@@ -612,7 +612,7 @@ def _tiles_around(spot: Sequence[float], within: float, tile_m: float) -> list[T
 
 
 def _drawn_level(surface: SurfaceRow, totals: Sequence[LevelTotals], plan: PlanFrame) -> int:
-    """Return the coarsest level with cells up to a pixel wide, or a coarser one if it is large."""
+    """Return the coarsest level with cells up to a pixel wide, or a coarser one with few cells."""
     fine = [level for level in totals if surface.cell_m * FACTOR**level.level <= plan.m_per_pixel]
     first = fine[-1].level if fine else 0
     few = [level.level for level in totals if level.level >= first and level.cells <= _DRAWN_CELLS]

@@ -43,7 +43,7 @@ def delete_selection(
     store: Store, map_name: str, selection: FrameSelection, tombstones: Tombstones,
     seconds: float = CALL_S,
 ) -> FramesDeleted:  # fmt: skip
-    """Delete selected frames in blocks.
+    """Delete selected frames in blocks; return the numbers of deleted and of remaining frames.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def delete_selection(
 def edit_selection(
     store: Store, map_name: str, edit: FramesEdit, seconds: float = CALL_S
 ) -> FramesEdited:
-    """Edit up to 1000 selected frames in blocks.
+    """Edit up to 1000 selected frames in blocks; return counts, the last id and inverse edits.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def delete_session(
     store: Store, map_name: str, session: str, tombstones: Tombstones, robot: str | None = None,
     seconds: float = CALL_S,
 ) -> SessionChange:  # fmt: skip
-    """Delete all frames of a session in blocks.
+    """Delete all frames of a session in blocks; return the numbers of deleted and remaining ones.
 
     Parameters
     ----------

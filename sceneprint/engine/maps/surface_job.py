@@ -54,7 +54,7 @@ from sceneprint_client.surface_encoding import CELL, NO_SESSION, SIDE, STEPS
 SURFACE, UPDATED = "surface", "surface.updated"
 #: Seconds for which a slice fuses frames; writing the tiles takes about as long.
 SLICE_S = 1.5
-#: Number of levels of a surface, and width of its finest cells in voxel widths of the model.
+#: Number of levels of a surface, and width of its finest cells in voxels of the model.
 LEVELS, VOXELS = 3, 2.5
 #: Maximum number of parent frames in a record, and of sessions that cells distinguish.
 MOST_PARENTS, MOST_SESSIONS = 20, 10_000
@@ -155,7 +155,7 @@ class SurfaceHandler:
         self._store, self._signers = store, signers
 
     def __call__(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice: add or remove frames, rebuild tiles, or conclude the job."""
+        """Add or remove frames, rebuild tiles, or conclude the job; return the slice's results."""
         is_over = ends_within(is_over, SLICE_S)
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
@@ -188,7 +188,7 @@ class SurfaceHandler:
         return self._conclude(row, surface, progress)
 
     def _reset(self, row: MapRow, surface: SurfaceRow, task: LongJob) -> SliceResult:
-        """Remove a block of tiles of a former model; after the last block, reset the surface."""
+        """Return a slice that removes a block of tiles of a former model, or resets the surface."""
         cell_m = cell_width(self._signers(row.model_id).model.parameters.cloud.voxel_size)
 
         def write(connection: Connection) -> Collection[str]:
@@ -204,7 +204,7 @@ class SurfaceHandler:
         return SliceResult(False, dict(task.progress), write=write)
 
     def _remove_frames(self, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Remove deleted and edited frames, and schedule their tiles to be rebuilt."""
+        """Return a slice that removes deleted and edited frames, and marks tiles to be rebuilt."""
         with self._store.database.read() as connection:
             numbers = stored.frames_to_remove(connection, surface, _REMOVED)
         if not numbers:
@@ -221,9 +221,7 @@ class SurfaceHandler:
         self, surface: SurfaceRow, progress: dict[str, Any], tiles: Sequence[TileRow],
         is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        """Rebuild tiles from the frames that overlap them, while time allows; store unfinished
-        drafts.
-        """
+        """Rebuild tiles from the frames that overlap them, while time allows; return the slice."""
         tiles = _leading_tiles(tiles)
         last = tiles[0].rebuilt_to or 0
         sums: dict[_Key, list[CellSums]] = {}
@@ -277,7 +275,7 @@ class SurfaceHandler:
         self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any],
         new: Sequence[FusedFrame], is_over: IsOver,
     ) -> SliceResult:  # fmt: skip
-        """Fuse frames into the tiles that they overlap, while time allows."""
+        """Fuse frames into the tiles that they overlap, while time allows; return the slice."""
         times = [frame.captured_at for frame in new if frame.captured_at is not None]
         scale = scale_of(surface)
         if times and (scale is None or not scale.holds(min(times), max(times))):
@@ -309,7 +307,7 @@ class SurfaceHandler:
         return self._result(surface, progress, done, sessions, _Addition(row, added, touches))
 
     def _change_scale(self, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """Extend the time scale of a surface to all its frames."""
+        """Return a slice that extends the time scale of a surface to all its frames."""
 
         def write(connection: Connection) -> Collection[str]:
             times = stored.capture_range(connection, surface)
@@ -324,7 +322,7 @@ class SurfaceHandler:
         return SliceResult(False, progress, write=write)
 
     def _conclude(self, row: MapRow, surface: SurfaceRow, progress: dict[str, Any]) -> SliceResult:
-        """End the job, or continue with another slice if frames have changed meanwhile."""
+        """Return the last slice, or a slice that continues the job if frames have changed."""
         with self._store.database.read() as connection:
             row = current_map(connection, row)
             now = stored.find_surface(connection, row.number)
@@ -364,7 +362,7 @@ class SurfaceHandler:
         return {(frame.parent, place): cells for place, cells in tiles.items()}
 
     def _sums_of(self, tiles: Iterable[TileRow], done: _Slice) -> dict[_Key, CellSums]:
-        """Read the cell sums of tiles; add damaged tiles to `done.damaged`."""
+        """Return the cell sums of tiles; add damaged tiles to `done.damaged`."""
         sums: dict[_Key, CellSums] = {}
         for tile in tiles:
             key = tile.parent, tile.place

@@ -1,4 +1,4 @@
-"""Tombstones: deleted frames can be restored for a while, and are purged afterwards."""
+"""Tombstones: deleted frames can be restored for a limited time, and are then purged."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Tombstones:
         self._wake()
 
     def restore(self, map_name: str, deletion_id: str, seconds: float = CALL_S) -> FramesRestored:
-        """Restore, block by block, the frames that a deletion removed.
+        """Restore the frames of a deletion in blocks; return counts and the refused frames.
 
         Parameters
         ----------

@@ -123,7 +123,7 @@ def runs_of(connection: Connection, row: MapRow, request: NewAssociation) -> lis
 def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
     """Return the frame numbers to compare the next frame with, in ascending order.
 
-    These are the frames of the other session, or sufficiently earlier frames of the same session.
+    These are the frames of the other session, or far enough earlier frames of the same session.
     """
     place, target = progress["done"], progress["target"]
     if len(request.sessions) == 2:
@@ -131,7 +131,7 @@ def eligible(request: NewAssociation, progress: Mapping[str, Any]) -> Keys:
     apart = request.apart or (1 if request.not_within_s is not None else APART)
     before = np.array(target[: max(place - apart + 1, 0)], np.int64)
     if request.not_within_s is not None:
-        times = np.array(progress["taken"], float)  # NaN if unknown: comparisons are false
+        times = np.array(progress["taken"], float)  # NaN if unknown, which makes comparisons false
         before = before[times[: len(before)] < times[place] - request.not_within_s]
     return np.sort(before)
 
@@ -211,7 +211,7 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
         self, task: LongJob, request: NewAssociation, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Conclude a job with verdicts on the edges, and joins of the parent frames."""
+        """Return the last slice, with verdicts on the edges and joins of the parent frames."""
         source, target = progress["source"], progress["target"]
         with self._store.database.read() as connection:
             edges = items_of(connection, task.job.number) + items
@@ -270,9 +270,9 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 
     def _rooted(self, task: LongJob, joins: list[dict[str, Any]]) -> list[ParentJoin]:
         """Return the transforms of strong joins to the root, the parent frame with the oldest
-        frames.
+        frames, at most one for each parent frame.
 
-        Also set the field `root` of these joins.
+        Set the field `root` of these joins in `joins`.
         """
         with self._store.database.read() as connection:
             parents = [run.parent for run in posed_runs(connection, task.of_map.number)]
@@ -422,8 +422,8 @@ class Associations(StepwiseProducts[NewAssociation, Association]):
 def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> list[str]:
     """Join parent frames in the commit that ends an association; return an empty list of blobs.
 
-    Raise Swept if another association joined one of the parent frames, so the slice must be
-    repeated.
+    Raise Swept if another association joined one of the parent frames, in which case the slice must
+    be repeated.
     """
     for join in joins:
         if not join_parent(connection, task.of_map.number, join, task.job.id):
@@ -432,7 +432,7 @@ def _apply(task: LongJob, joins: list[ParentJoin], connection: Connection) -> li
 
 
 def _item(number: int, match: PairMatch) -> dict[str, Any]:
-    """Return the item that stores an edge from frame `number`."""
+    """Return an edge from frame `number` to a match as a JSON item to store."""
     v = match.validation
     T = np.eye(4) if v.T_match_query is None else v.T_match_query
     return {

@@ -40,7 +40,7 @@ _JOBS = 200
 
 
 class JoinUpkeep:
-    """Scheduler of associations; several processes may run it. Without `auto`, it does nothing."""
+    """Scheduler of associations; several processes may run it. Without `auto`, it is disabled."""
 
     def __init__(self, store: Store, bell: Wakeup, *, auto: bool) -> None:
         self._store, self._bell, self._auto = store, bell, auto
@@ -65,7 +65,7 @@ class JoinUpkeep:
     def _queue_next(self, row: MapRow) -> bool:
         """Queue the next association of a map, once all frames are signed; wake a worker.
 
-        Return whether the map needs no check until it changes: there is nothing to associate.
+        Return True if there is nothing to associate until the map changes.
         """
         with self._store.database.read() as connection:  # usually none is due: avoid a write lock
             states = count_states(connection, row.number)
@@ -75,7 +75,7 @@ class JoinUpkeep:
                 return True
         with self._store.database.write(map_number=row.number) as connection:
             row = map_of_number(connection, row.number)
-            request = _next_association(connection, row)  # again, under the lock
+            request = _next_association(connection, row)  # check again under the lock
             if request is not None:
                 data = request.model_dump(mode="json", exclude_unset=True)
                 kind = Associations.kind
@@ -133,7 +133,7 @@ def _request(run: ParentRun, root: ParentRun) -> NewAssociation | None:
 
 
 def _is_worth(request: NewAssociation, total: int, jobs: Sequence[JobRow]) -> bool:
-    """Return whether two sessions were never associated, or have grown since they were."""
+    """Return whether two sessions were never associated, or have grown enough since then."""
     for job in jobs:
         before = NewAssociation.model_validate(job.data or {})
         if {*sessions_of(before)} == {*sessions_of(request)}:

@@ -141,7 +141,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         plain = Query(seed=request.seed, keep=False)
         origin = QueryOrigin(stop.robot, stop.session, stop.captured_at)
         left_out_s = request.not_within_s
-        if request.other_sessions:  # excludes the whole session, even without times
+        if request.other_sessions:  # exclude the whole session, even without times
             origin, left_out_s = replace(origin, captured_at=stop.captured_at or 0.0), _FOREVER_S
         query = plain
         if left_out_s > 0 and origin.session is not None and origin.captured_at is not None:
@@ -161,7 +161,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         self, task: LongJob, request: NewMapCoverage, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Conclude a job with counts, and plans as items after the items of the frames."""
+        """Return the last slice, with counts, and with plans as items after those of the frames."""
         with self._store.database.read() as connection:
             row = current_map(connection, task.of_map)
             results = items_of(connection, task.job.number) + items
@@ -208,7 +208,7 @@ class Coverages(StepwiseProducts[NewMapCoverage, MapCoverage]):
         return Page[CoverageFrame](items=items, next_cursor=more)
 
     def changes(self, map_name: str, job_id: str, since: str) -> CoverageChanges:
-        """Compare two results of the same map and the same options.
+        """Return the changes of cells between two results with the same map and options.
 
         Parameters
         ----------
@@ -292,7 +292,7 @@ def _frame_record(item: dict[str, Any], stops: dict[int, PathFrame]) -> Coverage
 
 
 def outcome_of(answer: Answer, stop: PathFrame, request: NewMapCoverage) -> dict[str, Any]:
-    """Return the item of a queried frame: outcome, pose errors, and ids of look-alikes.
+    """Return the outcome, pose errors and ids of look-alikes of a queried frame as a JSON item.
 
     Parameters
     ----------
@@ -337,12 +337,12 @@ def _is_within(off: tuple[float, float], request: NewMapCoverage) -> bool:
     return off[0] <= request.tolerance_m and math.degrees(off[1]) <= request.tolerance_deg
 
 
-#: Maximum distance, in metres, between a pose of an answer and the pose by a supporting match.
+#: Maximum distance, metres, between an answer's pose and the pose that a match implies.
 _SAME_POSE_M = 1.0
 
 
 def _look_alikes(answer: Answer, poses: Sequence[Transform]) -> list[str]:
-    """Return the ids of the matches that imply the poses most closely, without repetition."""
+    """Return the id of the match nearest to each pose, without duplicates."""
     frame_ids: list[str] = []
     for pose in poses:
         near = [

@@ -108,7 +108,7 @@ def _place_vertices(
     """
     counted = Counter(stop.parent for stop in stops if stop.pose is not None)
     parents = sorted((name for name in counted if name), key=lambda name: (-counted[name], name))
-    into: dict[str, tuple[str, Floats]] = {}  # T_root_parent, by parent
+    into: dict[str, tuple[str, Floats]] = {}  # root and T_root_parent by parent
     for root in parents:
         if root in into:
             continue

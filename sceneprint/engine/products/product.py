@@ -78,7 +78,7 @@ class Products(ABC, Generic[Request, Record]):
 
     @abstractmethod
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run a slice of a job: at least one step, or the conclusion of the job."""
+        """Run a slice, at least one step or the conclusion of the job; return its results."""
 
     def fields(self, job: JobRow) -> dict[str, Any]:
         """Return the record fields that depend on the request of a job."""
@@ -287,7 +287,7 @@ class Products(ABC, Generic[Request, Record]):
 
 
 def spread_evenly(numbers: list[int], most: int) -> list[int]:
-    """Return at most `most` of the numbers, evenly spaced."""
+    """Return the numbers if there are at most `most`, otherwise `most` of them, evenly spaced."""
     if len(numbers) <= most:
         return numbers
     return [numbers[i * len(numbers) // most] for i in range(most)]
@@ -307,10 +307,10 @@ class StepwiseProducts(Products[Request, Record]):
         self, task: LongJob, request: Request, progress: dict[str, Any],
         items: list[dict[str, Any]],
     ) -> SliceResult:  # fmt: skip
-        """Conclude a job after its last step; `items` are those of the last slice."""
+        """Return the last slice of a job, after its last step; `items` are those of this slice."""
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Run at least one step, and more while time allows; conclude the job after the last."""
+        """Run at least one step, more while time allows, and the conclusion; return the slice."""
         request: Request = self.record.request_type.model_validate(task.data)  # type: ignore[assignment]
         is_over = ends_within(is_over, SLICE_S)
         progress = dict(task.progress) or self.restart(task.of_map, request)

@@ -111,7 +111,7 @@ def fused(
     open3d("A reconstruction")
     p = FusionParameters(voxel_m=request.voxel_m)
     frames, parts, left_out = list[DepthFrame](), list[FusedView](), list[LeftOut]()
-    # a cloud cannot be fused; only the share of it that the matches explain is computed
+    # a cloud cannot be fused; compute only the share of it that the matches explain
     if query is not None and request.include_query and isinstance(query.surface.camera, Intrinsics):
         frame, source = _own(store, query, own, model_id, as_of)
         frames.append(prepare_view(frame, p))
@@ -241,7 +241,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
     record = Reconstruction
 
     def begin_for(self, stored: StoredAnswer, request: NewReconstruction) -> Reconstruction:
-        """Queue a reconstruction. The job copies the data of the answer, which may expire.
+        """Queue and return a reconstruction. It copies the data of the answer, which may expire.
 
         Parameters
         ----------
@@ -295,7 +295,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
         return not _is_current(connection, job)
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Fuse all views in one slice of a few seconds."""
+        """Fuse all views in one slice of a few seconds; return its results."""
         del is_over
         data = task.data
         request = NewReconstruction.model_validate(data["request"])
@@ -325,7 +325,7 @@ class Reconstructions(Products[NewReconstruction, Reconstruction]):
 
 
 def _matches_to_fuse(matches: Sequence[Match], request: NewReconstruction) -> list[Match]:
-    """Return the matches to fuse, in the order of the ranking; raise InvalidRequest without any."""
+    """Return the matches to fuse, by rank; raise InvalidRequest if there are none."""
     accepted = [m for m in matches if m.validation.status == "accepted" and m.transform is not None]
     if not accepted:
         raise InvalidRequest(

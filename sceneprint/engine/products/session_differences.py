@@ -126,7 +126,7 @@ class Differences(Products[NewDifference, Difference]):
         return any_purged(connection, [number for own in frames.values() for number in own])
 
     def run_slice(self, task: LongJob, is_over: IsOver) -> SliceResult:
-        """Fuse or compare at least one frame; conclude the job in its last slice."""
+        """Fuse or compare at least one frame, or conclude the job; return the slice's results."""
         is_over = ends_within(is_over, SLICE_S)
         request = NewDifference.model_validate(task.data)
         progress = dict(task.progress) or self.restart(task.of_map, request)
@@ -201,7 +201,7 @@ class Differences(Products[NewDifference, Difference]):
         return queue.JobFile(name, self._store.blobs.put(data), len(data), MEDIA_TYPE)
 
     def _conclude(self, row: MapRow, progress: dict[str, Any], state: _State) -> SliceResult:
-        """Conclude a job with the counts and the points of all cells by state."""
+        """Return the last slice, with the counts and the points of all cells by state."""
         frames = progress["frames"]
         positions, states = {}, {}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):

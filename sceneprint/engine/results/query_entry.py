@@ -35,7 +35,7 @@ class StoredAnswer:
     Parameters
     ----------
     vector : (D,) signature of the query
-    geometry : encoded geometry of the query; None without validation
+    geometry : encoded geometry of the query; None if validation is skipped
     ranked : frame numbers of R, in the order of R
     at : time of the answer, seconds since 1970
     origin : robot, session and capture time of an uploaded query

@@ -3,8 +3,8 @@
 NewQuery, StoredAnswer  --QueryLog.note, then a thread-->  row and file
 id  --QueryLog.find-->  StoredAnswer
 
-Logging never delays or fails a query. While the database is unreachable, entries wait in memory;
-lost entries are logged and counted.
+Logging never delays a query or makes it fail. While the database is unreachable, entries wait in
+memory; lost entries are logged and counted.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class QueryLog:
     def note(
         self, row: NewQuery, answer: StoredAnswer | None = None, shown: Sequence[int] = ()
     ) -> None:
-        """Queue a query for the log, with its answer if memory permits; never block or raise.
+        """Queue a query for the log, with its answer if memory permits, without waits or errors.
 
         Do nothing if the log is disabled; count the query as lost if too many queries wait.
 
@@ -158,7 +158,7 @@ class QueryLog:
             return self._changed.wait_for(lambda: self._settled >= target, wait_s)
 
     def close(self) -> None:
-        """Accept no more queries, and wait CLOSING_S seconds for the waiting ones to be written."""
+        """Accept no more queries; after CLOSING_S seconds, count unwritten ones as lost."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -170,7 +170,7 @@ class QueryLog:
                 self._waiting.clear()
 
     def _write(self) -> None:
-        """Write queued queries until the log is closed."""
+        """Write queued queries in batches until the log is closed."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._closed)
@@ -189,7 +189,7 @@ class QueryLog:
                 return
 
     def _write_batch(self, batch: Sequence[_Waiting]) -> bool:
-        """Write a batch of queries; return False if the batch must be retried."""
+        """Write a batch of queries; return False if the caller must retry."""
         loss_reason = None
         try:
             if not self._store.database.read_only:
@@ -325,7 +325,7 @@ class QueryLog:
         return query_record(self.find_row(query_id), self._days, lambda _: True)
 
     def keep(self, query_id: str, title: str | None) -> QueryRecord:
-        """Make an answer permanent until `release`, and set its title.
+        """Make an answer permanent until `release`, set its title, and return its record.
 
         Raises
         ------
@@ -367,7 +367,7 @@ class QueryLog:
             record_change(connection, "answer.released", row.map, query_id)
 
     def remove_of_map(self, name: str) -> int:
-        """Remove all queries of a map in blocks; return their number.
+        """Remove all queries of a map in blocks; return the number of queries.
 
         Raise UnknownMap if the map does not exist.
         """
@@ -450,7 +450,7 @@ class QueryLog:
         self, find: Callable[[Connection, int], Sequence[int]],
         remove: Callable[[Connection, Sequence[int]], list[str]] = remove_queries,
     ) -> int:  # fmt: skip
-        """Remove the rows that `find` returns, in blocks, then their files; return their number."""
+        """Remove, in blocks, the rows that `find` returns and their files; return the row count."""
         query_ids: list[str] = []
 
         def remove_rows(connection: Connection, numbers: Sequence[int]) -> None:

@@ -108,7 +108,7 @@ class Pairs:
         self._cache = _ValidationCache()
 
     def find(self, query_id: str, frame_id: str, map_name: str | None = None) -> StoredPair:
-        """Return a stored answer with one of its matches.
+        """Return a stored answer together with one of its matches.
 
         Raises
         ------
@@ -173,7 +173,7 @@ class Pairs:
         return self._signers(pair.stored.model_id).model.parameters.validation
 
     def validated(self, pair: StoredPair, query: Geometry, match: Geometry) -> PairValidation:
-        """Validate a match with the options of its query; the result is cached."""
+        """Return the validation of a match with the options of its query; cache the result."""
         p = self.parameters(pair)
         seed, options = pair.stored.query.seed, thresholds(pair.stored.query.validation, p)
         key = pair.stored.answer.query_id, pair.blob
@@ -186,7 +186,7 @@ class Pairs:
                     return guided
             validation = validate(query, match, seed, *options, ups=pair.ups)
             if validation.reason != pair.match.validation.reason and pair.stored.up is not None:
-                # like the query, retry without up vectors
+                # retry without up vectors, as the query does
                 return validate_without_up(query, match, seed, options[0], pair.ups) or validation
             return validation
 
@@ -194,7 +194,7 @@ class Pairs:
 
 
 class _ValidationCache:
-    """Cache of the latest validations, without errors; concurrent requests share a computation."""
+    """Cache of recent validations, but not of errors; concurrent requests share a computation."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -304,7 +304,7 @@ class Inspection:
             rows = frames_of(connection, numbers)
             vectors = stored_signatures(connection, rows, stored.model_id)
             names = {row.number: row.name for row in list_maps(connection)}
-        # omit maps that were not searched, which the caller may not be permitted to read
+        # omit maps that were not searched, since the caller may not be permitted to read them
         readable = [
             n for n in numbers if n in vectors and names[rows[n].map_number] in stored.answer.maps
         ]
@@ -517,7 +517,7 @@ class PointClouds:
 
 
 def _limited_points(geometry: Geometry, limit: int) -> tuple[Floats32, int]:
-    """Return up to `limit` points with normals (N, 6), and the total number of points."""
+    """Return points and normals (N, 6), at most `limit`, and the number of all points."""
     every = sample_points(geometry.surface, 1)
     return np.ascontiguousarray(every[thinned(len(every), limit)]), len(every)
 

@@ -65,7 +65,7 @@ from sceneprint_client.api.query import Cause
 
 @dataclass
 class _Clock:
-    """Durations of the stages of a query, milliseconds; a stage may be timed several times."""
+    """Total durations of the stages of a query, milliseconds."""
 
     spent: dict[str, float]
     _since: float = field(default_factory=time.perf_counter)
@@ -229,7 +229,7 @@ def _attempt(
     store: Store, places: Sequence[SearchedMap], model: Model, prepared: PreparedQuery,
     query: Query, deadline: Deadline, prior: PosePrior | None, clock: _Clock | None = None,
 ) -> _Attempt:  # fmt: skip
-    """Search the maps for a frame of a query, and validate its candidates.
+    """Search the maps for a frame of a query, validate its candidates, and return the results.
 
     Frames with damaged signatures are queued for signing.
     """
@@ -324,7 +324,7 @@ def _answer(
 def _listed_matches(
     candidates: Candidates, last: _Attempt, checks: Validated, rivals: Sequence[PairMatch], k: int
 ) -> list[Match]:
-    """Return the match records of the candidates and the rivals, with at most `k` accepted ones."""
+    """Return match records of candidates and rivals, without accepted matches after the first k."""
     shown = listed([match for match in checks.matches if match.index in last.rows], k)
     hidden = {match.index for match in checks.matches} - {match.index for match in shown}
     order = candidates.ranking.indices.tolist()
@@ -382,7 +382,7 @@ def _counts(
     checks: Validated,
     matches: Sequence[PairMatch],
 ) -> Counts:
-    """Count the frames of the searched map `searched.parts[i]` that reached each stage."""
+    """Return the number of frames of the map `searched.parts[i]` that reached each stage."""
     part, hits = searched.parts[i], searched.hits[i]
     number = part.place.row.number
     statuses = [
@@ -421,7 +421,7 @@ def answer_status(
     query: Query, estimate: PoseEstimate | None, checks: Validated, matches: Sequence[PairMatch],
     counts: Counts, geometry: Geometry | None, p: ValidationParameters, *, posed: bool,
 ) -> Outcome:  # fmt: skip
-    """Determine the status of an answer, with its reason and cause.
+    """Return the status of an answer, with its reason and cause.
 
     Parameters
     ----------
@@ -429,7 +429,7 @@ def answer_status(
     checks : result of `validated`
     matches : validated candidates that still exist
     counts : number of frames at each stage, summed over the maps
-    geometry : geometry of the query; None without validation
+    geometry : geometry of the query; None if validation is skipped
     posed : whether an accepted match has a pose in the map
     """
     if "validate" not in query.stages:

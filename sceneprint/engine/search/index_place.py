@@ -103,7 +103,7 @@ class IndexPlace:
         return index_folder(self._indexes, row)
 
     def head(self, row: MapRow) -> IndexManifest | None:
-        """Return the newest manifest of a map; None without an index, or if the newest is
+        """Return the newest manifest of a map; None if there is no index, or if the newest is
         withdrawn.
         """
         if self._store is not None:
@@ -115,7 +115,7 @@ class IndexPlace:
         return None
 
     def last_number(self, row: MapRow) -> int:
-        """Return the highest index number of a map in the object store; 0 without an index."""
+        """Return the highest index number of a map in the object store; 0 if there is no index."""
         numbered = _numbered(self._list(row))
         return _number(numbered[-1]) or 0 if numbered else 0
 
@@ -179,7 +179,7 @@ class IndexPlace:
         numbered = _numbered(listed)
         if self._store is None or not numbered:
             return
-        now = max(entry.changed_at for entry in listed)  # by the clock of the object store
+        now = max(entry.changed_at for entry in listed)  # use the clock of the object store
         before = math.inf if clean else now - GRACE_S
         fetchable = [entry for entry, after in pairwise(numbered) if after.changed_at >= before]
         needed = set[str]()
@@ -262,7 +262,7 @@ class IndexPlace:
 
         Parameters
         ----------
-        version : current local version; None without an index
+        version : current local version; None if there is no index
         """
         folder = self.folder(row)
         since = 0 if version is None else version.revision

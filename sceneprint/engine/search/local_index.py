@@ -55,7 +55,7 @@ class IndexView:
     size : number of searchable frames
     dead : frame numbers of deleted frames in the index or the tail
     damaged : frame numbers of frames without a readable signature
-    version : version of the index; None without an index
+    version : version of the index; None if there is no index
     """
 
     model_id: str
@@ -69,14 +69,14 @@ class IndexView:
 
     @property
     def number(self) -> int:
-        """Number of the version of the index; 0 without an index."""
+        """Number of the version of the index; 0 if there is no index."""
         return 0 if self.version is None else self.version.number
 
     def search(
         self, query: Bytes, size: int, *, dead: frozenset[int], among: Keys | None = None,
         exact: bool = False,
     ) -> SearchHits:  # fmt: skip
-        """Return the `size` nearest frames, sorted by exact distance; see `index.search`."""
+        """Return the `size` nearest frames by exact distance, except `dead`; see `index.search`."""
         return search(
             query, self.version, self.tail, size, metric=self.metric, dead=dead, among=among,
             exact=exact,
@@ -86,7 +86,7 @@ class IndexView:
         self, query: Bytes, key: int, distance: int, *, dead: frozenset[int],
         among: Keys | None = None,
     ) -> int:  # fmt: skip
-        """Count the frames nearer than frame `key` at `distance`; ties are sorted by key."""
+        """Return the number of frames that rank before frame `key`, which is at `distance`."""
         hits = self.search(query, max(self.size, 1), dead=dead, among=among, exact=True)
         same = (hits.distances == distance) & (hits.keys < key)
         return int(((hits.distances < distance) | same).sum())
@@ -159,7 +159,7 @@ class AppendBuffer:
         self._places[change.number] = n
 
     def copy(self, after: int, without: Collection[int] = ()) -> AppendBuffer:
-        """Copy the signatures after a revision, except those of the frames `without`."""
+        """Return a buffer with the signatures after a revision, except of the frames `without`."""
         n = len(self)
         selected = (self._revisions[:n] > after) & ~np.isin(self._keys[:n], list(without))
         places = np.flatnonzero(selected)
@@ -189,7 +189,7 @@ class AppendBuffer:
 
 
 def _nameless(folder: Path, size: int) -> mmap.mmap:
-    """Map a new temporary file of `size` bytes; raise UnusableStore if the disk is full."""
+    """Return a mapped temporary file of `size` bytes; raise UnusableStore if the disk is full."""
     failed: OSError | None = None
     for place in (folder, Path(tempfile.gettempdir())):
         try:
@@ -236,7 +236,7 @@ Published = TypeVar("Published", IndexVersion, IndexManifest)
 
 
 def trusted(connection: Connection, row: MapRow, published: Published | None) -> Published | None:
-    """Return a version of an index if it is consistent with the database, else None.
+    """Return `published` if it is consistent with the database, else None.
 
     It is inconsistent if the database was restored to an earlier state, or no longer has the rows
     of frames that were deleted after the version.
@@ -268,7 +268,7 @@ class Reader:
 
     @property
     def version(self) -> IndexVersion | None:
-        """Current version of the index; None without an index."""
+        """Current version of the index; None if there is no index."""
         return self._view.version
 
     @property

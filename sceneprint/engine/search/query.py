@@ -63,7 +63,7 @@ TRIES = 5
 
 
 def steadily(store: Store, maps: Sequence[str], ask: Callable[[list[MapRow]], T]) -> T:
-    """Run a query; repeat it if one of its maps switched to another model meanwhile.
+    """Return the result of `ask`; call it again if a map has switched to another model meanwhile.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ Side = NamedFrame | tuple[bytes, FrameMeta]
 
 
 def compare(store: Store, signers: Signers, a: Side, b: Side, how: Comparison) -> Similarity:
-    """Compare two frames without storing them.
+    """Return the similarity of two frames, without storing them.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def _signer(store: Store, signers: Signers, rows: Sequence[MapRow], how: Compari
 
 
 def _cameras(a: PreparedQuery, b: PreparedQuery) -> tuple[str, str]:
-    """Return the names of both sensor frames; `a` and `b` replace frame ids that are equal."""
+    """Return the names of both sensor frames, with the ids `a` and `b` if the ids are equal."""
     ids = [x if side.frame is None else side.frame[1] for x, side in (("a", a), ("b", b))]
     if ids[0] == ids[1]:
         ids = ["a", "b"]
@@ -226,7 +226,7 @@ class Queries:
         self, maps: Sequence[str], data: bytes, meta: FrameMeta, query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Search maps for an uploaded frame, without storing it; see `prepare_upload`.
+        """Return the answer to an uploaded frame, which is not stored; see `prepare_upload`.
 
         Parameters
         ----------
@@ -253,7 +253,7 @@ class Queries:
         self, map_name: str, frames: Sequence[tuple[bytes, FrameMeta]], query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Localise the last frame of a sequence; earlier frames vote for its pose.
+        """Return the answer for the last frame of a sequence; earlier frames vote for its pose.
 
         Parameters
         ----------
@@ -284,7 +284,7 @@ class Queries:
         self, maps: Sequence[str], frame: FrameName, query: Query, since: float | None = None,
         sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Search maps for a stored frame, but do not match it with itself.
+        """Return the answer to a stored frame, which is not matched with itself.
 
         See `prepare_stored` and `upload`.
         """
@@ -304,7 +304,7 @@ class Queries:
         self, maps: Sequence[str], stored: StoredAnswer, query: Query,
         since: float | None = None, sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Repeat a query whose answer is stored, without sending its upload again.
+        """Return a new answer to a query whose answer is stored, without its upload.
 
         Parameters
         ----------
@@ -348,7 +348,7 @@ class Queries:
         self, expected: Sequence[MapRow], prepared: PreparedQuery, query: Query, deadline: Deadline,
         earlier: Sequence[SequenceFrame] = (), sent: SentQuery | None = None,
     ) -> Answer:  # fmt: skip
-        """Answer a prepared query with the current state of its maps, and log it; see `answer`."""
+        """Return the answer to a prepared query, with its maps' current state; log the query."""
         database = self._store.database
         with database.read() as connection:
             rows = find_maps(connection, [former.name for former in expected])
@@ -394,7 +394,7 @@ class Queries:
             return steadily(self._store, maps, ask)
 
     def compare(self, a: Side, b: Side, how: Comparison) -> Similarity:
-        """Compare two frames; see the function `compare`."""
+        """Return the similarity of two frames; see the function `compare`."""
         with self._cores.shared():
             return compare(self._store, self._signers, a, b, how)
 

@@ -96,7 +96,7 @@ class Candidates:
 
 
 def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
-    """Return the matches, but only the first `k` of the accepted matches."""
+    """Return the matches without the accepted ones after the first `k`."""
     accepted = [match.index for match in matches if match.validation.status == "accepted"]
     return [match for match in matches if match.index not in accepted[k:]]
 
@@ -104,7 +104,7 @@ def listed(matches: Sequence[PairMatch], k: int) -> list[PairMatch]:
 def match_records(
     candidates: Candidates, chosen: Sequence[int], matches: Sequence[PairMatch]
 ) -> list[MatchRecord]:
-    """Return match records: first validated candidates in their order, then the others by rank."""
+    """Return match records: first those of `matches`, then the unvalidated frames of `chosen`."""
     position = {int(candidates.ranking.indices[i]): i for i in chosen}
     checks = {match.index: match.validation for match in matches}
     order = [*checks, *(number for number in position if number not in checks)]
@@ -125,7 +125,7 @@ def _skipped(reason: str) -> ValidationRecord:
 
 
 def location_record(candidates: Candidates, estimate: PoseEstimate | None) -> LocationRecord | None:
-    """Return the API record of the pose of the query; None without a pose."""
+    """Return the API record of the pose of the query; None if there is no pose."""
     if estimate is None or estimate.average is None:
         return None
     average, (number, _, parent) = estimate.average, estimate.parent.partition(" ")
@@ -258,7 +258,7 @@ def validation_record(v: PairValidation) -> ValidationRecord:
 def explain(
     candidates: Candidates, checks: Validated, among: Ints64 | None, p: DiversityParameters | None
 ) -> list[Explanation]:
-    """Explain for each frame of the ranking R which stage it reached last, and why.
+    """Return, for each frame of the ranking R, which stage it reached last, and why.
 
     Parameters
     ----------
@@ -354,7 +354,7 @@ class ExplainedQuery:
 
 
 def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
-    """Explain at which stage a query rejected a frame, and how the frame would align.
+    """Return the stage at which a query rejected a frame, and how the frame would align.
 
     Raise UnknownFrame if the frame is not in the queried maps.
     """
@@ -409,7 +409,7 @@ def why(case: ExplainedQuery, frame_id: str) -> ExplainedFrame:
 
 
 def _locate_frame(case: ExplainedQuery, frame_id: str) -> tuple[retrieval.MapSearch, FrameRow]:
-    """Find a frame in the queried maps; return the search of its map, and its row.
+    """Return the search of the map that has the frame, and the row of the frame.
 
     If several maps have a frame of this id, prefer a map whose search can return it.
     """
@@ -484,7 +484,7 @@ def _lost(
 def _aligned(
     case: ExplainedQuery, part: retrieval.MapSearch, row: FrameRow
 ) -> tuple[ValidationRecord | None, np.ndarray | None]:
-    """Return the validation of a frame, and its transform; if necessary, validate it now."""
+    """Return validation and transform of a frame, validated now if necessary; None if unknown."""
     geometry = case.prepared.geometry
     if geometry is None:
         return None, None

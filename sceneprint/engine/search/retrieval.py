@@ -91,7 +91,7 @@ class Readers:
             self._open.pop(name, None)
 
     def purge(self, connection: Connection) -> None:
-        """Remove deleted frames from memory, except from the newest indexes."""
+        """Remove deleted frames from the readers, which switch to the newest indexes."""
         self.tidy(connection)
         with self._lock:
             readers = list(self._open.items())
@@ -125,7 +125,7 @@ class PreparedQuery:
     ----------
     model_id : id of the model of the signature
     vector : (D,) signature
-    geometry : geometry; None without validation
+    geometry : geometry; None if validation is skipped
     origin : robot, session and capture time
     frame : number and id of a stored frame, which the search excludes; None for an upload
     prepare_ms : duration of the preparation, milliseconds
@@ -160,7 +160,7 @@ class PreparedQuery:
 def prepare_upload(
     data: bytes, meta: FrameMeta, signer: Signer, query: Query, decoders: Decoders
 ) -> PreparedQuery:
-    """Decode and sign an uploaded frame.
+    """Return an uploaded frame as a query, decoded and signed.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def prepare_upload(
 def prepare_stored(
     store: Store, signers: Signers, map_name: str, frame_id: str, query: Query
 ) -> PreparedQuery:
-    """Load a stored frame as a query; rebuild a damaged signature or artifact from its upload.
+    """Return a stored frame as a query; rebuild damaged signatures and artifacts from uploads.
 
     Raises
     ------
@@ -311,7 +311,7 @@ class MapSearch:
     Parameters
     ----------
     dead : frame numbers to exclude: deleted frames, and the queried frame
-    among : frame numbers that pass the filter; None without a filter
+    among : frame numbers that pass the filter; None if there is no filter
     size : number of searchable frames
     """
 

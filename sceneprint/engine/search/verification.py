@@ -69,7 +69,7 @@ class Validated:
     matches : results of `associate` for the validated candidates
     unreadable : errors of unreadable artifacts, by frame number
     untried : reason why the other candidates were not validated
-    late : whether the deadline passed before enough were validated; None without a deadline
+    late : whether the deadline passed before enough were validated; None if there is no deadline
     geometries : geometries of the first validated candidates, by frame number
     """
 
@@ -84,7 +84,7 @@ class Validated:
 def thresholds(
     options: ValidationOptions | None, p: ValidationParameters
 ) -> tuple[ValidationParameters, Mode]:
-    """Apply the options of a query to validation parameters; return parameters and mode."""
+    """Return the validation parameters with the limits that a query sets, and its mode."""
     if options is None:
         return p, "full"
     own = options.model_dump(exclude={"mode", "residual_deg"}, exclude_unset=True)
@@ -100,14 +100,14 @@ def validated(
     validations: Mapping[int, PairValidation] | None = None, *, k: int = VERDICT_MATCHES,
     guided: bool = True, retry: bool = True,
 ) -> Validated:  # fmt: skip
-    """Validate candidates in order until `k` are accepted or the deadline passes.
+    """Validate candidates in order until `k` are accepted or time is up; return the results.
 
     Frames with an unreadable geometry are queued for signing.
 
     Parameters
     ----------
     chosen : positions in R of the candidates
-    geometry : geometry of the query; None without validation
+    geometry : geometry of the query; None if validation is skipped
     up : (3,) up vector in the sensor frame of the query; None if unknown
     validations : validations to reuse, by frame number
     k : number of accepted matches after which validation stops
@@ -307,7 +307,7 @@ def _prior_covariance(prior: Prior) -> Floats:
 def nearest_first(
     store: Store, ranking: Ranking, chosen: Sequence[int], prior: PosePrior, p: MapParameters
 ) -> list[int]:
-    """Sort candidates (positions in R): first those near a prior, then the others."""
+    """Return the candidates (positions in R), sorted so that those near a prior come first."""
     with store.database.read() as connection:
         viewpoints = viewpoints_among(connection, ranking.indices[list(chosen)].tolist())
     posed = {viewpoint.number: viewpoint for viewpoint in viewpoints}

@@ -18,7 +18,7 @@ from sceneprint.store.events import number_events
 
 
 def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
-    """Create the object that purges deleted frames.
+    """Return an object that purges the deleted frames of a context.
 
     Parameters
     ----------

@@ -47,7 +47,7 @@ from sceneprint.types import Bytes
 
 log = logging.getLogger(__name__)
 
-#: Seconds for which a step verifies indexes; meanwhile, jobs wait.
+#: Seconds for which a step verifies indexes, while jobs wait.
 STEP_S = 0.25
 #: Name of the file whose modification time is the start time of the last verification round.
 _STAMP = ".scrubbed"
@@ -161,7 +161,7 @@ class Upkeep:
         return published
 
     def rebuild(self, row: MapRow) -> IndexVersion:
-        """Build the index of a map from scratch, and publish it.
+        """Build the index of a map from scratch, publish it, and return it.
 
         Raises
         ------
@@ -191,7 +191,7 @@ class Upkeep:
 
         Returns
         -------
-        version : newest index of the next model; None without an index
+        version : newest index of the next model; None if there is no index
 
         Raises
         ------
@@ -265,7 +265,7 @@ class Upkeep:
         )
 
     def _is_aging(self, connection: Connection, row: MapRow, since: int) -> bool:
-        """Return whether an index lacks a deletion whose row is past half of its lifetime."""
+        """Return whether an index contains a frame whose deletion is past half of its lifetime."""
         key = (row.number, row.model_id)
         if row.revision == since or time.monotonic() < self._aged.get(key, 0):
             return False
@@ -370,7 +370,7 @@ class Upkeep:
         self, row: MapRow, share: Callable[[IndexManifest], bool], *, force: bool,
         rebuild: bool, clean: bool,
     ) -> IndexVersion | None:  # fmt: skip
-        model = self._signers(row.model_id).model  # before the transaction
+        model = self._signers(row.model_id).model  # load it before the transaction
         after, damaged = self._place.last_number(row), list[int]()
         with self._store.database.read() as connection:
             allow(connection, 0)  # no time limit, since the connection is idle during the build

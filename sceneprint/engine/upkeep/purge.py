@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 #: Maximum number of frames to delete in one commit (about 20 ms).
 AT_ONCE = 100
-#: Maximum duration of a call, seconds; meanwhile, jobs wait.
+#: Maximum duration of a call, during which jobs wait, seconds.
 TURN_S = 2.0
 #: Seconds between checks after all old frames and rows were deleted.
 LOOK_S = 60.0
@@ -151,7 +151,7 @@ class MemoryPurging:
         surplus queries and answers.
         """
         context, readers = self._context, self._context.readers
-        context.query_log.tidy()  # needed on nodes without workers
+        context.query_log.tidy()  # nodes without workers need this
         with context.store.database.read() as connection:
             if time.monotonic() - self._purged < self._every_s:
                 readers.tidy(connection)
@@ -166,7 +166,7 @@ class MemoryPurging:
 #: Minimum age, in seconds, of doomed blobs to remove here; the deleting process removes younger
 #: ones.
 _YOUNG_S = 60.0
-#: Maximum duration of the removal of doomed blobs, seconds; meanwhile, jobs wait.
+#: Maximum duration of the removal of doomed blobs, during which jobs wait, seconds.
 _SWEEP_S = 20.0
 #: Pause before the next purge of an index, as a multiple of the duration of the last purge.
 PAUSE = 10.0
@@ -219,7 +219,7 @@ class Purging:
         return self._purge_all(before, self._upkeep.is_purge_due, seconds=seconds)
 
     def now(self) -> Purged:
-        """Purge all deleted frames; no deletion can be undone afterwards.
+        """Purge all deleted frames, whose deletion then cannot be undone; return the counts.
 
         Raises
         ------

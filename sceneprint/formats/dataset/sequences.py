@@ -344,7 +344,7 @@ def find_sequences(
 
 
 def _with_note(sequences: Sequence[FrameSequence], note: str) -> tuple[FrameSequence, ...]:
-    """Return the sequences with `note` appended to the note of the first sequence, if any."""
+    """Return the sequences, with `note` appended to the note of the first one."""
     first = [
         replace(sequence, note="; ".join(filter(None, (sequence.note, note))))
         for sequence in sequences[:1]
@@ -531,7 +531,7 @@ def _is_above_images(folder: Path, files: list[str], folders: list[str], depth: 
 def _sequences_in(
     path: Path, files: list[str], layout: Layout, root: Path, camera: Camera | None = None
 ) -> tuple[FrameSequence, ...]:
-    """Return the sequences of a result of `_walk`; `root` is the path of the search."""
+    """Return the sequences in a folder or file that `_walk` found below `root`."""
     from sceneprint.formats import exports
 
     if not layout.is_export:
@@ -596,7 +596,7 @@ def _single_frame(file: Path) -> FrameSequence:
 
 
 def _split(folder: Path) -> Split | None:
-    """Return whether the scene's split files list a sequence for training or testing; None if not.
+    """Return the use that the scene's split files state for a sequence; None if neither lists it.
 
     Raise DatasetError if both list it.
     """

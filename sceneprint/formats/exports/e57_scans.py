@@ -111,7 +111,7 @@ def e57_sequence(path: Path, name: str) -> FrameSequence:
             f"{path}: No scan of the file has a single viewpoint ({reasons}). Upload the file as a "
             "whole with --as-map, or export structured scans with their poses."
         )
-    note = f"{len(frames)} of {len(scans)} scans taken"
+    note = f"{len(frames)} of {len(scans)} scans used"
     note += f"; skipped: {reasons}" if reasons else ""
     note += f"; {dense} scans with more than {MOST_POINTS} points are thinned" if dense else ""
     lost = count_lost(left_out)

@@ -62,7 +62,7 @@ class ScaledNpy:
         return self.converted(read_bytes(self.path, MAXIMUM_IMAGE_BYTES, UnreadableFrame))
 
     def converted(self, data: bytes) -> bytes:
-        """Convert the bytes of the file to metres; raise UnreadableFrame if they are invalid."""
+        """Return the file with floats in metres; PNGs and integers are returned unchanged."""
         if not data.startswith(NPY_SIGNATURE):
             return data
         samples = decode_npy(data)

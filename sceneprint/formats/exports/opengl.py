@@ -44,7 +44,7 @@ class Lens:
     ----------
     fx, fy, cx, cy : intrinsics, pixels
     width, height : size of the image, pixels
-    distortion : k1, k2, p1, p2 and optionally k3; empty without distortion
+    distortion : k1, k2, p1, p2 and optionally k3; empty if there is none
     """
 
     fx: float
@@ -167,7 +167,7 @@ def sequence_of(
         raise DatasetError(
             f"{folder}: No frame of this {layout.value} export has depth{why}. {remedy}"
         )
-    note = f"{len(frames)} frames of {layout.value} taken"
+    note = f"{len(frames)} frames of {layout.value} used"
     note += f"; skipped: {'; '.join(reasons)}" if reasons else ""
     lost = count_lost(left_out)
     return FrameSequence(name, folder, layout, name, None, tuple(frames), note, lost=lost)

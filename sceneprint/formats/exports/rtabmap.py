@@ -193,7 +193,7 @@ def rtabmap_sequences(path: Path, name: str | None = None) -> tuple[FrameSequenc
 
 @contextmanager
 def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open an untrusted database with restrictions.
+    """Yield an untrusted database, opened with restrictions.
 
     Raise DatasetError if the database has an unfinished journal, or SQLite raises an error.
     """
@@ -344,7 +344,7 @@ def _parse_node(row: tuple[Any, ...], version: Version, left_out: Counter[str]) 
 
 
 def _scale_camera(lens: RtabmapCamera, width: int, height: int) -> _NodeCamera:
-    """Scale the camera of a colour image to a depth image of `width` x `height` pixels.
+    """Return the camera of a depth image of `width` x `height` pixels, from a colour camera.
 
     Raise BrokenBlob if the images have different aspect ratios, or the camera is invalid.
     """
@@ -440,7 +440,7 @@ def _scan_frame(path: Path, name: str, node: _Node) -> FrameReference:
 
 
 def _describe(sequences: list[FrameSequence], is_optimised: bool, left_out: Counter[str]) -> str:
-    """Describe the frames, the source of their poses, and the omitted nodes for users."""
+    """Return a note for users on frames, the source of their poses, and omitted nodes."""
     frames = sum(len(sequence.frames) for sequence in sequences)
     poses = "optimised poses"
     if not is_optimised:
@@ -448,7 +448,7 @@ def _describe(sequences: list[FrameSequence], is_optimised: bool, left_out: Coun
             "odometry poses, because the database has no optimised poses: "
             "open and close it in RTAB-Map to store them"
         )
-    return f"{frames} frames taken, {poses}{_list_counts(left_out, '; skipped: ', '')}"
+    return f"{frames} frames used, {poses}{_list_counts(left_out, '; skipped: ', '')}"
 
 
 def _list_counts(counts: Counter[str], before: str, after: str) -> str:

@@ -69,7 +69,7 @@ class RtabmapCamera:
 
 
 class BrokenBlob(ValueError):
-    """A column has an invalid value. The message is the reason."""
+    """Error for an invalid value in a column; the message states the reason."""
 
 
 def transform(blob: bytes) -> Floats | None:

@@ -229,7 +229,7 @@ class ReadPoints:
     Parameters
     ----------
     points : (n, 3) float32, metres relative to the viewpoint; finite, at most `FARTHEST_M` per axis
-    viewpoint : position of the sensor, metres in the file's axes; None without a viewpoint
+    viewpoint : position of the sensor, metres in the file's axes; None if there is none
     file_points : number of points in the file, including missing points
     """
 
@@ -249,7 +249,7 @@ class Scan:
     Parameters
     ----------
     cloud : points relative to the viewpoint
-    viewpoint : position of the sensor, metres in the file's axes; None without a viewpoint
+    viewpoint : position of the sensor, metres in the file's axes; None if there is none
     file_points : number of points in the file, including missing points
     """
 
@@ -336,7 +336,7 @@ def decode_scan(
         if len(points) > MOST_POINTS:
             before = len(points)
             points, edge = thinned(points, MOST_POINTS)
-            thinning = f"thinned from {before} points to {len(points)}, one to {100 * edge:.1f} cm"
+            thinning = f"thinned from {before} points to {len(points)}, {100 * edge:.1f} cm apart"
             note = f"{note}; {thinning}" if note else thinning
             if len(points) < FEWEST_POINTS:
                 raise UselessFrame(

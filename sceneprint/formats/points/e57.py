@@ -160,7 +160,7 @@ def read_e57(data: Buffer) -> tuple[E57Scan, ...]:
             f"The file has version {major} of E57; only version 1 is supported. {_AS_PLY}"
         )
     if not _PAGE_BYTES[0] <= page <= _PAGE_BYTES[1] or page % 4:
-        raise UnreadableCloud(f"The header of the file declares pages of {page} bytes. {_AGAIN}")
+        raise UnreadableCloud(f"The header states an invalid page size of {page} bytes. {_AGAIN}")
     if length > len(data) or length % page:
         raise UnreadableCloud(
             f"The header declares {length} bytes, but the file has {len(data)}. {_AGAIN}"
@@ -239,7 +239,7 @@ class _Pages:
         return number * self._payload + within
 
     def read(self, start: int, length: int) -> bytes:
-        """Return bytes of the payload.
+        """Return `length` bytes from offset `start` of the payload.
 
         Raise UnreadableCloud if the bytes are beyond the end, or the checksum of a page is wrong.
         """
@@ -459,7 +459,7 @@ class _Stream:
 
 
 def unpacked(content: bytes, bits: int, n: int) -> NDArray[np.uint64]:
-    """Unpack n integers of `bits` (0 to 64) bits; the least significant bit is stored first."""
+    """Return n integers of `bits` (0 to 64) bits; the least significant bit is stored first."""
     if bits == 0:
         return np.zeros(n, np.uint64)
     source = np.frombuffer(content + bytes(9), np.uint8)

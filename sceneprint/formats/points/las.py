@@ -71,7 +71,7 @@ def inflated_records(
     if not is_supported or not _is_record(kinds, layered, length):
         raise UnreadableCloud(
             f"The LAZ file stores records of {length} bytes of format {form} as {kinds[:20]} with "
-            f"compressor {compressor}, which is contradictory or not supported. {_AGAIN}"
+            f"compressor {compressor}, a combination that is not supported. {_AGAIN}"
         )
     if count * length > min(_MOST, _FREE + _MOST_RATIO * len(data)):
         raise UnreadableCloud(

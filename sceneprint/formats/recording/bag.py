@@ -70,7 +70,7 @@ def is_packed(path: Path) -> bool:
 
 
 def is_recording(path: Path) -> bool:
-    """Return whether a path is a ROS recording: by its suffix, or as a folder with metadata."""
+    """Return whether a path is a ROS recording, by its suffix or a metadata file in it."""
     if path.is_dir():
         return (path / _METADATA).is_file() and not (path / "intrinsics.json").is_file()
     return format_named(path.name, "recording") is not None or is_packed(path)
@@ -171,7 +171,7 @@ class Bag:
             return
         with self._lock, _dataset_errors(self.path):
             for connection, log_ns, data in self._reader.messages(connections, start_ns, stop_ns):
-                if connection.topic not in topics:  # rosbags, if an index is damaged
+                if connection.topic not in topics:  # a damaged index yields other topics
                     continue
                 if len(data) > MAXIMUM_MESSAGE_BYTES:
                     raise DatasetError(

@@ -132,7 +132,7 @@ def bag_outline(path: Path, options: RecordingOptions) -> BagOutline:
 def sampled_range(
     sequences: Sequence[FrameSequence],
 ) -> tuple[SampleRange | None, SceneprintError | None]:
-    """Return the depth range of a sample of the frames, or an error if none can be read."""
+    """Return (range of some frames, None), or (None, error) if none of them is readable."""
     frames = [frame for sequence in sequences for frame in sequence.frames]
     ranges, error = list[SampleRange](), None
     for place in sorted(set(np.linspace(0, len(frames) - 1, _SAMPLED).round().astype(int))):

@@ -70,7 +70,7 @@ class BagPart:
     tree : transforms, and odometry for edges without transforms
     imus : measurements by coordinate frame of the IMU
     odometry : poses by topic
-    ignored_odometry : sentences about topics of odometry that another topic replaces
+    ignored_odometry : notes on odometry topics that another topic replaces
     info_stamps_ns, infos : stamp of each calibrated CameraInfo, ns, and index in `BagScan.infos`
     """
 
@@ -244,7 +244,7 @@ class _Scanner:
         return scan
 
     def _part_at(self, source: str, stamp_ns: int) -> BagPart:
-        """Return the part for a stamp; start a part if the clock was set back."""
+        """Return the part to which a stamp belongs; start a new part if the clock was set back."""
         parts = self._scan.parts
         if self._clocks.goes_back(source, stamp_ns):
             if len(parts) == MOST_PARTS:

@@ -147,8 +147,8 @@ def sequences_of(
         )
     if options.join_m and frames.encoding is not None:
         raise DatasetError(
-            f"{bag.path}: {frames.topic.name} has depth images, and only scans are joined. Omit "
-            "--join-m."
+            f"{bag.path}: {frames.topic.name} has depth images, but --join-m joins only scans. "
+            "Omit it."
         )
     info = None if frames.encoding is None else camera_topic(bag, frames, options.camera_info)
     scan = scan_bag(bag, frames.topic, info, options.progress)
@@ -301,7 +301,8 @@ def _compute_motions(
         above = dict.fromkeys(frame for tree in trees for frame in tree.ancestors(sensor)[1:])
         raise DatasetError(
             f"{bag.path}: There are no transforms from {sensor or 'the sensor'} to "
-            f"{world!r:.100}. Frames above the sensor are {', '.join(above) or 'none'}."
+            f"{world!r:.100}. Select one of the frames above the sensor: "
+            f"{', '.join(above) or 'none'}."
         )
     motions = [
         _compute_motion(part, places, scan, (sensor, frames.frame), world, scan_s)
@@ -310,7 +311,7 @@ def _compute_motions(
     with_poses = any(motion.poses for motion in motions)
     if options.join_m and not with_poses:
         raise DatasetError(
-            f"{bag.path}: {_describe_selection(frames, scan, motions)}. Scans are joined by "
+            f"{bag.path}: {_describe_selection(frames, scan, motions)}. Joining scans requires "
             "odometry: omit --join-m, or record /tf or odometry."
         )
     is_elsewhere = sensor != frames.frame
@@ -330,7 +331,7 @@ def _compute_motion(
     part: BagPart, places: range, scan: BagScan, names: tuple[str, str], pose_frame: str | None,
     scan_s: float,
 ) -> _Motion:  # fmt: skip
-    """Compute the poses and mountings of a sensor in a part; keyframes are not selected yet."""
+    """Return the poses and mountings of a sensor in a part, without a selection of keyframes."""
     tree, (sensor, frame) = part.tree, names
     stamps = [scan.stamps_ns[place] for place in places]
     world = frame_name(pose_frame or "") or tree.world_of(sensor)
@@ -414,7 +415,7 @@ def _compute_ups(
 ) -> dict[int, Floats]:
     """Return the up directions (3,) of keyframes in the sensor's axes, by index.
 
-    Of the IMUs that are fixed to the sensor, the one with the most measurements determines them.
+    They are computed from the IMU with the most measurements among those fixed to the sensor.
     """
     for imu in sorted(part.imus, key=lambda name: (-len(part.imus[name]), name)):
         T_sensor_imu = part.tree.fixed_transform(sensor, imu)
@@ -509,7 +510,7 @@ def _describe_selection(frames: FrameTopic, scan: BagScan, motions: list[_Motion
     poses = sum(len(motion.poses) for motion in motions)
     worlds = sorted({motion.world for motion in motions if motion.poses and motion.world})
     text = (
-        f"{selected} of {total} frames of {printable(frames.topic.name)} taken, poses of {poses} "
+        f"{selected} of {total} frames of {printable(frames.topic.name)} used, poses of {poses} "
         f"of {total} frames{' in ' if worlds else ''}{', '.join(worlds)}"
     )
     if poses < total:

@@ -107,7 +107,7 @@ class FrameTopic:
 
     @property
     def is_rectified(self) -> bool:
-        """Return whether the images are rectified, by the ROS naming convention."""
+        """Return whether the images are rectified, according to the name of the topic."""
         return is_rectified(self.topic.name)
 
     @property
@@ -166,7 +166,7 @@ class BagSource:
 
 
 def _restore_source(path: Path, topic: BagTopic, *place: Any) -> BagSource:
-    """Rebuild a source that was pickled in another process; open its bag in this process."""
+    """Return a source that another process pickled, with its bag opened in this process."""
     return BagSource(shared_bag(path), topic, *place)
 
 
@@ -206,7 +206,7 @@ def _describe_topic(bag: Bag, topic: BagTopic) -> FrameTopic | None:
 
 
 def choose_topic(bag: Bag, name: str | None) -> FrameTopic:
-    """Select the topic of the frames.
+    """Return the selected topic of frames.
 
     `name`: name that the user specifies, or None; images other than depth, such as infrared, are
     selected only by name. Raise DatasetError if no topic fits, or several topics fit and `name` is
@@ -251,7 +251,7 @@ _SUPPORTED = "16UC1, mono16, 32FC1, compressedDepth, or 16-bit PNG"
 
 
 def _list_encodings(bag: Bag) -> str:
-    """List the encodings of a bag's images, for error messages."""
+    """Return the encodings of a bag's images as text for error messages."""
     encodings = []
     for topic in bag.of_type(IMAGE, COMPRESSED)[:20]:
         try:
@@ -312,7 +312,7 @@ def _frame_of(bag: Bag, topic: BagTopic) -> str | None:
 
 
 def listed(topics: Iterable[BagTopic]) -> str:
-    """List the names, types and message counts of topics, for error messages."""
+    """Return names, types and message counts of at most 20 topics as text for errors."""
     names = [
         f"{topic.name} ({topic.type.rpartition('/')[2]}, {topic.count} messages)"
         for topic in topics

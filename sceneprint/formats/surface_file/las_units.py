@@ -47,7 +47,7 @@ def _read_geo_keys(body: bytes) -> float | None:
 
 
 def _read_wkt(text: str) -> float | None:
-    """Read the units per metre from the first length unit in well-known text, if any."""
+    """Read the units per metre from the first length unit in well-known text; or return None."""
     head = text.lstrip()[:8].upper()
     if head.startswith(("GEOGCS", "GEOGCRS")):
         raise _degrees_error()

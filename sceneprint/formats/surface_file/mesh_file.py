@@ -99,7 +99,7 @@ def _import_trimesh() -> ModuleType:
 
 
 def _join_parts(trimesh: ModuleType, scene: Any, name: str) -> FileMesh:
-    """Join all triangles of a scene; join all points if it has no triangles.
+    """Return all triangles of a scene, or all points if it has no triangles.
 
     Raise UnreadableCloud if the scene has neither, or exceeds the limits.
     """

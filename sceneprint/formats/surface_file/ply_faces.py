@@ -85,7 +85,7 @@ def check_triangles(count: int) -> None:
 def _binary_fans(
     data: FileBytes, start: int, face: Element, at: int, order: str
 ) -> Iterator[Indices]:
-    element_end(data, start, face, order)  # checks that the rows fit into the file
+    element_end(data, start, face, order)  # check that the rows fit into the file
     view = np.frombuffer(data, np.uint8)
     kinds = [(prop.kind, prop.length) for prop in face.properties]
     chosen = face.properties[at]

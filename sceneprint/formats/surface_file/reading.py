@@ -50,7 +50,7 @@ AXES: dict[str, Floats] = {
 FAR_M = 1000.0
 _STL_HEADER, _STL_TRIANGLE = 84, 50  #: bytes
 _BLOCK = 1 << 18
-#: Coordinate larger than any on Earth in all supported units; products of coordinates are finite.
+#: A value above any coordinate on Earth in all supported units, whose products are finite.
 _MOST_UNITS = 1e15
 #: Minimum and maximum usual extent of a place, metres; other extents cause a note.
 _SMALL_M, _LARGE_M = 1.0, 5000.0
@@ -110,7 +110,7 @@ class ReadSurface:
 
 
 def surface_format(head: bytes, name: str, size: int) -> SurfaceFormat:
-    """Recognise the format of a whole map file, from its first bytes or its name.
+    """Return the format of a whole map file, from its first bytes or its name.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def _estimate_units(points: Floats32, triangles: Ints32 | None, usual_up: Floats
 
 
 def _convert(raw: RawSurface, options: SurfaceOptions) -> ReadSurface:
-    """Remove missing points and triangles, and convert a surface to metres."""
+    """Return a surface in metres, without missing points and triangles."""
     notes = list(raw.notes)
     points, triangles = _clean(raw, notes)
     if not max(float(points.max()), -float(points.min())) < _MOST_UNITS:
@@ -292,7 +292,7 @@ def _select_units(
 
 
 def _clean(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
-    """Remove missing points, and invalid triangles; add notes on them to `notes`."""
+    """Return valid points and triangles (None for clouds); add notes on the others to `notes`."""
     if raw.triangles is None:
         missing = raw.file_points - len(raw.points)
         if missing and raw.voxel is None:
@@ -323,7 +323,7 @@ def _clean(raw: RawSurface, notes: list[str]) -> tuple[Floats32, Ints32 | None]:
 
 
 def _remove_flat(points: Floats32, triangles: Ints32) -> tuple[Floats32, Ints32]:
-    """Return the triangles that have an area, and their vertices."""
+    """Return the vertices of the triangles that have an area, and these triangles."""
     proper = np.ones(len(triangles), np.bool_)
     present = np.asarray(np.isfinite(points).all(axis=1))
     for first in range(0, len(triangles), _BLOCK):
