@@ -95,6 +95,8 @@ def pytest_configure(config):
     os.environ.setdefault("SCENEPRINT_JOIN_SESSIONS", "on_request")
     # Decoder processes cost a second each, so only their own tests use them.
     os.environ.setdefault("SCENEPRINT_DECODERS", "0")
+    # On a busy machine, requests wait instead of failing.
+    os.environ.setdefault("SCENEPRINT_QUEUE_TIMEOUT_S", "600")
     config.addinivalue_line("markers", "sqlite_only(reason): of nothing that PostgreSQL does")
     config.addinivalue_line("markers", "thorough: takes long, and runs with `make test-thorough`")
     if not entry_points(group="sceneprint.commands"):

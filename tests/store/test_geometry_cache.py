@@ -1,9 +1,10 @@
 """Tests of the cache of decoded artifacts: content, limits and eviction."""
 
-import time
+from types import SimpleNamespace
 
 import pytest
 
+from sceneprint import store
 from sceneprint.errors import DamagedBlob
 from sceneprint.formats.artifact import write_geometry
 from sceneprint.geometry.registration.overlap import sample_points
@@ -60,7 +61,8 @@ def test_a_deleted_frame_leaves_nothing(blobs, artifacts):
 
 def test_what_was_read_long_ago_goes_however_often_it_is_used(blobs, artifacts, monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    # the clock of other threads stays: an event loop that reads another time may sleep for hours
+    monkeypatch.setattr(store, "time", SimpleNamespace(monotonic=lambda: now[0]))
     cache, digests = GeometryCache(blobs, 1 << 30), [blobs.put(one) for one in artifacts[:2]]
     first = cache.read(digests[0])
     now[0] = 130.0
