@@ -221,7 +221,7 @@ def test_a_description_that_lies_is_refused(file, old, new, message):
 def test_a_later_version_and_huge_pages_are_refused(file):
     with pytest.raises(UnreadableCloud, match=r"version 2 of E57.*Export the scan as PLY"):
         everything(changed(file, 8, struct.pack("<I", 2)))
-    with pytest.raises(UnreadableCloud, match="pages of 1125899906842624 bytes"):
+    with pytest.raises(UnreadableCloud, match="invalid page size of 1125899906842624 bytes"):
         everything(changed(file, 40, struct.pack("<Q", 1 << 50)))
     with pytest.raises(UnreadableCloud, match="not an E57 file"):
         everything(b"ply\n" + file[4:])

@@ -91,8 +91,8 @@ def test_packed_lies(laz, form):
     lies = [
         (count, wide, 20_000_000, "exceeds 250 times the size"),
         (count, wide, 50_001, "chunk table of the LAZ file"),
-        (105, "H", length + 1, "contradictory or not supported"),
-        (vlr, "H", 1, "contradictory or not supported"),  # compressor
+        (105, "H", length + 1, "a combination that is not supported"),
+        (vlr, "H", 1, "a combination that is not supported"),  # compressor
         (vlr + 12, "I", 0, "how its points are compressed"),  # chunk size
         (vlr + 32, "H", 65_535, "how its points are compressed"),  # values
         (100, "I", 0, "how its points are compressed"),  # records before the points
