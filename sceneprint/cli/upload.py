@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
+import statistics
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -409,8 +411,8 @@ _LONGEST_STEP_M = 5.0
 def _doubt_steps(frames: list[FrameReference]) -> list[str]:
     """Return a note if the poses of depth images are too far apart for metres."""
     places = [frame.pose[:3, 3] for frame in frames if frame.camera and frame.pose is not None]
-    steps = sorted(float(max(abs(b - a))) for a, b in pairwise(places))
-    step = steps[len(steps) // 2] if steps else 0.0
+    steps = [math.dist(a, b) for a, b in pairwise(places)]
+    step = statistics.median(steps) if steps else 0.0
     if step <= _LONGEST_STEP_M:
         return []
     return [f"poses of consecutive frames are {step:.2g} m apart: check that they are in metres"]

@@ -197,3 +197,21 @@ def test_distant_scans_of_a_street_are_accepted_by_their_points_above_the_ground
     plan = replace(numbers.alignment.plan, slice_margin=100.0)
     without = replace(numbers, alignment=replace(numbers.alignment, plan=plan))
     assert validate(query, match, 0, without).status == "rejected"
+
+
+def test_scans_that_see_a_part_are_measured_if_planes_agree():
+    clouds = synthesise_survey(9800, 8, 5, kind="block").clouds
+    model = read_model("lidar")
+    parts = {}
+    for k in (0, 2, 3):
+        x, y, _ = (clouds[k].points @ clouds[k].pose[:3, :3].T).T
+        ahead = np.abs(np.degrees(np.arctan2(y, x))) < 120  # two thirds of a turn
+        part = replace(clouds[k], points=clouds[k].points[ahead])
+        parts[k] = geometry_of(see(part, model.parameters), model)
+    numbers = model.parameters.validation
+    result = validate(parts[2], parts[0], 0, numbers)
+    assert not result.around
+    assert pose_difference(result.T_match_query, inverse(clouds[0].pose) @ clouds[2].pose)[0] < 0.5
+    assert result.distinctness > 1.5  # measured: 2.6
+    apart = validate(parts[3], parts[0], 0, numbers)
+    assert (apart.planes < numbers.acceptance.sliced_planes, apart.distinctness) == (True, 0.0)

@@ -259,7 +259,8 @@ class _Scanner:
         scan = self._scan
         header = self._bag.header_ns(message)
         stamp = message.log_ns if header is None else header
-        scan.stampless.update([] if header is not None else [len(scan.places)])
+        if header is None:
+            scan.stampless.add(len(scan.places))
         self._part_at(message.topic, stamp)
         same = bool(scan.places) and scan.places[-1][0] == message.log_ns
         scan.places.append((message.log_ns, scan.places[-1][1] + 1 if same else 0))

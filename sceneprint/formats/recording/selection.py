@@ -347,11 +347,10 @@ def _compute_motion(
             motion.remarks.append(
                 f"{parent} -> {child} is normalised: its quaternion has the length {length:.3g}"
             )
-    motion.remarks += [
-        f"{stampless} frames have no time stamp, and get the time of recording"
-        for stampless in [sum(place in scan.stampless for place in places)]
-        if stampless
-    ]
+    if stampless := sum(place in scan.stampless for place in places):
+        motion.remarks.append(
+            f"{stampless} frames have no time stamp, and get the time of recording"
+        )
     motion.remarks += [
         f"{topic} is ignored because its child_frame_id is empty"
         for topic, samples in part.odometry.items()
