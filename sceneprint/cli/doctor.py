@@ -347,7 +347,7 @@ def _decoders(settings: Settings) -> Check:
     pool = DecoderPool(1, settings.decoder_memory_bytes, settings.decoder_timeout_s)
     try:
         pool.start()
-        protections = pool.protections
+        protections = next((process.protections for process in pool.processes()), None)
     finally:
         pool.close()
     if protections is None:

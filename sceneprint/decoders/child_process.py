@@ -1,10 +1,10 @@
 """Program of a decoder process: load all code, confine the process, and decode until it is killed.
 
-    python -m sceneprint.decoders.child_process CONTROL MEMORY PARENT BYTES plain|kernels [MORE]
+    python -m sceneprint.decoders.child_process CONTROL PARENT BYTES plain|kernels [MORE]
 
-CONTROL is a socket for one JSON request and one JSON reply per task. MEMORY is shared with the
-parent; it contains the bytes of the upload, and then the arrays. BYTES limits the memory for work.
-MORE stands for arguments of other programs. Nothing is pickled, and the parent checks every reply.
+CONTROL is a socket. A task is a line of JSON, followed by the bytes of the upload. A reply is the
+length of its JSON, the JSON, and the arrays. BYTES limits the memory for work. MORE stands for
+arguments of other programs. Nothing is pickled, and the parent checks every reply.
 """
 
 from __future__ import annotations
@@ -35,23 +35,21 @@ from sceneprint.geometry.kernel import Kernel
 from sceneprint_client.formats import formats_of, function_at
 from sceneprint_client.sidecars import UNSAID
 
-#: Size of the shared memory, bytes, for the largest upload; arrays are smaller.
-SHARED_BYTES = 512 << 20
 #: Maximum size of a message, bytes, and maximum length of an error or traceback, characters.
 MESSAGE_BYTES, MOST_TEXT = 1 << 16, 8000
 
-#: An array, consecutive arrays, or none.
-Arrays = NDArray[Any] | tuple[NDArray[Any], ...] | None
+#: Arrays that follow a reply.
+Arrays = tuple[NDArray[Any], ...]
 #: Function that takes the bytes of an upload and a request, and returns the reply and its arrays.
 Task = Callable[[bytes, dict[str, Any]], tuple[dict[str, Any], Arrays]]
 
 
-def _read_samples(data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
+def _read_samples(data: bytes, _request: dict[str, Any]) -> tuple[dict[str, Any], Arrays]:
     samples = decode_samples(data)
-    return {"type": samples.dtype.str, "shape": samples.shape}, samples
+    return {"type": samples.dtype.str, "shape": samples.shape}, (samples,)
 
 
-def _read_points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], NDArray[Any]]:
+def _read_points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], Arrays]:
     position = request["viewpoint"]
     viewpoint = (
         UNSAID if position == UNSAID.value else None if position is None else tuple(position)
@@ -61,7 +59,7 @@ def _read_points(data: bytes, request: dict[str, Any]) -> tuple[dict[str, Any], 
         "shape": cloud.points.shape, "viewpoint": cloud.viewpoint,
         "file_points": cloud.file_points,
     }  # fmt: skip
-    return reply, cloud.points
+    return reply, (cloud.points,)
 
 
 TASKS: Mapping[str, Task] = {"samples": _read_samples, "points": _read_points}
@@ -83,56 +81,52 @@ def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None)
     warm : function that loads the code of the tasks, and the kernels if its argument is true; None
         selects `load_decoders`
     """
-    control, memory, parent, more_bytes = map(int, sys.argv[1:5])
+    control, parent, more_bytes = map(int, sys.argv[1:4])
     # signals that stop the service reach its process group, but uploads must finish
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     if not die_with_parent(parent):
         return
-    shared = mmap.mmap(memory, SHARED_BYTES)
+    incoming = os.fdopen(control, "rb")
     try:
-        (warm or load_decoders)(sys.argv[5] == "kernels")
+        (warm or load_decoders)(sys.argv[4] == "kernels")
         _redirect_to_null()
         protections = asdict(close_process(more_bytes))
     except Exception:
         _send(control, {"broke": traceback.format_exc()[-MOST_TEXT:]})
         return
     _send(control, {"ready": protections})
-    while message := os.read(control, MESSAGE_BYTES):
-        _send(control, _run_task(tasks, json.loads(message), shared))
+    while message := incoming.readline(MESSAGE_BYTES):
+        request = json.loads(message)
+        _send(control, *_run_task(tasks, request, incoming.read(request["bytes"])))
 
 
 def _run_task(
-    tasks: Mapping[str, Task], request: dict[str, Any], shared: mmap.mmap
-) -> dict[str, Any]:
-    """Run a task on the first `request["bytes"]` bytes of `shared`; return its reply or an error.
+    tasks: Mapping[str, Task], request: dict[str, Any], data: bytes
+) -> tuple[dict[str, Any], Arrays]:
+    """Run a task on an upload; return its reply and arrays, or an error.
 
-    The arrays of the result replace the upload in `shared`, one after another. An error reply has
-    `error` and `text` if the upload is at fault, `memory` if memory ran out, or else `broke` with
-    the traceback.
+    An error reply has `error` and `text` if the upload is at fault, `memory` if memory ran out, or
+    else `broke` with the traceback.
     """
     try:
-        reply, arrays = tasks[request["task"]](shared[: request["bytes"]], request)
-        if arrays is None:
-            return reply
-        first = 0
-        for array in arrays if isinstance(arrays, tuple) else (arrays,):
-            size = array.nbytes
-            np.frombuffer(shared, np.uint8, size, first)[:] = (
-                np.ascontiguousarray(array).view(np.uint8).reshape(-1)
-            )
-            first += size
+        reply, arrays = tasks[request["task"]](data, request)
+        return reply, tuple(map(np.ascontiguousarray, arrays))
     except SceneprintError as error:
-        return {"error": type(error).__name__, "text": str(error)[:MOST_TEXT]}
+        return {"error": type(error).__name__, "text": str(error)[:MOST_TEXT]}, ()
     except MemoryError:
-        return {"memory": True}
+        return {"memory": True}, ()
     except Exception:
-        return {"broke": traceback.format_exc()[-MOST_TEXT:]}
-    return reply
+        return {"broke": traceback.format_exc()[-MOST_TEXT:]}, ()
 
 
-def _send(control: int, reply: dict[str, Any]) -> None:
-    os.write(control, json.dumps(reply).encode())
+def _send(control: int, reply: dict[str, Any], arrays: Arrays = ()) -> None:
+    text = json.dumps(reply).encode()
+    whole = memoryview(struct.pack("<I", len(text)) + text)
+    for data in (whole, *(array.reshape(-1).view(np.uint8).data for array in arrays)):
+        left = data
+        while left:
+            left = left[os.write(control, left) :]
 
 
 def _redirect_to_null() -> None:

@@ -3,22 +3,20 @@
     DecoderPool.place  -->  a decoder for one upload  --samples | points-->  arrays
 
 A compromised decoder can send any reply. Replies are therefore JSON and plain arrays, and the pool
-copies the arrays from the shared memory before it checks them. The memory is sealed: a decoder that
-shrinks it would crash the service.
+checks both.
 """
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import math
-import mmap
 import os
 import select
 import shutil
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -26,20 +24,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sceneprint import errors
-from sceneprint.decoders.child_process import MESSAGE_BYTES, SHARED_BYTES
+from sceneprint.decoders.child_process import MESSAGE_BYTES
 from sceneprint.decoders.sandbox import Protections
 from sceneprint.errors import DecoderFailure
 from sceneprint.formats.depth_file import Samples, decode_samples
 from sceneprint.formats.points.cloud import FARTHEST_M, ReadPoints
 from sceneprint.formats.points.rows import MAXIMUM_POINTS
+from sceneprint.process import current_tenant
 from sceneprint.turns import ThreadTurns
 from sceneprint.types import MAXIMUM_SAMPLES, Floats32
 from sceneprint_client.files import MAXIMUM_IMAGE_BYTES
@@ -64,15 +63,15 @@ _ERRORS = {
 _BEGIN_S, _LOOK_S, _WAIT_S = 300.0, 0.25, 60.0
 #: Maximum wall time of a task on a busy machine, as a multiple of the limit for processor time.
 _PATIENCE = 8
-#: Maximum size of used shared memory that is overwritten after a task, bytes; more is freed.
-_ERASED_BYTES = 8 << 20
 #: Settings of glibc. A process retains freed memory up to a maximum size: otherwise, a decoder
 #: would spend half of its time on freeing and allocating pages. Freed memory is overwritten, since
 #: the next image may be another tenant's.
 _MALLOC = {
-    "MALLOC_TRIM_THRESHOLD_": f"{_ERASED_BYTES}", "MALLOC_MMAP_THRESHOLD_": f"{_ERASED_BYTES}",
+    "MALLOC_TRIM_THRESHOLD_": f"{8 << 20}", "MALLOC_MMAP_THRESHOLD_": f"{8 << 20}",
     "MALLOC_PERTURB_": "85",
 }  # fmt: skip
+#: Lock of the process that compiles kernels.
+_compiling = threading.Lock()
 #: Environment variables that a decoder needs to find its code. Other variables may contain secrets.
 _ENVIRONMENT = (
     "PATH", "LANG", "LC_ALL", "HOME", "USER", "TMPDIR", "XDG_CACHE_HOME", "PYTHONPATH",
@@ -99,7 +98,7 @@ class DecoderEnded(Exception):
 
 
 class DecoderProcess:
-    """A decoder process with its socket and shared memory. It runs one task at a time.
+    """A decoder process and its socket. It runs one task at a time.
 
     Parameters
     ----------
@@ -111,33 +110,21 @@ class DecoderProcess:
     """
 
     def __init__(
-        self,
-        program: str,
-        more_bytes: int,
-        *,
-        compiled: bool,
-        files: tuple[int, ...] = (),
+        self, program: str, more_bytes: int, *, compiled: bool, files: tuple[int, ...] = (),
         more: tuple[str, ...] = (),
-    ) -> None:
-        self.compiled, self._more_bytes = compiled, more_bytes
-        self._sent = self._used = 0  # size of the upload, and of the memory that the task used
+    ) -> None:  # fmt: skip
+        self.compiled, self._more_bytes, self._until = compiled, more_bytes, 0.0
         self.protections = Protections(no_new_privileges=False, seccomp=False, landlock=0)
-        memory = os.memfd_create("sceneprint-decoder", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket, theirs = socket.socketpair()
+        kind = "kernels" if compiled else "plain"
+        arguments = (theirs.fileno(), os.getpid(), more_bytes, kind, *files, *more)
         try:
-            os.ftruncate(memory, SHARED_BYTES)
-            seals = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
-            fcntl.fcntl(memory, fcntl.F_ADD_SEALS, seals)
-            self._shared = mmap.mmap(memory, SHARED_BYTES)
-            arguments = (theirs.fileno(), memory, os.getpid(), more_bytes)
-            kind = "kernels" if compiled else "plain"
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", program, *map(str, arguments), kind, *map(str, files),
-                 *more],
+                [sys.executable, "-P", "-m", program, *map(str, arguments)],
                 env={name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
                 | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
                 | _MALLOC,
-                pass_fds=(*arguments[:2], *files), stdin=subprocess.DEVNULL,
+                pass_fds=(theirs.fileno(), *files), stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )  # fmt: skip
         except BaseException:
@@ -145,7 +132,6 @@ class DecoderProcess:
             raise
         finally:
             theirs.close()
-            os.close(memory)
 
     @property
     def pid(self) -> int:
@@ -162,47 +148,18 @@ class DecoderProcess:
             walls["no_new_privileges"] is True, walls["seccomp"] is True, int(walls["landlock"])
         )
 
-    def run(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
-        """Run a task on an upload; return its reply, an object with unchecked content.
+    def run(self, request: dict[str, Any], data: bytes, seconds: float, check: Check) -> Any:
+        """Run a task on an upload, and return its checked result; see `ConfinedDecoder.run`.
 
         Parameters
         ----------
-        request : name of the task and its parameters
-        data : bytes of the upload
-        seconds : maximum processor time, and maximum idle time
+        seconds : maximum processor time; the task may take eight times as long in all
 
         Raises
         ------
-        DecoderEnded : If the process ends during the task, or the reply is not an object.
-        DecoderFailure : If the task exceeds `seconds`, or takes eight times as long in all; the
-            process continues.
+        DecoderEnded : If the process ends, or its reply is invalid.
         """
-        self._sent, self._used = len(data), SHARED_BYTES  # upper bound until the reply arrives
-        self._shared[: len(data)] = data
-        try:
-            self._socket.send(json.dumps({**request, "bytes": len(data)}).encode())
-        except OSError as error:
-            raise DecoderEnded(self._cause()) from error
-        return self._receive(seconds * _PATIENCE, seconds)
-
-    def result(
-        self, reply: dict[str, Any], checked: Callable[[DecoderProcess, dict[str, Any]], Any]
-    ) -> Any:
-        """Check a reply, and return its result.
-
-        Parameters
-        ----------
-        reply : return value of `run`
-        checked : function that checks a reply and returns its result; it raises an error for an
-            invalid reply
-
-        Raises
-        ------
-        DecoderEnded : If the reply is invalid.
-        DecoderFailure : If the task needs too much memory.
-        FrameError, MissingDependency : If the decoder reports an error of the upload.
-        RuntimeError : If the task failed with another exception, which is logged.
-        """
+        reply = self.ask(request, data, seconds)
         if reply.get("memory") is True:
             raise DecoderFailure(
                 f"it needs more than {self._more_bytes >> 20} MiB of memory to decode"
@@ -211,99 +168,181 @@ class DecoderProcess:
             text = str(reply["broke"])
             log.error("decoder failed", extra={"pid": self.pid, "traceback": text})
             raise RuntimeError(f"A decoder failed: {text.strip().rpartition(chr(10))[2][:200]}")
-        self._used = self._sent
         if "error" in reply:
             raise _reported_error(reply)
         try:
-            return checked(self, reply)
+            return check(self, reply)
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             raise DecoderEnded(f"its reply is invalid: {str(error)[:80]}") from error
 
-    def array_of(self, kind: str, shape: tuple[int, ...], first: int = 0) -> NDArray[Any]:
-        """Return a copy of an array that starts at byte `first` of the shared memory."""
-        array = np.frombuffer(self._shared, kind, math.prod(shape), first).copy()
-        self._used = max(self._used, first + array.nbytes)
-        return array.reshape(shape)
+    def ask(self, request: dict[str, Any], data: bytes, seconds: float) -> dict[str, Any]:
+        """Send a task; return the reply, an object with unchecked content."""
+        self._socket.settimeout(seconds * _PATIENCE)
+        try:
+            self._socket.sendall(json.dumps({**request, "bytes": len(data)}).encode() + b"\n")
+            self._socket.sendall(data)
+        except OSError as error:
+            raise DecoderEnded(self._cause()) from error
+        return self._receive(seconds * _PATIENCE, seconds)
 
-    def clear(self) -> None:
-        """Erase the shared memory: the next upload may be another tenant's."""
-        if self._used > _ERASED_BYTES:
-            self._shared.madvise(mmap.MADV_REMOVE)  # frees the pages, which then read as zeros
-        else:
-            self._shared[: self._used] = bytes(self._used)
+    def array_of(self, kind: str, shape: tuple[int, ...]) -> NDArray[Any]:
+        """Receive the next array of a reply."""
+        return np.frombuffer(self._read(math.prod(shape) * np.dtype(kind).itemsize), kind).reshape(
+            shape
+        )
 
     def end(self) -> None:
         """Kill the process."""
         self._process.kill()
         self._process.wait()
         self._socket.close()
-        with suppress(BufferError):
-            self._shared.close()
 
     def _receive(self, longest_s: float, cpu_s: float = math.inf) -> dict[str, Any]:
         """Wait for a reply; raise DecoderFailure after a timeout, or DecoderEnded."""
-        begun, until = self._cpu_s(), time.monotonic() + longest_s
+        begun, self._until = self._cpu_s(), time.monotonic() + longest_s
         waiting = select.poll()
         waiting.register(self._socket, select.POLLIN)
-        asleep_s = 0.0
         while not waiting.poll(1e3 * _LOOK_S):
-            asleep_s = asleep_s + _LOOK_S if self._is_asleep() else 0.0
-            if asleep_s > cpu_s:
-                raise DecoderFailure(f"its decoder has been idle for {cpu_s:g} s")
-            if self._cpu_s() - begun > cpu_s or time.monotonic() > until:
+            if self._cpu_s() - begun > cpu_s or time.monotonic() > self._until:
                 raise DecoderFailure(f"it takes longer than {cpu_s:g} s to decode")
+        (size,) = struct.unpack("<I", self._read(4))
+        if size > MESSAGE_BYTES:
+            raise DecoderEnded("its reply is too long")
         try:
-            message = self._socket.recv(MESSAGE_BYTES)
-        except OSError:
-            message = b""
-        if not message:
-            raise DecoderEnded(self._cause())
-        try:
-            reply = json.loads(message)
+            reply = json.loads(self._read(size))
         except (ValueError, RecursionError) as error:
             raise DecoderEnded("its reply is not JSON") from error
         if not isinstance(reply, dict):
             raise DecoderEnded("its reply is not an object")
         return reply
 
+    def _read(self, size: int) -> bytearray:
+        """Receive `size` bytes before the time limit of the task; raise DecoderEnded."""
+        data = bytearray(size)
+        rest = memoryview(data)
+        try:
+            while rest:
+                self._socket.settimeout(max(self._until - time.monotonic(), _LOOK_S))
+                length = self._socket.recv_into(rest)
+                if length == 0:
+                    raise DecoderEnded(self._cause())
+                rest = rest[length:]
+        except OSError as error:
+            raise DecoderEnded(self._cause()) from error
+        return data
+
     def _cpu_s(self) -> float:
         with suppress(OSError):  # if the process has ended, the socket reports it
             return time.clock_gettime((~self._process.pid << 3) | 2)
         return 0.0
 
-    def _is_asleep(self) -> bool:
-        """Return whether the process is neither runnable nor waiting for a disk."""
-        with suppress(OSError):
-            stat = Path(f"/proc/{self._process.pid}/stat").read_text()
-            return stat.rpartition(")")[2].split()[0] not in ("R", "D")
-        return False
-
     def _cause(self) -> str:
+        self._process.kill()  # it may have closed only the socket; an earlier exit code remains
         code = self._process.wait()
         if code < 0:
             return f"signal {-code}, {signal.strsignal(-code)}"
         return f"exit code {code}"
 
 
-class _Slot:
-    """A place in the pool. It serves one upload at a time, and starts its process on demand."""
+#: Function that checks a reply, and returns its result. It raises an error for an invalid reply.
+Check = Callable[[DecoderProcess, dict[str, Any]], Any]
 
-    def __init__(self, pool: DecoderPool) -> None:
-        self._pool = pool
+
+class ConfinedDecoder:
+    """A decoder whose process starts with its first task, and is replaced after a failure.
+
+    Parameters
+    ----------
+    program, more_bytes, files, more : see `DecoderProcess`
+    seconds : maximum processor time of a task
+    starter : executor that starts processes; a process is killed when the thread that started it
+        ends. None uses the calling thread
+    """
+
+    def __init__(
+        self, program: str, more_bytes: int, seconds: float, *, files: tuple[int, ...] = (),
+        more: tuple[str, ...] = (), starter: ThreadPoolExecutor | None = None,
+    ) -> None:  # fmt: skip
+        self._spawn = partial(DecoderProcess, program, more_bytes, files=files, more=more)
+        self._seconds, self._starter = seconds, starter
         self.process: DecoderProcess | None = None
+
+    def run(
+        self, request: dict[str, Any], data: bytes, check: Check, *, compiled: bool = False,
+        again: bool = True,
+    ) -> Any:  # fmt: skip
+        """Run a task; if its process ends, retry once in a new process. Return the checked result.
+
+        Parameters
+        ----------
+        request : name of the task and its parameters
+        data : bytes of the upload
+        check : function that checks the reply
+        compiled : whether the task needs kernels
+        again : whether to retry
+
+        Raises
+        ------
+        DecoderFailure : If the task crashes twice, takes too long, or needs too much memory.
+        FrameError, MissingDependency : If the decoder reports an error of the upload.
+        RuntimeError : If the task failed with another exception, which is logged.
+        Busy : If no process can be started.
+        """
+        process = self.process
+        if process is None or (compiled and not process.compiled):
+            process = self.start(compiled=compiled)
+        try:
+            return process.run(request, data, self._seconds, check)
+        except (DecoderEnded, DecoderFailure) as error:
+            about = {"pid": process.pid, "error": str(error), "tenant": current_tenant()}
+            log.warning("decoder replaced", extra=about)
+            self.end()
+            if isinstance(error, DecoderFailure):
+                raise
+            if not again:
+                raise DecoderFailure(f"it crashes the decoder ({error})") from error
+        return self.run(request, data, check, compiled=compiled, again=False)
+
+    def start(self, *, compiled: bool) -> DecoderProcess:
+        """Start the process and wait until it is ready; raise Busy if it fails."""
+        self.end()
+        try:
+            spawn = partial(self._spawn, compiled=compiled)
+            process = spawn() if self._starter is None else self._starter.submit(spawn).result()
+            self.process = process
+            # the first process compiles kernels, and later processes load them
+            with _compiling if compiled else nullcontext():
+                process.await_ready()
+        except (DecoderEnded, DecoderFailure, OSError, RuntimeError) as error:
+            self.end()
+            log.error("decoder cannot be started", extra={"error": str(error)})
+            raise errors.Busy(
+                "No decoder can be started for this upload. Nothing was stored. Retry in a minute. "
+                "The log of the service shows the cause."
+            ) from error
+        walls = process.protections
+        level = logging.INFO if walls.seccomp else logging.WARNING
+        log.log(level, "decoder started", extra={"pid": process.pid, "protections": walls.text})
+        return process
+
+    def end(self) -> None:
+        """Kill the process if one is running."""
+        process, self.process = self.process, None
+        if process is not None:
+            process.end()
 
     def samples(self, data: bytes) -> Samples:
         """Return the samples of a depth image; see `decode_samples`."""
         if len(data) > MAXIMUM_IMAGE_BYTES:  # `decode_samples` rejects it without decoding
             return decode_samples(data)
 
-        def checked(process: DecoderProcess, reply: dict[str, Any]) -> Samples:
+        def check(process: DecoderProcess, reply: dict[str, Any]) -> Samples:
             kind, shape = reply["type"], _checked_shape(reply, MAXIMUM_SAMPLES)
             if kind not in ("<u2", "<f4"):
                 raise ValueError(f"type {kind!r:.40}")
             return process.array_of(kind, shape)
 
-        samples: Samples = self.run({"task": "samples"}, data, checked)
+        samples: Samples = self.run({"task": "samples"}, data, check)
         return samples
 
     def points(
@@ -317,7 +356,7 @@ class _Slot:
             "units_per_metre": units_per_metre,
         }  # fmt: skip
 
-        def checked(process: DecoderProcess, reply: dict[str, Any]) -> ReadPoints:
+        def check(process: DecoderProcess, reply: dict[str, Any]) -> ReadPoints:
             shape = _checked_shape(reply, 3 * MAXIMUM_POINTS)
             file_points = int(reply["file_points"])
             if shape[1] != 3 or not shape[0] <= file_points <= MAXIMUM_POINTS:
@@ -334,60 +373,8 @@ class _Slot:
                 raise ValueError("a point is too far away")
             return ReadPoints(points, place, file_points)
 
-        read: ReadPoints = self.run(request, data, checked, compiled=file_format in _COMPILED)
+        read: ReadPoints = self.run(request, data, check, compiled=file_format in _COMPILED)
         return read
-
-    def run(
-        self, request: dict[str, Any], data: bytes,
-        checked: Callable[[DecoderProcess, dict[str, Any]], Any], *, compiled: bool = False,
-    ) -> Any:  # fmt: skip
-        """Run a task; if its process ends, retry once in a new process. Return the checked result.
-
-        Parameters
-        ----------
-        request : name of the task and its parameters
-        data : bytes of the upload
-        checked : function that checks a reply and returns its result; it raises an error for an
-            invalid reply
-        compiled : whether the task needs kernels
-
-        Raises
-        ------
-        DecoderFailure : If the task crashes twice, takes too long, or needs too much memory.
-        FrameError, MissingDependency, RuntimeError : See `DecoderProcess.result`.
-        Busy : If no process can be started.
-        """
-        try:
-            return self._run(request, data, checked, compiled=compiled)
-        except DecoderEnded as first:
-            self._pool.drop_process(self, str(first))
-            try:
-                return self._run(request, data, checked, compiled=compiled)
-            except DecoderEnded as again:
-                self._pool.drop_process(self, str(again))
-                raise DecoderFailure(f"it crashes the decoder ({again})") from again
-        except DecoderFailure as error:
-            self._pool.drop_process(self, str(error))
-            raise
-
-    def end(self) -> None:
-        """Kill the process if one is running."""
-        process, self.process = self.process, None
-        if process is not None:
-            process.end()
-
-    def _run(
-        self, request: dict[str, Any], data: bytes,
-        checked: Callable[[DecoderProcess, dict[str, Any]], Any], *, compiled: bool,
-    ) -> Any:  # fmt: skip
-        process = self.process
-        if process is None or (compiled and not process.compiled):
-            self.end()
-            process = self.process = self._pool.start_process(compiled=compiled)
-        try:
-            return process.result(process.run(request, data, self._pool.seconds), checked)
-        finally:
-            process.clear()
 
 
 class DecoderPool:
@@ -398,97 +385,50 @@ class DecoderPool:
     count : maximum number of processes
     more_bytes : maximum memory that each process may allocate for its work, bytes; 0 for no limit
     seconds : maximum processor time per upload
-    whose : function that returns the tenant of the current request
     program : name of the module that the processes run
     """
 
-    def __init__(
-        self, count: int, more_bytes: int, seconds: float, whose: Callable[[], str] = str,
-        program: str = PROGRAM,
-    ) -> None:  # fmt: skip
-        self.more_bytes, self.seconds = more_bytes, seconds
-        self._whose, self._program = whose, program
+    def __init__(self, count: int, more_bytes: int, seconds: float, program: str = PROGRAM) -> None:
         self._turns = ThreadTurns(count)
-        self._free = [_Slot(self) for _ in range(count)]
-        self._slots = tuple(self._free)
-        self._closed = False
-        # a process is killed when the thread that started it ends, so this thread must persist
         self._starter = ThreadPoolExecutor(1, "decoder-starter")
-        self._compiling = threading.Lock()
-        #: Protections of the processes; None before the first process is ready.
-        self.protections: Protections | None = None
+        self._decoders = tuple(
+            ConfinedDecoder(program, more_bytes, seconds, starter=self._starter)
+            for _ in range(count)
+        )
+        self._free = list(self._decoders)
 
     @contextmanager
-    def place(self) -> Iterator[_Slot]:
+    def place(self) -> Iterator[ConfinedDecoder]:
         """Reserve a free decoder; raise Busy if none becomes free in time."""
-        tenant = self._whose()
+        tenant = current_tenant()
         if not self._turns.acquire(tenant, _WAIT_S):
             raise errors.Busy(
                 f"No decoder became free within {_WAIT_S:g} s. Nothing was stored. Retry in a "
                 "minute."
             )
-        slot = self._free.pop()  # last in, first out: a lightly loaded pool uses few processes
+        decoder = self._free.pop()  # last in, first out: a lightly loaded pool uses few processes
         try:
-            yield slot
+            yield decoder
         finally:
-            self._free.append(slot)
+            self._free.append(decoder)
             self._turns.release(tenant)
 
     def start(self) -> None:
         """Start a process in advance."""
-        with self.place() as slot, suppress(errors.Busy):
-            if slot.process is None:
-                slot.process = self.start_process(compiled=False)
+        with self.place() as decoder, suppress(errors.Busy):
+            if decoder.process is None:
+                decoder.start(compiled=False)
 
-    def pids(self) -> list[int]:
-        """Return the process ids of the running decoders."""
-        return [slot.process.pid for slot in self._slots if slot.process is not None]
+    def processes(self) -> list[DecoderProcess]:
+        """Return the running processes."""
+        return [each.process for each in self._decoders if each.process is not None]
 
     def close(self) -> None:
         """Kill all processes; uploads in progress fail."""
-        self._closed = True
+        self._starter.shutdown()  # no process starts after this
         self._turns.close()
-        for slot in self._slots:
-            slot.end()
-        self._starter.shutdown()
-
-    def start_process(self, *, compiled: bool) -> DecoderProcess:
-        """Start a process and wait until it is ready; raise Busy if it fails."""
-        try:
-            if self._closed:
-                raise DecoderEnded("the service is stopping")
-            starting = self._starter.submit(
-                DecoderProcess, self._program, self.more_bytes, compiled=compiled
-            )
-            process = starting.result()
-            try:
-                if compiled:  # the first process compiles kernels, and later processes load them
-                    with self._compiling:
-                        process.await_ready()
-                else:
-                    process.await_ready()
-            except BaseException:
-                process.end()
-                raise
-        except (DecoderEnded, DecoderFailure, OSError, RuntimeError) as error:
-            log.error("decoder cannot be started", extra={"error": str(error)})
-            raise errors.Busy(
-                "No decoder can be started for this upload. Nothing was stored. Retry in a minute. "
-                "The log of the service shows the cause."
-            ) from error
-        if self.protections is None:
-            walls = process.protections
-            level = logging.INFO if walls.seccomp else logging.WARNING
-            log.log(level, "decoders are confined", extra={"protections": walls.text})
-        self.protections = process.protections
-        return process
-
-    def drop_process(self, slot: _Slot, reason: str) -> None:
-        """Log the failure of a decoder, and kill its process."""
-        process = slot.process
-        about = {"pid": None if process is None else process.pid, "error": reason}
-        log.warning("decoder replaced", extra={**about, "tenant": self._whose()})
-        slot.end()
+        for decoder in self._decoders:
+            decoder.end()
 
 
 def _checked_shape(reply: dict[str, Any], most: int) -> tuple[int, int]:

@@ -9,8 +9,8 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from sceneprint.decoders.pool import DecoderEnded, DecoderProcess
-from sceneprint.errors import Busy, DecoderFailure, UnreadableArchive
+from sceneprint.decoders.pool import ConfinedDecoder, DecoderProcess
+from sceneprint.errors import DecoderFailure, UnreadableArchive
 from sceneprint_client.api.frames import ImportOptions, RecordingOutline
 from sceneprint_client.files import MAXIMUM_CLOUD_BYTES
 
@@ -57,8 +57,6 @@ class RecordingIndex:
 class RecordingDecoder:
     """A confined process with an open recording, for use by one thread.
 
-    The process starts with the first request, and restarts with the first request after a failure.
-
     Parameters
     ----------
     file : descriptor of the recording
@@ -67,14 +65,12 @@ class RecordingDecoder:
     """
 
     def __init__(self, file: int, name: str, seconds: float) -> None:
-        self._file, self._name, self._seconds = file, name, seconds
-        self._process: DecoderProcess | None = None
+        self._name = name
+        self._decoder = ConfinedDecoder(_PROGRAM, _MORE_BYTES, seconds, files=(file,), more=(name,))
 
     def close(self) -> None:
         """Kill the process."""
-        process, self._process = self._process, None
-        if process is not None:
-            process.end()
+        self._decoder.end()
 
     def outline(self, options: ImportOptions) -> tuple[bytes, RecordingIndex]:
         """Return the index of the recording, as JSON for `RecordingIndex.parse` and parsed.
@@ -100,37 +96,20 @@ class RecordingDecoder:
         """
         return self._run({"task": "frame", "topic": topic, "place": place})
 
-    def _start(self) -> DecoderProcess:
-        process = self._process = DecoderProcess(
-            _PROGRAM, _MORE_BYTES, compiled=False, files=(self._file,), more=(self._name,)
-        )
-        try:
-            process.await_ready()
-        except (DecoderEnded, DecoderFailure) as error:
-            self.close()
-            raise Busy(
-                f"No process can be started to read {self._name} ({error}). Retry in a minute."
-            ) from error
-        return process
-
     def _run(self, request: dict[str, Any]) -> bytes:
-        """Return the data of a reply; on failure, kill the process, raise UnreadableArchive."""
+        """Return the data of a reply; raise UnreadableArchive if the process fails."""
 
-        def checked(process: DecoderProcess, reply: dict[str, Any]) -> bytes:
+        def check(process: DecoderProcess, reply: dict[str, Any]) -> bytes:
             size = int(reply["size"])
             if not 0 <= size <= MAXIMUM_CLOUD_BYTES:
                 raise ValueError(f"{size} bytes")
             return process.array_of("u1", (size,)).tobytes()
 
-        process = self._process or self._start()
         try:
-            reply = process.run(request, b"", self._seconds)
-            data: bytes = process.result(reply, checked)
-        except (DecoderEnded, DecoderFailure) as error:
-            self.close()  # a late reply must not answer the next request
+            data: bytes = self._decoder.run(request, b"", check)
+        except DecoderFailure as error:
             raise UnreadableArchive(
                 f"{self._name} cannot be read: {error}. Split the recording, or send only the "
                 "topics of the sensor, its camera, /tf and /tf_static."
             ) from error
-        process.clear()
         return data

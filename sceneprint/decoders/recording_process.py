@@ -1,6 +1,6 @@
 """Program of a process that reads a ROS recording.
 
-    python -m sceneprint.decoders.recording_process CONTROL MEMORY PARENT BYTES plain FILE NAME
+    python -m sceneprint.decoders.recording_process CONTROL PARENT BYTES plain FILE NAME
 
 Before its confinement, the process maps FILE into memory and loads the readers. See
 child_process.py.
@@ -17,9 +17,8 @@ from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 import numpy.ma  # percentiles need it, and a confined process cannot import
-from numpy.typing import NDArray
 
-from sceneprint.decoders.child_process import load_decoders, mapped, serve
+from sceneprint.decoders.child_process import Arrays, load_decoders, mapped, serve
 from sceneprint.errors import DatasetError, UnreadableArchive
 from sceneprint.formats.dataset.frame_reference import import_meta, numbered_sequences
 from sceneprint.formats.points.rows import FileBytes
@@ -39,8 +38,6 @@ from sceneprint_client.formats import HEAD, format_at
 
 #: Maximum number of frames that a recording may select.
 MOST_FRAMES = 100_000
-
-Reply = tuple[dict[str, Any], NDArray[np.uint8]]
 
 
 class _MappedFile(io.RawIOBase):
@@ -87,7 +84,7 @@ class _MappedPath(type(Path())):  # type: ignore[misc]  # the class of paths of 
         return io.BufferedReader(_MappedFile(self.data))
 
 
-def _outline(path: Path, request: dict[str, Any]) -> Reply:
+def _outline(path: Path, request: dict[str, Any]) -> bytes:
     """Return the outline of a recording and its selected frames as JSON; see `RecordingIndex`.
 
     `request["options"]` contains ImportOptions. Raise UnreadableArchive if more than `MOST_FRAMES`
@@ -133,7 +130,7 @@ def _outline(path: Path, request: dict[str, Any]) -> Reply:
         "sequences": len(outline.sequences),
         "notes": [sequence.note[:1000] for sequence in outline.sequences if sequence.note],
     }  # fmt: skip
-    return {}, np.frombuffer(json.dumps(document).encode(), np.uint8)
+    return json.dumps(document).encode()
 
 
 #: Advice for the command line only.
@@ -154,28 +151,28 @@ def _place_of(source: Any) -> list[Any]:
     return [source.log_ns, source.occurrence, None if T is None else T.tolist()]
 
 
-def _frame(path: Path, request: dict[str, Any]) -> Reply:
+def _frame(path: Path, request: dict[str, Any]) -> bytes:
     """Return the bytes of the frame at `request["place"]` of `request["topic"]`."""
     log_ns, occurrence, T = request["place"]
     T_cloud_sensor = None if T is None else np.array(T)
     name, kind = request["topic"]
     topic = BagTopic(name, kind, 0)
     source = BagSource(shared_bag(path), topic, log_ns, occurrence, T_cloud_sensor)
-    return {}, np.frombuffer(source.read_bytes(), np.uint8)
+    return source.read_bytes()
 
 
 def _main() -> None:
-    data = _MappedPath.data = mapped(int(sys.argv[6]))
+    data = _MappedPath.data = mapped(int(sys.argv[5]))
     form = format_at(bytes(data[:HEAD]), "recording")
     suffix = "" if form is None else form.suffixes[0]  # readers identify formats by their suffix
-    path = _MappedPath(sys.argv[7].removesuffix(suffix) + suffix)
+    path = _MappedPath(sys.argv[6].removesuffix(suffix) + suffix)
 
-    def run(task: Any, request: dict[str, Any]) -> Reply:
+    def run(task: Any, request: dict[str, Any]) -> tuple[dict[str, Any], Arrays]:
         try:
-            reply, data = task(path, request)
+            result = np.frombuffer(task(path, request), np.uint8)
         except DatasetError as error:
             raise UnreadableArchive(str(error)) from error
-        return {**reply, "size": len(data)}, data
+        return {"size": len(result)}, (result,)
 
     serve(
         {

@@ -2,7 +2,7 @@
 
 file, name, options  --read_surface_confined-->  ReadSurface, checked again
 
-The process inherits the open file, which avoids a copy, and returns arrays in shared memory.
+The process inherits the open file, which avoids a copy.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from sceneprint.decoders.pool import DecoderEnded, DecoderProcess
-from sceneprint.errors import Busy, DecoderFailure, UnreadableCloud
+from sceneprint.decoders.pool import ConfinedDecoder, DecoderProcess
+from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.cloud import FARTHEST_M
 from sceneprint.formats.surface_file.raw_surface import (
     MOST_FILE_POINTS,
@@ -95,24 +95,14 @@ def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) 
         "task": "surface", "name": name, "up": options.up,
         "units_per_metre": options.units_per_metre,
     }  # fmt: skip
-    process = DecoderProcess(
-        _PROGRAM, limits.more_bytes, compiled=True, files=(file,), more=(form,)
+    decoder = ConfinedDecoder(
+        _PROGRAM, limits.more_bytes, limits.seconds, files=(file,), more=(form,)
     )
     try:
-        try:
-            process.await_ready()
-        except (DecoderEnded, DecoderFailure) as error:
-            raise Busy(
-                f"No process can be started to read {name} ({error}). Nothing was stored. Retry in "
-                "a minute."
-            ) from error
-        try:
-            read: ReadSurface = process.result(process.run(request, b"", limits.seconds), _check)
-        except DecoderEnded as error:
-            raise DecoderFailure(f"it crashes the decoder ({error})") from error
+        read: ReadSurface = decoder.run(request, b"", _check, compiled=True)
         return read
     finally:
-        process.end()
+        decoder.end()
 
 
 def _check(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
@@ -126,7 +116,7 @@ def _check(process: DecoderProcess, reply: dict[str, Any]) -> ReadSurface:
     triangles: Ints32 | None = None
     if m is not None:
         _require(_is_integer(m, 1, MOST_TRIANGLES), "triangles")
-        triangles = process.array_of("<i4", (m, 3), points.nbytes)
+        triangles = process.array_of("<i4", (m, 3))
         _require(bool(triangles.min() >= 0 and triangles.max() < n), "indices of triangles")
     offset, up = _checked_vector(reply["offset"]), _checked_vector(reply["up"])
     _require(abs(float(np.linalg.norm(up)) - 1.0) < 1e-6, "up direction")

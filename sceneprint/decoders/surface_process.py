@@ -1,6 +1,6 @@
 """Program of a process that reads the file of a whole map.
 
-    python -m sceneprint.decoders.surface_process CONTROL MEMORY PARENT BYTES kernels FILE FORMAT
+    python -m sceneprint.decoders.surface_process CONTROL PARENT BYTES kernels FILE FORMAT
 
 Before its confinement, the process maps FILE into memory and loads the reader of FORMAT. See
 child_process.py.
@@ -35,7 +35,7 @@ from sceneprint.geometry.surface.upright import estimate_up
 
 
 def _main() -> None:
-    file, form = mapped(int(sys.argv[6])), cast(SurfaceFormat, sys.argv[7])
+    file, form = mapped(int(sys.argv[5])), cast(SurfaceFormat, sys.argv[6])
 
     def surface(
         _data: bytes, request: dict[str, Any]

@@ -15,7 +15,6 @@ from sceneprint.engine.search.index_place import IndexPlace
 from sceneprint.engine.search.retrieval import Readers
 from sceneprint.engine.signers import Signers
 from sceneprint.geometry.kernel import Cores
-from sceneprint.process import current_tenant
 from sceneprint.settings import Settings
 from sceneprint.store import Store, open_store
 from sceneprint.store.answer_files import open_answers
@@ -83,7 +82,6 @@ def _enter(stack: ExitStack, settings: Settings) -> Context:
             settings.decoders,
             settings.decoder_memory_bytes,
             settings.decoder_timeout_s,
-            current_tenant,
         )
     with ExitStack() as opened:  # close the objects if a later step fails
         store = open_store(

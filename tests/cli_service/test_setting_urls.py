@@ -7,9 +7,9 @@ import pytest
 from pydantic import ValidationError
 
 from sceneprint.cli.options import settings_of
-from sceneprint.decoders.child_process import SHARED_BYTES
 from sceneprint.errors import InvalidRequest
 from sceneprint.settings import Settings
+from sceneprint_client.files import MAXIMUM_CLOUD_BYTES
 
 SERVER = "postgresql+psycopg://u:hunter2@host/db"
 
@@ -51,9 +51,9 @@ def test_urls_are_taken_and_hide_what_is_in_them(monkeypatch):
 
 
 def test_bodies_may_be_as_large_as_a_decoder_takes(monkeypatch):
-    monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(SHARED_BYTES))
+    monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(MAXIMUM_CLOUD_BYTES))
     assert settings_of(argparse.Namespace()).max_upload_bytes == 536870912  # as the docs say
-    monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(SHARED_BYTES + 1))
+    monkeypatch.setenv("SCENEPRINT_MAX_UPLOAD_BYTES", str(MAXIMUM_CLOUD_BYTES + 1))
     with pytest.raises(
         InvalidRequest, match=r"less than or equal to 536870912.*MAX_UPLOAD_BYTES\.$"
     ):

@@ -31,12 +31,12 @@ def _escape(_data, request):
         "signal": lambda: os.kill(os.getppid(), signal.SIGTERM),
         "list": lambda: list(Path("/").iterdir()),
     }
-    return {name: _errno_of(do) for name, do in tried.items()}, None
+    return {name: _errno_of(do) for name, do in tried.items()}, ()
 
 
 def _crash(_data, _request):
     ctypes.string_at(0)
-    return {}, None
+    return {}, ()
 
 
 def _hang(_data, _request):
@@ -46,21 +46,21 @@ def _hang(_data, _request):
 
 def _sleep(_data, _request):
     time.sleep(3600)
-    return {}, None
+    return {}, ()
 
 
 def _hoard(_data, request):
-    return {"sum": float(np.ones(request["numbers"]).sum())}, None
+    return {"sum": float(np.ones(request["numbers"]).sum())}, ()
 
 
 def _leave(_data, request):
     """Free an array of one value."""
-    return {"sum": int(np.full(request["numbers"], 77, np.uint8).sum())}, None
+    return {"sum": int(np.full(request["numbers"], 77, np.uint8).sum())}, ()
 
 
 def _look(_data, request):
     """Count the bytes of that value in new memory of the same size."""
-    return {"seen": int((np.empty(request["numbers"], np.uint8) == 77).sum())}, None
+    return {"seen": int((np.empty(request["numbers"], np.uint8) == 77).sum())}, ()
 
 
 def _fail(_data, _request):

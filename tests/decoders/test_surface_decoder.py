@@ -114,13 +114,11 @@ def test_a_reply_that_lies_is_no_result(tmp_path, lie, monkeypatch):
     path = tmp_path / "upload"
     path.write_bytes(rows(20))
 
-    def run(self, *_):
-        block = np.full(400 * 3, 7, np.int32)  # of no triangle: index 7 is fine, 12 is none
-        block[40:] = 12
-        self._shared[: block.nbytes] = block.tobytes()
-        return truth | lie
+    def receive(_, kind, shape):  # of triangles: index 12 is out of range
+        return np.full(shape, 12, kind)
 
     monkeypatch.setattr(DecoderProcess, "await_ready", lambda self: None)
-    monkeypatch.setattr(DecoderProcess, "run", run)
+    monkeypatch.setattr(DecoderProcess, "ask", lambda *_: truth | lie)
+    monkeypatch.setattr(DecoderProcess, "array_of", receive)
     with pytest.raises(DecoderFailure, match="its reply is invalid"):
         read_surface_confined(path, "map.npy")
