@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
 from itertools import islice
-from typing import IO, Any, Literal, TypeVar
+from typing import IO, Any, Literal, NamedTuple, TypeVar
 
 from sqlalchemy import Connection
 
@@ -53,7 +53,7 @@ _BATCH = 256
 LARGE = 8 << 20
 #: Callback that receives the number of finished rows and blobs, and their total number.
 Progress = Callable[[int, int], None]
-#: Columns of a list of blobs: digest, size in bytes, and reason why the blob is not in the bundle.
+#: Columns of a list of blobs; see ListedBlob.
 BLOB_COLUMNS = ("digest", "bytes", "lost")
 
 #: SQL query for the digests of all blobs that must exist.
@@ -70,18 +70,12 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-#: Reason why a blob is not in a bundle.
-Loss = Literal["missing", "damaged"]
-#: Entry in a bundle's list of blobs: digest, size in bytes, and reason for its loss, if any.
-ListedBlob = tuple[str, int, Loss | None]
-
-
-@dataclass(frozen=True)
-class LostBlob:
-    """A blob that is not in a bundle because it was missing or damaged in the store."""
+class ListedBlob(NamedTuple):
+    """An entry in a bundle's list of blobs: `why` is the reason for its loss, if any."""
 
     digest: str
-    why: Loss
+    bytes: int
+    why: Literal["missing", "damaged"] | None = None
 
 
 @dataclass(frozen=True)
@@ -91,12 +85,12 @@ class Bundle:
     Parameters
     ----------
     manifest : manifest of the bundle
-    lost : blobs that are not in the bundle
+    lost : blobs that were missing or damaged in the store, and are not in the bundle
     written : number of bytes that the backup added to the place
     """
 
     manifest: BundleManifest
-    lost: tuple[LostBlob, ...]
+    lost: tuple[ListedBlob, ...]
     written: int = 0
 
 
@@ -127,7 +121,7 @@ def take_backup(
     ):
         target = BundlePlace.open(place, create=True)
         target.claim(OpaqueIds(database).owner)
-        with target.turn(), blobs.block_removals():  # referenced blobs must not be removed
+        with target.turn(), blobs.locks.block_removals():  # referenced blobs must not be removed
             backup = _Backup(target, progress or (lambda _done, _total: None))
             bundle = backup.write(database, blobs)
             if keep is not None:
@@ -156,7 +150,7 @@ class _Backup:
     def __init__(self, place: BundlePlace, progress: Progress) -> None:
         self._place, self._progress = place, progress
         self._done = self._total = self._written = self._blob_bytes = 0
-        self._lost = list[LostBlob]()
+        self._lost = list[ListedBlob]()
         self._reusable = _reusable_parts(place)
 
     def write(self, database: Database, blobs: Blobs) -> Bundle:
@@ -176,7 +170,7 @@ class _Backup:
                     parts += self._parts(f"rows/{table.name}", rows, partial(table_part, table))
                 summary = summary_of(connection)
             digests.seek(0)
-            rows = cut_rows(self._blobs(blobs, digests), [0])
+            rows = cut_rows(map(tuple, self._blobs(blobs, digests)), [0])
             lists = [*self._parts("blobs", rows, partial(write_part, BLOB_COLUMNS))]
         manifest = BundleManifest(
             created_at=started_at, sceneprint=version("sceneprint"),
@@ -193,24 +187,19 @@ class _Backup:
     ) -> Iterator[Part]:  # fmt: skip
         """Yield the parts of all groups of rows; write those that the previous bundle lacks."""
 
-        def changed() -> Iterator[Part | tuple[bytes, int, str]]:
-            for rows, source in groups:
-                reusable = self._reusable.get((kind, source))
-                if reusable is not None and self._place.size(reusable.digest) == reusable.bytes:
-                    yield reusable
-                else:
-                    yield write(rows), len(rows), source
-
-        def put(group: Part | tuple[bytes, int, str]) -> tuple[Part, bool]:
-            if isinstance(group, Part):
-                return group, False
-            data, rows, source = group
+        def put(group: tuple[list[Row], str]) -> tuple[Part, int]:
+            rows, source = group
+            part = self._reusable.get((kind, source))
+            if part is not None and self._place.size(part.digest) == part.bytes:
+                return part, 0
+            data = write(rows)
             digest, new = self._place.put(data)
             size = len(data)
-            return Part(kind=kind, digest=digest, bytes=size, rows=rows, source=source), new
+            part = Part(kind=kind, digest=digest, bytes=size, rows=len(rows), source=source)
+            return part, size if new else 0
 
-        for part, new in in_order(put, changed()):
-            self._written += part.bytes if new else 0
+        for part, new in in_order(put, groups):
+            self._written += new
             if kind != "blobs":
                 self._advance(part.rows)
             yield part
@@ -225,10 +214,9 @@ class _Backup:
 
         for entries in in_order(copy, batches):
             for listed, new in entries:
-                digest, size, why = listed
-                if why is not None:
-                    self._lost.append(LostBlob(digest, why))
-                self._blob_bytes += size
+                if listed.why is not None:
+                    self._lost.append(listed)
+                self._blob_bytes += listed.bytes
                 self._written += new
                 yield listed
             self._advance(len(entries))
@@ -236,24 +224,24 @@ class _Backup:
     def _copy(self, blobs: Blobs, digest: str) -> tuple[ListedBlob, int]:
         """Copy a blob unless it is in the place; return its list entry and the written bytes."""
         if not is_digest(digest):  # the database was edited by hand
-            return (digest, 0, "missing"), 0
+            return ListedBlob(digest, 0, "missing"), 0
         stored_size = self._place.size(digest)
         if stored_size is not None:
-            return (digest, stored_size, None), 0
+            return ListedBlob(digest, stored_size), 0
         size = blobs.size(digest)
         if size is not None and size > LARGE:
             condition = blobs.condition(digest)
             if condition != "sound":
-                return (digest, 0, condition), 0
+                return ListedBlob(digest, 0, condition), 0
             with closing(blobs.open(digest)) as file:
                 self._place.put_file(digest, file)
-            return (digest, size, None), size
+            return ListedBlob(digest, size), size
         try:
             data = blobs.get(digest)
         except DamagedBlob:
-            return (digest, 0, "damaged" if blobs.holds(digest) else "missing"), 0
+            return ListedBlob(digest, 0, "damaged" if blobs.holds(digest) else "missing"), 0
         self._place.put(data)
-        return (digest, len(data), None), len(data)
+        return ListedBlob(digest, len(data)), len(data)
 
     def _advance(self, rows: int) -> None:
         self._done += rows
@@ -315,7 +303,7 @@ def listed_blobs(place: BundlePlace, manifest: BundleManifest) -> Iterator[Liste
                 None, "missing", "damaged",
             ):  # fmt: skip
                 raise place.damaged(str(digest)[:64], "has an invalid entry in the list of blobs")
-            yield digest, size, why
+            yield ListedBlob(digest, size, why)
 
 
 def part_digests(place: BundlePlace, manifest: BundleManifest) -> Iterator[str]:

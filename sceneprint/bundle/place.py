@@ -26,7 +26,7 @@ from urllib.parse import quote
 from pydantic import Field
 
 from sceneprint.atomic_files import folder_turn, make_folder
-from sceneprint.errors import BundleError, DamagedBundle, UnusableStore
+from sceneprint.errors import BundleError, DamagedBundle
 from sceneprint.sealed_record import StrictRecord, seal, unseal
 from sceneprint.store.blobs.folder import Condition, is_digest
 from sceneprint.store.blobs.object_client import Objects, open_objects
@@ -289,20 +289,8 @@ class BundlePlace:
 
     def _list_sizes(self, first: str) -> dict[str, int]:
         """Return the sizes of all parts whose digests start with two digits, by digest."""
-        folder = f"{_PARTS}{first}/"
-        if self._folder is None:
-            return {
-                entry.key.rpartition("/")[2]: entry.size for entry in self._objects.list(folder)
-            }
-        try:  # twice as fast as listing through the client of object stores
-            with os.scandir(self._folder / folder) as entries:
-                return {entry.name: entry.stat().st_size for entry in entries}
-        except FileNotFoundError:
-            return {}
-        except OSError as error:
-            raise UnusableStore(
-                f"{self.shown}/{folder} cannot be listed ({error.strerror})."
-            ) from error
+        parts = self._objects.list(f"{_PARTS}{first}/")
+        return {part.key.rpartition("/")[2]: part.size for part in parts}
 
 
 def _part_key(digest: str) -> str:

@@ -25,7 +25,6 @@ from sceneprint.bundle.backup import (
     LARGE,
     Bundle,
     ListedBlob,
-    LostBlob,
     Progress,
     check_sound,
     in_order,
@@ -46,7 +45,7 @@ from sceneprint.store.opaque_ids import OpaqueIds, owner_of
 from sceneprint.store.postgres.connection import allow
 from sceneprint.store.tables import keys, secrets
 
-#: Names, in a data folder, of the database, the blobs, and the folder for unfinished files.
+#: Names, in a data folder, of the database, the blobs, and the folder for the unfinished database.
 _DATABASE, _BLOBS, _WORK = "sceneprint.db", "blobs", ".restoring"
 #: Tables that may have rows in an unused database: secrets, samples of a service's metrics, the
 #: schema range, and the progress of a scrub.
@@ -73,24 +72,22 @@ class _Restoration:
         rows = (part.rows for part in self.manifest.parts if part.kind != "blobs")
         self._total = max(sum(rows) + listed, 1)
 
-    def blobs(self, blobs: Blobs | None) -> tuple[LostBlob, ...]:
+    def blobs(self, blobs: Blobs | None) -> tuple[ListedBlob, ...]:
         """Copy all blobs, or only verify them if `blobs` is None; return the lost blobs."""
-        lost, count, size = list[LostBlob](), 0, 0
+        lost, count, size, manifest = list[ListedBlob](), 0, 0, self.manifest
 
         def copy(entry: ListedBlob) -> ListedBlob:
-            if entry[2] is None:
-                self._copy_blob(blobs, *entry[:2])
+            if entry.why is None:
+                self._copy_blob(blobs, entry.digest, entry.bytes)
             return entry
 
-        for digest, length, why in in_order(copy, listed_blobs(self.place, self.manifest)):
-            if why is None:
-                count, size = count + 1, size + length
+        for entry in in_order(copy, listed_blobs(self.place, manifest)):
+            if entry.why is None:
+                count, size = count + 1, size + entry.bytes
             else:
-                lost.append(LostBlob(digest, why))
+                lost.append(entry)
             self._advance(1)
-        if (count, size, len(lost)) != (
-            self.manifest.blobs, self.manifest.blob_bytes, self.manifest.lost,
-        ):  # fmt: skip
+        if (count, size, len(lost)) != (manifest.blobs, manifest.blob_bytes, manifest.lost):
             raise self._mismatch("its blobs")
         return tuple(lost)
 
@@ -144,7 +141,7 @@ class _Restoration:
             check_sound(connection, self.place.shown)
         except UnusableStore as error:
             raise DamagedBundle(str(error)) from error
-        listed = (digest for digest, _, _ in listed_blobs(self.place, self.manifest))
+        listed = (entry.digest for entry in listed_blobs(self.place, manifest))
         if any(digest != other for digest, other in zip_longest(listed, referred(connection))):
             raise self._mismatch("the blobs that its rows refer to")
         # bundles contain no answers that are stored in files
@@ -268,21 +265,26 @@ def restore_to_folder(
     _require_unused_folder(folder)
     reading, work = _Restoration(place, name, progress), folder / _WORK
     is_new = not folder.exists()
-    make_folder(work)
     with folder_turn(work) as mine:
         if not mine:
             raise BundleError(
                 f"{folder}: another process is restoring to this folder. Wait until it ends."
             )
-        if (folder / _BLOBS).exists():  # a restore was killed inside `_publish`
-            (folder / _BLOBS).rename(work / _BLOBS)
-        for half in work.glob(f"{_BLOBS}/*/.*"):  # unfinished files of a killed restore
+        for half in (folder / _BLOBS).rglob(".*.part"):  # unfinished files of a killed restore
             half.unlink()
-        _require_space(folder, reading.manifest, work)
-        with closing(FolderBlobs(work / _BLOBS)) as blobs:
+        _require_space(folder, reading.manifest)
+        with closing(FolderBlobs(folder / _BLOBS)) as blobs:
             lost = reading.blobs(blobs)
         _write_file(work / _DATABASE, reading, keep_keys=keep_keys)
-        _publish(work, folder)
+        try:
+            put_new(work / _DATABASE, folder / _DATABASE)  # completes the store
+        except OSError as error:
+            raise BundleError(
+                f"{folder}: the restored database cannot be moved into this folder "
+                f"({error.strerror}). Nothing was overwritten. Check the files in the folder and "
+                "its permissions."
+            ) from error
+        shutil.rmtree(work)
     if is_new:
         sync_folder(folder.parent)
     return Bundle(reading.manifest, lost)
@@ -294,9 +296,9 @@ def _require_unused_folder(folder: Path) -> None:
         if os.path.lexists(folder):
             raise BundleError(f"{folder} is not a folder. Pass another path with --data.")
         return
-    allowed = {_WORK, "lost+found"} if os.path.ismount(folder) else {_WORK}
-    if (folder / _WORK / _DATABASE).exists() and not (folder / _WORK / _BLOBS).exists():
-        allowed.add(_BLOBS)  # a restore was killed inside `_publish`
+    allowed = {"lost+found"} if os.path.ismount(folder) else set[str]()
+    if (folder / _WORK).is_dir():
+        allowed |= {_WORK, _BLOBS}
     names = sorted({path.name for path in folder.iterdir()} - allowed)
     if names:
         more = "" if len(names) <= 3 else f" and {len(names) - 3} more"
@@ -306,9 +308,9 @@ def _require_unused_folder(folder: Path) -> None:
         )
 
 
-def _require_space(folder: Path, manifest: BundleManifest, work: Path) -> None:
+def _require_space(folder: Path, manifest: BundleManifest) -> None:
     """Raise BundleError if the disk has no room for the parts that are not restored yet."""
-    restored = sum(path.stat().st_size for path in work.rglob("*") if path.is_file())
+    restored = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
     required, free = manifest.bytes - restored, shutil.disk_usage(folder).free
     if free < required:
         raise BundleError(
@@ -324,19 +326,6 @@ def _write_file(path: Path, reading: _Restoration, *, keep_keys: bool = True) ->
     url = URL.create("sqlite", database=str(path)).render_as_string(hide_password=False)
     with closing(open_database(url)) as database, database.write() as connection:
         reading.rows(connection, keep_keys=keep_keys)
-
-
-def _publish(work: Path, folder: Path) -> None:
-    """Move the blobs to the data folder, and then the database, to complete the store."""
-    try:
-        (work / _BLOBS).rename(folder / _BLOBS)
-        put_new(work / _DATABASE, folder / _DATABASE)
-        shutil.rmtree(work)
-    except OSError as error:
-        raise BundleError(
-            f"{folder}: the restored files cannot be moved into this folder ({error.strerror}). "
-            "Nothing was overwritten. Check the files in the folder and its permissions."
-        ) from error
 
 
 def restore_to_server(
@@ -377,7 +366,7 @@ def restore_to_server(
                 connection.exec_driver_sql("DELETE FROM secrets")
                 write_rows(connection, secrets, iter(names))
             blobs = open_blobs(settings.blobs, database, make=True)
-            with closing(blobs), blobs.block_removals():
+            with closing(blobs), blobs.locks.block_removals():
                 lost = reading.blobs(blobs)
                 with database.write() as connection:
                     reading.rows(connection, keep_keys=keep_keys)

@@ -373,9 +373,9 @@ def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
 def test_a_sweep_under_way_is_waited_for(data, tmp_path, settings):
     with ThreadPoolExecutor(1) as pool, Engine(settings(data)) as engine:
         (frame, *_) = [one.frame_id for one in engine.list_frames("hall").items]
-        with engine.store.blobs.removing() as allowed:
+        with engine.store.blobs.locks.removing() as allowed:
             assert allowed
-            with engine.store.blobs.removing() as second:
+            with engine.store.blobs.locks.removing() as second:
                 assert not second
             taking = pool.submit(take_backup, settings(data), str(tmp_path / "place"))
             while not (tmp_path / "place").exists():

@@ -33,7 +33,6 @@ def refused(copy, tmp_path):
                 attempt()
             assert "\n" not in str(raised.value)
         assert not (tmp_path / "new" / "sceneprint.db").exists()
-        assert not (tmp_path / "new" / "blobs").exists()
 
     return check
 
