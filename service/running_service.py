@@ -14,7 +14,6 @@ from sceneprint.engine.admin.statistics import Statistics
 from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.archive_import import Imports
 from sceneprint.engine.ingest.uploads import Uploads
-from sceneprint.engine.maps.map_copy import MapCopies
 from sceneprint.engine.maps.map_frames import FrameFiles
 from sceneprint.engine.maps.map_lifecycle import Catalogue
 from sceneprint.engine.maps.map_surface import MapSurfaces
@@ -80,7 +79,7 @@ class Service:
         self.coverage = Coverages(context, self.queries)
         self.reconstructions = Reconstructions(context)
         self.surfaces = MapSurfaces(store, context.bell)
-        self.outputs, self.copies = FrameFiles(store, context.signers), MapCopies(store)
+        self.outputs = FrameFiles(store, context.signers)
         self.tombstones = Tombstones(store, settings.undo_window_s, context.bell.ring)
         self.audit = Audit(store, settings.audit_log_days)
         self.events, self.statistics = Events(store, settings), Statistics(context)

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from fastapi import Path, Request, Response
 
+from sceneprint.engine.maps import map_copy
 from sceneprint_client.api.copies import CopyRequest
 from service.auth import may_read, v1_router
 from service.bodies import json_body, read_record
@@ -31,7 +32,7 @@ async def copy_map(map_name: str, request: Request, here: Here) -> Response:
     MB. To receive the remaining parts, repeat the request.
     """
     body = await read_record(request, CopyRequest, "The request")
-    data = await here.run(here.copies.bundle, map_name, frozenset(body.have))
+    data = await here.run(map_copy.read_copy, here.context.store, map_name, frozenset(body.have))
     return Response(data, media_type=_BYTES)
 
 
@@ -40,10 +41,10 @@ def get_artifact(
     map_name: str, digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$")], here: Here
 ) -> Response:
     """Return the geometry that validation compares for an indexed frame."""
-    return Response(here.copies.artifact(map_name, digest), media_type=_BYTES)
+    return Response(map_copy.read_artifact(here.context.store, map_name, digest), media_type=_BYTES)
 
 
 @router.get("/model", response_class=Response, responses=_responses(404))
 def get_map_model(map_name: str, here: Here) -> Response:
     """Return the model file of a map."""
-    return Response(here.copies.model(map_name), media_type=_BYTES)
+    return Response(map_copy.read_copied_model(here.context.store, map_name), media_type=_BYTES)

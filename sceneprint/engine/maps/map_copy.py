@@ -1,7 +1,7 @@
 """Copies of single maps in the store of a robot, updated incrementally from the service.
 
-    digests of the copy's parts  --MapCopies.bundle-->  head of the map, and missing parts
-    rows of these parts          -------------------->  missing artifacts
+    digests of the copy's parts  --read_copy-->  head of the map, and missing parts
+    rows of these parts          ------------->  missing artifacts
     --pull_map-->  one transaction
 
 A part consists of the encoded rows of some frames, and has the same bytes in the service and in the
@@ -68,59 +68,53 @@ def copy_parts(connection: Connection, row: MapRow) -> Iterator[tuple[str, bytes
         yield hashlib.sha256(data).hexdigest(), data, len(rows)
 
 
-class MapCopies:
-    """Sources of map copies in the service."""
+def read_copy(store: Store, map_name: str, have: Collection[str]) -> bytes:
+    """Return a consistent state of a map: a line of JSON (`MapCopy`), then the bytes of parts.
 
-    def __init__(self, store: Store) -> None:
-        self._store = store
+    Parameters
+    ----------
+    have : digests of the parts that the caller has; other parts follow, up to about 32 MB
 
-    def bundle(self, map_name: str, have: Collection[str]) -> bytes:
-        """Return a consistent state of a map: a line of JSON (`MapCopy`), then the bytes of parts.
+    Raises
+    ------
+    UnknownMap : If the map does not exist.
+    """
+    parts, sent, size = list[CopyPart](), list[bytes](), 0
+    with store.database.read() as connection:
+        allow(connection, 0)  # no time limit, since sorting the rows of a large map takes long
+        row = find_map(connection, map_name)
+        name = model_names(connection)[row.model_id]
+        for digest, data, count in copy_parts(connection, row):
+            is_sent = digest not in have and size < MOST_BYTES
+            if is_sent:
+                sent.append(data)
+                size += len(data)
+            parts.append(CopyPart(digest=digest, bytes=len(data), rows=count, sent=is_sent))
+    head = copy_fields(MapCopy, row, model=name, parts=parts)
+    return b"".join((head.model_dump_json().encode(), b"\n", *sent))
 
-        Parameters
-        ----------
-        have : digests of the parts that the caller has; other parts follow, up to about 32 MB
 
-        Raises
-        ------
-        UnknownMap : If the map does not exist.
-        """
-        parts, sent, size = list[CopyPart](), list[bytes](), 0
-        with self._store.database.read() as connection:
-            allow(connection, 0)  # no time limit, since sorting the rows of a large map takes long
-            row = find_map(connection, map_name)
-            name = model_names(connection)[row.model_id]
-            for digest, data, count in copy_parts(connection, row):
-                is_sent = digest not in have and size < MOST_BYTES
-                if is_sent:
-                    sent.append(data)
-                    size += len(data)
-                parts.append(CopyPart(digest=digest, bytes=len(data), rows=count, sent=is_sent))
-        head = copy_fields(MapCopy, row, model=name, parts=parts)
-        return b"".join((head.model_dump_json().encode(), b"\n", *sent))
+def read_artifact(store: Store, map_name: str, digest: str) -> bytes:
+    """Return the artifact of an indexed frame.
 
-    def artifact(self, map_name: str, digest: str) -> bytes:
-        """Return the artifact of an indexed frame.
+    Raises
+    ------
+    UnknownMap, NotFound : If the map does not exist, or none of its frames has the artifact.
+    DamagedBlob : If the artifact is damaged or was removed meanwhile.
+    """
+    with store.database.read() as connection:
+        if not has_artifact(connection, find_map(connection, map_name), digest):
+            raise NotFound(
+                f"No indexed frame of map {map_name!r} has an artifact {digest[:80]!r}. List "
+                "the parts of the map again."
+            )
+    return store.blobs.get(digest)
 
-        Raises
-        ------
-        UnknownMap, NotFound : If the map does not exist, or none of its frames has the artifact.
-        DamagedBlob : If the artifact is damaged or was removed meanwhile.
-        """
-        with self._store.database.read() as connection:
-            row = find_map(connection, map_name)
-            if not has_artifact(connection, row, digest):
-                raise NotFound(
-                    f"No indexed frame of map {map_name!r} has an artifact {digest[:80]!r}. List "
-                    "the parts of the map again."
-                )
-        return self._store.blobs.get(digest)
 
-    def model(self, map_name: str) -> bytes:
-        """Return the model of a map as a file; raise UnknownMap if the map does not exist."""
-        with self._store.database.read() as connection:
-            row = find_map(connection, map_name)
-            return model_content(connection, row.model_id)
+def read_copied_model(store: Store, map_name: str) -> bytes:
+    """Return the model of a map as a file; raise UnknownMap if the map does not exist."""
+    with store.database.read() as connection:
+        return model_content(connection, find_map(connection, map_name).model_id)
 
 
 @dataclass(frozen=True)
@@ -160,23 +154,8 @@ def claim_folder(folder: Path) -> None:
     write_durable(folder / _MARK, b"{}", folder_is_new=False)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pull:
-    """Rows of a running pull.
-
-    Parameters
-    ----------
-    own : encoded rows in the copy, by part digest and frame id
-    fetched : encoded rows from the service, by part digest and frame id
-    """
-
-    own: dict[str, dict[str, Row]]
-    fetched: dict[str, dict[str, Row]]
-
-    def rows(self, head: MapCopy) -> dict[str, Row]:
-        """Return the rows of all frames of the map, by frame id."""
-        parts = self.own | self.fetched
-        return {name: row for part in head.parts for name, row in parts[part.digest].items()}
+#: Encoded rows by frame id, for each part digest.
+Parts = dict[str, dict[str, Row]]
 
 
 def pull_map(
@@ -201,17 +180,15 @@ def pull_map(
         were uploaded into the copy.
     DamagedBlob : If the service sent damaged bytes, or an artifact was removed during the update.
     """
-    pull = _Pull(_own_parts(store, map_name), {})
+    own, fetched = _own_parts(store, map_name), Parts()
     artifacts = size = idle = 0
     while True:
-        head, parts = client.map_copy(map_name, [*pull.own, *pull.fetched])
-        if pull.own:
-            with store.database.read() as connection:
-                is_copy = _find_copy(connection, head) is not None
-            if not is_copy:
-                pull.own.clear()  # these rows belong to another map
+        head, parts = client.map_copy(map_name, [*own, *fetched])
+        with store.database.read() as connection:
+            if own and _find_copy(connection, head) is None:
+                own.clear()  # these rows belong to another map
                 continue
-        before = len(pull.fetched)
+        count = len(fetched)
         for digest, data in parts.items():
             rows = _read_part(map_name, digest, data)
             try:
@@ -222,25 +199,26 @@ def pull_map(
                 raise
             except NotFound:  # the frame was deleted or signed again
                 continue
-            pull.fetched[digest] = rows
+            fetched[digest] = rows
             if progress is not None:
-                total = sum(part.rows for part in head.parts if part.digest not in pull.own)
-                done = sum(part.rows for part in head.parts if part.digest in pull.fetched)
-                progress(done, total)
-        if all(part.digest in pull.own or part.digest in pull.fetched for part in head.parts):
+                total = sum(part.rows for part in head.parts if part.digest not in own)
+                progress(sum(part.rows for part in head.parts if part.digest in fetched), total)
+        if all(part.digest in own or part.digest in fetched for part in head.parts):
             break
-        idle = 0 if len(pull.fetched) > before else idle + 1
+        idle = 0 if len(fetched) > count else idle + 1
         if idle >= ROUNDS:
             raise _changed(map_name)
     model = client.copied_model(map_name)
     if parse_model(model, map_name).id != head.model_id:
         raise _changed(map_name)
-    rows = pull.rows(head)
-    written, removed = _write(store, head, pull, rows, model)
-    return PulledMap(head.revision, len(rows), written, removed, artifacts, size)
+    rows = {key: row for part in head.parts for key, row in (own | fetched)[part.digest].items()}
+    before = {key: row for part in own.values() for key, row in part.items()}
+    changed = [_decode_row(head, row) for key, row in rows.items() if before.get(key) != row]
+    removed = _write(store, head, changed, rows.keys(), model)
+    return PulledMap(head.revision, len(rows), len(changed), removed, artifacts, size)
 
 
-def _own_parts(store: Store, map_name: str) -> dict[str, dict[str, Row]]:
+def _own_parts(store: Store, map_name: str) -> Parts:
     """Return rows by frame id for each part digest of a map; empty if the map does not exist."""
     with store.database.read() as connection:
         row = next((record for record in list_maps(connection) if record.name == map_name), None)
@@ -295,17 +273,21 @@ def _find_copy(connection: Connection, head: MapCopy) -> MapRow | None:
 
 
 def _write(
-    store: Store, head: MapCopy, pull: _Pull, rows: dict[str, Row], model: bytes
-) -> tuple[int, int]:
-    """Update the copy in one transaction; return the number of written and of removed frames."""
-    before = {name: row for part in pull.own.values() for name, row in part.items()}
-    written = [_decode_row(head, row) for name, row in rows.items() if before.get(name) != row]
+    store: Store, head: MapCopy, written: list[CopiedFrame], ids: Collection[str], model: bytes
+) -> int:
+    """Update the copy in one transaction; return the number of removed frames.
+
+    Parameters
+    ----------
+    written : new and changed frames
+    ids : ids of all frames of the map
+    """
     blobs: list[str] = []
-    with store.blobs.block_removals(), store.database.write() as connection:
+    with store.blobs.locks.block_removals(), store.database.write() as connection:
         store_model(connection, head.model_id, head.model, model)
         row = _prepare_map(store, connection, head, blobs)
         existing = living_rows(connection, row)
-        deleted = [frame for name, frame in existing.items() if name not in rows]
+        deleted = [frame for name, frame in existing.items() if name not in ids]
         renewed = [
             existing[copy.id] for copy in written
             if copy.id in existing and existing[copy.id].content_id != copy.values["content_id"]
@@ -326,7 +308,7 @@ def _write(
         for first in range(0, len(new), BLOCK):
             add_copied(connection, row, new[first : first + BLOCK])
     collect_deleted_blobs(store, blobs)
-    return len(written), len(deleted)
+    return len(deleted)
 
 
 def _decode_row(head: MapCopy, row: Row) -> CopiedFrame:
