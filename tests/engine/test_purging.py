@@ -208,7 +208,7 @@ def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
     for one in (a, b):
         engine.add(one)
     first, second = (one.frame_id for one in engine.list_frames("hall").items)
-    with engine.store.blobs.block_removals():  # as while a snapshot is being taken
+    with engine.store.blobs.locks.block_removals():  # as while a snapshot is being taken
         engine.delete_frame("hall", first)
         assert len(list(engine.store.blobs.digests())) == 2
         assert engine.purging.now().blobs == 1

@@ -293,13 +293,13 @@ def test_a_server_that_fell_tells_of_the_removal_that_was_under_way(tmp_path, bu
             with store.database.write() as connection:
                 doom(connection, [digest])
             for _ in range(17):  # past 33, which is how far `nextval` would be logged ahead
-                with store.blobs.removing() as allowed:
+                with store.blobs.locks.removing() as allowed:
                     assert allowed
-            assert store.blobs._locks.removals() == 34
-            with store.blobs.removing():
+            assert store.blobs.locks.removals() == 34
+            with store.blobs.locks.removing():
                 server.kill()
                 server.start()
-                assert store.blobs._locks.removals() is None
+                assert store.blobs.locks.removals() is None
                 # the lock went with the server, and the request to remove may still come
                 with pytest.raises(StoreLocked):
                     store.blobs.holds(digest)

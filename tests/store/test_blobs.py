@@ -78,13 +78,13 @@ def test_one_flipped_bit_is_noticed(kept, tmp_path):
         kept.blobs.get(DIGEST)
     assert kept.blobs.condition(DIGEST) == "damaged"
     assert kept.blobs.condition(DIGEST, quick=True) == "sound"
-    with kept.blobs.removing() as allowed:
+    with kept.blobs.locks.removing() as allowed:
         assert allowed
         place = kept.blobs.quarantine(DIGEST, tmp_path / "away")
     assert place == tmp_path / "away" / f"blob-{DIGEST}"
     assert place.read_bytes() == bytes(data)
     assert kept.blobs.condition(DIGEST) == kept.blobs.condition("x") == "missing"
-    with kept.blobs.removing():
+    with kept.blobs.locks.removing():
         assert kept.blobs.quarantine(DIGEST, tmp_path / "away") is None
 
 
@@ -175,11 +175,12 @@ def test_what_others_leave_there_is_no_blob(kept):
 
 
 def test_who_needs_blobs_keeps_others_from_removing_them(kept):
-    with kept.blobs.block_removals(), kept.blobs.block_removals(), kept.blobs.removing() as allowed:
+    locks = kept.blobs.locks
+    with locks.block_removals(), locks.block_removals(), locks.removing() as allowed:
         assert not allowed
-    with kept.blobs.removing() as allowed, kept.blobs.removing() as also:
+    with locks.removing() as allowed, locks.removing() as also:
         assert (allowed, also) == (True, False)
-    with kept.blobs.removing() as allowed:
+    with locks.removing() as allowed:
         assert allowed
 
 

@@ -17,7 +17,7 @@ from sceneprint.store.blobs.object_client import open_objects
 HOLDS = """
 import sys, time
 from sceneprint.store import open_store
-with open_store(sys.argv[1], sys.argv[2]).blobs.block_removals():
+with open_store(sys.argv[1], sys.argv[2]).blobs.locks.block_removals():
     print("held", flush=True)
     time.sleep(600)
 """
@@ -104,18 +104,18 @@ def test_all_processes_share_one_lock(store_url, bucket, until):
         [sys.executable, "-c", HOLDS, store_url, bucket], stdout=subprocess.PIPE, text=True
     ) as other:
         assert other.stdout.readline() == "held\n"
-        with store.blobs.removing() as allowed:
+        with store.blobs.locks.removing() as allowed:
             assert not allowed
-        with store.blobs.block_removals():  # others may need them kept as well
+        with store.blobs.locks.block_removals():  # others may need them kept as well
             pass
         other.kill()
 
     def removes():
-        with store.blobs.removing() as allowed:
+        with store.blobs.locks.removing() as allowed:
             return allowed
 
     until(removes)  # the lock of the dead goes when the server sees the end of its connection
-    with store.blobs.removing() as allowed, store.blobs.removing() as also:
+    with store.blobs.locks.removing() as allowed, store.blobs.locks.removing() as also:
         assert (allowed, also) == (True, False)
     store.close()
 
@@ -128,7 +128,7 @@ def test_what_was_put_is_held_without_asking_until_something_is_removed(postgres
     assert mine.blobs.holds(digest)  # not asked
     assert not theirs.blobs.holds(digest)  # asked: another process put it
     mine.blobs.put(b"depth")
-    with theirs.blobs.removing() as allowed:
+    with theirs.blobs.locks.removing() as allowed:
         assert allowed
         theirs.blobs.remove(digest)
         assert not mine.blobs.holds(digest)  # while it goes on
@@ -150,7 +150,7 @@ def test_a_folder_without_locks_holds_what_it_has(tmp_path, monkeypatch):
     monkeypatch.setattr("fcntl.flock", refuse)
     store = open_store(f"sqlite:///{tmp_path / 'a.db'}", tmp_path / "blobs")
     digest = store.blobs.put(b"depth")
-    with store.blobs.removing() as allowed:
+    with store.blobs.locks.removing() as allowed:
         assert not allowed
     assert store.blobs.holds(digest)
     store.close()
@@ -159,7 +159,7 @@ def test_a_folder_without_locks_holds_what_it_has(tmp_path, monkeypatch):
 def test_a_folder_waits_for_who_removes(tmp_path, monkeypatch):
     store = open_store(f"sqlite:///{tmp_path / 'a.db'}", tmp_path / "blobs")
     digest = store.blobs.put(b"depth")
-    with ThreadPoolExecutor(1) as pool, store.blobs.removing() as allowed:
+    with ThreadPoolExecutor(1) as pool, store.blobs.locks.removing() as allowed:
         assert allowed
         held = pool.submit(store.blobs.holds, digest)
         with pytest.raises(TimeoutError):
@@ -167,14 +167,14 @@ def test_a_folder_waits_for_who_removes(tmp_path, monkeypatch):
         store.blobs.remove(digest)
     assert held.result() is False
     monkeypatch.setattr("sceneprint.store.blobs.folder.TURN_S", 0.0)
-    with store.blobs.removing(), pytest.raises(StoreLocked, match="Try again later"):
+    with store.blobs.locks.removing(), pytest.raises(StoreLocked, match="Try again later"):
         store.blobs.holds(digest)
     store.close()
 
 
 def test_a_lock_that_was_lost_is_said(postgres_url, bucket):
     store = open_store(postgres_url, bucket)
-    kept = store.blobs.block_removals()
+    kept = store.blobs.locks.block_removals()
     kept.__enter__()
     with store.database.write() as connection:
         connection.execute(

@@ -51,7 +51,7 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
     store.geometries.forget(blobs)
     if not blobs:
         return
-    remove = _remove_after_turn if store.blobs.outlast_turns else _remove_in_turn
+    remove = _remove_after_turn if store.blobs.locks.outlast_turns else _remove_in_turn
     for first in range(0, len(blobs), SWEPT_AT_ONCE):
         if not remove(store, blobs[first : first + SWEPT_AT_ONCE]):
             log.info("blob removal deferred", extra={"blobs": len(blobs)})
@@ -62,7 +62,7 @@ def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
 
     If another process holds the removal lock, doom the whole block instead, and return False.
     """
-    with store.database.write() as connection, store.blobs.removing() as allowed:
+    with store.database.write() as connection, store.blobs.locks.removing() as allowed:
         if not allowed:
             doom(connection, block)
             return False
@@ -79,10 +79,10 @@ def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
     instead, and return False.
     """
     with suppress(StoreLocked):
-        store.blobs.wait_for_removal(seconds=_PATIENCE_S)
+        store.blobs.locks.await_removal(seconds=_PATIENCE_S)
     with ExitStack() as removal:
         with store.database.write() as connection:
-            if not removal.enter_context(store.blobs.removing()):
+            if not removal.enter_context(store.blobs.locks.removing()):
                 doom(connection, block)
                 return False
             referred = referred_blobs(connection, block)

@@ -144,7 +144,7 @@ def take_upload(store: Store, map_name: str, frame_id: str, data: bytes) -> list
         return []
     if store.database.read_only or frame.state == FrameState.DELETED:
         return []
-    store.blobs.wait_for_removal(frame.blob)  # it may have started before the commit
+    store.blobs.locks.await_removal(frame.blob)  # it may have started before the commit
     if not is_known_loss(frame.reason) and store.blobs.condition(frame.blob) == "sound":
         return []
     while True:

@@ -174,7 +174,7 @@ def quarantine_blob(folder: Folder, digest: str) -> str:
     ------
     StoreError : If a backup or another process that removes blobs is running.
     """
-    with folder.store.blobs.removing() as allowed:
+    with folder.store.blobs.locks.removing() as allowed:
         if not allowed:
             raise StoreError(BUSY_BLOBS)
         place = folder.store.blobs.quarantine(digest, folder.settings.quarantine_dir)

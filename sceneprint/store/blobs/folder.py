@@ -40,19 +40,29 @@ _LOOK_S = 0.01
 
 
 class Locks(ABC):
-    """Lock on blob storage; see `Blobs.block_removals` and `Blobs.removing`."""
+    """Lock on blob storage; shared while blobs must not be removed."""
 
     @abstractmethod
     def block_removals(self) -> AbstractContextManager[None]:
-        """Hold a shared lock that prevents removals; other processes may hold it too."""
+        """Hold a shared lock that prevents removals; first wait for a removal in progress.
+
+        Raises
+        ------
+        UnusableStore : If the lock cannot be acquired.
+        """
 
     @abstractmethod
     def removing(self) -> AbstractContextManager[bool]:
-        """Acquire the exclusive lock without waiting; yield whether this succeeded."""
+        """Acquire the exclusive lock without waiting; yield False if another process holds it.
+
+        Begin this within a write transaction: removals then run one at a time, and do not starve
+        `block_removals`. Continue after the transaction only if `outlast_turns` is true, and only
+        with blobs that the transaction doomed.
+        """
 
     @property
     def outlast_turns(self) -> bool:
-        """Return whether a removal may continue after the write turn in which it began."""
+        """Return whether removals may continue after the turn that found no references."""
         return False
 
     def removals(self) -> int | None:
@@ -61,6 +71,11 @@ class Locks(ABC):
 
     def mark_uncertain(self) -> None:  # noqa: B027  (removals from a folder end at once)
         """Mark the removal by this thread as unfinished: its requests may still be executed."""
+
+    def await_removal(self, digest: str | None = None, seconds: float = REMOVAL_S) -> None:
+        """Wait for the end of a removal in progress; see `wait` for the parameters and errors."""
+        if self.removals() is None:
+            self.wait(digest, seconds)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: B027  (most have none)
         """Wait for a removal that continues after its write turn, unless its process has died.
@@ -232,7 +247,8 @@ class Blobs(ABC):
     """Storage of blobs; safe to share between threads."""
 
     def __init__(self, locks: Locks) -> None:
-        self._locks = locks
+        #: Lock of all processes that share the blobs.
+        self.locks = locks
 
     @abstractmethod
     def put(self, data: bytes) -> str:
@@ -259,7 +275,6 @@ class Blobs(ABC):
         StoreFull, UnusableStore : See `put`; also raised by `write` and `keep`.
         """
 
-    @abstractmethod
     def get(self, digest: str) -> bytes:
         """Return the verified bytes of a blob.
 
@@ -268,6 +283,23 @@ class Blobs(ABC):
         DamagedBlob : If the blob is missing or damaged.
         UnusableStore : If the storage is unreachable.
         """
+        advice = "Restore it from a copy, or delete the frame and upload it again."
+        try:
+            data = self.read(digest)
+        except OSError as error:
+            reason = error.strerror or "it does not exist"
+            raise DamagedBlob(
+                f"The blob {digest[:12]} cannot be read ({reason}). {advice}"
+            ) from error
+        if hashlib.sha256(data).hexdigest() != digest:
+            raise DamagedBlob(
+                f"The blob {digest[:12]} is damaged: its content has a different hash. {advice}"
+            )
+        return data
+
+    @abstractmethod
+    def read(self, digest: str) -> bytes:
+        """Return the unverified bytes of a blob; raise OSError if it is missing or unreadable."""
 
     @abstractmethod
     def open(self, digest: str) -> BinaryIO:
@@ -308,34 +340,6 @@ class Blobs(ABC):
     def size(self, digest: str) -> int | None:
         """Return the size of a blob, in bytes, without verifying it; None if it is missing."""
 
-    def block_removals(self) -> AbstractContextManager[None]:
-        """Prevent removals of blobs during the context; first wait for a removal in progress.
-
-        Raises
-        ------
-        UnusableStore : If the lock cannot be acquired.
-        """
-        return self._locks.block_removals()
-
-    def removing(self) -> AbstractContextManager[bool]:
-        """Acquire the right to remove blobs; yield False if another process needs or removes blobs.
-
-        Begin this within a write transaction: removals then run one at a time, and do not starve
-        `block_removals`. Continue after the transaction only if `outlast_turns` is true, and only
-        with blobs that the transaction doomed.
-        """
-        return self._locks.removing()
-
-    @property
-    def outlast_turns(self) -> bool:
-        """Return whether removals may continue after the turn that found no references."""
-        return self._locks.outlast_turns
-
-    def wait_for_removal(self, digest: str | None = None, seconds: float = REMOVAL_S) -> None:
-        """Wait for the end of a removal in progress; see `Locks.wait`."""
-        if self._locks.removals() is None:
-            self._locks.wait(digest, seconds)
-
     @abstractmethod
     def remove(self, *digests: str) -> None:
         """Remove blobs without references; call it within `removing`."""
@@ -369,9 +373,9 @@ class Blobs(ABC):
     def place(self, digest: str) -> str:
         """Return the path or URL of a blob for messages."""
 
-    @abstractmethod
     def digests(self) -> Iterator[str]:
         """Yield the digests of all blobs in arbitrary order."""
+        return (entry.digest for entry in self.entries() if entry.digest is not None)
 
     @abstractmethod
     def entries(self) -> Iterator[BlobEntry]:
@@ -392,7 +396,7 @@ class Blobs(ABC):
 
     def close(self) -> None:
         """Close open files and connections."""
-        self._locks.close()
+        self.locks.close()
 
 
 #: Pattern of the names of unfinished files, which killed writers leave behind.
@@ -473,25 +477,13 @@ class FolderBlobs(Blobs):
             return folder.name not in self._durable
         return True
 
-    def get(self, digest: str) -> bytes:
-        """Return the verified bytes of a blob; see `Blobs.get`."""
-        try:
-            data = self.path(digest).read_bytes()
-        except OSError as error:
-            raise DamagedBlob(
-                f"The blob {digest[:12]} cannot be read ({error.strerror}). Restore the data "
-                "folder from a copy, or delete the frame and upload it again."
-            ) from error
-        if hashlib.sha256(data).hexdigest() != digest:
-            raise DamagedBlob(
-                f"The blob {digest[:12]} is damaged: its content has a different hash. Restore the "
-                "data folder from a copy, or delete the frame and upload it again."
-            )
-        return data
+    def read(self, digest: str) -> bytes:
+        """Return the unverified bytes of a blob; see `Blobs.read`."""
+        return self.path(digest).read_bytes()
 
     def holds(self, digest: str) -> bool:
         """Return whether a blob exists; see `Blobs.holds`."""
-        self._locks.wait(digest, TURN_S)
+        self.locks.wait(digest, TURN_S)
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:
@@ -552,14 +544,6 @@ class FolderBlobs(Blobs):
     def place(self, digest: str) -> str:
         """Return the path or URL of a blob for messages."""
         return str(self._folder / digest[:2] / digest)
-
-    def digests(self) -> Iterator[str]:
-        """Yield the digests of all blobs in arbitrary order."""
-        for folder in self._folder.iterdir():
-            if folder.is_dir():
-                for name in os.listdir(folder):  # noqa: PTH208  (Path objects would take time)
-                    if DIGEST.fullmatch(name):
-                        yield name
 
     def entries(self) -> Iterator[BlobEntry]:
         """Yield all files in arbitrary order, except files removed meanwhile."""

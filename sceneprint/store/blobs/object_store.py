@@ -24,7 +24,7 @@ from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from sceneprint.atomic_files import make_folder, sync_folder
-from sceneprint.errors import DamagedBlob, UnusableStore
+from sceneprint.errors import UnusableStore
 from sceneprint.store.blobs.folder import (
     DIGEST,
     MARK,
@@ -198,7 +198,7 @@ class ObjectBlobs(Blobs):
     @contextmanager
     def _putting(self, digest: str) -> Iterator[None]:
         self.claim()
-        before = self._locks.removals()
+        before = self.locks.removals()
         yield
         with self._lock:
             self._put.pop(digest, None)
@@ -207,22 +207,10 @@ class ObjectBlobs(Blobs):
             if len(self._put) > _REMEMBERED:
                 self._put.popitem(last=False)
 
-    def get(self, digest: str) -> bytes:
-        """Return the verified bytes of a blob; see `Blobs.get`."""
+    def read(self, digest: str) -> bytes:
+        """Return the unverified bytes of a blob; see `Blobs.read`."""
         require_digest(digest)
-        try:
-            data = self.objects.get(_key(digest))
-        except FileNotFoundError as error:
-            raise DamagedBlob(
-                f"The blob {digest[:12]} does not exist. Restore it from a copy, or delete the "
-                "frame and upload it again."
-            ) from error
-        if hashlib.sha256(data).hexdigest() != digest:
-            raise DamagedBlob(
-                f"The blob {digest[:12]} is damaged: its content has a different hash. Restore it "
-                "from a copy, or delete the frame and upload it again."
-            )
-        return data
+        return self.objects.get(_key(digest))
 
     def open(self, digest: str) -> BinaryIO:
         """Return an unverified blob as a seekable file; see `Blobs.open`."""
@@ -246,11 +234,11 @@ class ObjectBlobs(Blobs):
         require_digest(digest)
         with self._lock:
             before = self._put.get(digest)
-        now = self._locks.removals()
+        now = self.locks.removals()
         if before is not None and before == now:
             return True
         if now is None:  # a removal is running, and may remove the blob
-            self._locks.wait(digest, seconds)
+            self.locks.wait(digest, seconds)
         return self.objects.size(_key(digest)) is not None
 
     def size(self, digest: str) -> int | None:
@@ -269,7 +257,7 @@ class ObjectBlobs(Blobs):
         try:
             self.objects.delete(*map(_key, digests), seconds=REMOVAL_S, once=True)
         except BaseException:
-            self._locks.mark_uncertain()
+            self.locks.mark_uncertain()
             raise
 
     def condition(self, digest: str, *, quick: bool = False) -> Condition:
@@ -310,10 +298,6 @@ class ObjectBlobs(Blobs):
     def place(self, digest: str) -> str:
         """Return the path or URL of a blob for messages."""
         return f"{self.objects.url}/{_key(digest)}"
-
-    def digests(self) -> Iterator[str]:
-        """Yield the digests of all blobs in arbitrary order."""
-        return (entry.digest for entry in self.entries() if entry.digest is not None)
 
     def entries(self) -> Iterator[BlobEntry]:
         """Yield all objects of the blob storage, page by page.

@@ -184,7 +184,7 @@ def test_a_repair_removes_nothing_under_a_backup(house):
         stray = house.blob(engine.store.blobs.put(b"nothing refers to this"))
         age(stray, 3700)
         house.damage(house.blob(blob))
-        with engine.store.blobs.block_removals():
+        with engine.store.blobs.locks.block_removals():
             actual = house.look(repair=True)
             assert [one.left for one in actual] == [True, True]
             assert all("a backup or another process" in str(one.error) for one in actual)
