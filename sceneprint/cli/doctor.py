@@ -347,16 +347,16 @@ def _decoders(settings: Settings) -> Check:
     pool = DecoderPool(1, settings.decoder_memory_bytes, settings.decoder_timeout_s)
     try:
         pool.start()
-        protections = next((process.protections for process in pool.processes()), None)
+        seccomp = next((process.seccomp for process in pool.processes()), None)
     finally:
         pool.close()
-    if protections is None:
+    if seccomp is None:
         text = "no decoder can be started, so uploads get 503; the log of the service says why"
         return Check("WRONG", "decoders", text)
-    if not protections.seccomp:
-        text = f"{protections.text}. This kernel has no seccomp filter: confine the service itself"
+    if not seccomp:
+        text = "limits on memory and time. This kernel has no seccomp: confine the service itself"
         return Check("note", "decoders", text)
-    return Check("ok", "decoders", protections.text)
+    return Check("ok", "decoders", "limits on memory and time, seccomp")
 
 
 def _tables(cache_dir: Path) -> Iterator[Check]:

@@ -1,6 +1,6 @@
 """Decoding of uploads in confined processes, or of trusted data in this process.
 
-untrusted bytes  --Decoders.place-->  Decoder  --samples | points-->  arrays, checked again
+untrusted bytes  --Decoders.place-->  decoder  --samples | points-->  arrays, checked again
 
 `DecoderPool` (pool.py) uses confined processes. `LocalDecoders` uses this process.
 """
@@ -9,43 +9,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeAlias
 
 from sceneprint.formats.depth_file import Samples, decode_samples
 from sceneprint.formats.points.cloud import ReadPoints, read_points
 from sceneprint_client.formats import CloudFormat
 from sceneprint_client.sidecars import Position, Unsaid
 
-
-class Decoder(Protocol):
-    """A decoder of the bytes of an upload."""
-
-    def samples(self, data: bytes) -> Samples:
-        """Return the samples of a depth image; see `decode_samples`."""
-
-    def points(
-        self, data: bytes, file_format: CloudFormat, viewpoint: Position | Unsaid | None,
-        units_per_metre: float,
-    ) -> ReadPoints:  # fmt: skip
-        """Return the points of a cloud; see `read_points`."""
-
-
-class Decoders(Protocol):
-    """A set of decoders that threads may share."""
-
-    def place(self) -> AbstractContextManager[Decoder]:
-        """Wait for a free decoder, and reserve it within a `with` block.
-
-        Process the arrays within the block: then the number of decoders also limits memory and
-        processor usage.
-        """
-
-    def start(self) -> None:
-        """Start a decoder in advance, to decode the first upload faster."""
-
-    def close(self) -> None:
-        """Stop all decoders."""
+if TYPE_CHECKING:
+    from sceneprint.decoders.pool import ConfinedDecoder, DecoderPool
 
 
 class LocalDecoders:
@@ -58,7 +31,7 @@ class LocalDecoders:
         self._places = threading.BoundedSemaphore(count)
 
     @contextmanager
-    def place(self) -> Iterator[Decoder]:
+    def place(self) -> Iterator[LocalDecoders]:
         """Wait until fewer than `count` uploads are in progress; yield this decoder."""
         with self._places:
             yield self
@@ -79,3 +52,9 @@ class LocalDecoders:
 
     def close(self) -> None:
         """Do nothing."""
+
+
+#: A decoder of uploads, for one thread.
+Decoder: TypeAlias = "LocalDecoders | ConfinedDecoder"
+#: A set of decoders that threads may share.
+Decoders: TypeAlias = "LocalDecoders | DecoderPool"

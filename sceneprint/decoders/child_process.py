@@ -18,7 +18,6 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict
 from types import ModuleType
 from typing import Any
 
@@ -91,11 +90,11 @@ def serve(tasks: Mapping[str, Task], warm: Callable[[bool], None] | None = None)
     try:
         (warm or load_decoders)(sys.argv[4] == "kernels")
         _redirect_to_null()
-        protections = asdict(close_process(more_bytes))
+        seccomp = close_process(more_bytes)
     except Exception:
         _send(control, {"broke": traceback.format_exc()[-MOST_TEXT:]})
         return
-    _send(control, {"ready": protections})
+    _send(control, {"seccomp": seccomp})
     while message := incoming.readline(MESSAGE_BYTES):
         request = json.loads(message)
         _send(control, *_run_task(tasks, request, incoming.read(request["bytes"])))

@@ -33,7 +33,6 @@ from numpy.typing import NDArray
 
 from sceneprint import errors
 from sceneprint.decoders.child_process import MESSAGE_BYTES
-from sceneprint.decoders.sandbox import Protections
 from sceneprint.errors import DecoderFailure
 from sceneprint.formats.depth_file import Samples, decode_samples
 from sceneprint.formats.points.cloud import FARTHEST_M, ReadPoints
@@ -114,7 +113,8 @@ class DecoderProcess:
         more: tuple[str, ...] = (),
     ) -> None:  # fmt: skip
         self.compiled, self._more_bytes, self._until = compiled, more_bytes, 0.0
-        self.protections = Protections(no_new_privileges=False, seccomp=False, landlock=0)
+        #: Whether the process is confined by seccomp; see `close_process`.
+        self.seccomp = False
         self._socket, theirs = socket.socketpair()
         kind = "kernels" if compiled else "plain"
         arguments = (theirs.fileno(), os.getpid(), more_bytes, kind, *files, *more)
@@ -141,12 +141,9 @@ class DecoderProcess:
     def await_ready(self) -> None:
         """Wait until the process is confined; raise DecoderEnded if it fails."""
         reply = self._receive(_BEGIN_S)
-        walls = reply.get("ready")
-        if not isinstance(walls, dict):
+        if "seccomp" not in reply:
             raise DecoderEnded(str(reply.get("broke", reply))[-2000:])
-        self.protections = Protections(
-            walls["no_new_privileges"] is True, walls["seccomp"] is True, int(walls["landlock"])
-        )
+        self.seccomp = reply["seccomp"] is True
 
     def run(self, request: dict[str, Any], data: bytes, seconds: float, check: Check) -> Any:
         """Run a task on an upload, and return its checked result; see `ConfinedDecoder.run`.
@@ -320,9 +317,8 @@ class ConfinedDecoder:
                 "No decoder can be started for this upload. Nothing was stored. Retry in a minute. "
                 "The log of the service shows the cause."
             ) from error
-        walls = process.protections
-        level = logging.INFO if walls.seccomp else logging.WARNING
-        log.log(level, "decoder started", extra={"pid": process.pid, "protections": walls.text})
+        level = logging.INFO if process.seccomp else logging.WARNING
+        log.log(level, "decoder started", extra={"pid": process.pid, "seccomp": process.seccomp})
         return process
 
     def end(self) -> None:

@@ -1,10 +1,7 @@
 """Confinement of a process that reads untrusted bytes: no new files, network, processes or memory.
 
-close_process  -->  Protections: the protections that this kernel supports
-
-The protections are independent, and a kernel or container may lack some of them: resource limits
-(setrlimit), no new privileges, a system call filter (seccomp), and rules for files, TCP and signals
-(Landlock). Open files remain open. Import all code before confinement.
+Resource limits (setrlimit) always apply; a kernel or container may lack the system call filter
+(seccomp). Open files remain open. Import all code before confinement.
 """
 
 from __future__ import annotations
@@ -15,37 +12,11 @@ import platform
 import resource
 import signal
 import struct
-from dataclasses import dataclass
 
 from sceneprint.process import limit_memory
 
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
-
-
-@dataclass(frozen=True)
-class Protections:
-    """The protections of a process, in addition to limits on memory, files and processes.
-
-    Parameters
-    ----------
-    no_new_privileges : whether programs that the process executes cannot gain privileges
-    seccomp : whether only system calls for memory, time and open files are allowed
-    landlock : version of Landlock that forbids files, TCP and signals; 0 if unavailable
-    """
-
-    no_new_privileges: bool
-    seccomp: bool
-    landlock: int
-
-    @property
-    def text(self) -> str:
-        """Return a list of the protections for logs and pages."""
-        protections = ["limits on memory and time"]
-        protections += ["no new privileges"] if self.no_new_privileges else []
-        protections += ["seccomp"] if self.seccomp else []
-        protections += [f"Landlock {self.landlock}"] if self.landlock else []
-        return ", ".join(protections)
 
 
 def die_with_parent(parent: int) -> bool:
@@ -57,45 +28,21 @@ def die_with_parent(parent: int) -> bool:
     return os.getppid() == parent
 
 
-def close_process(more_bytes: int) -> Protections:
-    """Confine this process irrevocably to computation and open files; return its protections.
+def close_process(more_bytes: int) -> bool:
+    """Confine this process irrevocably to computation and open files.
 
-    `more_bytes`: maximum memory that this process may still allocate, bytes; 0 for no limit.
+    Return whether seccomp is active; without it, only memory, files and processes are limited.
+
+    Parameters
+    ----------
+    more_bytes : maximum memory that this process may still allocate, bytes; 0 for no limit
     """
     limit_memory(more_bytes)
-    no_new = _LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0
-    # Landlock and seccomp require no_new_privs; seccomp is last, since it forbids the other calls
-    landlock = _restrict_by_landlock() if no_new else 0
     for limit in (resource.RLIMIT_CORE, resource.RLIMIT_FSIZE, resource.RLIMIT_NOFILE,
                   resource.RLIMIT_NPROC):  # fmt: skip
         resource.setrlimit(limit, (0, 0))
-    return Protections(no_new, no_new and _filter_system_calls(), landlock)
-
-
-# Landlock: a ruleset without rules forbids all access that it handles.
-
-_CREATE_RULESET, _RESTRICT_SELF = 444, 446  #: system call numbers, the same on all processors
-_GET_VERSION = 1
-#: Number of file access rights by Landlock version.
-_FILE_BITS = {1: 13, 2: 14, 3: 15, 4: 15, 5: 16}
-
-
-def _restrict_by_landlock() -> int:
-    """Forbid all access that Landlock handles; return its version, or 0 if unavailable."""
-    version = int(_LIBC.syscall(_CREATE_RULESET, None, 0, _GET_VERSION))
-    if version < 1:
-        return 0
-    files = (1 << _FILE_BITS[min(version, max(_FILE_BITS))]) - 1
-    network = 3 if version >= 4 else 0  # binding and connecting TCP sockets
-    scoped = 3 if version >= 6 else 0  # connecting to abstract sockets, signalling other processes
-    rules = struct.pack("=QQQ", files, network, scoped)
-    size = 24 if version >= 6 else 16 if version >= 4 else 8
-    ruleset = int(_LIBC.syscall(_CREATE_RULESET, rules, size, 0))
-    if ruleset < 0:
-        return 0
-    closed = _LIBC.syscall(_RESTRICT_SELF, ruleset, 0) == 0
-    os.close(ruleset)
-    return version if closed else 0
+    no_new_privileges = _LIBC.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0) == 0  # seccomp requires it
+    return no_new_privileges and _filter_system_calls()
 
 
 # seccomp: a classic BPF program checks the number, architecture and arguments of a system call.
