@@ -9,15 +9,11 @@ from __future__ import annotations
 
 import math
 import os
-import stat
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
 from sceneprint.decoders.pool import ConfinedDecoder, DecoderProcess
-from sceneprint.errors import UnreadableCloud
 from sceneprint.formats.points.cloud import FARTHEST_M
 from sceneprint.formats.surface_file.raw_surface import (
     MOST_FILE_POINTS,
@@ -40,64 +36,33 @@ _PROGRAM = "sceneprint.decoders.surface_process"
 _MOST_NOTES, _LONGEST_NOTE = 20, 1000
 
 
-@dataclass(frozen=True)
-class SurfaceLimits:
-    """Limits for the process that reads a map file.
-
-    Parameters
-    ----------
-    more_bytes : maximum further memory, besides the file and the result, bytes; 0 for no limit
-    seconds : maximum processor time
-    """
-
-    more_bytes: int = 2 << 30
-    seconds: float = 600.0
-
-
 def read_surface_confined(
-    file: int | Path, name: str, options: SurfaceOptions | None = None,
-    limits: SurfaceLimits | None = None,
+    file: int, name: str, options: SurfaceOptions, *, seconds: float = 600.0,
+    more_bytes: int = 2 << 30,
 ) -> ReadSurface:  # fmt: skip
     """Read the surface of a file in a confined process; see `read_surface`.
 
     Parameters
     ----------
-    file : descriptor or path of a regular file; the file must not change in the meantime
+    file : descriptor of a regular file, which must not change in the meantime
     name : name of the file for errors; its suffix identifies formats without a magic number
-    options : units and up direction; None if the user states neither
-    limits : limits for the process; None selects 2 GiB and 10 minutes
+    options : units and up direction
+    seconds : maximum processor time
+    more_bytes : maximum further memory, besides the file and the result, bytes; 0 for no limit
 
     Raises
     ------
     UnreadableCloud, UselessFrame, MissingDependency : See `read_surface`.
     DecoderFailure : If the process crashes, takes too long, or needs too much memory.
     Busy : If no process can be started.
-    OSError : If the file cannot be opened.
     """
-    if isinstance(file, int):
-        return _read(file, name, options or SurfaceOptions(), limits or SurfaceLimits())
-    descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
-    try:
-        return _read(descriptor, name, options or SurfaceOptions(), limits or SurfaceLimits())
-    finally:
-        os.close(descriptor)
-
-
-def _read(file: int, name: str, options: SurfaceOptions, limits: SurfaceLimits) -> ReadSurface:
-    status = os.fstat(file)
     with naming(name):
-        if not stat.S_ISREG(status.st_mode):
-            raise UnreadableCloud(
-                "This is not a regular file. Specify the file that contains the map."
-            )
-        form = surface_format(os.pread(file, HEAD, 0), name, status.st_size)
+        form = surface_format(os.pread(file, HEAD, 0), name, os.fstat(file).st_size)
     request = {
         "task": "surface", "name": name, "up": options.up,
         "units_per_metre": options.units_per_metre,
     }  # fmt: skip
-    decoder = ConfinedDecoder(
-        _PROGRAM, limits.more_bytes, limits.seconds, files=(file,), more=(form,)
-    )
+    decoder = ConfinedDecoder(_PROGRAM, more_bytes, seconds, files=(file,), more=(form,))
     try:
         read: ReadSurface = decoder.run(request, b"", _check, compiled=True)
         return read

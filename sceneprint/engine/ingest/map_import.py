@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from sceneprint.decoders.pool import inheritable
-from sceneprint.decoders.surface_decoder import SurfaceLimits, read_surface_confined
+from sceneprint.decoders.surface_decoder import read_surface_confined
 from sceneprint.engine.context import Context
 from sceneprint.engine.ingest.archive_import import (
     import_item,
@@ -175,7 +175,7 @@ class MapImporter:
 
     def __init__(self, context: Context, uploads: Uploads, queries: Queries) -> None:
         # limit of processor time, which leaves a quarter of the timeout for writing
-        self._limits = SurfaceLimits(seconds=0.75 * context.settings.job_timeout_s)
+        self._seconds = 0.75 * context.settings.job_timeout_s
         self._store, self._signers = context.store, context.signers
         self._uploads, self._queries = uploads, queries
         self._phases = {
@@ -206,7 +206,7 @@ class MapImporter:
         with self._open_file(file) as source, inheritable(source) as descriptor:
             try:
                 read = read_surface_confined(
-                    descriptor, options.name, surface_options, self._limits
+                    descriptor, options.name, surface_options, seconds=self._seconds
                 )
             except DecoderFailure as error:
                 raise UnreadableCloud(
