@@ -44,6 +44,11 @@ from sceneprint.types import Bytes
 
 log = logging.getLogger(__name__)
 
+#: Inode and modification time, which change when a file is written again; None for a missing file.
+FileState = tuple[int, int] | None
+#: States of the parts that this process has verified or written, by index folder and name.
+_sound: dict[Path, Mapping[str, FileState]] = {}
+
 
 @dataclass(frozen=True, eq=False)
 class IndexVersion:
@@ -54,12 +59,12 @@ class IndexVersion:
     Parameters
     ----------
     segments : segments that together contain each frame once
-    inodes : inodes of the parts by name: a part may be written again with the same name
+    files : states of the parts by name: a part may be written again with the same name
     """
 
     manifest: IndexManifest
     segments: tuple[Segment, ...]
-    inodes: Mapping[str, int]
+    files: Mapping[str, FileState]
 
     def __len__(self) -> int:
         return sum(len(segment) for segment in self.segments)
@@ -117,19 +122,17 @@ def newest(
     dimension: int,
     *,
     previous: IndexVersion | None = None,
-    sound: Mapping[str, int] | None = None,
 ) -> IndexVersion | None:
     """Open the newest sound version in a folder; return None if there is none.
 
-    All parts are verified before use. A version with a damaged part is logged and skipped.
+    All parts are verified before use, once in each process. A version with a damaged part is logged
+    and skipped.
 
     Parameters
     ----------
     folder : folder of the map's index; it may be missing
     model_id, dimension : model and length of the signatures; versions of other models are skipped
-    previous : open version of this folder; if it is the newest, it is returned, and its parts are
-        not verified again
-    sound : inodes, by name, of parts that this process has verified
+    previous : open version of this folder; if it is the newest, it is returned
     """
     while True:
         listed, version, errors = manifests(folder), None, []
@@ -137,7 +140,7 @@ def newest(
             try:
                 manifest = read_manifest(path)
                 if (manifest.model_id, manifest.dimension) == (model_id, dimension):
-                    version = open_version(folder, manifest, previous, sound)
+                    version = open_version(folder, manifest, previous)
                     break
             except DamagedIndex as error:
                 errors.append(error)
@@ -149,44 +152,37 @@ def newest(
 
 
 def open_version(
-    folder: Path, manifest: IndexManifest, previous: IndexVersion | None = None,
-    sound: Mapping[str, int] | None = None,
-) -> IndexVersion:  # fmt: skip
-    """Open the parts in a manifest; raise DamagedIndex if one is missing or damaged.
-
-    Parameters
-    ----------
-    previous, sound : see `newest`
-    """
-    verified = {**(previous.inodes if previous is not None else {}), **(sound or {})}
-    inodes = {name: _inode(folder / name) for name, _ in manifest.files}
-    if previous is not None and previous.manifest == manifest and previous.inodes == inodes:
+    folder: Path, manifest: IndexManifest, previous: IndexVersion | None = None
+) -> IndexVersion:
+    """Open the parts in a manifest; raise DamagedIndex if one is missing or damaged."""
+    files = {name: _state_of(folder / name) for name, _ in manifest.files}
+    if previous is not None and previous.manifest == manifest and previous.files == files:
         return previous
+    sound = _sound.get(folder, {})
     for name, size in manifest.files:
-        if inodes[name] != verified.get(name, -1):
+        if files[name] is None or sound.get(name) != files[name]:
             for _ in verify(folder, name, size):
                 pass
+    _sound[folder] = files
     # reuse open segments with their caches, unless a damaged part was written again
-    reusable = (
-        {} if previous is None else {segment.record: segment for segment in previous.segments}
-    )
+    reusable = {} if previous is None else {
+        segment.record: segment for segment in previous.segments
+        if all(previous.files[name] == files.get(name) for name, _ in segment.record.files)
+    }  # fmt: skip
     segments = tuple(
-        reusable[record]
-        if record in reusable
-        and previous is not None
-        and all(previous.inodes[name] == inodes[name] for name, _ in record.files)
+        reusable[record] if record in reusable
         else open_segment(folder, record, manifest.dimension)
         for record in manifest.segments
-    )
-    return IndexVersion(manifest, segments, inodes)
+    )  # fmt: skip
+    return IndexVersion(manifest, segments, files)
 
 
-def _inode(path: Path) -> int:
-    """Return the inode of a file; 0 if it does not exist."""
+def _state_of(path: Path) -> FileState:
     try:
-        return path.stat().st_ino
+        status = path.stat()
     except OSError:
-        return 0
+        return None
+    return status.st_ino, status.st_mtime_ns
 
 
 # A search returns the nearest frames of a map by exact distance of signatures: Sec. III-C. It
@@ -417,9 +413,11 @@ def publish(
         # the previous version is sound; versions after it may be damaged
         before = last if previous is None else previous.number
         keep_only(folder, {manifest.number} if clean else {manifest.number, before})
-        known = {} if previous is None else previous.inodes
-        written = {name: _inode(folder / name) for name, _ in manifest.files if name not in known}
-        return open_version(folder, manifest, previous, written)
+        known = {} if previous is None else previous.files
+        _sound[folder] = {
+            name: known.get(name) or _state_of(folder / name) for name, _ in manifest.files
+        }
+        return open_version(folder, manifest, previous)
 
 
 def _write_segments(

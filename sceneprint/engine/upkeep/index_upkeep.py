@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -131,8 +131,6 @@ class Upkeep:
         self._elsewhere: dict[int, float] = {}  # time of the next attempt, by map
         # number and revision of the published index, by map and model
         self._published: dict[tuple[int, str], tuple[int, int]] = {}
-        # inodes of verified parts by name, by map and model, to verify each part only once
-        self._verified: dict[tuple[int, str], Mapping[str, int]] = {}
         self._metrics: dict[str, Metric | None] = {}
         self._scrubber = Scrubber(settings.indexes, settings.index_check_interval_s)
         self._rows_s = DAY_S * settings.deleted_rows_days
@@ -359,7 +357,6 @@ class Upkeep:
                 return None
             self._place.prune(row, clean=clean)
         self._published[row.number, row.model_id] = version.number, version.revision
-        self._verified[row.number, row.model_id] = version.inodes
         log.info(
             "index published",
             extra={"map": row.name, "version": version.number, "frames": len(version)},
@@ -416,12 +413,8 @@ class Upkeep:
             return not self._is_outdated(connection, now, since)
 
     def _newest(self, row: MapRow, model: Model) -> IndexVersion | None:
-        """Return the newest sound local index; verify each part only once."""
-        sound = self._verified.get((row.number, row.model_id))
-        version = newest(self._place.folder(row), row.model_id, model.signature_bytes, sound=sound)
-        if version is not None:
-            self._verified[row.number, row.model_id] = version.inodes
-        return version
+        """Return the newest sound local index."""
+        return newest(self._place.folder(row), row.model_id, model.signature_bytes)
 
 
 def _blocks(
