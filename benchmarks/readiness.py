@@ -45,7 +45,7 @@ def fill_map(data: Path, frames: int, model: Preset) -> None:
             fill(store.database, MAP, read_model(model), vectors, blob=blob)
             with store.database.read() as connection:
                 row = find_map(connection, MAP)
-            Upkeep(store, context.signers, context.settings, context.indexes).rebuild(row)
+            Upkeep(context).rebuild(row)
 
 
 def measure(frame: FrameReference, to_sign: Sequence[FrameReference]) -> list[str]:

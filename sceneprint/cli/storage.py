@@ -193,12 +193,13 @@ def _record(finding: Finding) -> dict[str, object]:
 def _purge(options: argparse.Namespace) -> int:
     """Purge deleted frames; return 1 if the write-ahead log could not be emptied."""
     from sceneprint.engine.context import open_context
-    from sceneprint.engine.upkeep.housekeeping import purging_of
+    from sceneprint.engine.upkeep.index_upkeep import Upkeep
+    from sceneprint.engine.upkeep.purge import Purging
 
     if not options.map is options.grace is options.json is None:
         raise InvalidRequest("--purge checks nothing. Use it only with --data.")
     with open_context(existing_store(options)) as context:
-        purged = purging_of(context).now()
+        purged = Purging(context, Upkeep(context)).now()
         print(
             f"purged {purged.blobs} blobs, {purged.answers} stored answers, "
             f"{purged.products} products; rebuilt {purged.indexes} indexes"

@@ -225,10 +225,8 @@ def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
 def test_an_index_that_another_process_builds_is_not_said_to_be_purged(lived_in, monkeypatch):
     monkeypatch.setattr(purge, "PAUSE", 1e4)
     engine, names = lived_in, lived_in.ids()
-    worker = Purging(
-        engine.store, engine.upkeep, engine.query_log, engine.tombstones,
-        (engine.reconstructions, engine.differences), 0.0, engine.settings.quarantine_dir,
-    )  # fmt: skip
+    worker = Purging(engine.context, engine.upkeep)
+    worker._every_s = worker._next = 0.0
     folder = index_folder(engine.settings.indexes, engine.row("hall"))
     before = newest_number(folder)
     engine.delete_frame("hall", names[0])

@@ -8,30 +8,10 @@ from sceneprint.engine.ingest.archive_import import Imports
 from sceneprint.engine.ingest.uploads import Uploads
 from sceneprint.engine.maps.map_lifecycle import Reencodings
 from sceneprint.engine.maps.map_surface import SurfaceUpkeep
-from sceneprint.engine.maps.tombstones import Tombstones
 from sceneprint.engine.products.join_upkeep import JoinUpkeep
-from sceneprint.engine.products.reconstruction import Reconstructions
-from sceneprint.engine.products.session_differences import Differences
 from sceneprint.engine.upkeep.index_upkeep import Upkeep
 from sceneprint.engine.upkeep.purge import Purging, Retention
 from sceneprint.store.events import number_events
-
-
-def purging_of(context: Context, upkeep: Upkeep | None = None) -> Purging:
-    """Return an object that purges the deleted frames of a context.
-
-    Parameters
-    ----------
-    upkeep : upkeep of the indexes; None creates one
-    """
-    settings, store = context.settings, context.store
-    upkeep = upkeep or Upkeep(store, context.signers, settings, context.indexes)
-    return Purging(
-        store, upkeep, context.query_log,
-        Tombstones(store, settings.undo_window_s, context.bell.ring),
-        (Reconstructions(context), Differences(context)),
-        settings.purge_deadline_s, settings.quarantine_dir,
-    )  # fmt: skip
 
 
 class Housekeeping:
@@ -40,7 +20,7 @@ class Housekeeping:
     def __init__(self, context: Context) -> None:
         settings, store, bell = context.settings, context.store, context.bell
         self._context = context
-        self.upkeep = Upkeep(store, context.signers, settings, context.indexes)
+        self.upkeep = Upkeep(context)
         self.reencodings = Reencodings(store, self.upkeep)
         self.retention = Retention(store, settings.deleted_rows_days)
         self.events = Events(store, settings)
@@ -48,7 +28,7 @@ class Housekeeping:
         self.imports = Imports(context, Uploads(context))
         self.surfaces = SurfaceUpkeep(store, bell, auto=settings.build_surfaces == "auto")
         self.joins = JoinUpkeep(store, bell, auto=settings.join_sessions == "auto")
-        self.purging = purging_of(context, self.upkeep)
+        self.purging = Purging(context, self.upkeep)
 
     def run(self) -> int:
         """Run the tasks that are due; return the number of published indexes."""

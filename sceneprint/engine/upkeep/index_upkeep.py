@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection
 
 from sceneprint.atomic_files import PRIVATE_FILE, make_folder
-from sceneprint.engine.search.index_place import IndexPlace
+from sceneprint.engine.context import Context
 from sceneprint.engine.search.local_index import trusted
-from sceneprint.engine.signers import Signers
 from sceneprint.engine.upkeep.repair import resign_frames
 from sceneprint.errors import (
     BusyIndex,
@@ -33,8 +32,6 @@ from sceneprint.geometry.retrieval.ranking import Metric
 from sceneprint.index.index_manifest import IndexManifest, newest_number, scrub
 from sceneprint.index.index_version import IndexVersion, newest, publish
 from sceneprint.models import Model
-from sceneprint.settings import Settings
-from sceneprint.store import Store
 from sceneprint.store.deletion import DAY_S, newest_deletion
 from sceneprint.store.events import anchor_of_now
 from sceneprint.store.maps import find_map, list_maps
@@ -115,18 +112,11 @@ class Scrubber:
 
 
 class Upkeep:
-    """Publication and verification of the indexes of a machine.
+    """Publication and verification of the indexes of a machine."""
 
-    Parameters
-    ----------
-    settings : maximum number of unindexed frames, interval of verification, and lifetime of rows of
-        deleted frames
-    """
-
-    def __init__(
-        self, store: Store, signers: Signers, settings: Settings, place: IndexPlace
-    ) -> None:
-        self._store, self._signers, self._place = store, signers, place
+    def __init__(self, context: Context) -> None:
+        settings = context.settings
+        self._store, self._signers, self._place = context.store, context.signers, context.indexes
         self._tail_frames = settings.unindexed_frames
         self._elsewhere: dict[int, float] = {}  # time of the next attempt, by map
         # number and revision of the published index, by map and model
@@ -308,10 +298,6 @@ class Upkeep:
                 "still contain bytes of deleted frames. Try again later."
             )
         return stale
-
-    def sweep(self, *, now: bool = False) -> None:
-        """Remove shared indexes of deleted maps and of former models."""
-        self._place.sweep(now=now)
 
     def postpone_purge(self, row: MapRow, seconds: float) -> None:
         """Postpone the next purge of the index of a map by `seconds`, for all processes."""

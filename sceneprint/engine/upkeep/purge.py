@@ -14,17 +14,15 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from pathlib import Path
-from typing import Any
 
 from sceneprint.engine.context import Context
 from sceneprint.engine.maps.tombstones import Tombstones
-from sceneprint.engine.products.product import Products
-from sceneprint.engine.results.query_log import QueryLog
+from sceneprint.engine.products.reconstruction import Reconstructions
+from sceneprint.engine.products.session_differences import Differences
 from sceneprint.engine.upkeep.garbage_collection import (
     collect_deleted_blobs,
     collect_doomed_blobs,
@@ -190,22 +188,15 @@ class Purged:
 
 
 class Purging:
-    """Purge of deleted frames on a node; several processes may run it at the same time.
+    """Purge of deleted frames on a node; several processes may run it at the same time."""
 
-    Parameters
-    ----------
-    purge_s : maximum seconds from a deletion to the removal of the last byte
-    quarantine : folder of quarantined blobs
-    """
-
-    def __init__(
-        self, store: Store, upkeep: Upkeep, query_log: QueryLog, tombstones: Tombstones,
-        products: Sequence[Products[Any, Any]], purge_s: float, quarantine: Path,
-    ) -> None:  # fmt: skip
-        self._store, self._upkeep, self._log = store, upkeep, query_log
-        self._tombstones, self._quarantine = tombstones, quarantine
-        self._products = products
-        self._every_s = purge_s / 2  # half, since a deletion may follow just after a purge
+    def __init__(self, context: Context, upkeep: Upkeep) -> None:
+        settings, store = context.settings, context.store
+        self._context, self._upkeep = context, upkeep
+        self._tombstones = Tombstones(store, settings.undo_window_s, context.bell.ring)
+        self._products = Reconstructions(context), Differences(context)
+        # half of the deadline, since a deletion may follow just after a purge
+        self._every_s = settings.purge_deadline_s / 2
         self._next = time.monotonic() + self._every_s
 
     def run(self) -> Purged | None:
@@ -213,7 +204,7 @@ class Purging:
         if time.monotonic() < self._next:
             return None
         self._next = time.monotonic() + self._every_s
-        self._store.geometries.forget_older(self._every_s)
+        self._context.store.geometries.forget_older(self._every_s)
         before = time.time() - min(_YOUNG_S, self._every_s)
         seconds = min(_SWEEP_S, self._every_s)
         return self._purge_all(before, self._upkeep.is_purge_due, seconds=seconds)
@@ -248,18 +239,19 @@ class Purging:
                     failed.append(error)
                 return 0
 
+        context, store = self._context, self._context.store
         attempt(lambda: self._tombstones.purge(everything=before is None))
-        with self._store.database.read() as connection:
+        with store.database.read() as connection:
             rows = [row for row in list_maps(connection) if selects(row)]
         purged = Purged(
-            blobs=attempt(lambda: collect_doomed_blobs(self._store, before, seconds))
-            + attempt(lambda: collect_quarantined(self._store, self._quarantine)),
+            blobs=attempt(lambda: collect_doomed_blobs(store, before, seconds))
+            + attempt(lambda: collect_quarantined(store, context.settings.quarantine_dir)),
             products=sum(attempt(product.forget) for product in self._products),
-            answers=attempt(self._log.purge),
-            indexes=attempt(partial(self._upkeep.sweep, now=before is None))
-            + sum(attempt(lambda row=row: self._purge_index(row)) for row in rows),  # type: ignore[misc]
+            answers=attempt(context.query_log.purge),
+            indexes=attempt(partial(context.indexes.sweep, now=before is None))
+            + sum(attempt(partial(self._purge_index, row)) for row in rows),
         )
-        self._store.database.shrink_log()
+        store.database.shrink_log()
         return purged
 
     def _purge_index(self, row: MapRow) -> int:
