@@ -41,11 +41,6 @@ def is_ours(name: str) -> bool:
     return _OURS.match(name) is not None
 
 
-def unfinished(folder: Path) -> Path:
-    """Return an unused path in a folder for an unfinished file; create no file."""
-    return folder / f".{secrets.token_hex(6)}.part"
-
-
 def put(
     folder: Path, kind: str, write: Callable[[Callable[[bytes], None]], object]
 ) -> tuple[str, int]:
@@ -61,7 +56,7 @@ def put(
     ------
     OSError : If the part cannot be written; no file remains.
     """
-    part, digest = unfinished(folder), hashlib.sha256()
+    part, digest = folder / f".{secrets.token_hex(6)}.part", hashlib.sha256()
     try:
         with os.fdopen(create_private(part), "wb") as file:
 

@@ -13,7 +13,7 @@ is written again.
 from __future__ import annotations
 
 import mmap
-import os
+import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sceneprint.atomic_files import create_private
 from sceneprint.errors import DamagedIndex
 from sceneprint.geometry.retrieval.ranking import Metric, distances
 from sceneprint.index import faiss_index
@@ -36,7 +35,6 @@ from sceneprint.index.part_files import (
     check_block,
     mapped,
     put,
-    unfinished,
 )
 from sceneprint.index.sketches import (
     NEAR,
@@ -305,9 +303,8 @@ def spool_blocks(
     ------
     ValueError : If blocks are malformed, have several lengths, or have a key twice.
     """
-    keys, path = [np.empty(0, np.int64)], unfinished(folder)
-    with os.fdopen(create_private(path), "w+b") as file:
-        path.unlink()
+    keys = [np.empty(0, np.int64)]
+    with tempfile.TemporaryFile(dir=folder) as file:
         for own, signatures in blocks:
             if dimension is not None and signatures.ndim == 2 and signatures.shape[1] != dimension:
                 lengths = sorted({dimension, signatures.shape[1]})

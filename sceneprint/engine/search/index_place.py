@@ -20,6 +20,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import pairwise
@@ -76,9 +77,8 @@ class IndexPlace:
         self._store = None if url is None else open_objects(str(url), "SCENEPRINT_INDEX_URL")
         self._claimed = False
         self._lock = threading.Lock()
-        self._wanted: dict[str, MapRow] = {}
         self._looked: dict[str, float] = {}
-        self._thread: threading.Thread | None = None
+        self._fetches = ThreadPoolExecutor(1, "index")
         self._stop = threading.Event()
         self._stale: dict[str, frozenset[str]] = {}
 
@@ -90,13 +90,11 @@ class IndexPlace:
     def close(self) -> None:
         """Stop downloads after the current block."""
         self._stop.set()
-        self.finish()
+        self._fetches.shutdown(cancel_futures=True)
 
     def finish(self) -> None:
         """Wait until all requested indexes are downloaded."""
-        thread = self._thread
-        if thread is not None:
-            thread.join()
+        self._fetches.submit(bool).result()
 
     def folder(self, row: MapRow) -> Path:
         """Return the local folder of the index of a map."""
@@ -270,25 +268,16 @@ class IndexPlace:
             if time.monotonic() - self._looked.get(folder.name, -LOOK_S) < LOOK_S:
                 return
             self._looked[folder.name] = time.monotonic()
-            _mark_used(folder)
-            if row.revision - since <= self._tail_frames:
-                return
-            self._wanted[folder.name] = row
-            if self._thread is None or not self._thread.is_alive():
-                self._thread = threading.Thread(target=self._fetch, daemon=True, name="index")
-                self._thread.start()
+        _mark_used(folder)
+        if row.revision - since > self._tail_frames:
+            with suppress(RuntimeError):  # after `close`
+                self._fetches.submit(self._fetch, row)
 
-    def _fetch(self) -> None:
-        while not self._stop.is_set():
-            with self._lock:
-                if not self._wanted:
-                    self._thread = None
-                    return
-                _, row = self._wanted.popitem()
-            try:
-                self.sync(row, needed=False)
-            except (OSError, SceneprintError, ValueError) as error:
-                log.warning("index not fetched", extra={"map": row.name, "error": str(error)})
+    def _fetch(self, row: MapRow) -> None:
+        try:
+            self.sync(row, needed=False)
+        except (OSError, SceneprintError, ValueError) as error:
+            log.warning("index not fetched", extra={"map": row.name, "error": str(error)})
 
     def sync(self, row: MapRow, *, needed: bool = True) -> IndexManifest | None:
         """Download the newest index of a map to its local folder, unless it is there.
