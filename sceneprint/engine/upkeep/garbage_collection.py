@@ -3,9 +3,9 @@
 blobs  --collect_blobs-->  removed, or doomed during a snapshot
 doomed blobs  --collect_doomed_blobs-->  removed
 
-With an object store, writers do not wait for removals: one transaction marks the blobs as doomed,
-the blobs are removed, and another transaction clears the marks. A new reference to a doomed blob
-waits for the end of its removal (`ObjectBlobs.holds`).
+One transaction marks the unreferenced blobs as doomed, the blobs are removed, and another
+transaction clears the marks. Writers do not wait for removals, except for a new reference to a
+doomed blob, which waits for the end of its removal (`Blobs.holds`).
 """
 
 from __future__ import annotations
@@ -20,14 +20,12 @@ from pathlib import Path
 
 from sceneprint.errors import StoreLocked, UnusableStore
 from sceneprint.store import Store
-from sceneprint.store.blobs.folder import LONGEST_S
 from sceneprint.store.deletion import clear_doomed, doom, doomed_blobs
 from sceneprint.store.frames import referred_blobs, refers_to
 
 log = logging.getLogger(__name__)
 
-#: Number of blobs to check and remove at once. Writers wait during the check and, with a folder of
-#: blobs, during the removal.
+#: Number of blobs to check and remove at once. Writers wait during the check.
 SWEPT_AT_ONCE = 200
 #: Maximum seconds to wait for a removal by another process.
 _PATIENCE_S = 5.0
@@ -51,28 +49,12 @@ def collect_blobs(store: Store, blobs: Sequence[str]) -> None:
     store.geometries.forget(blobs)
     if not blobs:
         return
-    remove = _remove_after_turn if store.blobs.locks.outlast_turns else _remove_in_turn
     for first in range(0, len(blobs), SWEPT_AT_ONCE):
-        if not remove(store, blobs[first : first + SWEPT_AT_ONCE]):
+        if not _remove(store, blobs[first : first + SWEPT_AT_ONCE]):
             log.info("blob removal deferred", extra={"blobs": len(blobs)})
 
 
-def _remove_in_turn(store: Store, block: Sequence[str]) -> bool:
-    """Remove unreferenced blobs in one write transaction.
-
-    If another process holds the removal lock, doom the whole block instead, and return False.
-    """
-    with store.database.write() as connection, store.blobs.locks.removing() as allowed:
-        if not allowed:
-            doom(connection, block)
-            return False
-        referred = referred_blobs(connection, block)
-        store.blobs.remove(*(blob for blob in block if blob not in referred))
-        clear_doomed(connection, block)
-        return True
-
-
-def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
+def _remove(store: Store, block: Sequence[str]) -> bool:
     """Doom unreferenced blobs in a write transaction, remove them after it, and clear the marks.
 
     If another process still holds the removal lock after _PATIENCE_S seconds, doom the whole block
@@ -87,7 +69,7 @@ def _remove_after_turn(store: Store, block: Sequence[str]) -> bool:
                 return False
             referred = referred_blobs(connection, block)
             # leave younger marks: the removal of their blobs may still be running without its lock
-            clear_doomed(connection, [*referred], before=time.time() - LONGEST_S)
+            clear_doomed(connection, [*referred], before=time.time() - store.blobs.locks.late_s)
             unreferenced = [blob for blob in block if blob not in referred]
             at = doom(connection, unreferenced)
         store.blobs.remove(*unreferenced)

@@ -42,6 +42,9 @@ _LOOK_S = 0.01
 class Locks(ABC):
     """Lock on blob storage; shared while blobs must not be removed."""
 
+    #: Seconds for which a removal may continue after its process has lost the lock.
+    late_s = 0.0
+
     @abstractmethod
     def block_removals(self) -> AbstractContextManager[None]:
         """Hold a shared lock that prevents removals; first wait for a removal in progress.
@@ -56,14 +59,8 @@ class Locks(ABC):
         """Acquire the exclusive lock without waiting; yield False if another process holds it.
 
         Begin this within a write transaction: removals then run one at a time, and do not starve
-        `block_removals`. Continue after the transaction only if `outlast_turns` is true, and only
-        with blobs that the transaction doomed.
+        `block_removals`. After the transaction, remove only blobs that it doomed.
         """
-
-    @property
-    def outlast_turns(self) -> bool:
-        """Return whether removals may continue after the turn that found no references."""
-        return False
 
     def removals(self) -> int | None:
         """Return the value of the counter of removals; None if unknown, or during a removal."""

@@ -60,6 +60,8 @@ class SessionLocks(Locks):
     server directly, or configure the pooler for session pooling.
     """
 
+    late_s = LONGEST_S
+
     def __init__(self, database: Database) -> None:
         self._database = database
         self._alone = threading.Lock()  # lock of the thread that removes blobs
@@ -116,11 +118,6 @@ class SessionLocks(Locks):
     def mark_uncertain(self) -> None:
         """Mark this removal as unfinished; for LONGEST_S seconds, no other removal begins."""
         self._uncertain = True
-
-    @property
-    def outlast_turns(self) -> bool:
-        """Return whether a removal may continue after its write turn."""
-        return True
 
     def removals(self) -> int | None:
         """Return the counter of removals, an even number; None if unknown, or during a removal."""
