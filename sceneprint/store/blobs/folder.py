@@ -134,7 +134,7 @@ class FileLocks(Locks):
             os.close(descriptor)
 
     def wait(self, digest: str | None, seconds: float) -> None:  # noqa: ARG002  (one lock for all)
-        """Wait for a removal whose turn the database server ended early; see `Locks.wait`."""
+        """Wait for a removal in progress; see `Locks.wait`."""
         until = time.monotonic() + seconds
         while True:
             try:
@@ -309,11 +309,11 @@ class Blobs(ABC):
         """
 
     @abstractmethod
-    def holds(self, digest: str) -> bool:
+    def holds(self, digest: str, seconds: float = TURN_S) -> bool:
         """Return whether a blob exists and will exist until the transaction is committed.
 
         Call this in the transaction that writes a reference to the blob: no removal begins before
-        the commit, and the call waits for a removal that outlasted its turn.
+        the commit, and the call waits up to `seconds` for a removal in progress.
 
         Raises
         ------
@@ -330,7 +330,7 @@ class Blobs(ABC):
         ------
         StoreLocked, UnusableStore : See `holds` and `put`.
         """
-        if not self.holds(digest):
+        if not self.holds(digest, REMOVAL_S):
             self.put(data)
 
     @abstractmethod
@@ -478,9 +478,9 @@ class FolderBlobs(Blobs):
         """Return the unverified bytes of a blob; see `Blobs.read`."""
         return self.path(digest).read_bytes()
 
-    def holds(self, digest: str) -> bool:
+    def holds(self, digest: str, seconds: float = TURN_S) -> bool:
         """Return whether a blob exists; see `Blobs.holds`."""
-        self.locks.wait(digest, TURN_S)
+        self.locks.wait(digest, seconds)
         return self.path(digest).exists()
 
     def size(self, digest: str) -> int | None:

@@ -217,20 +217,12 @@ class ObjectBlobs(Blobs):
         require_digest(digest)
         return self.objects.open(_key(digest))
 
-    def holds(self, digest: str) -> bool:
+    def holds(self, digest: str, seconds: float = TURN_S) -> bool:
         """Return whether a blob exists; see `Blobs.holds`.
 
         If this process stored the blob, and no blob has been removed since, this does not contact
         the object store, because other writers are waiting.
         """
-        return self._holds(digest, TURN_S)
-
-    def ensure(self, digest: str, data: bytes) -> None:
-        """Store a blob again if it was removed; see `Blobs.ensure`."""
-        if not self._holds(digest, REMOVAL_S):
-            self.put(data)
-
-    def _holds(self, digest: str, seconds: float) -> bool:
         require_digest(digest)
         with self._lock:
             before = self._put.get(digest)
