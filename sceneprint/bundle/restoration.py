@@ -18,7 +18,7 @@ from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from sqlalchemy import URL, Connection
+from sqlalchemy import URL, Connection, Table
 
 from sceneprint.atomic_files import folder_turn, make_folder, put_new, sync_folder
 from sceneprint.bundle.backup import (
@@ -130,8 +130,7 @@ class _Restoration:
         for name in _INITIAL_TABLES:
             connection.exec_driver_sql(f"DELETE FROM {name}")
         for table in tables():
-            read = self._read_table(table.name, [column.name for column in table.columns])
-            write_rows(connection, table, decoded_rows([*table.columns], read))
+            write_rows(connection, table, self.read_table(table, counts=True))
         set_numbers(connection, self.manifest.numbers)
         manifest, names = self.manifest, ("maps", "frames", "signatures")
         summary = summary_of(connection)
@@ -153,28 +152,17 @@ class _Restoration:
             for key in list_keys(connection):
                 revoke_key(connection, key.name)
 
-    def key_names(self) -> list[str]:
-        """Return the names of the keys in the bundle, sorted."""
-        columns = [column.name for column in keys.columns]
-        rows = self._read_table(keys.name, columns, counts=False)
-        return sorted(str(row[columns.index("name")]) for row in rows)
-
-    def secrets(self) -> list[Row]:
-        """Return the rows of the table of secrets; they identify a store."""
-        columns = [column.name for column in secrets.columns]
-        return list(
-            decoded_rows([*secrets.columns], self._read_table(secrets.name, columns, counts=False))
-        )
-
-    def _read_table(self, table: str, columns: list[str], *, counts: bool = True) -> Iterator[Row]:
-        parts = [part for part in self.manifest.parts if part.kind == f"rows/{table}"]
+    def read_table(self, table: Table, *, counts: bool = False) -> Iterator[Row]:
+        """Yield the rows of a table; with `counts`, they count as progress."""
+        columns = [column.name for column in table.columns]
+        parts = [part for part in self.manifest.parts if part.kind == f"rows/{table.name}"]
         for part, data in zip(
             parts, in_order(lambda part: self.place.get(part.digest), parts), strict=True
         ):
             rows = list(read_rows(data, columns))
             if len(rows) != part.rows:
-                raise self._mismatch(f"its rows of table {table}")
-            yield from rows
+                raise self._mismatch(f"its rows of table {table.name}")
+            yield from decoded_rows([*table.columns], rows)
             if counts:
                 self._advance(len(rows))
 
@@ -218,7 +206,8 @@ def list_bundle_keys(place: str, name: str | None = None) -> list[str]:
     ------
     BundleError, DamagedBundle, NewerSchema : See `verify_bundle`.
     """
-    return _Restoration(place, name, None).key_names()
+    at = list(keys.columns).index(keys.c.name)
+    return sorted(str(row[at]) for row in _Restoration(place, name, None).read_table(keys))
 
 
 def verify_bundle(place: str, name: str | None = None, progress: Progress | None = None) -> Bundle:
@@ -356,7 +345,7 @@ def restore_to_server(
         _require_unused_database(before)
     reading = _Restoration(place, name, progress)
     with closing(open_database(settings.database)) as database:
-        names = reading.secrets()
+        names = list(reading.read_table(secrets))  # they identify the store
         owner = next((owner_of(value) for name, value in names if name == "seals"), "")
         with database.read() as connection:
             check_empty(connection)  # only then may the blobs' owner mark be replaced
@@ -397,21 +386,18 @@ def _require_unused_database(database: Database) -> None:
     with database.read() as connection:
         check_empty(connection)
     end = time.monotonic() + _DISCONNECT_S
-    while others := _count_other_connections(database):
+    statement = (
+        "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
+        " AND application_name = 'sceneprint' AND pid <> pg_backend_pid()"
+    )
+    while True:
+        with database.read() as connection:
+            others = connection.exec_driver_sql(statement).scalar_one()
+        if not others:
+            return
         if time.monotonic() >= end:
             raise BundleError(
                 f"{database.shown} is in use by {others} connections of sceneprint. Stop "
                 "the services and workers, and run the command again."
             )
         time.sleep(0.1)
-
-
-def _count_other_connections(database: Database) -> int:
-    """Return the number of other connections of sceneprint to a PostgreSQL database."""
-    with database.read() as connection:
-        return int(
-            connection.exec_driver_sql(
-                "SELECT count(*) FROM pg_stat_activity WHERE datname = current_database()"
-                " AND application_name = 'sceneprint' AND pid <> pg_backend_pid()"
-            ).scalar_one()
-        )

@@ -169,11 +169,8 @@ def _line(finding: Finding) -> str:
 
 def _summary(findings: list[Finding], *, repair: bool) -> str:
     kinds = Counter(each.severity for each in findings)
-    damaged, unneeded, unrepaired = (
-        kinds["damage"],
-        kinds["leftover"],
-        sum(o.left for o in findings),
-    )
+    damaged, unneeded = kinds["damage"], kinds["leftover"]
+    unrepaired = sum(each.left for each in findings)
     if not damaged and not unneeded:
         return "no problems found"
     counts = f"{damaged} damaged, {unneeded} left over"

@@ -394,8 +394,12 @@ def publish(
             f"an index of model {previous.model_id} cannot contain frames of {model_id}"
         )
     with folder_turn(folder) as mine:
-        if not mine or (previous is not None and _is_overtaken(folder, previous)):
+        if not mine:
             return None
+        if previous is not None:
+            now = newest(folder, model_id, previous.manifest.dimension, previous=previous)
+            if now is None or now.number != previous.number:
+                return None
         last = newest_number(folder) or 0
         records, dimension = _write_segments(folder, previous, blocks, drop, clean, flat_bytes)
         manifest = IndexManifest(
@@ -438,12 +442,6 @@ def _write_segments(
         for group in reversed(groups)
     )
     return records, dimension or stored.shape[1]
-
-
-def _is_overtaken(folder: Path, previous: IndexVersion) -> bool:
-    """Return whether the newest version in a folder is no longer `previous`."""
-    version = newest(folder, previous.model_id, previous.manifest.dimension, previous=previous)
-    return version is None or version.number != previous.number
 
 
 def clear(folder: Path, keep: int | None = None) -> bool:

@@ -67,9 +67,8 @@ class Scrubber:
     """
 
     def __init__(self, indexes: Path, pause_s: float) -> None:
-        self._indexes, self._pause_s = indexes, pause_s
+        self._stamp, self._pause_s = indexes / _STAMP, pause_s
         self._round: Iterator[Path | None] | None = None
-        self._looked = -pause_s
 
     def step(self, folders: Sequence[Path]) -> Path | None:
         """Verify indexes for STEP_S seconds, if a round is running or due.
@@ -96,19 +95,14 @@ class Scrubber:
 
     def _start_round(self) -> bool:
         """Return whether a round is due; if so, record its start for all processes."""
-        if time.monotonic() - self._looked < min(self._pause_s, 60):
-            return False
-        self._looked = time.monotonic()
-        stamp = self._indexes / _STAMP
         with suppress(OSError):
-            if time.time() - stamp.stat().st_mtime < self._pause_s:
+            if time.time() - self._stamp.stat().st_mtime < self._pause_s:
                 return False
-        try:
-            make_folder(self._indexes)
-            stamp.touch(PRIVATE_FILE)
-        except OSError:
-            return False
-        return True
+        with suppress(OSError):
+            make_folder(self._stamp.parent)
+            self._stamp.touch(PRIVATE_FILE)
+            return True
+        return False
 
 
 class Upkeep:
