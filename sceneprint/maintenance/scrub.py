@@ -52,22 +52,19 @@ class Scrub:
         self._budget = int(settings.blob_check_mb_per_s * 1e6 * SLICE_S)
         self._next = time.monotonic() + BEGIN_S
 
-    def run(
-        self, may_go_on: Callable[[], bool] = lambda: True, *, now: bool = False
-    ) -> ScrubRow | None:
+    def run(self, may_go_on: Callable[[], bool] = lambda: True) -> ScrubRow | None:
         """Verify the next slice if it is due. Errors are logged; the slice is then repeated later.
 
         Parameters
         ----------
         may_go_on : function that is called after each block; the slice ends if it returns False
-        now : whether to run even if this process ran a slice less than SLICE_S ago
 
         Returns
         -------
         row : progress of the scrub; None if no slice is due or possible, or after an error
         """
-        rested = now or time.monotonic() >= self._next
-        if self._budget <= 0 or self._store.database.read_only or not rested:
+        is_resting = time.monotonic() < self._next
+        if self._budget <= 0 or self._store.database.read_only or is_resting:
             return None
         self._next = time.monotonic() + SLICE_S
         try:

@@ -177,7 +177,9 @@ def _patient(monkeypatch):
 
 def _scrub(engine, rate=1.0):
     settings = engine.settings.model_copy(update={"blob_check_mb_per_s": rate})
-    return Scrub(settings, engine.store)
+    scrub = Scrub(settings, engine.store)
+    scrub._next = 0.0
+    return scrub
 
 
 def _row(engine):
@@ -203,7 +205,7 @@ def _blobs(engine):
 def test_all_bytes_are_read_once_a_day(full):
     uploads, artifacts, _ = _blobs(full)
     before = time.time()
-    row = _scrub(full).run(now=True)
+    row = _scrub(full).run()
     assert (row.blobs, row.damaged) == (len(uploads) + len(artifacts), 0)
     assert row.bytes == sum(one.stat().st_size for one in (*uploads, *artifacts))
     stored = _row(full)
@@ -211,7 +213,7 @@ def test_all_bytes_are_read_once_a_day(full):
     assert stored.finished_at is not None
     assert before <= stored.began_at <= stored.finished_at <= time.time()
     assert stored.next_at == stored.began_at + PASS_S
-    assert _scrub(full).run(now=True) is None  # nobody else begins another
+    assert _scrub(full).run() is None  # nobody else begins another
     result = full.statistics.collect().scrub
     assert (result.blobs, result.bytes, result.damaged) == (row.blobs, row.bytes, 0)
 
@@ -232,7 +234,7 @@ def test_damage_is_told_and_what_can_be_made_again_is(full):
             .values(vector=b"\7" * size)
         )
         connection.execute(update(frames).where(frames.c.id == ids[5]).values(pose_x=7.0))
-    row = _scrub(full).run(now=True)
+    row = _scrub(full).run()
     assert row.damaged == 5
     wanted = full.events.wanted("hall", ["frame.damaged"])
     actual = full.events.page(wanted).items
@@ -244,7 +246,7 @@ def test_damage_is_told_and_what_can_be_made_again_is(full):
     assert artifacts[1].read_bytes() == sound
     assert artifacts[2].exists()
     _due(full)
-    again = _scrub(full).run(now=True)
+    again = _scrub(full).run()
     assert again.damaged == 2  # the upload, until it is sent again, and the position
 
 
@@ -255,7 +257,7 @@ def test_a_slice_is_as_large_as_the_rate_and_goes_on_where_the_last_one_ended(fu
     rate = sizes[0] / 1e6 / SLICE_S  # a slice is over with the first five
     seen = []
     for _ in range(4):
-        row = _scrub(full, rate).run(now=True)
+        row = _scrub(full, rate).run()
         seen.append((row.blobs, row.bytes))
         stored = _row(full)
         if stored.finished_at is None:
@@ -269,8 +271,8 @@ def test_a_slice_is_as_large_as_the_rate_and_goes_on_where_the_last_one_ended(fu
 
 def test_two_workers_do_not_read_the_same_slice(full):
     first, second = _scrub(full, 1e-6), _scrub(full, 1e-6)
-    assert first.run(now=True) is not None
-    assert second.run(now=True) is None
+    assert first.run() is not None
+    assert second.run() is None
 
 
 @pytest.mark.parametrize(
