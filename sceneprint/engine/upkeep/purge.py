@@ -205,9 +205,7 @@ class Purging:
             return None
         self._next = time.monotonic() + self._every_s
         self._context.store.geometries.forget_older(self._every_s)
-        before = time.time() - min(_YOUNG_S, self._every_s)
-        seconds = min(_SWEEP_S, self._every_s)
-        return self._purge_all(before, self._upkeep.is_purge_due, seconds=seconds)
+        return self._purge_all(now=False)[0]
 
     def now(self) -> Purged:
         """Purge all deleted frames, whose deletion then cannot be undone; return the counts.
@@ -217,16 +215,15 @@ class Purging:
         BusyIndex : If another process is building an index that must be rebuilt.
         StoreError, OSError : If something cannot be removed; raised after the rest was removed.
         """
-        failed: list[Exception] = []
-        purged = self._purge_all(None, lambda _: True, failed)
+        purged, failed = self._purge_all(now=True)
         if failed:
             raise failed[0]
         return purged
 
-    def _purge_all(
-        self, before: float | None, selects: Callable[[MapRow], bool],
-        failed: list[Exception] | None = None, seconds: float = math.inf,
-    ) -> Purged:  # fmt: skip
+    def _purge_all(self, *, now: bool) -> tuple[Purged, list[Exception]]:
+        """Purge what is due, or everything if `now` is set; return the counts and the errors."""
+        failed = list[Exception]()
+
         def attempt(do: Callable[[], int | None]) -> int:
             try:
                 return do() or 0
@@ -235,24 +232,25 @@ class Purging:
             except (SceneprintError, OSError, ValueError) as error:
                 level = logging.INFO if isinstance(error, BusyIndex) else logging.ERROR
                 log.log(level, "purge incomplete", extra={"error": str(error)})
-                if failed is not None:
-                    failed.append(error)
+                failed.append(error)
                 return 0
 
         context, store = self._context, self._context.store
-        attempt(lambda: self._tombstones.purge(everything=before is None))
+        before = None if now else time.time() - min(_YOUNG_S, self._every_s)
+        seconds = math.inf if now else min(_SWEEP_S, self._every_s)
+        attempt(lambda: self._tombstones.purge(everything=now))
         with store.database.read() as connection:
-            rows = [row for row in list_maps(connection) if selects(row)]
+            rows = [row for row in list_maps(connection) if now or self._upkeep.is_purge_due(row)]
         purged = Purged(
             blobs=attempt(lambda: collect_doomed_blobs(store, before, seconds))
             + attempt(lambda: collect_quarantined(store, context.settings.quarantine_dir)),
             products=sum(attempt(product.forget) for product in self._products),
             answers=attempt(context.query_log.purge),
-            indexes=attempt(partial(context.indexes.sweep, now=before is None))
+            indexes=attempt(partial(context.indexes.sweep, now=now))
             + sum(attempt(partial(self._purge_index, row)) for row in rows),
         )
         store.database.shrink_log()
-        return purged
+        return purged, failed
 
     def _purge_index(self, row: MapRow) -> int:
         start = time.monotonic()
