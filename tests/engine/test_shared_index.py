@@ -20,6 +20,10 @@ from sceneprint_client.api import NewMap, Query
 ALL = Query(stages=("retrieve",), k=50)
 
 
+def await_fetches(engine):
+    engine.indexes._fetches.submit(bool).result()
+
+
 @pytest.fixture(autouse=True)
 def _always_look(monkeypatch):
     monkeypatch.setattr(local_index, "_LOOK_S", 0.0)
@@ -100,7 +104,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, upl
     assert stored == own
     assert "0000000001.json" in own
     first = ask(other, uploads)  # it waits for nothing
-    other.indexes.finish()
+    await_fetches(other)
     second = ask(other, uploads)
     assert second.index_version == 1
     assert found(second) == found(first) == found(ask(built, uploads))
@@ -109,7 +113,7 @@ def test_one_host_builds_and_others_fetch_what_they_serve(built, host, fill, upl
     fill(other, range(4, 8))
     assert (other.publish_due(), built.publish_due()) == (1, 0)
     ask(built, uploads)
-    built.indexes.finish()
+    await_fetches(built)
     assert ask(built, uploads).index_version == 2
     assert found(ask(built, uploads)) == found(ask(other, uploads))
     assert ask(built, uploads).counts.map == 8
@@ -135,7 +139,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, pl
     other, service = host("two"), host("three", purge_deadline_s=1)
     for engine in (other, service):
         ask(engine, uploads)
-        engine.indexes.finish()
+        await_fetches(engine)
         assert numbers(engine) == [1]
     objects, secret = open_objects(place), signature(built, built.ids()[0])
 
@@ -164,7 +168,7 @@ def test_no_byte_of_a_deleted_frame_is_left_in_any_copy(built, host, uploads, pl
 def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, host, uploads):
     service = host("two", purge_deadline_s=1)
     ask(service, uploads)
-    service.indexes.finish()
+    await_fetches(service)
     built.delete_frame("hall", built.ids()[0])
     left = []
     for _ in range(2):
@@ -178,7 +182,7 @@ def test_a_service_does_not_wait_for_ever_for_an_index_without_the_frame(built, 
 def test_nothing_is_shared_of_maps_that_are_gone(built, place, host, uploads):
     service = host("two", purge_deadline_s=1)
     ask(service, uploads)
-    service.indexes.finish()
+    await_fetches(service)
     folder, objects = folder_of(service), open_objects(place)
     built.delete_map("hall")
     built.purging.now()
@@ -228,7 +232,7 @@ def test_queries_go_on_without_the_store_and_workers_try_again(
         names = fill(engine, range(4))
         assert engine.publish_due() == 0
         answer = ask(engine, uploads)
-        engine.indexes.finish()
+        await_fetches(engine)
         assert (answer.matches[0].frame_id, answer.index_version) == (names[1], 0)
         assert numbers(engine) == []
     output = {record.message for record in caplog.records}
@@ -245,11 +249,11 @@ def test_room_is_made_of_indexes_that_nobody_uses(built, host, fill, uploads, id
     one = sum(path.stat().st_size for path in folder_of(built).glob("*.*"))
     node = host("two", index_cache_bytes=one + one // 2)
     ask(node, uploads)
-    node.indexes.finish()
+    await_fetches(node)
     ago = time.time() - idle_s
     os.utime(folder_of(node) / ".used", (ago, ago))
     ask(node, uploads, name="other")
-    node.indexes.finish()
+    await_fetches(node)
     assert bool(manifests(folder_of(node))) == left
     assert bool(manifests(folder_of(node, "other"))) != left
     for name in ("hall", "other"):

@@ -92,10 +92,6 @@ class IndexPlace:
         self._stop.set()
         self._fetches.shutdown(cancel_futures=True)
 
-    def finish(self) -> None:
-        """Wait until all requested indexes are downloaded."""
-        self._fetches.submit(bool).result()
-
     def folder(self, row: MapRow) -> Path:
         """Return the local folder of the index of a map."""
         return index_folder(self._indexes, row)
