@@ -84,7 +84,7 @@ def rvl(samples):
     nibbles += [0] * (-len(nibbles) % 8)
     height, width = samples.shape
     words = [
-        sum(one << (28 - 4 * place) for place, one in enumerate(nibbles[i : i + 8]))
+        sum(nibble << (28 - 4 * place) for place, nibble in enumerate(nibbles[i : i + 8]))
         for i in range(0, len(nibbles), 8)
     ]
     return struct.pack(f"<II{len(words)}I", width, height, *words)

@@ -347,8 +347,8 @@ def _cleaned(server, name):
         )
         if connection.execute(_SHAPE.encode()).fetchall() != _shape_of_new(server):
             return False
-        tables = [f"DELETE FROM {one.name}" for one in reversed(metadata.sorted_tables)
-                  if one.name not in ("schema_range", "secrets")]  # fmt: skip
+        tables = [f"DELETE FROM {table.name}" for table in reversed(metadata.sorted_tables)
+                  if table.name not in ("schema_range", "secrets")]  # fmt: skip
         numbers = "SELECT setval(oid::regclass, 1, false) FROM pg_class WHERE relkind = 'S'"
         connection.execute("; ".join(["BEGIN", *tables, numbers, "COMMIT"]).encode())
     return True
@@ -540,7 +540,7 @@ def run_command(capsys):
 
     def run(*arguments, expect=0):
         capsys.readouterr()
-        code = main([str(one) for one in arguments])
+        code = main([str(argument) for argument in arguments])
         said = Said(*capsys.readouterr())
         assert code == expect, said
         return said

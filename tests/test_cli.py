@@ -28,7 +28,7 @@ def run(*arguments, expect=0):
     """Run a command in this process: to start one takes longer than most commands."""
     with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as errors:
         try:
-            code = cli.main([str(one) for one in arguments])
+            code = cli.main([str(argument) for argument in arguments])
         except SystemExit as end:  # of argparse
             code = end.code
     said = Said(out.getvalue(), errors.getvalue())
@@ -84,7 +84,7 @@ def tree_hash(folder):
 @pytest.mark.thorough
 def test_synth_writes_the_layout(rooms, tmp_path):
     suffixes = ("0.depth.png", "0.pose.txt", "1.depth.png", "1.pose.txt")
-    names = ["intrinsics.json", *(f"seq-01/frame-00000{one}" for one in suffixes)]
+    names = ["intrinsics.json", *(f"seq-01/frame-00000{suffix}" for suffix in suffixes)]
     assert list(tree_hash(rooms)) == [f"room-00{r}/{name}" for r in range(2) for name in names]
     run("synth", tmp_path / "again", "--rooms", 2, "--views", 2, "--seed", 5, "--jobs", 2)
     assert tree_hash(tmp_path / "again") == tree_hash(rooms)

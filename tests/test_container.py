@@ -176,11 +176,11 @@ def test_a_part_of_the_composition_is_confined_and_told_what_is_read(name):
     variables = part.get("environment", {})
     for key, value in variables.items():
         if key.endswith("_FILE"):
-            assert value in [f"/run/secrets/{one}" for one in part["secrets"]], key
+            assert value in [f"/run/secrets/{secret}" for secret in part["secrets"]], key
         elif re.search("PASSWORD|SECRET", key):  # without a default
             assert re.fullmatch(r"\$\{SCENEPRINT_\w+:-\}", value), key
     if part["image"].startswith("sceneprint:"):
-        ours = {one for one in variables if one.removesuffix("_FILE") in SECRETS}
+        ours = {variable for variable in variables if variable.removesuffix("_FILE") in SECRETS}
         unknown = variables.keys() - KNOWN_SETTINGS - ours
         assert [one for one in unknown if not OF_LIBRARIES.fullmatch(one)] == []
         own = {key.removeprefix("SCENEPRINT_").lower(): value for key, value in variables.items()

@@ -96,8 +96,8 @@ def test_commands_in_their_order(primary, run, tmp_path):
         run(backup.replace("/backup", str(tmp_path / "backup")), SCENEPRINT_DATABASE_URL=url)
         run(back, SCENEPRINT_DATABASE_URL=url, FOLDER=str(tmp_path / "again"))
         with Engine(Settings(data_dir=tmp_path / "again")) as engine:
-            assert [one.name for one in engine.list_maps()] == ["building"]
-            assert [one.name for one in list_keys(engine.store).items] == ["operator", "robot-7"]
+            assert [map_.name for map_ in engine.list_maps()] == ["building"]
+            assert [key.name for key in list_keys(engine.store).items] == ["operator", "robot-7"]
     finally:
         run(f"pg_ctl stop --mode immediate --silent --pgdata {standby_data}")
 

@@ -88,7 +88,7 @@ def settings_of(text):
             assignments += line.removeprefix("Environment=").split()
         elif re.match(r"(# )?[A-Z_]+=", line):
             assignments += shlex.split(line.removeprefix("# "))
-    return dict(one.split("=", 1) for one in assignments)
+    return dict(assignment.split("=", 1) for assignment in assignments)
 
 
 def test_units_and_environment_set_what_is_read():
@@ -118,7 +118,7 @@ def test_a_shell_reads_the_environment_as_systemd_does():
     env = {"PATH": os.environ["PATH"]}
     done = subprocess.run(["bash", "-euc", block], env=env, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    sourced = dict(one.split("=", 1) for one in done.stdout.split("\0") if one)
+    sourced = dict(part.split("=", 1) for part in done.stdout.split("\0") if part)
     assert sourced.items() >= settings_of("\n".join(expected)).items()
     url = "postgresql+psycopg://sceneprint@/sceneprint?host=db1.example:5432&host=db2.example:5432"
     assert sourced["SCENEPRINT_DATABASE_URL"] == f"{url}&target_session_attrs=read-write"

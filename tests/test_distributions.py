@@ -43,11 +43,11 @@ print(json.dumps({
 def test_a_service_needs_neither_lab_nor_viewers(tmp_path):
     packages, file = tmp_path / "packages", tmp_path / "a.mcap"
     packages.mkdir()
-    for one in Path(sysconfig.get_path("purelib")).iterdir():
-        if one.suffix != ".pth" and not one.name.startswith(ABSENT):
-            (packages / one.name).symlink_to(one)
-    for one in ("sceneprint", "service", "worker", "migrations", "client/sceneprint_client"):
-        (packages / Path(one).name).symlink_to(ROOT / one)
+    for path in Path(sysconfig.get_path("purelib")).iterdir():
+        if path.suffix != ".pth" and not path.name.startswith(ABSENT):
+            (packages / path.name).symlink_to(path)
+    for path in ("sceneprint", "service", "worker", "migrations", "client/sceneprint_client"):
+        (packages / Path(path).name).symlink_to(ROOT / path)
     done = subprocess.run(
         [sys.executable, "-S", "-c", PROGRAM, str(file)], cwd=tmp_path, text=True,
         env={**os.environ, "PYTHONPATH": str(packages)}, capture_output=True, check=False,

@@ -75,7 +75,7 @@ def test_links_lead_somewhere(page):
         assert path.exists(), target
         if heading:
             titles = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
-            marks = {re.sub(r"[^\w -]", "", one).lower().replace(" ", "-") for one in titles}
+            marks = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
             assert heading in marks, target
 
 
@@ -108,7 +108,7 @@ def test_documented_commands_are_known():
         lines = commands_of(text)
         if page.name not in names[:2]:
             lines += re.findall(r"`(sceneprint (?!bag)[^`]+)`", text.replace("\n", " "))
-        own = [one for one in lines if re.match(r"(\.venv/bin/)?sceneprint ", one)]
+        own = [line for line in lines if re.match(r"(\.venv/bin/)?sceneprint ", line)]
         assert own, page
         for line in own:
             arguments = shlex.split(line, comments=True)[1:]
@@ -145,7 +145,7 @@ def messages_of_the_code():
             for node in ast.walk(ast.parse(path.read_text())):
                 parts = node.values if isinstance(node, ast.JoinedStr) else [node]
                 text = "".join(
-                    str(one.value) if isinstance(one, ast.Constant) else " " for one in parts
+                    str(part.value) if isinstance(part, ast.Constant) else " " for part in parts
                 )
                 yield " ".join(text.split())
 

@@ -78,7 +78,7 @@ def test_a_bag_becomes_live_poses(drives, tmp_path, example):
     with Client.embedded(tmp_path) as client:
         client.create_map("office")
         meta = {"parent_frame": mapping.parent_frame}
-        added = [client.upload("office", one, meta_of(one, **meta)) for one in mapping.frames]
+        added = [client.upload("office", frame, meta_of(frame, **meta)) for frame in mapping.frames]
         client.wait([one.job_id for one in added])
     lines = example(
         "live_from_bag.py", "office", drives / "later", "--truth", drives / "later.tum",
@@ -99,6 +99,6 @@ def test_two_recordings_become_one_map(drives, example):
     start = np.loadtxt(drives / "later.tum")[0]
     forward = rotation_of(start[4:])[:2, 2]
     base = start[1:3] - 0.1 * forward / np.linalg.norm(forward)
-    assert np.linalg.norm([float(one) for one in join.groups()] - np.array([*base, 0])) < 0.05
+    assert np.linalg.norm([float(group) for group in join.groups()] - np.array([*base, 0])) < 0.05
     agree = re.search(r"(strong|weak): (\d+) of (\d+) pairs agree", output)
     assert int(agree[2]) >= 0.9 * int(agree[3]) >= 5

@@ -82,7 +82,7 @@ def shortened(document):
     shared responses under `shared`.
     """
     document = deepcopy(document)
-    operations = [one for methods in document["paths"].values() for one in methods.values()]
+    operations = [method for methods in document["paths"].values() for method in methods.values()]
     shared = {"parameters": {}, "responses": {}}
     parameters = Counter(
         (one["name"], json.dumps(one, sort_keys=True))
@@ -90,9 +90,9 @@ def shortened(document):
         for one in operation.get("parameters", ())
     )
     responses = Counter(
-        (status, json.dumps(one, sort_keys=True))
+        (status, json.dumps(response, sort_keys=True))
         for operation in operations
-        for status, one in operation["responses"].items()
+        for status, response in operation["responses"].items()
         if status[0] != "2"  # what an operation is for is read with it
     )
     for part, found in (("parameters", parameters), ("responses", responses)):
@@ -102,13 +102,13 @@ def shortened(document):
     for operation in operations:
         if "parameters" in operation:
             operation["parameters"] = [
-                one["name"] if shared["parameters"].get(one["name"]) == one else one
-                for one in operation["parameters"]
+                p["name"] if shared["parameters"].get(p["name"]) == p else p
+                for p in operation["parameters"]
             ]
         answers = operation["responses"]
         same = [status for status in answers if shared["responses"].get(status) == answers[status]]
         operation["responses"] = {
-            **{status: one for status, one in answers.items() if status not in same},
+            **{status: answer for status, answer in answers.items() if status not in same},
             "shared": sorted(same),
         }
     return {"shared": shared, **document}
@@ -169,7 +169,7 @@ def help_lines(command):
             yield f"  {section.title}: {section.description}"
         yield from (f"  {option_line(action)}" for action in section._group_actions)
     yield from (f"  | {line}" for line in (command.epilog or "").splitlines())
-    subcommands = [one for one in command._actions if isinstance(one, argparse._SubParsersAction)]
+    subcommands = [a for a in command._actions if isinstance(a, argparse._SubParsersAction)]
     for one in subcommands:
         yield from (f"    {option_line(choice)}" for choice in one._choices_actions)
         for subcommand in one.choices.values():
@@ -187,7 +187,7 @@ def option_line(action):
     if action.option_strings and isinstance(action.metavar, str):
         words.append(action.metavar)
     if action.choices is not None and not isinstance(action, argparse._SubParsersAction):
-        words.append("{" + ",".join(str(one) for one in action.choices) + "}")
+        words.append("{" + ",".join(str(choice) for choice in action.choices) + "}")
     if action.nargs not in (0, None, argparse.PARSER):
         words.append(f"[nargs {action.nargs}]")
     if action.required and action.option_strings:

@@ -135,8 +135,8 @@ def test_pods_run_our_commands_with_our_settings(tmp_path):
         "work": objects["Deployment", "fleet-worker"],
         "migrate": objects["Job", "fleet-migration"],
     }
-    for command, one in parts.items():
-        pod = one["spec"]["template"]["spec"]
+    for command, part in parts.items():
+        pod = part["spec"]["template"]["spec"]
         (container,) = pod["containers"]
         assert container["args"] == [command]
         assert command in COMMANDS

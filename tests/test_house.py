@@ -61,9 +61,9 @@ def imports(tree, known):
     """
     for node in tree.body:
         if isinstance(node, ast.Import):
-            yield from (one.name for one in node.names if one.name in known)
+            yield from (name.name for name in node.names if name.name in known)
         elif isinstance(node, ast.ImportFrom) and node.module in known:
-            whole = (f"{node.module}.{one.name}" for one in node.names)
+            whole = (f"{node.module}.{name.name}" for name in node.names)
             yield from (one if one in known else node.module for one in whole)
 
 

@@ -156,7 +156,7 @@ def test_a_pose_is_found_where_it_outweighs_every_other(blank, here, there, stat
     else:
         assert found.average is None
         assert "less than twice the weight" in found.reason
-        told = [(one.support, one.T[0, 3]) for one in found.alternatives]
+        told = [(alternative.support, alternative.T[0, 3]) for alternative in found.alternatives]
         assert told == [(here, pytest.approx(0.0)), (there, pytest.approx(5.0))]
 
 
@@ -207,7 +207,7 @@ def test_a_copy_of_a_view_is_no_second_vote(blank):
     copy = match(12, outcome(T=inverse(rows[12]) @ shifted(0.0)))
     for matches in ([*both], [*both, copy], [*both, copy, copy]):
         found = localize([QueryFrame(blank, matches)], rows)
-        assert (found.status, {one.support for one in found.alternatives}) == ("ambiguous", {1})
+        assert (found.status, {a.support for a in found.alternatives}) == ("ambiguous", {1})
     other = localize([QueryFrame(blank, [*both, *seen_at(0.0, [2])])], rows)
     assert other.status == "found"
 
@@ -516,10 +516,10 @@ def test_alternatives_are_told_with_their_confidences_the_best_first():
     places = [[picture((count, SAME))] for count in (36, 36, 12)]
     found = judged(matches, *places)
     assert (found.status, found.average) == ("ambiguous", None)
-    assert sorted(one.T[0, 3] for one in found.alternatives) == [0.0, APART, 2 * APART]
-    assert [one.confidence for one in found.alternatives] == pytest.approx([1 / 2.2] * 3, abs=1)
+    assert sorted(a.T[0, 3] for a in found.alternatives) == [0.0, APART, 2 * APART]
+    assert [a.confidence for a in found.alternatives] == pytest.approx([1 / 2.2] * 3, abs=1)
     few = judged(matches, [picture((36, SAME))], [picture((30, SAME))], [picture((8, SAME))])
-    assert [one.T[0, 3] for one in few.alternatives] == [0.0, APART]
+    assert [alternative.T[0, 3] for alternative in few.alternatives] == [0.0, APART]
     assert few.alternatives[0].confidence > few.alternatives[1].confidence
 
 
@@ -543,7 +543,7 @@ def test_a_pose_that_one_view_alone_suggests_is_not_sure():
     for matches, status in ((alone, "ambiguous"), ([*alone, other], "found")):
         found = judged(matches, [WHOLE] * 3)
         assert found.status == status
-        assert [one.support for one in found.alternatives] == [1]
+        assert [alternative.support for alternative in found.alternatives] == [1]
         assert (found.evidence.rival, found.evidence.rival_weight) == (0.0, 0.0)
         assert status == "found" or "views of the place suggests this pose" in found.reason
     assert judged(alone, [WHOLE]).evidence.acceptance == 1.0  # the only frame
@@ -994,7 +994,7 @@ def test_frames_elsewhere_are_compared_before_a_pose_is_found(blank):
     unsure = decided(frames, shelf, (0, 1, 4, 5))
     assert shelf.compared == [[4, 5]]
     assert unsure.status == "ambiguous"
-    assert [(one.support, one.T[0, 3]) for one in unsure.alternatives] == [(3, 0.0), (2, 9.0)]
+    assert [(a.support, a.T[0, 3]) for a in unsure.alternatives] == [(3, 0.0), (2, 9.0)]
     alone = Shelf()
     assert decided(frames, alone, (0, 1, 4)).status == "found"
     assert alone.compared == [[4]]

@@ -108,7 +108,7 @@ def test_frames_that_overlap_by_half_are_accepted(model, data_root):
 def test_frames_of_other_rooms_are_not_accepted(model, data_root):
     rooms = []
     for name in ("7scenes/redkitchen", "tum/fr1_rpy", "sun3d/studyroom2"):
-        frames = [frame for one in find_sequences(data_root / name) for frame in one.frames]
+        frames = [frame for s in find_sequences(data_root / name) for frame in s.frames]
         chosen = frames[:: len(frames) // 7][:7]
         rooms.append([geometry(frame.read_depth(), model) for frame in chosen])
     pairs = [pair for two in combinations(rooms, 2) for pair in product(*two)]

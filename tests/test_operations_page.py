@@ -64,7 +64,7 @@ def expressions(dashboard):
 
 def test_dashboards_ask_for_what_there_is():
     named = set()
-    for expression in (one for each in DASHBOARDS.values() for one in expressions(each)):
+    for expression in (e for each in DASHBOARDS.values() for e in expressions(each)):
         assert queried(expression), expression
         check(expression)
         named |= {re.sub(r"_(bucket|sum|count)$", "", name) for name, _ in queried(expression)}

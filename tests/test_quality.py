@@ -58,8 +58,8 @@ def test_the_table_keeps_the_distances_of_the_exact_path(data_root, signer):
         ("sun3d/studyroom2", 33, 3),
     )
     for name, step, count in recordings:
-        references = [one for part in find_sequences(data_root / name) for one in part.frames]
-        frames += [one.read() for one in references[::step][:count]]
+        references = [frame for part in find_sequences(data_root / name) for frame in part.frames]
+        frames += [reference.read() for reference in references[::step][:count]]
     levels = [describe(frame, p).levels for frame in frames]
     table = [
         float_signature([table_statistics(x, signer) for x in h], signer.model) for h in levels

@@ -109,7 +109,7 @@ def test_what_is_lost_is_seen(tmp_path, shots, monkeypatch):
     monkeypatch.setattr(audit, "EVENTS_S", 0.0)
     with Client.embedded(tmp_path) as client:
         client.create_map("fleet", model="depth")
-        added = [client.upload("fleet", one.png, one.meta, wait_s=PATIENCE_S) for one in shots[:5]]
+        added = [client.upload("fleet", s.png, s.meta, wait_s=PATIENCE_S) for s in shots[:5]]
         waiting = client.upload("fleet", shots[5].png, shots[5].meta)
         kept = [
             Acknowledged(one.frame_id, "fleet", shot, 0.0)

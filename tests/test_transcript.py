@@ -108,7 +108,7 @@ def test_a_map_in_one_file_leads_to_a_pose(said):
         lines = said(command, 2 if " serve" in command else 0)
         if " localize " in command:  # which of the matches agree may be another
             assert lines[0].startswith("site-000/scan-000003: found ")
-            place = [float(one) for one in lines[1].split()[1:4]]
+            place = [float(part) for part in lines[1].split()[1:4]]
             assert place == pytest.approx([4.436, 13.913, 0.854], abs=0.1)
             continue
         lines = [line for line in lines if not line.startswith("weak area: ")]

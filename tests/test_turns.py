@@ -71,8 +71,8 @@ def test_beside_another_a_tenant_holds_so_many_and_alone_all():
     order = TurnOrder(4, 1, lambda: clock.now)
 
     def ask(*waiters):
-        for one in waiters:
-            order.enter(one[0], one)
+        for waiter in waiters:
+            order.enter(waiter[0], waiter)
         return order.admit()
 
     assert ask("a1", "a2") == ["a1", "a2"]

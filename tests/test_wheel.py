@@ -53,9 +53,13 @@ def environment_without_us(folder):
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder)], check=True)
     (there,) = folder.glob("lib/python*/site-packages")
     for libraries in (Path(one) for one in sys.path if one.endswith("site-packages")):
-        for one in libraries.iterdir():
-            if "sceneprint" not in one.name and one.suffix != ".pth" and one.name != "__pycache__":
-                (there / one.name).symlink_to(one)
+        for path in libraries.iterdir():
+            if (
+                "sceneprint" not in path.name
+                and path.suffix != ".pth"
+                and path.name != "__pycache__"
+            ):
+                (there / path.name).symlink_to(path)
     return folder / "bin" / "python"
 
 

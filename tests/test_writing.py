@@ -84,7 +84,7 @@ def test_a_name_that_cannot_be_made_durable_is_an_error(tmp_path, which, monkeyp
         write_durable(folder / "a", b"content")
     named = (folder, tmp_path)[which]
     assert (caught.value.errno, caught.value.filename) == (errno.EIO, str(named))
-    assert [one.name for one in folder.iterdir()] == ["a"]  # whole, and no part of it beside
+    assert [path.name for path in folder.iterdir()] == ["a"]  # whole, and no part of it beside
 
 
 @pytest.mark.parametrize("write", [write_whole, write_durable])
@@ -116,4 +116,4 @@ def test_a_library_writes_beside_the_file(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("a", b"new")]
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"new")]

@@ -116,8 +116,8 @@ def problem_rows() -> Iterator[tuple[str, str, str, str]]:
 def sections() -> dict[str, dict[str, str]]:
     """Return the tables between the marks of each page, by the names of the marks."""
     metrics = (
-        (f"`sceneprint_{name}`", one.kind, ", ".join(map(code, one.labels)), cell(one.meaning))
-        for name, one in METRICS.items()
+        (f"`sceneprint_{name}`", m.kind, ", ".join(map(code, m.labels)), cell(m.meaning))
+        for name, m in METRICS.items()
     )
     states = [
         table((title, "meaning"), ((f"`{one}`", cell(one.sentence)) for one in kind))

@@ -37,7 +37,7 @@ def names_in(folder):
 
 
 def parts_in(folder):
-    return {one.name: one.read_bytes() for one in folder.glob("parts/??/*")}
+    return {path.name: path.read_bytes() for path in folder.glob("parts/??/*")}
 
 
 def lines_of(data):
@@ -52,14 +52,14 @@ def test_what_is_in_a_bundle(master, place, rows):
     held = parts_in(Path(place))
     assert all(hashlib.sha256(data).hexdigest() == digest for digest, data in held.items())
     parts = manifest.pop("parts")
-    assert {one["digest"]: one["bytes"] for one in parts}.items() <= {
+    assert {part["digest"]: part["bytes"] for part in parts}.items() <= {
         digest: len(data) for digest, data in held.items()
     }.items()
-    of = {one["kind"]: one for one in parts}
+    of = {part["kind"]: part for part in parts}
     head, *frames = lines_of(held[of["rows/frames"]["digest"]])
     assert of["rows/frames"]["rows"] == len(frames) == 6
     columns = ", ".join(f'"{one}"' for one in head)
-    assert [tuple(one) for one in frames] == [
+    assert [tuple(frame) for frame in frames] == [
         tuple(bool(x) if n == "depth_along_ray" else x for n, x in zip(head, row, strict=True))
         for row in rows(master, f"SELECT {columns} FROM frames ORDER BY number")
     ]
@@ -126,7 +126,7 @@ def test_a_part_that_is_gone_or_cut_is_written_again(data, tmp_path, settings):
         path = folder / "parts" / part.digest[:2] / part.digest
         path.unlink() if left is None else path.write_bytes(left)
     again = take_backup(settings(data), str(folder))
-    assert again.written == sum(one.bytes for one in first.manifest.parts[:2])
+    assert again.written == sum(part.bytes for part in first.manifest.parts[:2])
     assert parts_in(folder) == held
     assert verify_bundle(str(folder), first.manifest.name).lost == ()
 
@@ -143,7 +143,7 @@ def test_parts_of_another_version_or_of_a_damaged_bundle_are_read_again(
             "digest": taken.manifest.parts[0].digest,
             "bytes": taken.manifest.parts[0].bytes,
         }
-        parts = tuple(one.model_copy(update=of_first) for one in taken.manifest.parts)
+        parts = tuple(part.model_copy(update=of_first) for part in taken.manifest.parts)
         wrong = taken.manifest.model_copy(update={"parts": parts})
         if change == "version":
             wrong = wrong.model_copy(update={"sceneprint": "0.0.1"})
@@ -167,7 +167,7 @@ def test_another_bundle_costs_what_is_new(data, tmp_path, settings, uploads):
         engine.add_frame("hall", uploads[9].data, uploads[9].meta)
     third = take_backup(settings(data), str(folder))
     new = set(parts_in(folder)) - set(held)
-    tables = {one.kind for one in third.manifest.parts if one.digest in new}
+    tables = {part.kind for part in third.manifest.parts if part.digest in new}
     changed = ("events", "frame_tags", "frames", "jobs", "maps")
     assert tables == {"blobs", *(f"rows/{table}" for table in changed)}
     assert len(new) == len(tables) + 1  # and the upload
@@ -355,7 +355,7 @@ def test_it_is_one_state(postgres_url, tmp_path):
 def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
     with Engine(settings(data)) as engine:
         before = set(engine.store.blobs.digests())
-        frames = [one.frame_id for one in engine.list_frames("hall").items]
+        frames = [frame.frame_id for frame in engine.list_frames("hall").items]
 
         def delete(_done, _total):
             while frames:
@@ -372,7 +372,7 @@ def test_what_is_deleted_meanwhile_is_in_it(data, tmp_path, settings, rows):
 
 def test_a_sweep_under_way_is_waited_for(data, tmp_path, settings):
     with ThreadPoolExecutor(1) as pool, Engine(settings(data)) as engine:
-        (frame, *_) = [one.frame_id for one in engine.list_frames("hall").items]
+        (frame, *_) = [frame.frame_id for frame in engine.list_frames("hall").items]
         with engine.store.blobs.locks.removing() as allowed:
             assert allowed
             with engine.store.blobs.locks.removing() as second:

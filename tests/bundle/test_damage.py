@@ -56,11 +56,11 @@ def replace_part(folder, kind, change):
     """Change the lines of a part, which gets the digest of what it then holds."""
 
     def put(record):
-        part = next(one for one in record["parts"] if one["kind"] == kind)
+        part = next(part for part in record["parts"] if part["kind"] == kind)
         old = folder / "parts" / part["digest"][:2] / part["digest"]
         lines = [json.loads(line) for line in zlib.decompress(old.read_bytes()).split(b"\n")]
         change(lines)
-        data = zlib.compress("\n".join(json.dumps(one) for one in lines).encode())
+        data = zlib.compress("\n".join(json.dumps(line) for line in lines).encode())
         digest = hashlib.sha256(data).hexdigest()
         new = folder / "parts" / digest[:2] / digest
         new.parent.mkdir(exist_ok=True)
@@ -77,7 +77,7 @@ def test_every_part_that_is_flipped_cut_missing_or_swapped_is_named(copy):
         good = path.read_bytes()
         flipped = bytearray(good)
         flipped[rng.randrange(len(good))] ^= rng.randrange(1, 256)
-        other = next(one for one in parts if one != path).read_bytes()
+        other = next(part for part in parts if part != path).read_bytes()
         bad = (bytes(flipped), good[:-1], good + b"x", b"", other, None)[number % 6]
         path.unlink() if bad is None else path.write_bytes(bad)
         with pytest.raises(DamagedBundle, match=path.name):
@@ -126,7 +126,7 @@ def test_manifests_that_lie(copy, place, refused):
         "manifest of the bundle",
     )
     lies(lambda one: one["parts"][0].update(rows=99), "its rows of table")
-    without = [one for one in record["parts"] if one["kind"] != "rows/maps"]
+    without = [part for part in record["parts"] if part["kind"] != "rows/maps"]
     lies(lambda one: one.update(parts=without), "refers to a missing row of maps|its rows")
 
 
@@ -161,7 +161,7 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
     lies("blobs", lambda lines: lines.pop(), "its blobs")
     lies("blobs", lambda lines: lines[1].__setitem__(0, "../../evil"), "invalid entry in the list")
     lies("blobs", lambda lines: lines.insert(1, ["0" * 64, 5, None]), "is missing")
-    part = next(one for one in manifest_of(copy)[1]["parts"] if one["kind"] == "rows/frames")
+    part = next(part for part in manifest_of(copy)[1]["parts"] if part["kind"] == "rows/frames")
     more = [part["digest"], part["bytes"], None]  # a blob that is there, and that no row refers to
     replace_part(copy, "blobs", lambda lines: lines.append(more))
     blobs = {"blobs": 10, "blob_bytes": manifest_of(copy)[1]["blob_bytes"] + part["bytes"]}
@@ -171,7 +171,7 @@ def test_rows_that_are_none_of_ours(copy, place, refused):
 
 def lines_of(folder, kind):
     _, record = manifest_of(folder)
-    digest = next(one["digest"] for one in record["parts"] if one["kind"] == kind)
+    digest = next(part["digest"] for part in record["parts"] if part["kind"] == kind)
     data = (folder / "parts" / digest[:2] / digest).read_bytes()
     return [json.loads(line) for line in zlib.decompress(data).split(b"\n")]
 

@@ -42,14 +42,14 @@ def ask(url, asked):
 
 def rows_in(url):
     own = ("secrets", "samples", "schema_range", "scrubs")
-    names = [one.name for one in metadata.sorted_tables if one.name not in own]
+    names = [table.name for table in metadata.sorted_tables if table.name not in own]
     return sum(ask(url, f"SELECT count(*) FROM {name}")[0][0] for name in names)
 
 
 def changed(folder, *statements):
     with closing(sqlite3.connect(folder / "sceneprint.db")) as database:
-        for one in statements:
-            database.execute(one)
+        for statement in statements:
+            database.execute(statement)
         database.commit()
 
 

@@ -19,7 +19,7 @@ from sceneprint_client.api import FrameMeta
 def maps(service_url, whole_rooms):
     """`near` has two views of the first room, `far` one of each."""
     found = {}
-    frames = [one for sequence in find_sequences(whole_rooms) for one in sequence.frames]
+    frames = [frame for sequence in find_sequences(whole_rooms) for frame in sequence.frames]
     with Client(service_url) as client:
         for name, which in (("near", (0, 1)), ("far", (0, 3))):
             client.create_map(name, model="depth")
@@ -94,10 +94,10 @@ def test_an_ambiguous_place_is_told_with_its_alternatives(sceneprint, sides):
     assert located[1:] == sceneprint("query", "sides", file).stdout.splitlines()[-5:]
     assert located[1] == "  4 poses are supported; at most one is right:"
     places = []
-    for line, one in zip(located[2:], told["alternatives"], strict=True):
+    for line, alternative in zip(located[2:], told["alternatives"], strict=True):
         sure, _, x, y = line.split()[:4]
-        assert float(sure) == floored(one["confidence"])
-        assert f" m in hall, support 1; {round(one['evidence']['planes'])} plane" in line
+        assert float(sure) == floored(alternative["confidence"])
+        assert f" m in hall, support 1; {round(alternative['evidence']['planes'])} plane" in line
         places.append(complex(float(x), float(y)))
     # the true place turned about the cube by 0, 90, 180 and 270 degrees
     true = complex(truth[0][3], truth[1][3])

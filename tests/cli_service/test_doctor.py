@@ -131,7 +131,7 @@ def test_addresses_of_databases(sceneprint, tmp_path, monkeypatch, url, verdict,
     monkeypatch.setenv("SCENEPRINT_DATABASE_URL", url.format(tmp=str(tmp_path).lstrip("/")
         if url.startswith("sqlite:////") else tmp_path))  # fmt: skip
     done = sceneprint("doctor", "--data", tmp_path, expect=2 if verdict == "WRONG" else 0)
-    (line,) = [one for one in done.stdout.splitlines() if one[7:].startswith("database ")]
+    (line,) = [line for line in done.stdout.splitlines() if line[7:].startswith("database ")]
     assert line.startswith(verdict)
     assert said.format(tmp=tmp_path) in line
     assert "hidden" not in done.stdout + done.stderr  # half of a password

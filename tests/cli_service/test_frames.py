@@ -16,11 +16,11 @@ def name():
 def test_lists_files_and_edits(sceneprint, rooms, name, tmp_path):
     sceneprint("upload", name, rooms / "room-0", "--model", "depth", "--robot", "r1")
     frames = [json.loads(line) for line in sceneprint("frames", name, "--json").stdout.splitlines()]
-    ids = [one["frame_id"] for one in frames]
+    ids = [frame["frame_id"] for frame in frames]
     table = sceneprint("frames", name, "--newest", "--limit", "2").stdout.splitlines()
     assert [line.split()[0] for line in table] == ["frame", ids[2], ids[1]]
     # four at a time they come in any order, and are told in that of their files
-    (session,) = {one["session"] for one in frames}
+    (session,) = {frame["session"] for frame in frames}
     table = sceneprint("frames", name, "--session", session).stdout.splitlines()
     assert [line.split()[-1] for line in table[1:]] == [
         f"frame-00000{i}.depth.png" for i in range(3)
@@ -70,7 +70,7 @@ def test_what_cannot_be_is_one_line(sceneprint, name, arguments, text):
 def test_a_session_is_renamed_tagged_and_deleted(sceneprint, rooms, name):
     name = f"{name}-sessions"
     sceneprint("upload", name, rooms / "room-0", "--model", "depth", "--robot", "r1")
-    (own,) = [json.loads(one) for one in sceneprint("sessions", name, "--json").stdout.splitlines()]
+    (own,) = [json.loads(x) for x in sceneprint("sessions", name, "--json").stdout.splitlines()]
     old, new = own["session"], "Monday / first floor"
     said = sceneprint("sessions", name, old, "--rename", new, "--tag", "door").stdout
     assert said == f"edited 3 frames of session {old}\n"

@@ -16,7 +16,7 @@ def dead(sceneprint, data_folder, rooms, service_url):
     """Jobs of a map of two frames: one as if it had broken down too often, and one done."""
     sceneprint("upload", "jobs", rooms / "room-0", "--every", 2, "--priority", -3)
     with Client(service_url) as client, Engine(Settings(data_dir=data_folder)) as engine:
-        (job, other) = [one for one in client.jobs() if one.map == "jobs"][:2]
+        (job, other) = [job for job in client.jobs() if job.map == "jobs"][:2]
         with engine.store.database.write() as connection:
             connection.exec_driver_sql(
                 "UPDATE jobs SET state = 'dead', error = 'it hung', traceback = 'Trace' "

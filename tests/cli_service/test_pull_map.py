@@ -20,9 +20,9 @@ def test_a_map_is_pulled_and_renewed(sceneprint, service_url, rooms, tmp_path):
         assert told[1].startswith(f"{copy} has map pulled-too of revision 0: 0 frames, 0 new")
         said = sceneprint("pull", "--map", "pulled", "--data", copy)
         assert ", 0 new or changed, 0 removed; 0 artifacts, 0.0 MB fetched" in said.stdout
-        online = sorted(one.frame_id for one in client.frames("pulled"))
+        online = sorted(frame.frame_id for frame in client.frames("pulled"))
     with Client.embedded(copy) as robot:
-        assert sorted(one.frame_id for one in robot.frames("pulled")) == online
+        assert sorted(frame.frame_id for frame in robot.frames("pulled")) == online
     said = sceneprint("pull", "--map", "nowhere", "--data", copy, expect=2)
     assert "nowhere" in said.stderr
     said = sceneprint("pull", "--map", "pulled", "--data", rooms, expect=2)

@@ -18,10 +18,10 @@ FRAMES = 8
 def folder(building, tmp_path_factory):
     made = tmp_path_factory.mktemp("folder") / "room"
     made.mkdir()
-    for one in find_sequences(building / "room-0" / "seq-01")[0].frames[:FRAMES]:
-        (made / one.path.name).write_bytes(one.path.read_bytes())
-        pose = one.path.name.replace(".depth.png", ".pose.txt")
-        (made / pose).write_bytes((one.path.parent / pose).read_bytes())
+    for frame in find_sequences(building / "room-0" / "seq-01")[0].frames[:FRAMES]:
+        (made / frame.path.name).write_bytes(frame.path.read_bytes())
+        pose = frame.path.name.replace(".depth.png", ".pose.txt")
+        (made / pose).write_bytes((frame.path.parent / pose).read_bytes())
     camera = building / "room-0" / "intrinsics.json"
     (made / "intrinsics.json").write_bytes(camera.read_bytes())
     return made
@@ -32,13 +32,13 @@ def record(ros, place, name, frames):
 
     def fill(writer):
         writer.transforms(0.0, {("base_link", "camera"): ros.camera}, "/tf_static")
-        for i, one in enumerate(frames):
-            k = one.camera.intrinsics
+        for i, frame in enumerate(frames):
+            k = frame.camera.intrinsics
             t = 0.2 * i
-            T_odom_base = one.pose @ np.linalg.inv(ros.camera)
+            T_odom_base = frame.pose @ np.linalg.inv(ros.camera)
             writer.camera_info(t, k=(k.fx, k.fy, k.cx, k.cy), size=(k.width, k.height))
             writer.transforms(t, {("odom", "base_link"): T_odom_base})
-            writer.image(t, decode_png(one.read_bytes()))
+            writer.image(t, decode_png(frame.read_bytes()))
 
     return Path(ros.write(place, fill, name=name))
 
@@ -88,8 +88,8 @@ def test_each_bag_of_a_folder_is_a_session(sceneprint, bags, service_url):
     assert f"{bags}/first.mcap: 2 of 2 frames of /camera" in done.stderr
     assert f"{bags}/day2/second: 3 of 3 frames of /camera" in done.stderr
     with Client(service_url) as client:
-        found = sorted((one.session, one.pose.parent_frame) for one in client.frames("days")
-                       if one.pose is not None)  # fmt: skip
+        found = sorted((frame.session, frame.pose.parent_frame) for frame in client.frames("days")
+                       if frame.pose is not None)  # fmt: skip
     assert found == [("day2/second", "day2/second/odom")] * 3 + [("first", "first/odom")] * 2
     done = sceneprint("query", "days", bags, *options, "--frame", 4, "--json")
     assert json.loads(done.stdout)["name"] == "day2/second/000002"
@@ -103,8 +103,8 @@ def test_bags_beside_other_frames_are_an_error(sceneprint, bags, folder, tmp_pat
     mixed = tmp_path / "mixed"
     (mixed / "room").mkdir(parents=True)
     (mixed / "run.mcap").write_bytes(b"never read")
-    for one in folder.iterdir():
-        (mixed / "room" / one.name).write_bytes(one.read_bytes())
+    for path in folder.iterdir():
+        (mixed / "room" / path.name).write_bytes(path.read_bytes())
     for command in (("upload", "mixed"), ("query", "folder"), ("localize", "folder"), ("sign",)):
         done = sceneprint(*command, mixed, expect=2)
         assert done.stderr == (

@@ -79,7 +79,7 @@ def room_frames(room_frames):
 @pytest.fixture(scope="session")
 def references(room_frames, tmp_path_factory):
     root = write_rooms(tmp_path_factory.mktemp("rooms"), room_frames)
-    return tuple(one for sequence in find_sequences(root) for one in sequence.frames)
+    return tuple(frame for sequence in find_sequences(root) for frame in sequence.frames)
 
 
 @pytest.fixture(scope="session")

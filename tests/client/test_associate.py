@@ -41,7 +41,7 @@ def test_edges_and_graphs(associated):
     edges = list(client.edges(MAP, name))
     assert found.result.edges == len(edges) > 4
     assert found.result.joins[0].transform is not None
-    assert {one.from_frame for one in edges} <= associated.numbers.keys()
+    assert {edge.from_frame for edge in edges} <= associated.numbers.keys()
     middle = sorted(edge.overlap for edge in edges)[len(edges) // 2]
     strongest = json.loads(client.graph(MAP, name, "json", min_overlap=middle))
     assert len(strongest["edges"]) == len(edges) - len(edges) // 2

@@ -40,10 +40,10 @@ def test_a_map_from_upload_to_deletion(service_url, map_name, references):
             created = await client.create_map(map_name, model="depth")
             added = await client.upload(map_name, references[3], wait_s=PATIENCE_S)
             assert added.state is FrameState.INDEXED
-            assert [one.frame_id async for one in client.frames(map_name)] == [added.frame_id]
+            assert [frame.frame_id async for frame in client.frames(map_name)] == [added.frame_id]
             coverage = await client.compute(MapCoverage, map_name, timeout_s=PATIENCE_S)
             assert coverage.state == "succeeded"
-            kinds = [one.kind async for one in client.events(map_name, follow=False)]
+            kinds = [event.kind async for event in client.events(map_name, follow=False)]
             assert kinds.count("frame.indexed") == 1
             await client.delete_map(created.name)
             with pytest.raises(UnknownMap, match=map_name):

@@ -36,7 +36,7 @@ def test_a_frame_from_upload_to_deletion(client, map_name, references):
     with pytest.raises(UnknownFrame):
         client.delete_frame(map_name, added.frame_id)
     assert list(client.frames(map_name)) == []
-    assert [one.frame_id for one in client.frames(map_name, FrameState.DELETED)] == [added.frame_id]
+    assert [f.frame_id for f in client.frames(map_name, FrameState.DELETED)] == [added.frame_id]
 
 
 def test_jobs_are_waited_for(client, map_name, references):
@@ -44,7 +44,7 @@ def test_jobs_are_waited_for(client, map_name, references):
     lens = meta_of(references[0]).intrinsics
     wall = np.zeros((lens.height, lens.width), np.float32)
     wall[100:105, 100:106] = 2.0  # no surface to sign: 30 samples
-    added = [client.upload(map_name, one) for one in references[:2]]
+    added = [client.upload(map_name, reference) for reference in references[:2]]
     added.append(client.upload(map_name, wall, lens))
     seen = []
     ids = [one.job_id for one in added]

@@ -29,7 +29,7 @@ def test_a_generated_client_maps_and_localizes(
     )  # fmt: skip
     names = {one["operationId"] for path in json.loads(document.read_text())["paths"].values()
              for one in path.values()}  # fmt: skip
-    assert {one.stem for one in tmp_path.glob("places/api/*/*.py")} == names | {"__init__"}
+    assert {path.stem for path in tmp_path.glob("places/api/*/*.py")} == names | {"__init__"}
     monkeypatch.syspath_prepend(tmp_path)
     places, models, types = (importlib.import_module(f"places{one}") for one in
                              ("", ".models", ".types"))  # fmt: skip
@@ -52,7 +52,7 @@ def test_a_generated_client_maps_and_localizes(
         with Client(service_url) as waiting:
             waiting.wait([added.job_id], timeout_s=PATIENCE_S)
         page = api["frames.list_frames"].sync(map_name, client=client)
-        assert [one.frame_id for one in page.items] == [added.frame_id]
+        assert [frame.frame_id for frame in page.items] == [added.frame_id]
         assert page.items[0].captured_at is None
         body = models.LocalizeFilesBody(**form(), k=1)
         found = api["queries.localize"].sync(map_name, client=client, body=body)

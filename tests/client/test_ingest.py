@@ -44,7 +44,7 @@ def done(client, map_name, archive, options=None):
     assert (job.kind, job.map, job.state.over) == ("import", map_name, False)
     [over] = client.wait([job.job_id], timeout_s=PATIENCE_S)
     items = list(client.import_items(map_name, job.job_id))
-    client.wait([one.job_id for one in items if one.job_id is not None], timeout_s=PATIENCE_S)
+    client.wait([item.job_id for item in items if item.job_id is not None], timeout_s=PATIENCE_S)
     return over, items
 
 
@@ -68,7 +68,7 @@ def test_a_batch(client, map_name, references):
     client.create_map(map_name, model="depth")
     sent, known = [references[0], b"none", references[0]], [meta_of(references[0])] * 3
     items = client.upload_batch(map_name, sent, known)
-    assert [one.status for one in items] == [202, 422, 200]
+    assert [item.status for item in items] == [202, 422, 200]
     with pytest.raises(InvalidRequest, match="has 0 frames"):
         client.upload_batch(map_name, [])
     with pytest.raises(InvalidRequest, match="for each"):
@@ -82,12 +82,12 @@ def test_an_archive_gives_what_an_upload_of_the_folder_gives(client, map_name, r
     job, items = done(client, map_name, packed(rooms, **extra), options)
     assert (job.state, job.error) == (JobState.SUCCEEDED, None)
     assert (job.result["received"], job.result["refused"]) == (len(references), 2)
-    assert {one.name: one.problem.type for one in items if one.problem is not None} == {
+    assert {item.name: item.problem.type for item in items if item.problem is not None} == {
         "../up.png": "/problems/unreadable-archive",
         "room-0/seq-01/frame-000900.depth.png": "/problems/unreadable-frame",
     }
-    frames = {one.frame_id: one for one in client.frames(map_name)}
-    named = {one.name: frames[one.frame_id] for one in items if one.frame_id is not None}
+    frames = {frame.frame_id: frame for frame in client.frames(map_name)}
+    named = {item.name: frames[item.frame_id] for item in items if item.frame_id is not None}
     for reference in references:
         frame = named[f"./{reference.path.relative_to(rooms)}"]
         place = reference.path.parent.relative_to(rooms).as_posix()

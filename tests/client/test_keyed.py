@@ -40,10 +40,10 @@ def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
         if name.startswith("_") or name in OPEN | {"wait_for_product"}:
             continue
         needed = {
-            one.name: own[one.name]
-            for one in list(inspect.signature(method).parameters.values())[1:]
-            if one.default is inspect.Parameter.empty
-            and one.kind is not inspect.Parameter.VAR_KEYWORD
+            parameter.name: own[parameter.name]
+            for parameter in list(inspect.signature(method).parameters.values())[1:]
+            if parameter.default is inspect.Parameter.empty
+            and parameter.kind is not inspect.Parameter.VAR_KEYWORD
         }
         if name in ("query", "localize"):
             needed = {"map_name": "hall", "frame_id": ID}

@@ -22,17 +22,17 @@ def ids(client, references):
     map_name = "outputs"
     client.create_map(map_name, model="depth")
     found = []
-    for i, one in enumerate(references[:3]):
-        meta = meta_of(one, robot="r2", tags=["door"] if i else [])
+    for i, reference in enumerate(references[:3]):
+        meta = meta_of(reference, robot="r2", tags=["door"] if i else [])
         meta = meta.model_copy(update={"captured_at": START + timedelta(seconds=i)})
         found.append(
-            client.upload(map_name, one.path.read_bytes(), meta, wait_s=PATIENCE_S).frame_id
+            client.upload(map_name, reference.path.read_bytes(), meta, wait_s=PATIENCE_S).frame_id
         )
     return found
 
 
 def listed(client, map_name, **wanted):
-    return [one.frame_id for one in client.frames(map_name, **wanted)]
+    return [frame.frame_id for frame in client.frames(map_name, **wanted)]
 
 
 def test_frames_by_their_metadata(client, map_name, ids):

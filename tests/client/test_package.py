@@ -61,6 +61,6 @@ def test_the_distributions_have_one_version():
     assert f"sceneprint-client{bounds}" in main["dependencies"]
     for one in (lab, viewers):
         assert f"sceneprint{bounds}" in one["dependencies"]
-    assert {one.partition(">")[0] for one in client["dependencies"]} == {
+    assert {dependency.partition(">")[0] for dependency in client["dependencies"]} == {
         "httpx", "numpy", "pydantic",
     }  # fmt: skip

@@ -60,7 +60,7 @@ def test_a_product_from_request_to_deletion(
             assert refused.status_code == status, (method, path, refused.text)
             assert refused.headers["Content-Type"] == "application/problem+json"
         client.delete_product(kind, MAP, ids[0])
-        assert [one.job_id for one in client.products(kind, MAP)] == ids[1:]
+        assert [product.job_id for product in client.products(kind, MAP)] == ids[1:]
         assert http.delete(place).status_code == 204
     for name in (done.job_id, "../jobs"):
         with pytest.raises(UnknownJob, match=f"no {kind.noun} "):
@@ -86,7 +86,7 @@ def test_frames_and_changes_of_coverage(client):
     )
     assert (first.result.frames, first.result.found) == (4, 4)
     frames = list(client.coverage_frames(MAP, first.job_id))
-    assert {frame.frame_id for frame in frames} == {one.frame_id for one in client.frames(MAP)}
+    assert {frame.frame_id for frame in frames} == {frame.frame_id for frame in client.frames(MAP)}
     assert list(client.coverage_frames(MAP, first.job_id, "not_found")) == []
     told = client.coverage_changes(MAP, second.job_id, first.job_id)
     assert set(told.trends) - {"same"} == {"better", "worse", "new", "gone"}

@@ -11,7 +11,7 @@ def test_all_ways_of_asking(client, map_name, references):
     """One after the other: options, maps as one, a pose, and two frames compared."""
     other = f"{map_name}-b"
     client.create_map(map_name)
-    ids = [client.upload(map_name, one, wait_s=PATIENCE_S).frame_id for one in references]
+    ids = [client.upload(map_name, r, wait_s=PATIENCE_S).frame_id for r in references]
     client.create_map(other)
     added = client.upload(other, references[1], wait_s=PATIENCE_S).frame_id
     options = {
@@ -58,7 +58,7 @@ def test_what_cannot_be_asked_is_refused(client, map_name, references):
 
 def test_what_an_answer_rests_on(client, map_name, references):
     client.create_map(map_name)
-    added = [client.upload(map_name, one, wait_s=60) for one in references[:2]]
+    added = [client.upload(map_name, reference, wait_s=60) for reference in references[:2]]
     answer = client.query(map_name, references[1], k=2, seed=3)
     assert client.answer(answer.query_id) == answer
     best = answer.matches[0].frame_id

@@ -58,12 +58,12 @@ def test_a_surface_and_its_figures(client, answered):
     assert comment == "comment frame query.optical: x right, y down, z forward, metres"
     accepted = [m for m in answered.matches if m.validation.status == "accepted"]
     views = coverage.views
-    assert [one.frame_id for one in views[1:]] == [
+    assert [view.frame_id for view in views[1:]] == [
         match.frame_id for match in sorted(accepted, key=lambda match: match.rank)
     ]
     assert (views[0].frame_id, views[0].source) == (None, "geometry")
-    assert all(one.source == "upload" for one in views[1:])
-    assert sum(one.added_m2 for one in views) == pytest.approx(coverage.area_m2)
+    assert all(view.source == "upload" for view in views[1:])
+    assert sum(view.added_m2 for view in views) == pytest.approx(coverage.area_m2)
     assert 0.5 < coverage.query_explained <= 1.0
     assert coverage.left_out == []
 
@@ -76,7 +76,7 @@ def test_what_is_wanted_is_what_is_fused(client, answered):
         output="cloud", wait_s=PATIENCE_S,
     )  # fmt: skip
     assert made.result is not None, made.error
-    assert [one.frame_id for one in made.result.views] == [first.frame_id]
+    assert [view.frame_id for view in made.result.views] == [first.frame_id]
     assert (made.result.triangles, made.result.voxel_m) == (0, 0.05)
     assert made.result.area_m2 > 1.0  # also of a cloud: it is that of the surface
     points, triangles, _ = ply(client.reconstruction_mesh(made.job_id))
@@ -142,7 +142,7 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(views, tmp_p
         [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
         assert job.state == "succeeded", job.error
         coverage = client.product(Reconstruction, None, made.job_id).result
-        sources = {one.frame_id: one.source for one in coverage.views}
+        sources = {view.frame_id: view.source for view in coverage.views}
         assert sources[lost] == "geometry"
         assert [one.frame_id for one in coverage.left_out] == [deleted]
         assert "replaced by a new frame" in coverage.left_out[0].reason

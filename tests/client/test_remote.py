@@ -137,7 +137,7 @@ def test_pages_are_followed(scripted):
     ]
     server = scripted([(200, {}, page) for page in pages])
     with Client(server.url) as client:
-        assert [one.frame_id for one in client.frames("m")] == ["a", "b", "c"]
+        assert [frame.frame_id for frame in client.frames("m")] == ["a", "b", "c"]
     assert [path for _, path, _ in server.asked] == [
         "/v1/maps/m/frames?limit=200",
         "/v1/maps/m/frames?cursor=2&limit=200",

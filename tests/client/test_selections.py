@@ -8,16 +8,16 @@ from sceneprint.errors import InvalidRequest, UnknownDeletion
 
 def test_frames_are_deleted_edited_and_restored(client, map_name, references):
     client.create_map(map_name)
-    ids = [client.upload(map_name, one).frame_id for one in references[:3]]
+    ids = [client.upload(map_name, reference).frame_id for reference in references[:3]]
     client.edit_frames(map_name, ids, session="monday", add_tags=["door"])
-    before = {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)}
+    before = {frame.frame_id: (frame.session, frame.tags) for frame in client.frames(map_name)}
     assert before == dict.fromkeys(ids, ("monday", ["door"]))
-    assert [one.frame_id for one in client.frames(map_name, find=ids[1])] == ids[1:2]
+    assert [frame.frame_id for frame in client.frames(map_name, find=ids[1])] == ids[1:2]
     count, inverse = client.edit_frames(
         map_name, filter={"session": ["monday"]}, session=None, remove_tags=["door"]
     )
     assert count == 3
-    assert [(one.session, one.tags) for one in client.frames(map_name)] == [(None, [])] * 3
+    assert [(frame.session, frame.tags) for frame in client.frames(map_name)] == [(None, [])] * 3
     for one in inverse:
         client.edit_frames(map_name, **one)
     count, (deletion,) = client.delete_frames(map_name, filter={"tag": ["door"]})
@@ -27,7 +27,7 @@ def test_frames_are_deleted_edited_and_restored(client, map_name, references):
     assert client.restore_frame(map_name, ids[0]).tags == ["door"]
     restored = client.restore_deletion(map_name, deletion.deletion_id)
     assert (restored.frames, restored.refused) == (2, [])
-    assert {one.frame_id: (one.session, one.tags) for one in client.frames(map_name)} == before
+    assert {f.frame_id: (f.session, f.tags) for f in client.frames(map_name)} == before
     with pytest.raises(UnknownDeletion):
         client.restore_deletion(map_name, deletion.deletion_id)
     with pytest.raises(InvalidRequest, match="`filter` has no condition"):

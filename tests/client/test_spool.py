@@ -149,7 +149,7 @@ def test_a_frame_is_there_once_and_survives(tmp_path):
     path = tmp_path / "spool"
     with Spool(path, 100 * CHARGE) as spool:
         assert spool.add(depth(1), meta(0))
-        assert {one.stat().st_mode & 0o777 for one in tmp_path.iterdir()} == {0o600}
+        assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o600}
         assert not spool.add(depth(1), meta(0))
         assert spool.add(depth(1), meta(1))
         assert spool.add(depth(2), meta(0))
@@ -221,7 +221,7 @@ def test_a_full_disk_does_not_stop_uploads(remote, map_name, tmp_path):
         assert taken > 5
         report = spool.sync(remote, map_name)
         assert (report.received, report.refused, spool.status().waiting) == (0, taken, 0)
-        explained = [one for one in spool.refusals() if "none of" in one.reason]
+        explained = [refusal for refusal in spool.refusals() if "none of" in refusal.reason]
         assert taken / 2 < len(explained) <= taken  # the disk has no room for all reasons
 
 
@@ -235,7 +235,7 @@ def test_a_frame_larger_than_the_journal_leaves_it_as_large(tmp_path, refused):
         assert before < 3 << 20
         spool._record_results(*(([], {1: "a reason"}) if refused else ([1], {})))
         assert journal.stat().st_size == before
-        assert [one.reason for one in spool.refusals()] == ["a reason"] * refused
+        assert [refusal.reason for refusal in spool.refusals()] == ["a reason"] * refused
         assert spool.status().uploaded == (not refused)
         assert (spool.retry_refused(), spool.status().waiting) == (refused, refused)
         assert journal.stat().st_size == before
@@ -262,8 +262,8 @@ def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, ref
     there = remote.upload(map_name, references[0], meta_of(references[0]))
     told = []
     with Spool(tmp_path / "spool") as spool:
-        for one in references[:3]:
-            spool.add(one, meta_of(one))
+        for reference in references[:3]:
+            spool.add(reference, meta_of(reference))
         spool.add(b"no depth image", meta(name="broken"))
         spool.add(depth(1), meta(0, name="last"))
         with pytest.raises(UnknownMap):
@@ -281,7 +281,7 @@ def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, ref
         found = list(remote.frames(map_name))
         assert found[0].frame_id == there.frame_id
         assert [one.name for one in found[1:]] == [
-            *(one.path.name for one in references[1:3]), "last",
+            *(reference.path.name for reference in references[1:3]), "last",
         ]  # fmt: skip
         assert found[-1].captured_at == START
         assert found[-1].pose is not None
@@ -316,7 +316,7 @@ def test_a_request_that_is_too_large_is_halved(remote, map_name, tmp_path):
         report = spool.sync(remote, map_name)
         [refusal] = spool.refusals()
     assert (report.received, report.refused) == (3, 1)
-    assert [one.name for one in remote.frames(map_name)] == ["a", "b", "d"]
+    assert [frame.name for frame in remote.frames(map_name)] == ["a", "b", "d"]
     assert refusal.name == "c"
     assert "2097152" in refusal.reason
 
@@ -452,8 +452,8 @@ def test_an_hour_offline_through_kills_and_a_full_disk(tmp_path):
                             process.kill()
                     process.wait()
                 syncs += process.returncode == -signal.SIGKILL
-            found = [one.name for one in client.frames("hall")]
-            contents = {one.content_id for one in client.frames("hall")}
+            found = [frame.name for frame in client.frames("hall")]
+            contents = {frame.content_id for frame in client.frames("hall")}
     finally:
         os.killpg(service.pid, signal.SIGTERM)
         service.communicate(timeout=PATIENCE_S)
@@ -474,7 +474,7 @@ def test_a_full_spool_reports_what_it_gave_up_of_a_drive(tmp_path):
             spool.add(depth(number), drive_meta(number))
         now = spool.status()
     assert (now.waiting, now.thinned) == (50, 150)
-    kept = [int(one) for one in names(path)]
+    kept = [int(name) for name in names(path)]
     assert (kept[0], kept[-1]) == (0, 199)
     # even along the drive: no gap is more than twice the mean of 4 but for the ends
     assert max(np.diff(kept)) <= 8

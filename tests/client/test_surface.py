@@ -37,7 +37,7 @@ def test_tiles_and_the_frames_that_saw_them(fused):
     cells, sessions = 0, set()
     for level in parent.levels:
         tiles = list(fused.surface_tiles(MAP, "room", level.level))
-        assert (len(tiles), sum(one.bytes for one in tiles)) == (level.tiles, level.bytes)
+        assert (len(tiles), sum(tile.bytes for tile in tiles)) == (level.tiles, level.bytes)
         for tile in tiles:
             found = decode_tile(fused.surface_tile(MAP, tile.digest), tile, level.tile_m)
             place = [tile.column, tile.row, tile.floor]
@@ -50,7 +50,7 @@ def test_tiles_and_the_frames_that_saw_them(fused):
     assert list(fused.surface_frames(MAP, spot, radius=1.0))
     every = [-100.0, -100.0, -100.0, 100.0, 100.0, 100.0]
     boxed = list(fused.surface_frames(MAP, box=every, parent="room"))
-    assert {one.frame_id for one in boxed} == {one.frame_id for one in fused.frames(MAP)}
+    assert {frame.frame_id for frame in boxed} == {frame.frame_id for frame in fused.frames(MAP)}
 
 
 def test_what_a_surface_refuses(fused):

@@ -41,7 +41,7 @@ class FakeClient:
         return self.answer({"map": map_name, "frames": [depth_of(frame)], "metas": [meta], **how})
 
     def localize_sequence(self, map_name, frames, metas, **how):
-        seen = [depth_of(one) for one in frames]
+        seen = [depth_of(frame) for frame in frames]
         return self.answer({"map": map_name, "frames": seen, "metas": metas, **how})
 
     def answer(self, asked):
@@ -115,7 +115,7 @@ def test_a_service_that_is_away_leaves_it_to_odometry():
     client = fake(answer("found", 5.0), *away, errors.UselessFrame("blank"))
     tracker = Tracker(client, "m", camera=K)
     states = [tracker.update(DEPTH, ahead(i), stamp=i) for i in range(5)]
-    assert {one.status for one in states} == {"tracking"}
+    assert {state.status for state in states} == {"tracking"}
     np.testing.assert_allclose(states[-1].T_map_sensor, ahead(9), atol=1e-9)
     assert states[-1].age == 4
     for wrong in (errors.UnknownMap("no map"), errors.Refused("odd", 418, {})):
@@ -133,7 +133,7 @@ def test_its_log_replays_to_the_same_states():
         states.append(tracker.move(ahead(i - 0.5), i - 0.5))
         states.append(tracker.update(DEPTH, ahead(i), stamp=float(i)))
     states.append(tracker.reset("a lift"))
-    assert "".join(one.status[0] for one in states) == "lttttttlllltl"
+    assert "".join(state.status[0] for state in states) == "lttttttlllltl"
     again = list(replay(log.getvalue().splitlines()))
     assert len(again) == len(states)
     assert all(map(equal, again, states))
@@ -193,7 +193,7 @@ def test_alternatives_weigh_by_their_confidence():
         for p in (0.6, 0.3, 0.0, None)
     ]
     unsure = answer("ambiguous").model_copy(update={"alternatives": alternatives})
-    weights = [one.weight for one in observation_of(unsure).poses]
+    weights = [pose.weight for pose in observation_of(unsure).poses]
     assert weights == [0.6, 0.3, 0.001, 0.001]
 
 
@@ -215,7 +215,7 @@ def test_while_it_is_lost_it_asks_with_the_latest_frames_that_differ():
     expected = [
         [5], [5.05], [5, 5.2], [5, 5.2, 5.4], [5, 5.2, 5.41], [5.2, 5.4, 5.8], [5.8, 8.75],
     ]  # fmt: skip
-    assert [[round(one, 2) for one in frames] for frames in told] == expected
+    assert [[round(frame, 2) for frame in frames] for frames in told] == expected
     third = client.asked[3]
     # odometry from the last frame: 40 cm and 20 cm behind it
     for meta, x in zip(third["metas"], (-0.4, -0.2, 0.0), strict=True):
@@ -280,7 +280,7 @@ def test_answers_that_share_frames_or_nearly_are_one_view():
         parameters = TrackerParameters(frames=frames)
         tracker = Tracker(client, "m", camera=K, parameters=parameters, log=log)
         states = [tracker.update(depth(x), ahead(x), stamp=x) for x in way]
-        assert [one.status == "tracking" for one in states] == [x >= tracks_from for x in way]
+        assert [state.status == "tracking" for state in states] == [x >= tracks_from for x in way]
         assert all(map(equal, replay(log.getvalue().splitlines()), states))
 
 
@@ -315,7 +315,7 @@ def test_beside_what_looks_alike_it_never_tracks_wrongly(client, map_name, kind,
         jobs.append(client.upload(map_name, one.depth, meta).job_id)
     client.wait(jobs)
     tracker = Tracker(client, map_name, camera=camera)
-    truth = [one.pose for one in site.queries]
+    truth = [query.pose for query in site.queries]
     travelled = 0.0  # since the last fix; the views are up to 20 m apart, and odometry drifts
     for i, T in enumerate(drifted(truth, index)):
         state = tracker.update(site.queries[i].depth, T, stamp=0.4 * i)

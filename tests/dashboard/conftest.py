@@ -374,9 +374,9 @@ def axe():
             options = {"resultTypes": ["violations"]}
             if theme == "dark":
                 options["runOnly"] = ["color-contrast"]
-            for one in judge.run(page, options=options).response["violations"]:
-                where = [node["html"][:200] for node in one["nodes"][:5]]
-                found.append(f"{theme}: {one['id']}: {one['help']}: {where}")
+            for violation in judge.run(page, options=options).response["violations"]:
+                where = [node["html"][:200] for node in violation["nodes"][:5]]
+                found.append(f"{theme}: {violation['id']}: {violation['help']}: {where}")
         return found
 
     return look

@@ -31,7 +31,7 @@ def measured(station, four_sides, page, settle):
     """The result of a job that was begun on the page, which shows it."""
     del four_sides  # its map is measured
     path = "/v1/maps/four-sides/coverage"
-    known = {one["job_id"] for one in station.client.get(path).json()["items"]}
+    known = {item["job_id"] for item in station.client.get(path).json()["items"]}
     page.goto(f"{station.home}#/maps/four-sides/coverage")
     settle(page)
     if not known:
@@ -44,10 +44,10 @@ def measured(station, four_sides, page, settle):
     dialog.get_by_role("button", name="Start").click()
     expect(page.get_by_text("Coverage was measured.")).to_be_visible()
     settle(page)
-    (one,) = (one for one in station.client.get(path).json()["items"] if one["job_id"] not in known)
-    assert (one["request"]["not_within_s"], one["request"]["cell_m"]) == (0, 0.5)
-    told = station.client.get(f"{path}/{one['job_id']}").json()
-    frames = station.client.get(f"{path}/{one['job_id']}/frames").json()["items"]
+    (i,) = (i for i in station.client.get(path).json()["items"] if i["job_id"] not in known)
+    assert (i["request"]["not_within_s"], i["request"]["cell_m"]) == (0, 0.5)
+    told = station.client.get(f"{path}/{i['job_id']}").json()
+    frames = station.client.get(f"{path}/{i['job_id']}/frames").json()["items"]
     return {**told, "frames": frames}
 
 
@@ -59,7 +59,7 @@ def test_a_result_is_begun_shown_and_explained(station, page, settle, measured, 
         count = page.locator(f".cover-counts [data-outcome={name}] strong")
         expect(count).to_have_text(str(result[name]))
     drawn = page.locator(".cover-cell").evaluate_all(CELLS)
-    cells = {key(one): one for one in plan["cells"]}
+    cells = {key(cell): cell for cell in plan["cells"]}
     assert {one["cell"] for one in drawn} == set(cells)
     for one in drawn:
         cell = cells[one["cell"]]
@@ -72,11 +72,11 @@ def test_a_result_is_begun_shown_and_explained(station, page, settle, measured, 
             worst = max(("not_found", "ambiguous", "found"), key=lambda name: counts[name])
             assert one["outcome"] == ("wrong" if counts["wrong"] else worst)
     # the cell of a frame that is mistaken: what stands in it, and what each looks like
-    frame = next(one for one in measured["frames"] if one["look_alikes"])
+    frame = next(frame for frame in measured["frames"] if frame["look_alikes"])
     axes = np.array([plan["x_axis"], plan["y_axis"]])
     places = {
-        one["frame_id"]: axes @ [one["position"][axis] for axis in "xyz"]
-        for one in measured["frames"]
+        frame["frame_id"]: axes @ [frame["position"][axis] for axis in "xyz"]
+        for frame in measured["frames"]
     }
     cell_of = {name: tuple(np.floor(at / 0.5).astype(int).tolist()) for name, at in places.items()}
     chosen = cell_of[frame["frame_id"]]

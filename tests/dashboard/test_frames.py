@@ -20,7 +20,7 @@ def ids(page):
 def listed(station, name, **wanted):
     """Frames of a page of 24 of the API."""
     found = station.client.get(f"/v1/maps/{name}/frames", params={"limit": 24, **wanted}).json()
-    return [one["frame_id"] for one in found["items"]]
+    return [item["frame_id"] for item in found["items"]]
 
 
 def told(station, path, **params):
@@ -49,7 +49,7 @@ def add(station, name, seeds, columns=32):
         files=files,
     )  # fmt: skip
     assert answer.status_code == 200, answer.text
-    return [one["frame"]["frame_id"] for one in answer.json()["items"]]
+    return [item["frame"]["frame_id"] for item in answer.json()["items"]]
 
 
 def test_gallery_shows_and_filters_what_the_api_lists(page, station, settle, axe):

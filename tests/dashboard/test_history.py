@@ -48,11 +48,11 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(
     settle(page)
     told = records(station)
     rows = page.evaluate(ROWS)
-    assert [(one["id"], one["status"]) for one in rows] == [
+    assert [(row["id"], row["status"]) for row in rows] == [
         (one["query_id"], one["status"]) for one in told
     ]
-    assert [one["status"] for one in rows] == ["failed", "not_found", "found", "found"]
-    failed, lost, second, first = (one["cells"] for one in rows)
+    assert [row["status"] for row in rows] == ["failed", "not_found", "found", "found"]
+    failed, lost, second, first = (row["cells"] for row in rows)
     assert (failed[1:5], failed[7]) == (["not named", "Failed", "–", "–"], "no answer")
     assert failed[6] == told[0]["reason"]
     assert lost[2] == "Not found"
@@ -62,7 +62,7 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(
     there = ", ".join(f"{place[axis]:.2f}" for axis in "xyz")
     assert first[3] == f"{there}\nm in room-0"
     assert first[4] == str(asked[0]["location"]["support"])
-    assert [one["answer"] for one in rows] == [
+    assert [row["answer"] for row in rows] == [
         None, *(f"#/queries/{one['query_id']}" for one in reversed(asked))
     ]  # fmt: skip
     assert axe(page) == []

@@ -26,8 +26,8 @@ def damaged(station, name, places):
     Returns what makes them sound again.
     """
     path = station.make_map(name)
-    workers = [one["name"] for one in station.client.get("/v1/stats").json()["workers"]]
-    processes = [int(one.rpartition(":")[2]) for one in workers]
+    workers = [worker["name"] for worker in station.client.get("/v1/stats").json()["workers"]]
+    processes = [int(worker.rpartition(":")[2]) for worker in workers]
     sound = {}
     for process in processes:
         os.kill(process, signal.SIGSTOP)
@@ -81,7 +81,7 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     def told():
         """What is shown at one moment, and the answer that it is of: the page asks again."""
         shown = page.evaluate(FIGURES)
-        of_it = [one for one in answers if one.json()["at"] == shown["at"]]
+        of_it = [answer for answer in answers if answer.json()["at"] == shown["at"]]
         # the table fills when the browser tells that it was opened
         return (shown, of_it[0].json()) if of_it and shown["minutes"] else None
 
@@ -95,14 +95,14 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     assert total["refused"] >= 1
     full = 1 - stats["bytes"]["free"] / stats["bytes"]["disk"]
     assert abs(float(shown["disk"].split()[0]) - 100 * full) < 1
-    for one in stats["workers"]:
-        assert page.get_by_text(one["name"], exact=True).is_visible()
+    for worker in stats["workers"]:
+        assert page.get_by_text(worker["name"], exact=True).is_visible()
     assert shown["indexes"] == [
-        [one["map"], "none", str(one["tail"]), "exact search"] for one in stats["indexes"]
+        [index["map"], "none", str(index["tail"]), "exact search"] for index in stats["indexes"]
     ]
     names = ("indexed", "redundant", "rejected", "failed", "received")
     assert [row[1:] for row in reversed(shown["minutes"])] == [
-        [str(one[name]) for name in names] for one in stats["minutes"]
+        [str(minute[name]) for name in names] for minute in stats["minutes"]
     ]
     assert total["received"] >= 19
     assert page.get_by_text(f"version {station.client.get('/readyz').json()['version']}").count()

@@ -20,7 +20,7 @@ def built(station, until):
     assert begun.status_code in (200, 202), begun.text
     until(lambda: station.client.get(path).json()["state"] == "ready")
     record = station.client.get(path).json()
-    (parent,) = (one for one in record["parents"] if one["parent_frame"] == "room-0")
+    (parent,) = (parent for parent in record["parents"] if parent["parent_frame"] == "room-0")
     tile_m, cells, seen = parent["levels"][0]["tile_m"], [], []
     params = {"parent": "room-0", "level": 0, "limit": 1000}
     for tile in station.client.get(f"{path}/tiles", params=params).json()["items"]:
@@ -101,7 +101,7 @@ def patrolled(station):
         assert added.json()["state"] == "indexed", added.text
     answers = [ask(station, who, sent) for who, sent in
                (("spot", 0), ("cart", 1), ("cart", 8), ("spot", 2))]  # fmt: skip
-    assert [one["status"] for one in answers] == ["found", "found", "not_found", "found"]
+    assert [answer["status"] for answer in answers] == ["found", "found", "not_found", "found"]
     return {"path": path, "answers": answers}
 
 

@@ -63,9 +63,7 @@ def shown(station, page):
 
 def accepted(answer):
     """Ids of the accepted matches that an answer lists."""
-    return [
-        one["frame_id"] for one in answer["matches"] if one["validation"]["status"] == "accepted"
-    ]
+    return [m["frame_id"] for m in answer["matches"] if m["validation"]["status"] == "accepted"]
 
 
 def test_the_rows_are_the_answer(station, page, ask, axe, written):
@@ -76,7 +74,7 @@ def test_the_rows_are_the_answer(station, page, ask, axe, written):
     for name in ("matches", "explanations", "counts", "location", "status"):
         assert again[name] == answer[name]  # the page asks as one asks by hand
     ranking, selection, validated = (tiles(page, row) for row in ("R", "DR", "VDR"))
-    assert [one["key"] for one in ranking] == [key(one) for one in answer["explanations"]]
+    assert [e["key"] for e in ranking] == [key(e) for e in answer["explanations"]]
     for tile, told in zip(ranking, answer["explanations"], strict=True):
         assert tile["rank"] == told["rank"]
         assert f"distance {told['distance']:,}" in tile["text"]
@@ -87,7 +85,7 @@ def test_the_rows_are_the_answer(station, page, ask, axe, written):
     assert [one["key"] for one in selection] == [key(one) for one in chosen]
     for tile, told in zip(selection, chosen, strict=True):
         assert f"gain {round(told['diversity_gain'], 2):g}" in tile["text"]
-    assert [one["key"] for one in validated] == [key(one) for one in answer["matches"]]
+    assert [match["key"] for match in validated] == [key(match) for match in answer["matches"]]
     for tile, told in zip(validated, answer["matches"], strict=True):
         validation = told["validation"]
         assert tile["status"] == validation["status"]
@@ -103,7 +101,7 @@ def test_the_rows_are_the_answer(station, page, ask, axe, written):
     )
     assert counts == {name: str(n) for name, n in answer["counts"].items()}
     # a frame that fell out is followed through the rows
-    lost = next(one for one in answer["explanations"] if one["outcome"] == "not_selected")
+    lost = next(e for e in answer["explanations"] if e["outcome"] == "not_selected")
     page.locator(f"[data-row=R] [data-key='{key(lost)}'] button").click()
     page.mouse.move(0, 0)
     assert page.locator("[data-row=R] .is-marked").count() == 1
@@ -188,7 +186,7 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
         assert item["figures"] == [
             f"{math.floor(1000 * sure) / 10:.1f} %", f"{100 * score:.0f} %", supported
         ]  # fmt: skip
-        assert [float(one.removesuffix("%")) for one in item["bars"]] == [
+        assert [float(bar.removesuffix("%")) for bar in item["bars"]] == [
             pytest.approx(100 * sure, abs=0.1), pytest.approx(100 * score, abs=0.1)
         ]  # fmt: skip
         assert " of the map agree, " in item["why"]
@@ -199,7 +197,7 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
     # each match stands with the pose that it votes for
     votes = page.locator("[data-row=VDR] .query-vote").all_inner_texts()
     support = {f"for pose {'ABCDE'[i]}": one["support"] for i, one in enumerate(several)}
-    voting = sum(one["validation"]["status"] == "ambiguous" for one in four_sides["matches"])
+    voting = sum(match["validation"]["status"] == "ambiguous" for match in four_sides["matches"])
     assert len(votes) == voting
     for letter, number in support.items():
         assert votes.count(letter) == number
@@ -232,10 +230,10 @@ def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, se
     assert axes == pytest.approx(
         np.sqrt(np.linalg.eigvalsh(covariance) * -2 * np.log(0.05)), rel=1e-3
     )
-    voting = [one for one in answer["matches"] if one["validation"]["status"] == "accepted"]
+    voting = [match for match in answer["matches"] if match["validation"]["status"] == "accepted"]
     assert page.locator(".plan .query-vote-line").count() == len(voting)
     # each match stands where its frame was taken
-    taken = {one.frame_id: one.meta["pose"]["matrix"] for one in station.frames}
+    taken = {frame.frame_id: frame.meta["pose"]["matrix"] for frame in station.frames}
     for one in voting:
         mark = page.locator(f".plan .query-spot-match[data-key='{key(one)}']")
         x, y, _ = map(float, re.findall(r"-?[\d.]+", mark.get_attribute("transform")))
@@ -308,15 +306,15 @@ def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle, writ
     options = {
         "k": 1, "candidates": 4, "filter": {"session": ["room-0/ann", "room-0/bob", "room-1/ann"]}
     }  # fmt: skip
-    ids = [one.frame_id for one in station.frames]
+    ids = [frame.frame_id for frame in station.frames]
     steps = {"query": "map", "filter": "passed", "selection": "selected", "turn": "validated"}
     seen = set()
-    out = next(one for one in answer["explanations"] if one["outcome"] == "not_selected")
+    out = next(e for e in answer["explanations"] if e["outcome"] == "not_selected")
     [listed] = accepted(answer)
     after = next(
-        one["frame_id"]
-        for one in answer["explanations"]
-        if one["outcome"] == "accepted" and one["frame_id"] != listed
+        explanation["frame_id"]
+        for explanation in answer["explanations"]
+        if explanation["outcome"] == "accepted" and explanation["frame_id"] != listed
     )
     for frame_id in (ids[0], ids[9], listed, after, out["frame_id"]):
         told = station.client.post(

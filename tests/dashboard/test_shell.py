@@ -166,6 +166,6 @@ def test_nothing_is_wider_than_a_small_screen(station, open_page, settle):
 @pytest.mark.thorough
 def test_the_api_s_page_draws_every_operation_with_its_own_files(page, station):
     told = station.client.get("/openapi.json").json()
-    operations = sum(len(one) for one in told["paths"].values())
+    operations = sum(len(path) for path in told["paths"].values())
     page.goto(station.home.replace("/dashboard", "/docs"))
     expect(page.locator(".opblock")).to_have_count(operations)

@@ -41,7 +41,7 @@ def row(page, name):
 
 
 def _states(station, path):
-    return {one["state"] for one in station.client.get(path).json()["items"]}
+    return {item["state"] for item in station.client.get(path).json()["items"]}
 
 
 def _count(station, path):
@@ -126,16 +126,20 @@ def test_files_of_many_kinds_are_sent_with_what_lies_beside_them(page, station, 
     expect(row(page, "broken.ply").locator(".row-more")).to_have_text(
         f"{refusal['title']}. {refusal['detail']}"
     )
-    frames = {one["bytes"]: one for one in station.client.get(path).json()["items"]}
+    frames = {item["bytes"]: item for item in station.client.get(path).json()["items"]}
     posed, plain = frames[len(wall(1))], frames[len(wall(0))]
     assert posed["pose"]["parent_frame"] == "r7/monday"
     assert posed["pose"]["matrix"] == pose.tolist()
     assert plain["pose"] is None
-    for one in frames.values():
-        assert (one["robot"], one["session"], one["tags"]) == ("r7", "monday", ["door", "north"])
+    for frame in frames.values():
+        assert (frame["robot"], frame["session"], frame["tags"]) == (
+            "r7",
+            "monday",
+            ["door", "north"],
+        )
     assert {n: posed["intrinsics"][n] for n in LENS} == LENS
     assert posed["depth_scale"] == 500
-    assert {one["points"] for one in frames.values() if one["kind"] == "cloud"} == {4500}
+    assert {frame["points"] for frame in frames.values() if frame["kind"] == "cloud"} == {4500}
     link = row(page, "frame-000001.depth.png").get_by_role("link")
     assert link.get_attribute("href") == f"#/maps/dropped/frames/{posed['frame_id']}"
     assert (posed["name"], posed["sequence"]) == ("frame-000001.depth.png", 1)
@@ -200,7 +204,7 @@ def test_a_recording_becomes_a_map_with_its_coverage(page, station, settle, axe,
     mine = row(page, bag.name)
     expect(mine.locator(".row-more > p").first).to_contain_text("2 topics have frames")
     topics = mine.locator("tbody tr").all_inner_texts()
-    assert [one.split()[0] for one in topics][:2] == [
+    assert [topic.split()[0] for topic in topics][:2] == [
         "/camera/depth/image_raw", "/other/image_raw",
     ]  # fmt: skip
     mine.get_by_role("button", name="Import /camera/depth/image_raw").click()

@@ -99,13 +99,13 @@ def tarred(folder, form=tarfile.GNU_FORMAT):
 def tar_of(*members):
     made = io.BytesIO()
     with tarfile.open(fileobj=made, mode="w", format=tarfile.GNU_FORMAT) as packed:
-        for one in members:
-            if isinstance(one, tarfile.TarInfo):
-                packed.addfile(one, io.BytesIO(bytes(one.size)))
+        for member in members:
+            if isinstance(member, tarfile.TarInfo):
+                packed.addfile(member, io.BytesIO(bytes(member.size)))
                 continue
-            info = tarfile.TarInfo(one[0])
-            info.size = len(one[1])
-            packed.addfile(info, io.BytesIO(one[1]))
+            info = tarfile.TarInfo(member[0])
+            info.size = len(member[1])
+            packed.addfile(info, io.BytesIO(member[1]))
     return made.getvalue()
 
 

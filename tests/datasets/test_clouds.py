@@ -113,11 +113,11 @@ def test_rows_that_clouds_json_names(tmp_path):
     np.testing.assert_array_equal(np.load(io.BytesIO(first.read_bytes())), POINTS)
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as file:
-        for one in folder.iterdir():
-            file.write(one, f"drive/{one.name}")
+        for path in folder.iterdir():
+            file.write(path, f"drive/{path.name}")
     with open_archive(packed, tmp_path) as archive:
-        ((one, _),) = (sequence.frames for sequence in archive.sequences)
-        assert archive.data_of(one) == first.read_bytes()
+        ((path, _),) = (sequence.frames for sequence in archive.sequences)
+        assert archive.data_of(path) == first.read_bytes()
     (folder / "0.bin").write_bytes(rows.tobytes()[:-4])
     with pytest.raises(
         UnreadableCloud, match=r"0\.bin: The file has 236 bytes, which is not a multiple of 20"

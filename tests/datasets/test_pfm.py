@@ -54,5 +54,5 @@ def test_a_folder_of_them_is_a_sequence(tmp_path):
         '{"width": 3, "height": 2, "fx": 5, "fy": 5, "cx": 1, "cy": 0.5}'
     )
     (sequence,) = find_sequences(tmp_path)
-    assert [one.path.name for one in sequence.frames] == ["a.pfm"]
+    assert [frame.path.name for frame in sequence.frames] == ["a.pfm"]
     assert sequence.frames[0].read().depth[1, 0] == 3.5

@@ -142,8 +142,8 @@ def test_mutations():
             if mutated.startswith(PNG_SIGNATURE):
                 both.append(repaired(mutated))
             outcomes = [frame_or_error(decode_png, one, CAMERA) for one in both]
-            frames += sum(one is not None for one in outcomes)
-            errors += sum(one is None for one in outcomes)
+            frames += sum(outcome is not None for outcome in outcomes)
+            errors += sum(outcome is None for outcome in outcomes)
     assert min(frames, errors) > 50  # both ends were reached
 
 

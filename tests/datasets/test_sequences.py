@@ -165,7 +165,7 @@ def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen):
     assert places(found, "all") == [[0, 1], [2, 3], [4, 5]]
     # files of one folder, named one by one, keep its numbers
     files = [kitchen / f"seq-{s}/frame-00000{i}.depth.png" for s in ("02", "01") for i in (1, 0)]
-    singles = [one for file in files for one in find_sequences(file)]
+    singles = [sequence for file in files for sequence in find_sequences(file)]
     assert places(singles, None) == [[1], [0], [1], [0]]
     assert places(singles, "all") == [[1], [0], [3], [2]]
     in_turns = [singles[i] for i in (1, 3, 0, 2)]

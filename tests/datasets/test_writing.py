@@ -60,7 +60,7 @@ def test_a_trajectory_is_read_again_without_loss(tmp_path):
         T[:3, 0] *= np.sign(np.linalg.det(T[:3, :3]))
         T[:3, 3] = rng.normal(size=3) * 10.0 ** rng.integers(-6, 6)
         poses.append((1763285400.123456 + i / 30, T))
-    text = trajectory_text([trajectory_row(*one) for one in poses], ["room 1\nq 2 3", "Küche"])
+    text = trajectory_text([trajectory_row(*pose) for pose in poses], ["room 1\nq 2 3", "Küche"])
     assert text.startswith("# room 1\\nq 2 3\n# K\\xfcche\n1763285400.123456 ")
     (tmp_path / "a.tum").write_text(text)
     read = read_trajectory(tmp_path / "a.tum")

@@ -63,7 +63,7 @@ def bytes_on_disk(engine):
     """Return the size of all files below the folder of blobs, unfinished ones too."""
     paths = engine.settings.blob_dir.rglob("*")
     # the mark says whose the blobs are
-    return sum(one.stat().st_size for one in paths if one.is_file() and one.name != MARK)
+    return sum(path.stat().st_size for path in paths if path.is_file() and path.name != MARK)
 
 
 def begin_import(engine, data, options=None, map_name="hall"):

@@ -87,7 +87,7 @@ def test_two_robots_maps_are_joined(engine):
     assert join.strength == "weak"  # ten edges of either run and more, of a few centimetres
     assert join.root is None
     with engine.store.database.read() as connection:
-        assert {one.parent for one in posed_runs(connection, 1)} == {"ann/a", "bob/b"}
+        assert {run.parent for run in posed_runs(connection, 1)} == {"ann/a", "bob/b"}
     assert "all within 0.0" in join.reason
     between = (join.transform.parent_frame, join.transform.child_frame)
     assert between == ("bob/b", "ann/a")
@@ -119,7 +119,7 @@ def test_sessions_of_rooms_that_look_alike_are_not_strongly_joined(empty, make_u
 
 def test_parent_frames_are_associated_unasked(engine):
     def look(*, auto=True):
-        before = {one.job_id for one in engine.associations.list_all("hall").items}
+        before = {job.job_id for job in engine.associations.list_all("hall").items}
         joins = {"join_sessions": "auto" if auto else "on_request"}
         settings = engine.settings.model_copy(update=joins)
         Housekeeping(replace(engine.context, settings=settings)).run()
@@ -306,19 +306,19 @@ BOX = (slice(120, 360), slice(160, 480))
 def compared(empty, uploads, make_upload):
     """Map `hall`: three frames of a room in session a, and in session b with something before the
     camera; one frame of another room in session c. Returns the engine and the box's pose."""
-    for one in uploads[:3]:
-        meta = one.meta.model_copy(update={"session": "a"})
-        empty.add_frame("hall", one.data, meta)
-    for one in uploads[:3]:
-        depth = one.frame.depth.copy()
+    for upload in uploads[:3]:
+        meta = upload.meta.model_copy(update={"session": "a"})
+        empty.add_frame("hall", upload.data, meta)
+    for upload in uploads[:3]:
+        depth = upload.frame.depth.copy()
         depth[BOX] = np.where(depth[BOX] > BOX_M, BOX_M, depth[BOX])
-        frame = replace(one.frame, depth=depth, pose=one.pose)
-        sent = make_upload(frame, one.room, session="b")
+        frame = replace(upload.frame, depth=depth, pose=upload.pose)
+        sent = make_upload(frame, upload.room, session="b")
         empty.add(sent)
     other = uploads[6].meta.model_copy(update={"session": "c"})
     empty.add_frame("hall", uploads[6].data, other)
     assert set(empty.work_off()) == {JobState.SUCCEEDED}
-    return empty, [one.pose for one in uploads[:3]]
+    return empty, [upload.pose for upload in uploads[:3]]
 
 
 def difference(engine, before, after):

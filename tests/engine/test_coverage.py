@@ -86,8 +86,8 @@ def rooms(tmp_path_factory, uploads, make_upload, room_views):
         for i, frame in enumerate(path.frames[:10]):
             pose = (np.eye(4), shift)[i % 2] @ frame.pose
             add("hall", replace(frame, pose=pose), path.name, "ab"[i % 2])
-        for one in uploads[6:10]:
-            add("hall", replace(one.frame, pose=one.pose), one.room, "c")
+        for upload in uploads[6:10]:
+            add("hall", replace(upload.frame, pose=upload.pose), upload.room, "c")
         assert set(engine.work_off()) == {JobState.SUCCEEDED}
         done = [measured(engine, **request).job_id for request in (WHOLE, LATER_DAY)]
     return Rooms(folder, positions, (path.name, uploads[6].room), *done)
@@ -125,7 +125,7 @@ def test_equal_rooms_are_ambiguous_and_linked(engine, rooms):
     assert [frame.number for frame in frames] == list(range(14))
     sessions = {frame.frame_id: frame.session for frame in frames}
     for frame in frames:
-        others = {sessions[one] for one in frame.look_alikes}
+        others = {sessions[look_alike] for look_alike in frame.look_alikes}
         if frame.session == "c":  # the room that nothing equals
             assert (frame.outcome, others) == ("found", set())
             assert frame.error_m < 0.05
@@ -137,11 +137,11 @@ def test_equal_rooms_are_ambiguous_and_linked(engine, rooms):
 
 
 def test_an_answer_in_another_parent_frame_is_not_checked(engine, rooms):
-    mine = [one for one in engine.list_frames("hall").items if one.session == "c"]
+    mine = [frame for frame in engine.list_frames("hall").items if frame.session == "c"]
     edit_frame(engine.store, "hall", mine[0].frame_id, {"pose": {"parent_frame": "elsewhere"}})
     result = measured(engine, session="c", not_within_s=0.0)
     assert (result.result.frames, result.result.found, result.result.unchecked) == (4, 3, 1)
-    of_parent = {one.parent_frame: one.cells for one in result.plans}
+    of_parent = {plan.parent_frame: plan.cells for plan in result.plans}
     assert sum(one.found for one in of_parent[rooms.parents[1]]) == 3
     assert sum(one.unchecked for one in of_parent["elsewhere"]) == 1
 
@@ -150,7 +150,7 @@ def test_only_another_session_of_an_equal_room_gives_wrong_poses(engine, rooms):
     result = engine.coverage.get("hall", rooms.later_day)
     assert (result.result.frames, result.result.wrong) == (5, 5)
     frames = frames_of(engine, result)
-    by_id = {one.frame_id: one for one in engine.list_frames("hall").items}
+    by_id = {frame.frame_id: frame for frame in engine.list_frames("hall").items}
     for frame in frames:
         assert frame.error_m == pytest.approx(APART_M, abs=0.1)
         assert frame.error_deg < 2
@@ -177,7 +177,7 @@ def test_a_duplicate_is_left_out_with_the_frames_around_it(engine):
 
 
 def test_every_nth_frame_and_at_most_so_many(engine):
-    frames = [(one.session, one.frame_id) for one in engine.list_frames("hall").items]
+    frames = [(frame.session, frame.frame_id) for frame in engine.list_frames("hall").items]
     order = [frame_id for _, frame_id in sorted(frames, key=lambda one: one[0] or "")]
 
     def chosen(**asked):
@@ -257,7 +257,7 @@ def test_frames_are_counted_by_cell():
     }
     plans, cell_m = coverage_plans(positions, taken, {"map": LEVEL, "odom": LEVEL}, 1.0)
     assert cell_m == 1.0
-    assert [one.parent_frame for one in plans] == ["map", "odom"]
+    assert [plan.parent_frame for plan in plans] == ["map", "odom"]
     assert plans[0].cells == [
         cell(-1, 0, 1, ambiguous=1), cell(0, 0, 2, found=1, wrong=1), cell(5, 5, 1)
     ]  # fmt: skip
@@ -286,17 +286,17 @@ def test_two_results_are_compared_cell_by_cell():
         )
     ]  # fmt: skip
     result, gone = plan_changes(before, after)
-    trends = {(one.column, one.row): one.trend for one in result.cells}
+    trends = {(cell.column, cell.row): cell.trend for cell in result.cells}
     assert trends == {
         (0, 0): "better", (1, 0): "worse", (2, 0): "same", (3, 0): "same", (4, 0): "gone",
         (5, 0): "new", (0, 1): "worse",
     }  # fmt: skip
-    assert [(one.column, one.row) for one in result.cells] == list(trends)  # by row, then by column
+    assert [(c.column, c.row) for c in result.cells] == list(trends)  # by row, then by column
     assert (result.cells[0].before, result.cells[0].after) == (
         before[0].cells[0],
         after[0].cells[0],
     )
     assert result.cells[4].after is None
-    assert (gone.parent_frame, [one.trend for one in gone.cells]) == ("gone", ["gone"])
+    assert (gone.parent_frame, [cell.trend for cell in gone.cells]) == ("gone", ["gone"])
     assert localisability(before[0].cells[3]) == pytest.approx(1 / 3)
     assert localisability(cell(0, 0, 3, found=1, wrong=0, not_found=1, unchecked=1)) == 0.5

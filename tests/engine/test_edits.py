@@ -124,13 +124,13 @@ def test_lists_and_queries_see_it_at_once(full):
 
     def found():
         answers = (full.query_frame("hall", second, query) for query in (tagged, inside))
-        return [[one.frame_id for one in answer.matches] for answer in answers]
+        return [[match.frame_id for match in answer.matches] for answer in answers]
 
     assert found() == [[], []]
     edit_frame(full.store, "hall", first, {"tags": ["seen"], "pose": {"parent_frame": "p"}})
     assert found() == [[first], []]
     for wanted in (FrameListing(tag=["seen"]), FrameListing(parent_frame="p")):
-        assert [one.frame_id for one in full.list_frames("hall", wanted=wanted).items] == [first]
+        assert [f.frame_id for f in full.list_frames("hall", wanted=wanted).items] == [first]
     edit_frame(full.store, "hall", first, {"pose": {"translation": {"x": 7, "y": 7, "z": 7}}})
     assert found() == [[first], [first]]
     edit_frame(full.store, "hall", first, {"pose": None, "tags": []})

@@ -39,8 +39,8 @@ def twin_folder(signed_folder, uploads, make_upload, tmp_path_factory):
     rng = np.random.default_rng(5)
     folder = Path(shutil.copytree(signed_folder, tmp_path_factory.mktemp("twins") / "data"))
     with Engine(Settings(data_dir=folder)) as engine:
-        for one in uploads[6:]:
-            copy = make_upload(equal(replace(one.frame, pose=one.pose), rng), one.room)
+        for upload in uploads[6:]:
+            copy = make_upload(equal(replace(upload.frame, pose=upload.pose), rng), upload.room)
             engine.add(copy)
         engine.work_off()
     return folder
@@ -90,7 +90,7 @@ def test_an_equal_room_that_fills_the_selection_makes_the_answer_ambiguous(twins
     assert {result[m.frame_id] for m in beyond} == {("validate", "accepted")}
     assert answer.counts.selected == FEW
     assert answer.counts.validated == FEW + len(beyond)
-    places = [one.pose.matrix[0][3] - twins.asked.pose[0, 3] for one in answer.alternatives[:2]]
+    places = [a.pose.matrix[0][3] - twins.asked.pose[0, 3] for a in answer.alternatives[:2]]
     assert sorted(places) == pytest.approx([0.0, APART], abs=0.05)
     # without them the selection alone would be believed: 30 m off
     monkeypatch.setattr(RIVAL_ROWS, blind_to_rivals)
@@ -142,7 +142,7 @@ def both(empty, signer):
             answer=model.answer, unrelated_distance=model.unrelated_distance,
         )  # fmt: skip
         ranked = rank(
-            np.stack([one.signature for one in members]),
+            np.stack([member.signature for member in members]),
             np.stack([one.signature for one in database]),
             np.ones((len(members), n), np.bool_), metric=model.metric, candidates=candidates,
         )  # fmt: skip
@@ -186,7 +186,7 @@ def test_guided_matches_that_are_searched_for_change_both_answers(both, make_upl
         in_map.append(make_upload(replace(path[i], pose=pose), "room"))
     [(served, _)] = both(in_map, [make_upload(path[4], "room")])
     assert served.status == "ambiguous"
-    assert {one.validation.search for one in served.matches} == {"correspondences"}
+    assert {match.validation.search for match in served.matches} == {"correspondences"}
     first = served.alternatives[0]
     assert first.support > 2  # that many had guided the others, which vote now as well
     assert pose_difference(np.array(first.pose.matrix), np.array(path[4].pose))[0] < 0.02

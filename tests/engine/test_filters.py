@@ -89,9 +89,9 @@ def passes(one, wanted, own):
 
 def ranked(frames, own, wanted):
     actual = [
-        (int(((one.vector.astype(int) - own.vector) ** 2).sum()), i, one.id)
-        for i, one in enumerate(frames)
-        if one.id != own.id and passes(one, wanted, own)
+        (int(((frame.vector.astype(int) - own.vector) ** 2).sum()), i, frame.id)
+        for i, frame in enumerate(frames)
+        if frame.id != own.id and passes(frame, wanted, own)
     ]
     return [(frame_id, distance) for distance, _, frame_id in sorted(actual)]
 
@@ -107,7 +107,7 @@ def hold(answer, frames, own, wanted):
 
 
 def draw(rng, frames):
-    seconds = [int(one) for one in sorted(rng.integers(0, 60, 2))]
+    seconds = [int(integer) for integer in sorted(rng.integers(0, 60, 2))]
     corners = np.sort(rng.integers(-2, 3, (2, 3)), axis=0).tolist()
     given = {
         "robot": "r1" if rng.random() < 0.5 else ["r2", "r3"],
@@ -146,7 +146,7 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine, published):
         engine.delete_frame("hall", gone.id)
         frames.remove(gone)
     rng, sizes = np.random.default_rng(3), []
-    askers = [one for one in frames if one.session is not None and one.at is not None]
+    askers = [frame for frame in frames if frame.session is not None and frame.at is not None]
     for i in range(60):
         own = askers[int(rng.integers(len(askers)))]
         wanted = draw(rng, frames)
@@ -159,7 +159,7 @@ def test_a_filter_leaves_what_plain_python_leaves(make_engine, published):
     for given in (
         {}, {"captured_after": own.at, "captured_before": own.at},  # bounds are inside
         {"captured_before": own.at.astimezone(timezone(timedelta(hours=5)))},  # the same moment
-        {"not_within_s": 1e300}, {"exclude_frames": [one.id for one in frames[:90]] + ["nobody"]},
+        {"not_within_s": 1e300}, {"exclude_frames": [f.id for f in frames[:90]] + ["nobody"]},
     ):  # fmt: skip
         wanted = Filter.model_validate(given)
         assert hold(ask(engine, own, wanted), frames, own, wanted) > 0

@@ -31,7 +31,7 @@ def packed(uploads):
     camera = uploads[0].meta.intrinsics.model_dump(exclude={"distortion"})
     with tarfile.open(fileobj=made, mode="w:gz") as archive:
         members = {"run/intrinsics.json": json.dumps(camera).encode()}
-        members |= {f"run/{i}.png": one.data for i, one in enumerate(uploads)}
+        members |= {f"run/{i}.png": upload.data for i, upload in enumerate(uploads)}
         for name, data in members.items():
             info = tarfile.TarInfo(name)
             info.size = len(data)
@@ -45,12 +45,12 @@ def test_a_slice_that_was_lost_is_done_again(empty, uploads, monkeypatch):
     task = claim_long(empty)
     # at least some are taken, so that it comes to an end
     lost = empty.imports.handle(task, lambda: True)  # and is never stored: its worker died
-    assert [one["status"] for one in lost.items] == [202, 202]
+    assert [item["status"] for item in lost.items] == [202, 202]
     assert lost.progress["done"] == 2
     assert list(empty.imports.items("hall", job.job_id).items) == []
     again = empty.imports.handle(task, lambda: True)
-    assert [one["status"] for one in again.items] == [200, 200]
-    assert [one["frame_id"] for one in again.items] == [one["frame_id"] for one in lost.items]
+    assert [item["status"] for item in again.items] == [200, 200]
+    assert [item["frame_id"] for item in again.items] == [item["frame_id"] for item in lost.items]
     assert empty.run(task) == JobState.SUCCEEDED  # there is time for all now
     result = empty.get_job(job.job_id)
     summary = UploadSummary.model_validate(result.result.pop("summary"))
@@ -61,9 +61,9 @@ def test_a_slice_that_was_lost_is_done_again(empty, uploads, monkeypatch):
     page = empty.imports.items("hall", job.job_id, limit=3)
     rest = empty.imports.items("hall", job.job_id, page.next_cursor, 3)
     items = [*page.items, *rest.items]
-    assert [one.name for one in items] == [f"run/{i}.png" for i in range(5)]
+    assert [item.name for item in items] == [f"run/{i}.png" for i in range(5)]
     assert rest.next_cursor is None
-    assert summary.depth == pooled_range(one.samples for one in items)
+    assert summary.depth == pooled_range(item.samples for item in items)
     assert len(empty.list_frames("hall").items) == 5
 
 
@@ -164,7 +164,7 @@ def test_two_services_do_not_share_the_room_of_one_archive(empty, make_engine):
     with ExitStack() as both:
         engines = (empty, make_engine())
         receivers = [
-            both.enter_context(one.imports.receive("hall", ImportOptions())) for one in engines
+            both.enter_context(e.imports.receive("hall", ImportOptions())) for e in engines
         ]
         files = []
         for i, receiver in enumerate(receivers):
@@ -277,10 +277,10 @@ def test_frames_are_those_of_an_upload(engine, ros, tmp_path, container):
     )
     assert len(ours) == FRAMES
     own = {"map", "frame_id", "job_id", "state", "received_at", "created_at", "etag"}
-    for one, other in zip(ours, theirs, strict=True):
+    for row, other in zip(ours, theirs, strict=True):
         texts = [
             frame.model_dump_json(exclude=own).replace(frame.frame_id, "ID")
-            for frame in (one, other)
+            for frame in (row, other)
         ]
         assert texts[0] == texts[1]
 
@@ -297,7 +297,7 @@ def test_a_process_that_ends_is_replaced(ros, tmp_path):
     with path.open("rb") as file, closing(RecordingDecoder(file.fileno(), path.name, 3)) as decoder:
         text, index = decoder.outline(options)
         assert RecordingIndex.parse(text).frames == index.frames
-        first, second = (decoder.frame(index.topic, one["place"]) for one in index.frames[:2])
+        first, second = (decoder.frame(index.topic, frame["place"]) for frame in index.frames[:2])
         os.kill(decoder._decoder.process.pid, signal.SIGKILL)
         assert decoder.frame(index.topic, index.frames[1]["place"]) == second != first
 

@@ -22,7 +22,7 @@ def vertices(data):
     lines = head.decode("ascii").splitlines()
     kinds = [(line.split()[2], "u1" if " uchar " in line else "<f4")
              for line in lines if line.startswith("property")]  # fmt: skip
-    return [one[8:] for one in lines if one.startswith("comment ")], np.frombuffer(body, kinds)
+    return [line[8:] for line in lines if line.startswith("comment ")], np.frombuffer(body, kinds)
 
 
 def xyz(rows, of=("x", "y", "z")):
@@ -52,7 +52,7 @@ def test_the_cloud_is_what_the_query_saw(full, uploads, prepared, asked):
 def test_similarities_are_those_of_the_signatures(full, prepared, asked, signer):
     answer = full.inspection.similarities(asked.query_id)
     numbers = {frame_id: i for i, frame_id in enumerate(full.ids())}
-    ranked = [numbers[one.frame_id] for one in answer.frames]
+    ranked = [numbers[frame.frame_id] for frame in answer.frames]
     assert len(ranked) == 11
     assert sorted(ranked) == [i for i in range(12) if i != 3]
     for match in asked.matches:
@@ -73,7 +73,7 @@ def test_a_match_is_validated_as_the_query_was(full, prepared):
     strict = ValidationOptions(residual_m=1e-6)
     names = full.ids()
     answer = full.query_frame("hall", names[3], Query(k=2, seed=5, validation=strict))
-    assert {one.validation.status for one in answer.matches} == {"rejected"}
+    assert {match.validation.status for match in answer.matches} == {"rejected"}
     for match in answer.matches[:3]:
         result = full.inspection.match(answer.query_id, match.frame_id)
         assert result.validation == match.validation
@@ -197,7 +197,7 @@ def test_a_guided_match_is_labelled_and_had_again(empty, make_upload, room_views
     answer = empty.ask(asking, Query(), meta=meta)
     assert (answer.status, answer.location.support, answer.location.guided) == ("found", 5, 3)
     assert pose_difference(np.array(answer.location.pose.matrix), asking.pose)[0] < 0.02
-    guided = [one for one in answer.matches if one.validation.search == "guided"]
+    guided = [match for match in answer.matches if match.validation.search == "guided"]
     assert len(guided) == 3
     for match in answer.matches:
         assert (match.predicted is not None) == (match in guided)

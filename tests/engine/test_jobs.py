@@ -92,7 +92,7 @@ def test_what_cannot_be_signed_again_is_refused_with_the_reason(empty, uploads):
 
 
 def test_all_dead_jobs_are_tried_again_page_by_page(empty, uploads):
-    added = [empty.add(one)[0] for one in uploads[:4]]
+    added = [empty.add(upload)[0] for upload in uploads[:4]]
     for _ in added:
         while die(empty, empty.claim("w")) != JobState.DEAD:
             empty.make_due()
@@ -108,7 +108,7 @@ def test_all_dead_jobs_are_tried_again_page_by_page(empty, uploads):
     assert [one.job_id for one in second.refused] == [ids[1]]
     assert "is missing" in second.refused[0].reason
     assert second.next_cursor is None
-    waiting = {one.job_id for one in list_jobs(empty.store, JobState.QUEUED).items}
+    waiting = {job.job_id for job in list_jobs(empty.store, JobState.QUEUED).items}
     assert waiting == {first.retried[0].job_id, second.retried[0].job_id}
     counted = {"dead": 1, "queued": 2, "succeeded": 1}  # of retried jobs only the latest
     assert empty.statistics.collect(1, "hall").jobs == counted == empty.statistics.collect(1).jobs
@@ -139,8 +139,8 @@ def test_a_death_counts_where_another_has_the_job_by_now(empty, uploads):
 
 def test_when_there_is_something_to_do_next(empty, uploads):
     assert empty.jobs.due_in_s() is None
-    for one in uploads[:3]:
-        empty.add(one)
+    for upload in uploads[:3]:
+        empty.add(upload)
     running = empty.claim("w").job
     with empty.store.database.write() as connection:
         start = read_clock(connection)
@@ -330,7 +330,7 @@ def test_a_map_takes_its_long_jobs_and_their_files_along(engine):
         engine.get_job(job.job_id)
     assert engine.work_off() == [JobState.QUEUED, JobState.SUCCEEDED]
     assert engine.get_job(other.job_id).state == JobState.SUCCEEDED
-    assert [one.job_id for one in list_jobs(engine.store, kind="count").items] == [other.job_id]
+    assert [job.job_id for job in list_jobs(engine.store, kind="count").items] == [other.job_id]
 
 
 def test_tries_before_a_slice_that_came_through_count_no_more(engine):

@@ -55,11 +55,11 @@ def upload(client, views, name=MAP):
 
 
 def answers(client, views):
-    responses = [client.query(MAP, one.depth, camera_of(one), explain=True) for one in views]
-    result = [one.model_dump(mode="json") for one in responses]
+    responses = [client.query(MAP, view.depth, camera_of(view), explain=True) for view in views]
+    result = [response.model_dump(mode="json") for response in responses]
     frames = [
-        one.model_dump(mode="json", exclude={"job_id"}) for one in client.frames(MAP)
-        if one.state == "indexed"  # of those that are gone, the copy need not have known
+        frame.model_dump(mode="json", exclude={"job_id"}) for frame in client.frames(MAP)
+        if frame.state == "indexed"  # of those that are gone, the copy need not have known
     ]  # fmt: skip
     return [
         *({name: one[name] for name in one if name not in OF_THE_QUERY} for one in result), *frames
@@ -142,7 +142,7 @@ def test_what_was_uploaded_into_the_copy_is_not_lost(robot, walk):
     with pytest.raises(Conflict, match="has 1 uploaded frames"):
         robot.pull()
     with Client.embedded(robot.folder) as client:
-        assert [one.frame_id for one in client.frames(MAP)] == [own]
+        assert [frame.frame_id for frame in client.frames(MAP)] == [own]
 
 
 #: Pulls in a process that is killed: after so many artifacts, or in the middle of the transaction.
@@ -216,7 +216,7 @@ def test_a_copy_is_one_state_of_a_map_that_changes(robot, walk, monkeypatch):
     assert (actual.frames, actual.written) == (5, 5)
     assert actual.revision == service.map(MAP).revision
     with Client.embedded(robot.folder) as client:
-        living = [one for one in client.frames(MAP) if one.state == "indexed"]
+        living = [frame for frame in client.frames(MAP) if frame.state == "indexed"]
         assert {one.frame_id for one in living} == set(ids[1:])
         assert client.frame(MAP, ids[5]).tags == ["dark"]
     again = robot.pull()

@@ -82,19 +82,19 @@ def test_a_room_becomes_a_map_in_which_it_is_found(chosen):
     done = chosen.get_job(job_id)
     result, progress = MapImportResult.model_validate(done.result), done.progress
     frames = chosen.list_frames("hall", limit=1000).items
-    assert result.views == sum(one.state == FrameState.INDEXED for one in frames) > 0
+    assert result.views == sum(frame.state == FrameState.INDEXED for frame in frames) > 0
     assert (result.session, result.parent_frame) == ("room", "r1/room")
-    for one in frames:
-        assert one.tags == ["given", "virtual"]
-        assert one.pose.parent_frame == "r1/room"
+    for frame in frames:
+        assert frame.tags == ["given", "virtual"]
+        assert frame.pose.parent_frame == "r1/room"
         # up in the sensor, turned by the pose, is that of the file
-        up = np.array(one.pose.matrix)[:3, :3] @ [one.up.x, one.up.y, one.up.z]
+        up = np.array(frame.pose.matrix)[:3, :3] @ [frame.up.x, frame.up.y, frame.up.z]
         np.testing.assert_allclose(up, [0, 0, 1], atol=1e-9)
     assert result.tested == result.found + result.wrong + result.ambiguous + result.not_found > 0
     assert result.wrong == 0
     assert result.coverage == result.found / result.tested
     assert progress.views == progress.rendered == progress.signed == len(frames) + result.refused
-    assert used_bytes(chosen) == sum(one.bytes for one in frames)
+    assert used_bytes(chosen) == sum(frame.bytes for frame in frames)
     # most frames that bear a pose out are read beside the one candidate
     query = Query(candidates=1, keep=False)
     there = localization_of(chosen.query_frame("hall", frames[0].frame_id, query))
@@ -107,11 +107,11 @@ def test_a_slice_that_was_lost_adds_nothing_twice(chosen, monkeypatch):
     monkeypatch.setattr(map_import, "_AT_ONCE", 3)
     task = claim_long(chosen)
     lost = slice_of(chosen, task, lambda: True)
-    assert [one["status"] for one in lost.items] == [202, 202, 202]
+    assert [item["status"] for item in lost.items] == [202, 202, 202]
     again = slice_of(chosen, task, lambda: False)  # there is time for all now
-    assert [one["status"] for one in again.items[:3]] == [200, 200, 200]
-    assert [one["frame_id"] for one in again.items[:3]] == [one["frame_id"] for one in lost.items]
-    names = [one.name for one in chosen.list_frames("hall", limit=1000).items]
+    assert [item["status"] for item in again.items[:3]] == [200, 200, 200]
+    assert [i["frame_id"] for i in again.items[:3]] == [i["frame_id"] for i in lost.items]
+    names = [frame.name for frame in chosen.list_frames("hall", limit=1000).items]
     assert len(set(names)) == len(names) > 3
     assert set(names) <= {f"room.ply/{i:05d}" for i in range(task.progress["views"])}
 

@@ -151,7 +151,7 @@ def test_of_two_that_are_signed_at_once_one_is_kept(make_engine, uploads, monkey
     with ThreadPoolExecutor(2) as pool:
         states = list(pool.map(Engine.run, engines, claims))
     assert states == [JobState.SUCCEEDED] * 2
-    frames = {one.state: one for one in engines[0].list_frames("hall").items}
+    frames = {frame.state: frame for frame in engines[0].list_frames("hall").items}
     assert set(frames) == {FrameState.INDEXED, FrameState.REDUNDANT}
     assert frames[FrameState.INDEXED].frame_id in str(frames[FrameState.REDUNDANT].reason)
     assert rows(engines[0]) == 1

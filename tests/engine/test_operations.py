@@ -59,10 +59,10 @@ def test_history_is_that_of_all_processes(make_engine, noon):
             add_sample(connection, "service", process, result)
             age_last(connection, samples, noon - ago)
     stats = engine.statistics.collect(3)
-    assert [one.at.timestamp() - noon for one in stats.minutes] == [-150, -90, -30]
-    assert [one.received for one in stats.minutes] == [0, 0, 1]
-    assert [one.indexed for one in stats.minutes] == [0, 2, 1]
-    assert [one.deleted for one in stats.minutes] == [1, 0, 0]  # 100 s ago: two minutes before
+    assert [minute.at.timestamp() - noon for minute in stats.minutes] == [-150, -90, -30]
+    assert [minute.received for minute in stats.minutes] == [0, 0, 1]
+    assert [minute.indexed for minute in stats.minutes] == [0, 2, 1]
+    assert [m.deleted for m in stats.minutes] == [1, 0, 0]  # 100 s ago: two minutes before
     last = stats.minutes[-1]
     assert last.queries == {"found": 5, "not_found": 5}
     assert (last.requests, last.refused, last.busy, last.broken) == (15, 2, 1, 4)
@@ -72,7 +72,7 @@ def test_history_is_that_of_all_processes(make_engine, noon):
     assert bin_of(last.latency.p50) == bin_of(last.latency.p95) == bin_of(0.1)
     assert bin_of(last.latency.p99) == bin_of(0.1)  # the 198th of 200; the 199th took 3 s
     own = engine.statistics.collect(3, "hall")
-    assert [one.indexed for one in own.minutes] == [0, 1, 1]
+    assert [minute.indexed for minute in own.minutes] == [0, 1, 1]
     assert (own.total.queries, own.total.latency, own.workers, own.bytes.free) == (None,) * 4
     with pytest.raises(UnknownMap):
         engine.statistics.collect(3, "shop")
@@ -99,7 +99,7 @@ def test_what_waits_and_who_works(make_engine, uploads):
     with engine.bell.listen():
         stats = engine.statistics.collect(1)
     here = f"{os.uname().nodename}:{os.getpid()}"
-    assert {one.name: one.job_id for one in stats.workers} == {
+    assert {worker.name: worker.job_id for worker in stats.workers} == {
         "far:17": work.job.id, here: None
     }  # fmt: skip
     engine.put_back(work)
@@ -129,11 +129,11 @@ def test_requests_are_remembered_for_a_day_and_their_keys_then_removed(make_engi
     database, day = make_engine().store.database, 86_400.0
     requests = [IdempotentRequest("robot", f"key {i}", f"{i}" * 64) for i in range(3)]
     with database.write() as connection:
-        for one, ago in zip(requests, (day - 60, day + 1, 2 * day), strict=True):
-            one.store(connection, {"job_id": one.key})
-            own = update(idempotency).where(idempotency.c.key == one.key)
+        for request, ago in zip(requests, (day - 60, day + 1, 2 * day), strict=True):
+            request.store(connection, {"job_id": request.key})
+            own = update(idempotency).where(idempotency.c.key == request.key)
             connection.execute(own.values(created_at=time.time() - ago))
-        actual = [one.stored_result(connection) for one in requests]
+        actual = [request.stored_result(connection) for request in requests]
         assert actual == [{"job_id": "key 0"}, None, None]
         # what is forgotten gives way though it was not removed yet: another request may have it
         other = IdempotentRequest("robot", "key 1", "f" * 64)
@@ -175,9 +175,9 @@ def test_quantiles_of_several_processes_are_those_of_all_times():
     rng = np.random.default_rng(3)
     times = np.exp(rng.normal(np.log(0.08), 1.0, 5000)).clip(FIRST_S, 600)
     processes = [Latencies() for _ in range(3)]
-    for i, one in enumerate(times):
-        processes[i % 3].add(float(one))
-    together = merged([one.as_json() for one in processes])
+    for i, moment in enumerate(times):
+        processes[i % 3].add(float(moment))
+    together = merged([process.as_json() for process in processes])
     assert sum(together.values()) == 5000
     for share in (0.5, 0.95, 0.99, 1.0):
         exact = float(np.quantile(times, share, method="inverted_cdf"))

@@ -58,7 +58,7 @@ def test_patches_are_those_that_were_signed(full, uploads, prepared, signer):
     result = full.outputs.patches("hall", full.ids()[3]).make()
     signature, geometry = prepared[3]
     levels = describe(uploads[3].frame, signer.model.parameters).levels
-    sizes = [len(one.mean) for one in result.levels]
+    sizes = [len(level.mean) for level in result.levels]
     assert tuple(sizes[level] for level in signer.model.levels) == signature.n_patches
     assert result.frame == f"{full.ids()[3]}.optical"
     for one, level in zip(
@@ -148,9 +148,9 @@ def test_a_trajectory_is_read_back(full, uploads, tmp_path):
 
 
 def test_pages_of_sessions(empty, uploads):
-    for i, one in enumerate(uploads[:5]):
-        meta = one.meta.model_copy(update={"session": f"s{i}" if i else None})
-        empty.add_frame("hall", one.data, meta)
+    for i, upload in enumerate(uploads[:5]):
+        meta = upload.meta.model_copy(update={"session": f"s{i}" if i else None})
+        empty.add_frame("hall", upload.data, meta)
     page = list_sessions(empty.store, "hall", None, 2)
     rest = list_sessions(empty.store, "hall", page.next_cursor, 9)
     actual = [*page.items, *rest.items]
@@ -171,7 +171,7 @@ def listed(engine, map_name="hall", **wanted):
     while True:
         request = FrameListing.model_validate(wanted)
         page = list_frames(engine.store, map_name, request, cursor, 3)
-        names += [one.name for one in page.items]
+        names += [item.name for item in page.items]
         cursor = page.next_cursor
         if cursor is None:
             return names
@@ -212,7 +212,7 @@ def test_what_is_deleted_is_forgotten_and_pages_go_on_after_it(empty, uploads):
     gone = empty.list_frames("hall", state=FrameState.DELETED).items[0]
     assert (gone.name, gone.sequence, gone.captured_at) == (None, None, None)
     rest = list_frames(empty.store, "hall", wanted, page.next_cursor, 9)
-    assert [one.name for one in rest.items] == taken[2:]
+    assert [item.name for item in rest.items] == taken[2:]
     cursor = str(page.next_cursor)
     sealed = cursor.partition("~")[0]
     for bad in (sealed, f"{sealed}~", f"{sealed}~x", f"{sealed}~W251bGwsIC0xXQ", cursor[1:]):

@@ -32,7 +32,7 @@ def localized(engine, upload, **how):
 def judged(there):
     if there.pose is not None:
         return [(there.pose.matrix, there.confidence, there.evidence)]
-    return [(one.pose.matrix, one.confidence, one.evidence) for one in there.alternatives]
+    return [(a.pose.matrix, a.confidence, a.evidence) for a in there.alternatives]
 
 
 def prior_at(upload, shift=0.0, **more):
@@ -46,7 +46,7 @@ def listed(covariance):
 
 
 def test_frames_are_found_by_where_they_were_taken(full, uploads):
-    poses = [np.array(one.pose)[:3, 3] for one in uploads]
+    poses = [np.array(upload.pose)[:3, 3] for upload in uploads]
     with full.store.database.read() as connection:
         row, _, _ = full.view("hall")
 
@@ -105,10 +105,12 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
     answer = full.query_frame("hall", names[asked], Query.model_validate(how))
     assert answer.status == by_library.status != "not_found"
     result = judged(localization_of(answer))
-    for (matrix, confidence, evidence), one in zip(result, by_library.alternatives, strict=True):
-        np.testing.assert_allclose(matrix, one.T, atol=1e-9)
-        assert confidence == pytest.approx(one.confidence)
-        assert evidence.score == pytest.approx(one.evidence.score, abs=1e-3)
+    for (matrix, confidence, evidence), alternative in zip(
+        result, by_library.alternatives, strict=True
+    ):
+        np.testing.assert_allclose(matrix, alternative.T, atol=1e-9)
+        assert confidence == pytest.approx(alternative.confidence)
+        assert evidence.score == pytest.approx(alternative.evidence.score, abs=1e-3)
 
 
 #: A query of which no match is accepted, so that the map judges the poses that it suggests.
@@ -156,14 +158,14 @@ def test_a_query_says_how_sure_a_pose_must_be(full, uploads):
 
 
 def test_candidates_near_a_prior_are_tried_first(full, uploads):
-    rooms = dict(zip(full.ids(), (one.room for one in uploads), strict=True))
+    rooms = dict(zip(full.ids(), (upload.room for upload in uploads), strict=True))
 
     def tried(prior):
         query = Query.model_validate({"keep": False, "prior": prior})
         meta = uploads[8].meta.model_copy(update={"pose": None})
         answer = full.ask(uploads[8], query, meta=meta)
         assert len(answer.matches) == 10
-        elsewhere = [one for one in answer.matches if rooms[one.frame_id] == uploads[0].room]
+        elsewhere = [match for match in answer.matches if rooms[match.frame_id] == uploads[0].room]
         assert len(elsewhere) > 1
         return [one.validation.status for one in elsewhere]
 
@@ -234,11 +236,11 @@ def test_a_sequence_places_its_last_frame(full, uploads):
     start = np.eye(4)
     start[:3, 3] = 40.0, -7.0, 1.0
     sent = []
-    for one in uploads[6:9]:
-        T = start @ inverse(np.array(uploads[6].pose)) @ np.array(one.pose)
+    for upload in uploads[6:9]:
+        T = start @ inverse(np.array(uploads[6].pose)) @ np.array(upload.pose)
         pose = {"matrix": T.tolist(), "parent_frame": "odom"}
-        meta = one.meta.model_validate(one.meta.model_dump() | {"pose": pose})
-        sent.append((one.data, meta))
+        meta = upload.meta.model_validate(upload.meta.model_dump() | {"pose": pose})
+        sent.append((upload.data, meta))
     answer = full.queries.sequence("hall", sent, Query(keep=False))
     assert (answer.status, answer.frames) == ("found", 3)
     assert answer.location.votes == 15  # five of each frame
@@ -308,7 +310,7 @@ def came_of(geometry, *statuses, estimate=None, late=False, others=()):
 
 
 def supported(*confidences):
-    answer = tuple(AlternativePose(np.eye(4), 0, one, None) for one in confidences)
+    answer = tuple(AlternativePose(np.eye(4), 0, confidence, None) for confidence in confidences)
     status = "ambiguous" if answer else "not_found"
     return PoseEstimate(status, "the map's say", "hall", None, None, None, None, answer)
 
@@ -332,7 +334,7 @@ def test_poses_of_the_map_are_told_where_no_match_is_accepted(prepared):
 
 def test_what_in_view_is_no_help_is_the_cause(prepared):
     seen, other = prepared[0][1], prepared[1][1]
-    few = Patches(*(one[:9] for one in vars(seen.patches).values()))
+    few = Patches(*(value[:9] for value in vars(seen.patches).values()))
     answer = came_of(replace(seen, patches=few), "rejected", others=[other])
     assert (answer.status, answer.cause) == ("not_found", "too_little_in_view")
     assert "the frame has 9 surface patches, but 10 are needed" in answer.reason

@@ -74,10 +74,10 @@ def lived_in(make_engine, store_url, uploads, tmp_path):
     given = {"database_url": store_url, "unindexed_frames": 2}
     engine = make_engine(tmp_path / "data", **given)
     engine.create_map(NewMap(name="hall", model="depth"))
-    for one in uploads[:6]:
-        meta = one.meta.model_copy(update={"tags": ["by-the-door"], "session": "one-morning"})
-        engine.uploads.add("hall", Upload(one.data, meta))
-        if one in (uploads[2], uploads[5]):
+    for upload in uploads[:6]:
+        meta = upload.meta.model_copy(update={"tags": ["by-the-door"], "session": "one-morning"})
+        engine.uploads.add("hall", Upload(upload.data, meta))
+        if upload in (uploads[2], uploads[5]):
             engine.work_off()
             assert engine.publish_due() == 1
     return engine
@@ -97,7 +97,7 @@ def secret(lived_in, uploads):
     version = newest(folder, row.model_id, len(vectors[0]))
     assert len(version) == len(numbers)
     return {
-        "upload": pieces(uploads[0].data, [one.data for one in uploads[1:]]),
+        "upload": pieces(uploads[0].data, [upload.data for upload in uploads[1:]]),
         "signature": pieces(vectors[0], vectors[1:]),
         "artifact": pieces(artifacts[0], artifacts[1:]),
         "tag": [b"by-the-door"],
@@ -176,19 +176,19 @@ def test_bytes_in_quarantine_go_with_their_frame(full):
     assert len(list(fsck(full.settings, repair=True, grace_s=0))) == 1
     aside = full.settings.quarantine_dir
     (aside / "notes.txt").write_text("of an operator")
-    names = sorted(one.name for one in aside.iterdir())
+    names = sorted(path.name for path in aside.iterdir())
     assert names == [f"blob-{frame.blob}", "notes.txt"]
     full.purging.now()
-    assert sorted(one.name for one in aside.iterdir()) == names  # its frame is there
+    assert sorted(path.name for path in aside.iterdir()) == names  # its frame is there
     full.delete_frame("hall", frame.id)
     full.purging.now()
-    assert [one.name for one in aside.iterdir()] == ["notes.txt"]
+    assert [path.name for path in aside.iterdir()] == ["notes.txt"]
 
 
 def test_readers_let_go_of_what_was_deleted(empty, uploads):
     engine = empty
-    for one in uploads[:3]:
-        engine.add(one)
+    for upload in uploads[:3]:
+        engine.add(upload)
     engine.work_off()
     view = engine.view("hall")[2]
     gone = bytes(view.tail.signatures[0])
@@ -207,7 +207,7 @@ def test_what_a_snapshot_or_a_crash_left_goes_later(empty, uploads):
     engine, (a, b, *_) = empty, uploads
     for one in (a, b):
         engine.add(one)
-    first, second = (one.frame_id for one in engine.list_frames("hall").items)
+    first, second = (frame.frame_id for frame in engine.list_frames("hall").items)
     with engine.store.blobs.locks.block_removals():  # as while a snapshot is being taken
         engine.delete_frame("hall", first)
         assert len(list(engine.store.blobs.digests())) == 2

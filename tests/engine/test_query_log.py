@@ -95,7 +95,7 @@ def numbers(engine, names=None, **wanted):
     results, cursor = [], None
     while True:
         page = engine.query_log.page(WantedQueries(**wanted), names, cursor, 2)
-        results += [int(one.query_id, 16) for one in page.items]
+        results += [int(item.query_id, 16) for item in page.items]
         cursor = page.next_cursor
         if cursor is None:
             return results
@@ -174,7 +174,7 @@ def test_recent_queries_are_counted_by_map_and_status(engine):
     engine.query_log.note(row(4, status="found", listed=False), stored())
     assert engine.query_log.flush(60)
     counts = {"attic": {"ambiguous": 1}, "hall": {"found": 2, "failed": 1}}
-    assert {one.name: one.recent_queries for one in get_maps(engine.store)} == counts
+    assert {map_.name: map_.recent_queries for map_ in get_maps(engine.store)} == counts
 
 
 def test_a_new_map_has_no_queries_of_the_deleted_one(engine):
@@ -204,7 +204,7 @@ def test_what_is_lost_is_logged_and_counted(engine, monkeypatch, caplog):
         for i in range(14):
             engine.query_log.note(row(i))
     assert engine.query_log.lost == 12
-    assert [(one.message, one.lost) for one in caplog.records] == [
+    assert [(record.message, record.lost) for record in caplog.records] == [
         ("queries lost", 1), ("queries lost", 10)
     ]  # fmt: skip
     engine.query_log.close()  # which writes what waits
@@ -311,7 +311,7 @@ def test_a_folder_that_cannot_be_written_costs_no_query_its_row(engine, caplog):
         for _ in range(2):
             log_answer(engine)
     assert (count(engine), count(engine, queries.c.bytes > 0)) == (2, 0)
-    assert [one.message for one in caplog.records] == ["answers cannot be stored"]
+    assert [record.message for record in caplog.records] == ["answers cannot be stored"]
 
 
 def test_old_and_surplus_queries_are_removed_in_blocks(engine, monkeypatch):
@@ -345,7 +345,7 @@ def test_a_kept_answer_stays_until_it_is_released(engine, make_engine):
     second = make_engine()
     assert second.query_log.find(kept).answer.query_id == kept
     page = second.query_log.page(WantedQueries(kept=True), None, None, 9)
-    assert [one.query_id for one in page.items] == [kept]
+    assert [item.query_id for item in page.items] == [kept]
     assert files_of(engine) == set()
     second.query_log.release(kept)
     assert second.query_log.record(kept).kept_at is None

@@ -42,7 +42,7 @@ def test_so_many_candidates_are_selected_and_tried(full):
         answer = ask(full, names[0], candidates=candidates, k=50, stages=stages)
         assert len(answer.matches) == answer.counts.validated == candidates
         if stages == VR:
-            assert sorted(one.rank for one in answer.matches) == [*range(1, candidates + 1)]
+            assert sorted(match.rank for match in answer.matches) == [*range(1, candidates + 1)]
         else:
             assert answer.counts.selected == candidates
     assert len(ask(full, names[0], candidates=7, k=2, stages=["retrieve"]).matches) == 2
@@ -60,7 +60,7 @@ def test_the_scales_of_diversity_are_those_of_the_library(full, prepared):
         wanted = {names[1 + order[i]]: gain for i, gain in pairs}
         stages = ["retrieve", "diversify"]
         answer = ask(full, names[0], k=4, stages=stages, diversity={"sigma": 0.7, "omega": omega})
-        assert {one.frame_id: one.diversity_gain for one in answer.matches} == wanted
+        assert {match.frame_id: match.diversity_gain for match in answer.matches} == wanted
         chosen[omega] = set(wanted)
     assert chosen[0.01] == {names[1 + i] for i in order[:4]}  # quality decides
     assert chosen[1000.0] != chosen[0.01]
@@ -68,25 +68,25 @@ def test_the_scales_of_diversity_are_those_of_the_library(full, prepared):
 
 def test_thresholds_decide_what_is_accepted(full):
     name = full.ids()[0]
-    before = {one.frame_id: one.validation for one in ask(full, name, k=50).matches}
+    before = {match.frame_id: match.validation for match in ask(full, name, k=50).matches}
     accepted = {one for one, v in before.items() if v.status == "accepted"}
     least = sorted(before[one].overlap for one in accepted)[1]
     after = ask(full, name, k=50, validation={"evidence": least, "violation_weight": 0.0})
-    still = {one.frame_id for one in after.matches if one.validation.status == "accepted"}
+    still = {match.frame_id for match in after.matches if match.validation.status == "accepted"}
     assert still == {one for one in accepted if before[one].overlap >= least} != accepted
     sure = ask(full, name, k=50, validation={"strong": 1.0})
-    assert {one.validation.strength for one in sure.matches[: len(accepted)]} == {"weak"}
-    assert {one.frame_id for one in sure.matches[: len(accepted)]} == accepted
+    assert {match.validation.strength for match in sure.matches[: len(accepted)]} == {"weak"}
+    assert {match.frame_id for match in sure.matches[: len(accepted)]} == accepted
     tight = ask(full, name, k=50, validation={"residual_m": 1e-9})
     assert tight.status == "not_found"
-    assert all("disagree" in one.validation.reason for one in tight.matches if one.transform)
+    assert all("disagree" in match.validation.reason for match in tight.matches if match.transform)
     paper = ask(full, name, k=50, validation={"mode": "paper"})
-    for one in paper.matches:
-        small = one.validation.residual is not None and (
-            one.validation.residual.translation_m <= 0.08
-            and one.validation.residual.rotation_deg <= 5.0
+    for match in paper.matches:
+        small = match.validation.residual is not None and (
+            match.validation.residual.translation_m <= 0.08
+            and match.validation.residual.rotation_deg <= 5.0
         )
-        assert (one.validation.status == "accepted") is small
+        assert (match.validation.status == "accepted") is small
 
 
 def test_a_limit_of_the_caller_holds_however_little_the_frames_share():
@@ -110,7 +110,7 @@ def test_a_deadline_stops_validation_and_says_so(full, monkeypatch):
     none = ask(full, name, deadline_ms=1)
     assert (none.deadline_reached, none.status, none.location) == (True, "unvalidated", None)
     assert none.counts.selected == len(none.matches) == 10
-    assert {one.validation.reason for one in none.matches} == {
+    assert {match.validation.reason for match in none.matches} == {
         "the deadline passed before it was validated"
     }
     allows, calls = Deadline.allows, []
@@ -123,11 +123,11 @@ def test_a_deadline_stops_validation_and_says_so(full, monkeypatch):
     monkeypatch.setattr(Deadline, "allows", thrice)
     some = ask(full, name, k=50, stages=VR, deadline_ms=600_000)
     assert (some.counts.validated, some.deadline_reached) == (3, True)
-    full_told = {one.frame_id: one for one in whole.matches}
-    assert [one.rank for one in some.matches[3:]] == [*range(4, 12)]
+    full_told = {match.frame_id: match for match in whole.matches}
+    assert [match.rank for match in some.matches[3:]] == [*range(4, 12)]
     assert some.status == "found"
-    for one in some.matches[:3]:
-        assert one.validation == full_told[one.frame_id].validation
+    for match in some.matches[:3]:
+        assert match.validation == full_told[match.frame_id].validation
 
 
 def test_no_candidate_is_begun_that_would_likely_end_too_late(monkeypatch):
@@ -155,7 +155,7 @@ def test_every_frame_of_the_ranking_is_explained(full, prepared):
     def apart(a, b):
         return distances(vectors[a], vectors[b][None], "l2")[0]
 
-    ranked = [one.frame_id for one in ask(full, names[0], k=50, stages=["retrieve"]).matches]
+    ranked = [match.frame_id for match in ask(full, names[0], k=50, stages=["retrieve"]).matches]
     outcomes = set()
     for candidates in (5, 11):  # some of the ranking, and all of it
         how = {"k": 2, "candidates": candidates}
@@ -163,7 +163,7 @@ def test_every_frame_of_the_ranking_is_explained(full, prepared):
         assert told(answer, "explanations") == told(plain, "explanations")
         actual = answer.explanations
         assert [(one.rank, one.frame_id) for one in actual] == list(enumerate(ranked, 1))
-        matches = {one.frame_id: one for one in answer.matches}
+        matches = {match.frame_id: match for match in answer.matches}
         # accepted ones beyond `k` are not listed
         chosen = {*matches, *(one.frame_id for one in actual if one.outcome == "accepted")}
         assert len(chosen) == candidates
@@ -260,7 +260,7 @@ def test_a_frame_that_is_not_searched_is_explained(full):
 
 def test_what_an_approximate_index_missed_is_said(full, monkeypatch):
     names = full.ids()
-    near = [one.frame_id for one in ask(full, names[0], stages=["retrieve"], k=11).matches]
+    near = [match.frame_id for match in ask(full, names[0], stages=["retrieve"], k=11).matches]
     real, lost = local_index.search, near[1]
     number = names.index(lost) + 1
 

@@ -41,7 +41,7 @@ def test_a_map_takes_what_its_quota_allows(empty, uploads):
     assert used(empty) == MapUsage(1, len(b.data))
     batch = [Upload(one.data, one.meta) for one in (b, c, d)]
     outcomes, _ = empty.uploads.add_all("hall", batch)
-    assert [one.new for one in outcomes] == [False, True, False]
+    assert [outcome.new for outcome in outcomes] == [False, True, False]
     assert isinstance(outcomes[2].error, QuotaExceeded)
     assert used(empty) == MapUsage(2, len(b.data) + len(c.data))
     limit(empty, quota_frames=None)
@@ -65,11 +65,11 @@ def test_a_quota_holds_to_the_frame_whoever_sends_at_once(empty, make_engine, up
     engines, taken = [empty, make_engine()], []
 
     def send(part):
-        for i, one in enumerate(uploads):
+        for i, upload in enumerate(uploads):
             if i % 4 == part:
                 continue  # each frame is sent three times
             with suppress(QuotaExceeded):
-                taken.append(engines[part % 2].add(one)[1])
+                taken.append(engines[part % 2].add(upload)[1])
 
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(send, range(4)))
@@ -124,7 +124,7 @@ def test_what_had_no_room_is_taken_when_it_is_sent_again(empty, uploads):
     (first, second), again = empty.uploads.add_all("hall", batch, other)
     assert (first.new, second.new, again) == (False, True, False)
     outcomes, again = empty.uploads.add_all("hall", batch, other)
-    assert (again, [one.error for one in outcomes]) == (True, [None, None])
+    assert (again, [outcome.error for outcome in outcomes]) == (True, [None, None])
 
 
 def test_a_map_made_anew_has_the_quota_of_the_one_before(empty):

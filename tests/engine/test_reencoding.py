@@ -353,7 +353,7 @@ def test_the_index_of_the_next_model_is_there_at_the_switch(
     assert found(answer) == right(names, by_model, answer.model, 4)
     assert not before.exists()
     after = index_folder(engine.settings.indexes, engine.row("hall"))
-    assert [one for one in engine.settings.indexes.iterdir() if one.is_dir()] == [after]
+    assert [path for path in engine.settings.indexes.iterdir() if path.is_dir()] == [after]
     # the next version is due again after as many frames, and not before
     assert engine.publish_due() == 0
 

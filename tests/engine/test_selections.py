@@ -42,7 +42,7 @@ def ids(empty, uploads):
 
 @pytest.fixture
 def of_sessions(empty, uploads):
-    return fill(empty, uploads, [(*one, ["old"]) for one in OF_SESSIONS])
+    return fill(empty, uploads, [(*row, ["old"]) for row in OF_SESSIONS])
 
 
 def known(engine):
@@ -62,7 +62,7 @@ def edit(engine, seconds=10.0, **wanted):
 def test_frames_are_deleted_by_their_ids_once(empty, ids):
     result = delete(empty, frame_ids=[ids[0], ids[7], "none", ids[0], ids[3]])
     assert (result.frames, result.remaining, result.deletion.frames) == (3, 0, 3)
-    assert list(known(empty)) == [one for one in ids if one not in (ids[0], ids[3], ids[7])]
+    assert list(known(empty)) == [f for f in ids if f not in (ids[0], ids[3], ids[7])]
     again = delete(empty, frame_ids=[ids[0], ids[7]])
     assert (again.frames, again.remaining, again.deletion) == (0, 0, None)
     assert len(empty.tombstones.list_all("hall", None, 9).items) == 1
@@ -78,10 +78,10 @@ def test_frames_are_deleted_by_a_filter(empty, ids):
         ({"state": "received", "order": "desc"}, list(range(12))),
     ):  # fmt: skip
         start = wanted.get("find", "-")  # an id may begin so as well
-        places = [i for i, one in enumerate(ids) if i in selected or one.startswith(start)]
+        places = [i for i, f in enumerate(ids) if i in selected or f.startswith(start)]
         result = delete(empty, filter=wanted)
         assert (result.frames, result.remaining) == (len(places), 0)
-        assert list(known(empty)) == [one for i, one in enumerate(ids) if i not in places]
+        assert list(known(empty)) == [frame_id for i, frame_id in enumerate(ids) if i not in places]
         if places:
             empty.tombstones.restore("hall", result.deletion.deletion_id)
 
@@ -100,7 +100,7 @@ def test_a_call_that_runs_out_of_time_says_what_is_left(empty, ids):
 
 
 def changed(session, robot, tags, changes):
-    kept = [one for one in tags if one not in changes.get("remove_tags", [])]
+    kept = [tag for tag in tags if tag not in changes.get("remove_tags", [])]
     return (
         changes.get("session", session), changes.get("robot", robot),
         sorted({*kept, *changes.get("add_tags", [])}),
@@ -115,10 +115,10 @@ def test_an_edit_is_undone_by_its_inverse(empty, ids):
     ]  # fmt: skip
     for changes in every:
         result = edit(empty, filter={"name": "0"}, **changes)
-        after = {one: changed(*before[one], changes) if i < 10 else before[one]
-                 for i, one in enumerate(ids)}  # fmt: skip
+        after = {frame_id: changed(*before[frame_id], changes) if i < 10 else before[frame_id]
+                 for i, frame_id in enumerate(ids)}  # fmt: skip
         assert known(empty) == after
-        assert result.frames == sum(after[one] != before[one] for one in ids)
+        assert result.frames == sum(after[frame_id] != before[frame_id] for frame_id in ids)
         assert (result.remaining, result.last_frame_id) == (0, None)
         again = edit(empty, filter={"name": "0"}, **changes)
         assert (again.frames, again.inverse) == (0, [])
@@ -159,14 +159,14 @@ def test_what_selects_nothing_or_everything_is_refused(given):
 
 
 def frames(engine):
-    return {one.frame_id: one for one in engine.list_frames("hall", None, 100).items}
+    return {frame.frame_id: frame for frame in engine.list_frames("hall", None, 100).items}
 
 
 def test_a_session_is_deleted_with_its_frames_and_blobs(empty, of_sessions):
     before = frames(empty)
     change = delete_session(empty.store, "hall", "a", empty.tombstones, "r1")
     assert (change.session, change.robot, change.frames, change.remaining) == ("a", "r1", 5, 0)
-    assert frames(empty) == {one: before[one] for one in of_sessions[5:]}
+    assert frames(empty) == {row: before[row] for row in of_sessions[5:]}
     assert empty.tombstones.purge(everything=True) == 5
     assert len(list(empty.store.blobs.digests())) == 7
     assert empty.get_map("hall").used_frames == 7
@@ -185,11 +185,11 @@ def test_a_session_is_renamed_and_joins_another(empty, of_sessions):
     edit = SessionEdit(session="a", robot="r2")
     assert edit_session(empty.store, "hall", "a/..", edit).frames == 2
     after = frames(empty)
-    for place, one in enumerate(of_sessions):
+    for place, row in enumerate(of_sessions):
         wanted = {"session": "a", "robot": "r2"} if place in (8, 9) else {}
         free = {"etag": "", "revision": 0}
-        now = after[one].model_copy(update=free)
-        assert now == before[one].model_copy(update={**wanted, **free})
+        now = after[row].model_copy(update=free)
+        assert now == before[row].model_copy(update={**wanted, **free})
     assert delete_session(empty.store, "hall", "a", empty.tombstones, "r2").frames == 3 + 2
 
 
@@ -197,7 +197,7 @@ def test_tags_are_added_once_and_removed(empty, of_sessions):
     edit = SessionEdit(add_tags=["new", "old", "new"], remove_tags=["other"])
     change = edit_session(empty.store, "hall", "a", edit, "r1")
     assert (change.frames, change.session, change.robot) == (5, "a", "r1")
-    tags = [one.tags for one in frames(empty).values()]
+    tags = [frame.tags for frame in frames(empty).values()]
     assert tags == [["old", "new"]] * 5 + [["old"]] * 7
     listed = list_sessions(empty.store, "hall", None, 10).items
     assert [(one.session, one.robot, one.tags) for one in listed] == [

@@ -33,12 +33,12 @@ def test_the_ranking_is_that_of_both_maps_together(two, uploads):
     how = {"stages": ["retrieve"], "k": 50}
     alone = {name: ask(two, [name], uploads[1], **how) for name in MAPS}
     both = ask(two, MAPS, uploads[1], **how)
-    listed = [(one.distance, one.map, one.frame_id, one.similarity)
-              for name in MAPS for one in alone[name].matches]  # fmt: skip
-    actual = [(one.distance, one.map, one.frame_id, one.similarity) for one in both.matches]
+    listed = [(match.distance, match.map, match.frame_id, match.similarity)
+              for name in MAPS for match in alone[name].matches]  # fmt: skip
+    actual = [(m.distance, m.map, m.frame_id, m.similarity) for m in both.matches]
     assert sorted(actual) == sorted(listed)
-    assert [one.distance for one in both.matches] == sorted(one[0] for one in listed)
-    assert [(one.distance, one.map) for one in both.matches[:2]] == [(0, "hall"), (0, "lab")]
+    assert [match.distance for match in both.matches] == sorted(match[0] for match in listed)
+    assert [(match.distance, match.map) for match in both.matches[:2]] == [(0, "hall"), (0, "lab")]
     assert (both.maps, both.per_map.keys()) == (MAPS, set(MAPS))
     assert {name: part.counts for name, part in both.per_map.items()} == {
         name: one.counts for name, one in alone.items()
@@ -48,13 +48,13 @@ def test_the_ranking_is_that_of_both_maps_together(two, uploads):
     other_way = ask(two, MAPS[::-1], uploads[1], **how)
     assert other_way.matches == both.matches
     only = ask(two, MAPS, uploads[1], filter={"exclude_frames": names_of(two, "hall")}, **how)
-    assert {one.map for one in only.matches} == {"lab"}
+    assert {match.map for match in only.matches} == {"lab"}
     assert (only.counts.passed, only.per_map["hall"].counts.passed) == (4, 0)
 
 
 def test_a_pose_is_of_one_map(two, uploads):
     both = ask(two, MAPS, uploads[8], k=50, candidates=50, stages=["retrieve", "validate"])
-    accepted = [one for one in both.matches if one.validation.status == "accepted"]
+    accepted = [match for match in both.matches if match.validation.status == "accepted"]
     counts = {name: sum(one.map == name for one in accepted) for name in MAPS}
     assert min(counts.values()) >= 1
     assert {name: part.counts.accepted for name, part in both.per_map.items()} == counts
@@ -74,7 +74,7 @@ def test_a_stored_frame_does_not_find_itself_and_finds_others(two):
     own = two.ids()[4]
     query = Query(stages=("retrieve",), k=50, keep=False)
     both = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), query)
-    assert own not in [one.frame_id for one in both.matches]
+    assert own not in [match.frame_id for match in both.matches]
     assert (both.counts.map, len(both.matches)) == (15, 15)
     assert (both.matches[0].distance, both.matches[0].map) == (0, "lab")
     assert (both.frame.map, both.frame.frame_id) == ("hall", own)
@@ -82,7 +82,7 @@ def test_a_stored_frame_does_not_find_itself_and_finds_others(two):
     assert (away.maps, away.counts.map, away.per_map) == (["lab"], 4, None)
     explain = query.model_copy(update={"explain_frame": names_of(two, "lab")[2]})
     answer = two.queries.stored(MAPS, NamedFrame(map="hall", frame_id=own), explain)
-    rank = next(one.rank for one in both.matches if one.frame_id == explain.explain_frame)
+    rank = next(match.rank for match in both.matches if match.frame_id == explain.explain_frame)
     assert (answer.explained_frame.map, answer.explained_frame.rank) == ("lab", rank)
     assert answer.explained_frame.of == 15
     with pytest.raises(UnknownFrame):
@@ -107,7 +107,7 @@ def test_two_maps_may_call_their_frames_alike(full, uploads):
     for match in several.matches:
         ends = match.transform.parent_frame, match.transform.child_frame
         assert ends == (f"{match.frame_id}.optical", "query.optical")
-    same = next(one for one in several.matches if (one.map, one.frame_id) == ("cellar", "b"))
+    same = next(m for m in several.matches if (m.map, m.frame_id) == ("cellar", "b"))
     details = full.inspection.match(several.query_id, "b", "cellar")
     assert details.transform == same.transform
     assert b"comment frame query.optical" in full.inspection.cloud(several.query_id)

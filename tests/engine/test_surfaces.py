@@ -78,9 +78,9 @@ def cells_of(engine, parent, level=0):
         decode_tile(engine.surfaces.tile("hall", tile.digest).make(), tile, own.tile_m)
         for tile in engine.surfaces.tiles("hall", parent, level).items
     ]
-    assert sum(len(one.points) for one in parts) == own.cells
+    assert sum(len(part.points) for part in parts) == own.cells
     names = ("points", "seen", "sessions", "taken")
-    columns = (np.concatenate([getattr(one, name) for one in parts]) for name in names)
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
     return SurfaceCells(*columns), own.cell_m
 
 

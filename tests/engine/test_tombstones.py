@@ -21,8 +21,8 @@ FRESH = {"revision", "job_id", "indexed_at", "state"}
 
 def frames(engine):
     return {
-        one.frame_id: one.model_dump(exclude=FRESH)
-        for one in engine.list_frames("hall", None, 100).items
+        frame.frame_id: frame.model_dump(exclude=FRESH)
+        for frame in engine.list_frames("hall", None, 100).items
     }
 
 
@@ -57,7 +57,7 @@ def test_a_deleted_frame_is_found_by_nothing(full, uploads):
         FrameListing(parent_frame=uploads[0].room, has_pose=True),
         FrameListing(state=FrameState.DELETED, parent_frame=uploads[0].room),
     ):  # fmt: skip
-        assert first not in {one.frame_id for one in full.list_frames("hall", wanted=wanted).items}
+        assert first not in {f.frame_id for f in full.list_frames("hall", wanted=wanted).items}
     bare = full.get_frame("hall", first)
     assert (bare.state, bare.pose, bare.content_id, bare.tags) == ("deleted", None, None, [])
     assert full.list_frames("hall", state=FrameState.DELETED).items == [bare]
@@ -66,7 +66,7 @@ def test_a_deleted_frame_is_found_by_nothing(full, uploads):
     with pytest.raises(InvalidRequest, match="Only an indexed frame can be a query"):
         full.query_frame("hall", first, Query())
     answer = full.query_frame("hall", second, Query())
-    assert first not in {one.frame_id for one in answer.matches}
+    assert first not in {match.frame_id for match in answer.matches}
 
 
 def test_a_restored_frame_is_as_it_was_and_found_at_once(full, uploads):
@@ -112,7 +112,7 @@ def test_a_session_is_restored_with_names_tags_and_states(empty, uploads, monkey
     assert (part.frames, part.refused, part.remaining) == (2, [], 3)
     assert restore(empty, deletion).frames == 3
     assert frames(empty) == before
-    assert {one.state for one in empty.list_frames("hall").items} == {FrameState.RECEIVED}
+    assert {frame.state for frame in empty.list_frames("hall").items} == {FrameState.RECEIVED}
     assert len(empty.list_frames("hall", wanted=FrameListing(tag=["x"])).items) == 7
     for unknown in (deletion.deletion_id, "0", "none", "9" * 40, "²"):
         with pytest.raises(UnknownDeletion):
@@ -156,8 +156,8 @@ def test_a_quota_of_frames_holds(full):
 
 
 def test_an_upload_beyond_the_quota_purges_the_oldest_deletions(empty, uploads):
-    names = [empty.add(one)[0].frame_id for one in uploads[:4]]
-    sizes = [len(one.data) for one in uploads]
+    names = [empty.add(upload)[0].frame_id for upload in uploads[:4]]
+    sizes = [len(upload.data) for upload in uploads]
     quota = sum(sizes[:4])
     edit_map(empty.store, "hall", {"quota_bytes": quota})
     for name in names[:3]:
@@ -166,9 +166,9 @@ def test_an_upload_beyond_the_quota_purges_the_oldest_deletions(empty, uploads):
     assert names[0] not in restorable(empty, names)
     assert names[2] in restorable(empty, names)
     assert used(empty).bytes == bytes_on_disk(empty) <= quota
-    batch = [Upload(one.data, one.meta) for one in uploads[5:7]]
+    batch = [Upload(upload.data, upload.meta) for upload in uploads[5:7]]
     results, _ = empty.uploads.add_all("hall", batch)
-    assert [one.new for one in results] == [True, sum(sizes[3:7]) <= quota]
+    assert [result.new for result in results] == [True, sum(sizes[3:7]) <= quota]
     assert used(empty).bytes == bytes_on_disk(empty) <= quota
     # what would not fit anyway purges nothing
     left = restorable(empty, names)
@@ -194,7 +194,7 @@ def restorable(engine, names):
 def test_after_its_time_a_deletion_is_for_good(full):
     names, use, on_disk = list(frames(full)), used(full), bytes_on_disk(full)
     deletion = delete(full, names[:2]).deletion
-    size = sum(full.get_frame("hall", one).bytes for one in names[2:])
+    size = sum(full.get_frame("hall", name).bytes for name in names[2:])
     assert used(full) == MapUsage(use.frames - 2, use.bytes)
     assert full.tombstones.purge() == 0
     end_undo(full)
@@ -212,8 +212,8 @@ def test_after_its_time_a_deletion_is_for_good(full):
 
 def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
     made = []
-    for one, state in zip(uploads, (FrameState.REJECTED, FrameState.REDUNDANT), strict=False):
-        name = empty.add(one)[0].frame_id
+    for upload, state in zip(uploads, (FrameState.REJECTED, FrameState.REDUNDANT), strict=False):
+        name = empty.add(upload)[0].frame_id
         with empty.store.database.write() as connection:
             actual = find_frame(connection, find_map(connection, "hall"), name)
             set_state(connection, actual.number, state, "as a test says")

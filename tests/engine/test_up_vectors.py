@@ -80,8 +80,8 @@ def test_a_map_tells_its_frames_their_up(full, uploads):
     edit_map(full.store, "hall", {"up": Z})
     actual = known()
     assert sorted(actual) == sorted(numbers)
-    for number, one in zip(numbers, uploads, strict=True):
-        np.testing.assert_allclose(actual[number], up_of(one), atol=1e-12)
+    for number, upload in zip(numbers, uploads, strict=True):
+        np.testing.assert_allclose(actual[number], up_of(upload), atol=1e-12)
     # a frame's own up counts while it agrees, and not where the map knows better
     edit_frame(full.store, "hall", names[0], {"up": up_of(uploads[0], 3)})
     edit_frame(full.store, "hall", names[1], {"up": up_of(uploads[1], 30)})

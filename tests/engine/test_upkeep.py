@@ -84,11 +84,11 @@ def test_indexes_of_deleted_maps_are_removed_and_nothing_else(make_engine, uploa
         folder, engine.settings.indexes / "hall-9-abc-0123456789ab.2"
     )  # of a map that is no more
     assert engine.publish_due() == 0
-    left = [one.name for one in engine.settings.indexes.glob("[!.]*")]
+    left = [path.name for path in engine.settings.indexes.glob("[!.]*")]
     assert set(left) == {folder.name, "notes"}
     engine.delete_map("hall")
     assert engine.publish_due() == 0
-    assert [one.name for one in engine.settings.indexes.glob("[!.]*")] == ["notes"]
+    assert [path.name for path in engine.settings.indexes.glob("[!.]*")] == ["notes"]
 
 
 def test_a_model_that_cannot_be_read_costs_its_maps_alone(make_engine, uploads, caplog):
@@ -121,9 +121,9 @@ def test_purging_removes_what_a_publication_had_only_marked(make_engine, uploads
     ((_, newest), _) = manifests(folder)
     actual = read_manifest(newest)
     assert (actual.frames, len(actual.worn_keys)) == (10, 1)
-    assert any(row in one.read_bytes() for one in folder.iterdir())
+    assert any(row in path.read_bytes() for path in folder.iterdir())
     assert engine.purging.now().indexes == 1
-    assert all(row not in one.read_bytes() for one in folder.iterdir())
+    assert all(row not in path.read_bytes() for path in folder.iterdir())
     assert engine.purging.now().indexes == 0
     fresh = make_engine(unindexed_frames=1)
     answer = fresh.ask(uploads[5], ALL)
@@ -143,7 +143,7 @@ def test_purging_writes_an_index_again_whose_keys_are_damaged(make_engine, uploa
     keys[1] = 0  # that of the deleted frame
     path.write_bytes(keys.tobytes())
     assert engine.purging.now().indexes == 1
-    assert all(row not in one.read_bytes() for one in folder.iterdir())
+    assert all(row not in path.read_bytes() for path in folder.iterdir())
     ((number, _),) = manifests(folder)
     assert number == 2
 
@@ -158,7 +158,7 @@ def test_maps_of_whole_fisher_vectors_are_compared_by_l1_without_an_index(make_e
         engine.rebuild_index("hall")
     answer = engine.ask(uploads[1], ALL)
     assert (answer.exact, answer.index_version) == (True, 0)
-    rows = np.stack([list(engine.outputs.vector("hall", one).make()) for one in names])
+    rows = np.stack([list(engine.outputs.vector("hall", name).make()) for name in names])
     apart = np.abs(rows - rows[1]).sum(axis=1)
     actual = [(match.frame_id, match.distance) for match in answer.matches]
     assert actual == [(names[i], apart[i]) for i in np.argsort(apart, kind="stable")]

@@ -71,7 +71,7 @@ def test_an_upload_whose_bytes_are_swept_before_its_commit_is_stored_again(empty
     assert new
     actual = empty.get_frame("hall", added.frame_id)
     assert empty.get_map("hall").frames == {"received": 1}
-    assert [empty.store.blobs.get(one) for one in blobs(empty)] == [uploads[0].data]
+    assert [empty.store.blobs.get(blob) for blob in blobs(empty)] == [uploads[0].data]
     assert actual.state == FrameState.RECEIVED
 
 
@@ -216,7 +216,7 @@ def test_what_is_behind_a_match_without_a_viewpoint_can_be_looked_at(empty, uplo
     answer = empty.queries.upload(
         ["hall"], points, FrameMeta(viewpoint=None), Query(k=2, explain=True)
     )
-    tried = {one.frame_id: one.validation for one in answer.matches}
+    tried = {match.frame_id: match.validation for match in answer.matches}
     assert tried[frame_id].free_space_violations is None
     assert tried[image_id].free_space_violations is not None  # the image knows of free space
     result = {one.frame_id: one.reason for one in answer.explanations or ()}

@@ -73,7 +73,7 @@ def outcome(ranking, selection, pairs, *, least=None, present=True, **rest):
         ranking=ranking,
         distances=np.arange(len(ranking)),
         selection=selection,
-        pairs={one.match: one for one in pairs},
+        pairs={pair.match: pair for pair in pairs},
         candidates=3,
         milliseconds={"rank": 1.0, "diversify": 1.0, "average": 1.0},
         **rest,

@@ -28,7 +28,7 @@ TRUTH = ConfidenceParameters(
 def drawn(rng):
     values = {name: float(rng.uniform(min(knots), max(knots))) for name, knots in KNOTS.items()}
     values |= {"frames": 5.0 + values["frames"], "accepted": 5.0 * values.pop("acceptance")}
-    names = [one.name for one in fields(PlaceEvidence)]
+    names = [field.name for field in fields(PlaceEvidence)]
     return PlaceEvidence(**{name: values.get(name, 0.0) for name in names})
 
 

@@ -178,7 +178,7 @@ def test_diversity_by_hand():
 def test_a_site_whose_map_is_one_surface_is_asked_of_views(small_signer, monkeypatch):
     monkeypatch.setattr(sites, "VIEWS", 12)
     answers = ask_site(small_signer, ("object", 0, 1), seed=5, as_surface=True)
-    places = [place for one in answers for place in one.answer.places]
+    places = [place for answer in answers for place in answer.answer.places]
     assert places
     assert all(place.evidence.rendered for place in places)
 

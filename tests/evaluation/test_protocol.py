@@ -32,7 +32,7 @@ def test_by_hand():
     # the grid has 4 columns at 10, 30, 50, 70; 2 m away, 40 px are 40 / 70 * 2 m: two columns
     half = 40 / 70 * 2
     others = [wall(), wall(half), wall(100.0), wall(0.0, 3.0)]
-    actual = overlaps([view_of(wall())], [view_of(one) for one in others])
+    actual = overlaps([view_of(wall())], [view_of(other) for other in others])
     np.testing.assert_allclose(actual.mean, [[1.0, 0.5, 0.0, 0.0]], atol=1e-12)
     np.testing.assert_allclose(actual.least, [[1.0, 0.5, 0.0, 0.0]], atol=1e-12)
 

@@ -316,7 +316,7 @@ def test_scans_of_an_e57_file_are_frames(room, tmp_path):
         assert cloud.pose == pytest.approx(T, abs=1e-12)
         world = cloud.points.astype(float) @ T[:3, :3].T + T[:3, 3]
         assert room.error(world) < 1e-3
-    assert [one.original for one in sequence.frames] == ["Setup 0", "Setup 1", "Setup 2"]
+    assert [frame.original for frame in sequence.frames] == ["Setup 0", "Setup 1", "Setup 2"]
     [same] = find_sequences(tmp_path)
     assert same.name == "hall"
     with pytest.raises(DatasetError, match="may hold several frames"):

@@ -166,8 +166,8 @@ def test_optimised_poses_replace_those_of_odometry(room, tmp_path):
     del right[3]
     right[-7] = np.eye(4)  # a landmark
     [sequence] = find_sequences(write(tmp_path / "a.db", "0.21.4", nodes, **optimised(right)))
-    assert [one.name for one in sequence.frames] == ["a/000001", "a/000002"]
-    assert all(error_of(room, one) < 1e-3 for one in sequence.frames)
+    assert [frame.name for frame in sequence.frames] == ["a/000001", "a/000002"]
+    assert all(error_of(room, frame) < 1e-3 for frame in sequence.frames)
     assert "optimised poses; skipped: 1 nodes without an optimised pose" in sequence.note
 
 
@@ -175,9 +175,9 @@ def test_sessions_that_nothing_joins_have_frames_of_their_own(room, tmp_path):
     nodes = nodes_of(room, "0.23.0")
     nodes[2]["map_id"] = 4
     sequences = find_sequences(write(tmp_path / "a.db", "0.23.0", nodes))
-    assert [one.parent_frame for one in sequences] == ["a/map-0", "a/map-4"]
-    assert [session_of(one) for one in sequences] == ["a/map-0", "a/map-4"]
-    assert [len(one.frames) for one in sequences] == [2, 1]
+    assert [sequence.parent_frame for sequence in sequences] == ["a/map-0", "a/map-4"]
+    assert [session_of(sequence) for sequence in sequences] == ["a/map-0", "a/map-4"]
+    assert [len(sequence.frames) for sequence in sequences] == [2, 1]
 
 
 @pytest.mark.parametrize("version", ["0.11.11", "0.21.4"])
@@ -196,10 +196,10 @@ def test_images_of_several_cameras_are_split(room, tmp_path, version, packed):
             }
         )
     sequences = find_sequences(write(tmp_path / "a.db", version, nodes))
-    assert [one.name for one in sequences] == ["a/camera-0", "a/camera-1"]
-    assert {one.parent_frame for one in sequences} == {"a"}
+    assert [sequence.name for sequence in sequences] == ["a/camera-0", "a/camera-1"]
+    assert {sequence.parent_frame for sequence in sequences} == {"a"}
     for sequence in sequences:
-        assert all(error_of(room, one) < 1e-3 for one in sequence.frames)
+        assert all(error_of(room, frame) < 1e-3 for frame in sequence.frames)
 
 
 def test_depth_may_be_smaller_than_the_image_of_the_calibration(room, tmp_path):
@@ -208,7 +208,7 @@ def test_depth_may_be_smaller_than_the_image_of_the_calibration(room, tmp_path):
     for node in nodes:
         node["calibration"] = calibration("0.21.4", large, LOCAL)
     [sequence] = find_sequences(write(tmp_path / "a.db", "0.21.4", nodes))
-    assert all(error_of(room, one) < 1e-3 for one in sequence.frames)
+    assert all(error_of(room, frame) < 1e-3 for frame in sequence.frames)
 
 
 @pytest.mark.parametrize("version", ["0.11.11", "0.16.1", "0.21.4"])
@@ -245,7 +245,7 @@ def test_what_is_damaged_costs_only_its_node(room, tmp_path):
     nodes[4]["calibration"] = None
     nodes[5]["depth"] = nodes[5]["depth"][:200]
     [sequence] = find_sequences(write(tmp_path / "a.db", "0.21.4", nodes))
-    assert [one.sequence for one in sequence.frames] == [1, 6]
+    assert [frame.sequence for frame in sequence.frames] == [1, 6]
     for output in (
         "1 damaged nodes (a calibration has",
         "1 nodes without a pose",

@@ -34,10 +34,10 @@ def main():
     for store in options.store or ("sqlite", "postgresql"):
         start = time.monotonic()
         trials = _enumerate(store, options)
-        found = [one for each in trials.values() for one in each.violations]
+        found = [violation for each in trials.values() for violation in each.violations]
         broken += len(found)
-        for (operation, fault), one in trials.items():
-            counts.setdefault(operation, {})[fault] = one.calls
+        for (operation, fault), trial in trials.items():
+            counts.setdefault(operation, {})[fault] = trial.calls
         lines += [f"**{store}**, {time.monotonic() - start:.0f} s:", "", *report(trials), ""]
         lines += [*(f"* {one}" for one in found), ""] if found else []
     text = "\n".join(lines)

@@ -169,11 +169,11 @@ class Enumeration:
                 failed = line.removeprefix("failed ")
         if failed or broken:
             failed = failed or "unknown"
-            said = [one for one in child.lines if one.split(" ")[0] in ACKNOWLEDGED]
+            said = [line for line in child.lines if line.split(" ")[0] in ACKNOWLEDGED]
 
             def check(say):
-                for one in violations(store, operation, said, self._before):
-                    say(one)
+                for violation in violations(store, operation, said, self._before):
+                    say(violation)
 
             checked = Child(check)
             broken += [line.removeprefix("! ") for line in checked.lines]

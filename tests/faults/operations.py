@@ -65,8 +65,8 @@ class Store:
 def fill(store):
     with Engine(store.settings) as engine:
         engine.create_map(NewMap(name=MAP, model="depth"))
-        for one in store.uploads[:STORED]:
-            engine.add_frame(MAP, one.data, one.meta)
+        for upload in store.uploads[:STORED]:
+            engine.add_frame(MAP, upload.data, upload.meta)
         work_off(engine)
         engine.publish_due()
 
@@ -159,7 +159,7 @@ def _archive(uploads):
     members = {
         "run/intrinsics.json": json.dumps(camera.model_dump(exclude={"distortion"})).encode()
     }
-    members |= {f"run/{i}.png": one.data for i, one in enumerate(uploads)}
+    members |= {f"run/{i}.png": upload.data for i, upload in enumerate(uploads)}
     with tarfile.open(fileobj=packed, mode="w") as archive:
         for name, data in members.items():
             info = tarfile.TarInfo(name)
@@ -185,7 +185,7 @@ OPERATIONS = {
 def small_uploads():
     with recordings(None, 1) as folder:
         shots = walks(folder, 1, STORED + 2)[0]
-    return tuple(Upload(one.png, one.meta) for one in shots)
+    return tuple(Upload(shot.png, shot.meta) for shot in shots)
 
 
 def contents(store):
@@ -220,7 +220,7 @@ def violations(store, operation, acknowledged, before):
 
 
 def _states(engine):
-    return {one.frame_id: one.state for one in engine.list_frames(MAP).items}
+    return {frame.frame_id: frame.state for frame in engine.list_frames(MAP).items}
 
 
 def _wrong_frames(engine, operation, said, before):
@@ -238,7 +238,7 @@ def _wrong_frames(engine, operation, said, before):
     wanted = Query(k=50, candidates=50, keep=False, record=False, stages=["retrieve"])
     first = min(states)
     matches = engine.query_frame(MAP, first, wanted).matches
-    if {first, *(one.frame_id for one in matches)} != states.keys():
+    if {first, *(match.frame_id for match in matches)} != states.keys():
         yield "a search does not find each frame"
 
 

@@ -27,7 +27,7 @@ def graph(a, b, pairs):
     bits = np.zeros((len(pairs), (len(pairs) + 63) // 64), np.uint64)
     rows = (a.means[i], a.normals[i], b.means[j], b.normals[j])
     module._build_graph(
-        *(np.ascontiguousarray(one.T) for one in rows),
+        *(np.ascontiguousarray(row.T) for row in rows),
         P.distance_tolerance, P.angle_tolerance, P.minimum_distance, bits,
     )  # fmt: skip
     unpacked = np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")

@@ -55,7 +55,7 @@ def test_transport_against_monte_carlo():
         (lambda A: A @ after, transform_covariance(S, np.eye(3), T[:3, :3] @ after[:3, 3])),
         (inverse, transform_covariance(S, T[:3, :3].T, inverse(T)[:3, 3])),
     )
-    some = [with_error(T, one) for one in errors]
+    some = [with_error(T, error) for error in errors]
     for told, expected in cases:
         there = told(T)
         found = np.cov(np.array([pose_error(there, told(one)) for one in some]).T)

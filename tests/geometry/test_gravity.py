@@ -88,7 +88,7 @@ def test_correspondences_stand_at_one_angle_to_up():
     rng = np.random.default_rng(4)
     source, target = (rng.integers(0, 256, (n, 16), np.uint8) for n in (30, 40))
     normals = [Rotation.random(n, rng=rng).as_matrix()[:, 0] for n in (30, 40)]
-    angles = [slopes(one, Z) for one in normals]
+    angles = [slopes(normal, Z) for normal in normals]
     np.testing.assert_allclose(angles[0], np.arccos(normals[0][:, 2]))
     p = MatchingParameters(30, 3)
     free = correspondences(source, target, np.random.default_rng(0), p)

@@ -57,12 +57,12 @@ BARE = {
 
 def leaves(record):
     found = []
-    for one in fields(record):
-        value = getattr(record, one.name)
+    for field in fields(record):
+        value = getattr(record, field.name)
         if is_dataclass(value):
             found += leaves(value)
         elif isinstance(value, float):
-            found.append((type(record), one.name))
+            found.append((type(record), field.name))
     return found
 
 
@@ -74,7 +74,7 @@ def test_every_number_is_a_length_or_bare():
     ]
     assert unknown == []
     for kind, powers in POWERS.items():
-        assert set(powers) <= {one.name for one in fields(kind)}
+        assert set(powers) <= {field.name for field in fields(kind)}
         assert not set(powers) & BARE.get(kind.__name__, set())
 
 

@@ -48,7 +48,7 @@ def samples(index):
 def survey(index):
     """The scans of a hall, a storey or a block, in one frame."""
     clouds = synthesise_survey(4242, index, 6).clouds
-    parts = [one.points @ one.pose[:3, :3].T + one.pose[:3, 3] for one in clouds]
+    parts = [cloud.points @ cloud.pose[:3, :3].T + cloud.pose[:3, 3] for cloud in clouds]
     return np.concatenate(parts).astype(np.float32)
 
 

@@ -22,7 +22,7 @@ def bits(n, seed):
 
 
 def sizes(version):
-    return [len(one) for one in version.segments]
+    return [len(segment) for segment in version.segments]
 
 
 def names(version):
@@ -72,8 +72,8 @@ def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, fla
         frames |= dict(zip(keys.tolist(), own, strict=True))
         frames = {key: row for key, row in frames.items() if key not in drop}
         assert not (clean and made.manifest.worn_keys)
-        for one in made.segments:
-            assert len(one.gone) <= GONE_SHARE * len(one.keys)
+        for segment in made.segments:
+            assert len(segment.gone) <= GONE_SHARE * len(segment.keys)
     opened = newest(folder, "model", LENGTH)
     assert made is not None
     assert opened is not None
@@ -112,12 +112,12 @@ def test_a_segment_of_which_too_much_is_gone_is_written_again(published):
     made = published(np.arange(400, 440), rows[400:440], made)
     before = made.segments
     made = published(*NONE, made, drop=frozenset(range(100)))  # a quarter
-    assert [len(one.keys) for one in made.segments] == [400, 40]
+    assert [len(segment.keys) for segment in made.segments] == [400, 40]
     made = published(*NONE, made, drop=frozenset([100]))
-    assert [len(one.keys) for one in made.segments] == [299, 40]
+    assert [len(segment.keys) for segment in made.segments] == [299, 40]
     assert made.segments[1] is before[1]
     made = published(*NONE, made, drop=frozenset(range(400, 440)))  # nothing stays of it
-    assert [len(one.keys) for one in made.segments] == [299]
+    assert [len(segment.keys) for segment in made.segments] == [299]
 
 
 def test_cleaning_writes_only_segments_that_something_is_gone_of(walk, published, tmp_path):
@@ -146,27 +146,27 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(walk, published,
     flat = 2500 * length
     made = published(np.arange(2000), signatures[:2000], flat_bytes=flat)
     made = published(np.arange(2000, 2500), signatures[2000:2500], made, flat_bytes=flat)
-    assert [one.sketches for one in made.segments] == [None, None]
+    assert [segment.sketches for segment in made.segments] == [None, None]
     assert made.manifest.recall.sample == 0
     known = made.segments
     made = published(np.arange(2500, 2530), signatures[2500:2530], made, flat_bytes=flat)
     assert sizes(made) == [2000, 500, 30]
-    assert [one.sketches is None for one in made.segments] == [False, False, True]
-    for one, before in zip(made.segments, known, strict=False):
-        assert one.record.file("faiss") == before.record.file("faiss")
-        assert one.record.recall.frames == len(one)
+    assert [segment.sketches is None for segment in made.segments] == [False, False, True]
+    for segment, before in zip(made.segments, known, strict=False):
+        assert segment.record.file("faiss") == before.record.file("faiss")
+        assert segment.record.recall.frames == len(segment)
     opened = newest(tmp_path / "map", "model", length)
-    each = [one.sketches.probes for one in opened.segments if one.sketches is not None]
+    each = [segment.sketches.probes for segment in opened.segments if segment.sketches is not None]
     recall = opened.manifest.recall
     assert recall.probes == sum(each)
-    assert recall.share == min(one.record.recall.share for one in opened.segments) < 1.001
-    assert recall.sample == sum(one.record.recall.sample for one in opened.segments) > 0
+    assert recall.share == min(segment.record.recall.share for segment in opened.segments) < 1.001
+    assert recall.sample == sum(segment.record.recall.sample for segment in opened.segments) > 0
     hits = search(signatures[2999], opened, Tail.empty(length), 10, metric="l2")
     assert not hits.exact
     assert 30 + 10 <= hits.compared < 2530
     less = published(*[part[:0] for part in (np.arange(0), signatures)], made,
                      drop=frozenset(range(2500, 2530)), flat_bytes=flat)  # fmt: skip
-    assert [one.sketches for one in less.segments] == [None, None]
+    assert [segment.sketches for segment in less.segments] == [None, None]
     assert less.manifest.recall.probes == 0
 
 

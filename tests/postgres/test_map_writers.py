@@ -108,6 +108,6 @@ def test_nothing_is_pending_where_nobody_reads_once_somebody_numbers(server_stor
     number_events(server_store.database)
     with server_store.database.read() as connection:
         assert connection.execute(select(pending_events)).all() == []
-        assert [one.map for one in list_events(connection, EventFilter(kinds=("x",)))] == [
+        assert [event.map for event in list_events(connection, EventFilter(kinds=("x",)))] == [
             row.name for row in rows
         ]

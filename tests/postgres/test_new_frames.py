@@ -108,7 +108,7 @@ def test_what_was_done_under_its_key_is_not_done_again(server_store, rows):
         return request.columns({"frames": request.key})
 
     assert receive(database, new(a, 1, result=kept(requests[0]))) == [True]
-    given = [new(b, 2, result=kept(one)) for one in requests[:1]]
+    given = [new(b, 2, result=kept(request)) for request in requests[:1]]
     given += [new(b, 3), new(a, 3, result=kept(requests[1]))]
     assert receive(database, *given) == [False, True, True]
     with database.read() as connection:

@@ -108,7 +108,7 @@ def test_a_frame_is_received_as_by_its_parts(server_store, pair):
         received(server_store, row, at_once=at_once)
     single, parts = (rows(server_store, row) for row in pair)
     assert single == parts
-    assert [one["tag"] for one in single["frame_tags"]] == ["dark", "wet"]
+    assert [tag["tag"] for tag in single["frame_tags"]] == ["dark", "wet"]
     assert single["frames"][0]["pose_x"] == 2.5
     assert single["jobs"][0] | {"priority": 3, "state": "queued"} == single["jobs"][0]
     assert (single["maps"][0]["used_frames"], single["maps"][0]["used_bytes"]) == (1, 70)
@@ -153,9 +153,9 @@ def test_a_frame_is_indexed_as_by_its_parts(server_store, pair, fused):
     assert single == parts
     assert single["frames"][0]["state"] == "indexed"
     assert single["frames"][0]["revision"] == single["maps"][0]["revision"]
-    assert [one["vector"] for one in single["signatures"]] == [b"signature"]
-    assert [one["changed"] for one in single["surface_frames"]] == [True] * fused
-    assert [one["kind"] for one in single["pending_events"]] == ["frame.received", "frame.indexed"]
+    assert [signature["vector"] for signature in single["signatures"]] == [b"signature"]
+    assert [frame["changed"] for frame in single["surface_frames"]] == [True] * fused
+    assert [e["kind"] for e in single["pending_events"]] == ["frame.received", "frame.indexed"]
 
 
 def _lost(connection, job):
@@ -195,6 +195,6 @@ def test_revisions_of_a_map_follow_each_other(server_store, pair):
             assert receive_frames(connection, [NewFrame(row, values)])
     for _ in range(3):
         assert indexed(server_store, row, claimed(server_store, row), at_once=True)
-    assert [one["revision"] for one in rows(server_store, row)["frames"]] == [1, 2, 3]
+    assert [frame["revision"] for frame in rows(server_store, row)["frames"]] == [1, 2, 3]
     with server_store.database.read() as connection:
         assert map_of_number(connection, row.number).revision == 3

@@ -57,7 +57,7 @@ def test_poses_and_samples_are_those_that_were_recorded(
     sequence = only(path)
     assert (sequence.name, sequence.layout) == ("run", Layout.RECORDING)
     assert (sequence.parent_frame, session_of(sequence)) == ("run/odom", "run")
-    assert [one.name for one in sequence.frames] == [f"run/{i:06d}" for i in range(len(walk))]
+    assert [frame.name for frame in sequence.frames] == [f"run/{i:06d}" for i in range(len(walk))]
     for i, (reference, (t, T)) in enumerate(zip(sequence.frames, walk, strict=True)):
         frame = reference.read()
         assert isinstance(frame, DepthFrame)
@@ -422,7 +422,7 @@ def test_images_that_are_no_depth_by_name_must_be_named(tmp_path, ros, depth):
     with pytest.raises(DatasetError, match=r"no topic .*confidence_map \('16UC1'\).*--topic"):
         only(path)
     outline = bag_outline(path, RecordingOptions())
-    assert {outline.use_of(one.topic) for one in outline.frames} == {"not depth by its name"}
+    assert {outline.use_of(frame.topic) for frame in outline.frames} == {"not depth by its name"}
     camera = RecordingOptions(topic=confidence, camera_info="/camera/depth/camera_info")
     assert len(only(path, camera).frames) == 1
 
@@ -461,7 +461,7 @@ def test_several_topics_are_listed(tmp_path, ros, depth):
         with pytest.raises(DatasetError, match=message):
             only(path, RecordingOptions(**options))
     outline = bag_outline(path, RecordingOptions())
-    assert [one.topic.name for one in outline.frames] == ["/camera/depth/image_raw", "/points"]
+    assert [frame.topic.name for frame in outline.frames] == ["/camera/depth/image_raw", "/points"]
     uses = {topic.name: outline.use_of(topic) for topic in outline.topics}
     assert (uses["/imu"], uses["/camera/color/image_raw"]) == ("up", "no depth by its encoding")
     assert "--topic" in outline.problem

@@ -37,7 +37,7 @@ def test_each_frame_has_the_camera_info_of_its_time(way, container, tmp_path, ro
             writer.late = 0.0
 
     (found,) = find_sequences(ros.write(tmp_path, fill, container), ALL)
-    focal = [one.camera.intrinsics.fx for one in found.frames if one.camera]
+    focal = [frame.camera.intrinsics.fx for frame in found.frames if frame.camera]
     assert focal == [70.0] * 4 + [50.0] * 4
     assert found.note.endswith(
         "2 cameras, because the camera info changes: each frame has the camera of its time"
@@ -55,7 +55,7 @@ def test_a_camera_info_of_another_run_is_not_that_of_this_one(tmp_path, ros):
                 writer.camera_info(1.0 + 0.2 * i + 0.1 * run, k=(f, f, 39.5, 29.5))
 
     found = find_sequences(ros.write(tmp_path, fill), ALL)
-    focal = [[one.camera.intrinsics.fx for one in each.frames if one.camera] for each in found]
+    focal = [[f.camera.intrinsics.fx for f in each.frames if f.camera] for each in found]
     assert focal == [[70.0] * 4, [50.0] * 4]
 
 
@@ -86,9 +86,9 @@ def test_rvl_by_hand():
     """Two zeros; then 1000, 1001 and 990: differences 1000, 1 and -11, zigzag 2000, 2 and 21."""
     groups = "2 3 | 0 2 7 3 | 2 | 5 2 | 1 0"
     ends = {0, 1, 5, 6, 8, 9, 10}
-    digits = [int(one) for one in groups.replace("|", "").split()]
-    nibbles = [one | (0 if i in ends else 8) for i, one in enumerate(digits)] + [0] * 5
-    words = [int("".join(f"{one:x}" for one in nibbles[i : i + 8]), 16) for i in (0, 8)]
+    digits = [int(part) for part in groups.replace("|", "").split()]
+    nibbles = [digit | (0 if i in ends else 8) for i, digit in enumerate(digits)] + [0] * 5
+    words = [int("".join(f"{nibble:x}" for nibble in nibbles[i : i + 8]), 16) for i in (0, 8)]
     found = rvl_samples(struct.pack("<IIII", 3, 2, *words))
     assert found.tolist() == [[0, 0, 1000], [1001, 990, 0]]
 
@@ -107,7 +107,7 @@ def test_compressed_depth_by_rvl(encoding, tmp_path, ros):
         topic, form = "/camera/depth/image_raw/compressedDepth", f"{encoding}; compressedDepth rvl"
         writer.write_compressed(topic, 0.0, form, head + rvl(samples))
 
-    ((frame,),) = [one.frames for one in find_sequences(ros.write(tmp_path, fill), ALL)]
+    ((frame,),) = [sequence.frames for sequence in find_sequences(ros.write(tmp_path, fill), ALL)]
     metres = samples / np.float32(1000) if encoding == "16UC1" else a / (samples - b)
     missing = (samples == 0) | ((samples == 65_535) & (encoding == "16UC1"))
     expected = np.where(missing, 0, metres)

@@ -67,7 +67,7 @@ def small(tmp_path_factory, ros, walk):
             writer.points(t, rows, height=1 + i % 2)
 
     folder = tmp_path_factory.mktemp("small")
-    made = {one: ros.write(folder / one, fill, one) for one in ros.containers}
+    made = {c: ros.write(folder / c, fill, c) for c in ros.containers}
     made["zstd"] = ros.write(folder / "zstd", fill, "mcap", compression="storage")
     made["bz2"] = ros.write(folder / "bz2", fill, "ros1", compression="bz2")
     made["message"] = ros.write(folder / "message", fill, "sqlite3", compression="message")

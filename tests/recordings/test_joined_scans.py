@@ -63,11 +63,11 @@ def write_walls(writer, kind):
 
 def check_walls(sequence, tolerance):
     """Each frame has the walls of its scans, in the axes of the newest."""
-    for one in sequence.frames:
-        scans = range(one.sequence, max(one.sequence - 21, -1), -1)
+    for frame in sequence.frames:
+        scans = range(frame.sequence, max(frame.sequence - 21, -1), -1)
         world = np.concatenate([wall(number) for number in scans])
-        T = np.linalg.inv(one.pose)
-        found = one.read().points
+        T = np.linalg.inv(frame.pose)
+        found = frame.read().points
         assert len(found) == len(world)
         assert np.abs(found - (world @ T[:3, :3].T + T[:3, 3])).max() < tolerance
 
@@ -85,7 +85,7 @@ def check_walls(sequence, tolerance):
 def test_scans_are_joined_without_their_motion(kind, container, tmp_path, ros):
     path = ros.write(tmp_path, lambda writer: write_walls(writer, kind), container)
     (sequence,) = find_sequences(path, JOINED)
-    median = np.median([min(one.sequence + 1, 21) for one in sequence.frames])
+    median = np.median([min(frame.sequence + 1, 21) for frame in sequence.frames])
     assert sequence.note == (
         f"{len(sequence.frames)} of 30 frames of /livox/lidar used, poses of 30 of 30 frames in "
         f"odom; skipped: {30 - len(sequence.frames)} between keyframes; each frame joins the scans "

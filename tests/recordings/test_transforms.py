@@ -27,7 +27,7 @@ def sequences(ros, folder, fill, mounting=None, **how):
 
 
 def positions(sequence):
-    return [[round(float(x), 6) for x in one.pose[:3, 3]] for one in sequence.frames]
+    return [[round(float(x), 6) for x in frame.pose[:3, 3]] for frame in sequence.frames]
 
 
 @pytest.mark.parametrize("container", ["mcap", "ros1"])
@@ -53,7 +53,7 @@ def test_a_clock_that_is_set_back_splits_a_recording(source, container, tmp_path
     assert [positions(one) for one in found] == [
         [[0.4 + i, 10.0 * run, 0.0] for i in range(last - 1)] for run, last in enumerate((4, 3, 6))
     ]
-    assert [one.name for one in found[1].frames] == ["run.part2/000004", "run.part2/000005"]
+    assert [frame.name for frame in found[1].frames] == ["run.part2/000004", "run.part2/000005"]
     assert found[0].note == (
         "10 of 13 frames of /camera/depth/image_raw used, poses of 10 of 13 frames in odom; 3 "
         "without: no sample of odom -> base_link within 20 ms (nearest 0.2 s); skipped: 3 without "
@@ -188,7 +188,7 @@ def test_quaternions_that_are_not_of_length_1(length, tmp_path, ros):
         assert found.lost == 0
     else:
         assert found.lost == 3
-        assert [one.pose for one in found.frames] == [None] * 3
+        assert [frame.pose for frame in found.frames] == [None] * 3
         assert found.note.endswith(
             "poses of 0 of 3 frames; 3 without: there are no transforms from camera to a frame in "
             "which it moves; base_link -> camera is ignored because its quaternion has the length "
@@ -206,7 +206,7 @@ def test_a_fixed_transform_with_two_values_is_passed_over(other, tmp_path, ros):
             writer.image(0.1 * i, IMAGE)
 
     (found,) = sequences(ros, tmp_path, fill)
-    assert [one.pose for one in found.frames] == [None] * 3
+    assert [frame.pose for frame in found.frames] == [None] * 3
     assert found.note.endswith(
         "base_link -> camera is ignored because it is static, but has values that differ by 0.3 m "
         "or rad"
@@ -274,5 +274,5 @@ def test_points_in_the_base_of_a_robot_with_an_arm_stay_there(tmp_path, ros):
             writer.points(0.1 * i, rows, frame="base_link")
 
     (found,) = sequences(ros, tmp_path, fill)
-    assert [one.pose for one in found.frames] == [None] * 3
+    assert [frame.pose for frame in found.frames] == [None] * 3
     np.testing.assert_array_equal(found.frames[2].read().points, np.ones((12, 3)))

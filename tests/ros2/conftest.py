@@ -241,7 +241,7 @@ def bus(ros, monkeypatch):
         "tf2_msgs": ("TFMessage",),
     }.items():
         module(package)
-        made_of = {one: message_class(writer, f"{package}/msg/{one}") for one in names}
+        made_of = {name: message_class(writer, f"{package}/msg/{name}") for name in names}
         module(f"{package}.msg", **made_of)
     monkeypatch.syspath_prepend(str(PACKAGE))
     for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):

@@ -73,7 +73,7 @@ def test_a_node_on_a_drive(bus, node_module, drive, room, service_url, ros, tmp_
         covariance = np.reshape(message.pose.covariance, (6, 6))
         assert (np.linalg.eigvalsh(covariance) > 0).all()
     assert len(poses) >= 4
-    transforms = [one for message in bus.on("/tf") for one in message.transforms]
+    transforms = [transform for message in bus.on("/tf") for transform in message.transforms]
     T_odom_base = pose_of(arrived[-1][2].transforms[0].transform)
     last = transforms[-1]
     assert (last.header.frame_id, last.child_frame_id) == ("world", "odom")
@@ -84,7 +84,7 @@ def test_a_node_on_a_drive(bus, node_module, drive, room, service_url, ros, tmp_
     (status,) = bus.on("/diagnostics")[-1].status
     assert (status.level, status.hardware_id) == (0, DEPTH)
     assert status.message.startswith("tracking: ")
-    values = {one.key: one.value for one in status.values}
+    values = {value.key: value.value for value in status.values}
     assert (values["map"], values["map_is"], values["frames"]) == ("room", "site", "6")
     assert bus.log[0].startswith("lost: ") or bus.log[0].startswith("tracking: ")
 
@@ -96,7 +96,7 @@ def test_a_node_on_a_drive(bus, node_module, drive, room, service_url, ros, tmp_
     node.destroy_node()
     with (tmp_path / "drive.jsonl").open() as log:
         states = list(replay(log))
-    assert "tracking" in {one.status for one in states}
+    assert "tracking" in {state.status for state in states}
     assert states[-1].status == "lost"
 
 
@@ -124,7 +124,7 @@ def test_a_manager_starts_and_stops_a_node(bus, node_module, drive):
         tick()
         diagnose()
         (status,) = bus.on("/diagnostics")[-1].status
-        assert {one.key: one.value for one in status.values}["frames"] == count
+        assert {value.key: value.value for value in status.values}["frames"] == count
         assert (status.message == "the node is not active") is not is_active
         assert status.level == (3 if is_active else 1)  # STALE, for no transform has arrived
     assert node.on_cleanup(None) == "success"

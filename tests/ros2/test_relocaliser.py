@@ -87,10 +87,10 @@ def test_a_drive_is_tracked_as_the_truth_is(kind, drive, service_url, room, ros)
             "unreadable": 0,
         }
     assert len(reports) == count
-    tracked = [i for i, one in enumerate(reports) if one.pose is not None]
+    tracked = [i for i, report in enumerate(reports) if report.pose is not None]
     assert tracked[0] <= 2
     assert tracked == list(range(tracked[0], count))
-    assert [one.is_fix for one in reports] == [i == tracked[0] for i in range(count)]
+    assert [report.is_fix for report in reports] == [i == tracked[0] for i in range(count)]
     for i in tracked:
         report = reports[i]
         step, turn = difference(report.pose.T_map_base, room[i].pose @ np.linalg.inv(ros.camera))
@@ -115,7 +115,7 @@ def test_frames_are_asked_for_no_oftener_than_told(ros):
         reports = run(core, still(ros, 31, every=1 / 15).written)
     assert len(reports) == 31
     assert len(client.asked) == 4  # at 0, 8, 16 and 24 fifteenths of a second
-    assert [round((one.stamp_ns - ros.start * SECOND) * 15e-9) for one in reports] == [*range(31)]
+    assert [round((r.stamp_ns - ros.start * SECOND) * 15e-9) for r in reports] == [*range(31)]
 
 
 def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros):
@@ -162,7 +162,7 @@ def test_what_is_silent_is_not_told(ros):
 def test_relocalising_forgets_and_asks_at_once(ros):
     with scripted(interval_s=60.0) as (core, client):
         reports = run(core, still(ros, 3).written)
-        assert [one.state.status for one in reports] == ["tracking"] * 3
+        assert [report.state.status for report in reports] == ["tracking"] * 3
         assert len(client.asked) == 1
         core.relocalise()
         lost = core.report(ros.start * SECOND + SECOND)
@@ -178,8 +178,8 @@ def test_a_clock_that_jumps_back_begins_anew(ros):
     with scripted() as (core, client):
         run(core, still(ros, 3, start=100.0).written)
         reports = run(core, still(ros, 2, start=0.0).written)
-    assert [one.is_fix for one in reports] == [True, False]
-    assert [one.stamp_ns for one in reports] == [
+    assert [report.is_fix for report in reports] == [True, False]
+    assert [report.stamp_ns for report in reports] == [
         ros.start * SECOND,
         ros.start * SECOND + SECOND // 2,
     ]
@@ -292,6 +292,6 @@ def test_what_cannot_be_used_is_told_and_the_robot_goes_on(ros):
         writer.image(-ros.start, np.full((6, 8), 1000))
         take(core, *writer.written[-1])
         assert core.report((ros.start + 1) * SECOND).message.startswith("A frame has no stamp.")
-    assert [one.level for one in reports] == [Level.ERROR, Level.ERROR, Level.OK]
+    assert [report.level for report in reports] == [Level.ERROR, Level.ERROR, Level.OK]
     assert reports[0].message.startswith("No calibrated camera info has arrived.")
     assert "encoding 'rgb8'" in reports[1].message

@@ -33,7 +33,7 @@ def written(path, fields, columns, **header):
         points = lib.CompressedVectorNode(imf, prototype, lib.VectorNode(imf, True))
         scan.set("points", points)
         file.data3d.append(scan)
-        arrays = [np.ascontiguousarray(one) for one in columns.values()]
+        arrays = [np.ascontiguousarray(column) for column in columns.values()]
         buffers = lib.VectorSourceDestBuffer()
         for name, array in zip(columns, arrays, strict=True):
             buffers.append(lib.SourceDestBuffer(imf, name, array, n, True, True))
@@ -136,8 +136,8 @@ def test_a_merged_cloud_has_no_viewpoint_and_registered_scans_have(tmp_path):
             file.write_scan_raw(columns, translation=np.array([x, 0, 0]))
     scans = read_e57((tmp_path / "b.e57").read_bytes())
     assert with_viewpoint(scans) == [True, True]
-    assert [one.T_world_scan[0, 3] for one in scans] == [0.0, 4.0]
-    assert all(np.abs(points_of(one) - POINTS[:100]).max() < 1e-6 for one in scans)
+    assert [scan.T_world_scan[0, 3] for scan in scans] == [0.0, 4.0]
+    assert all(np.abs(points_of(scan) - POINTS[:100]).max() < 1e-6 for scan in scans)
 
 
 @pytest.mark.parametrize("bits", range(65))

@@ -192,12 +192,12 @@ def ply(faces, order, vertices):
     ).encode()
     if order == "ascii":
         rows = [f"{x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-        rows += [f"7 {len(one)} {' '.join(map(str, one))} 2 0.5 1e-3" for one in faces]
+        rows += [f"7 {len(face)} {' '.join(map(str, face))} 2 0.5 1e-3" for face in faces]
         return head + ("\n".join(rows) + "\n").encode()
     sign = "<" if "little" in order else ">"
     body = vertices.astype(f"{sign}f8").tobytes()
-    for one in faces:
-        body += struct.pack(f"{sign}BB{len(one)}iB2f", 7, len(one), *one, 2, 0.5, 1e-3)
+    for face in faces:
+        body += struct.pack(f"{sign}BB{len(face)}iB2f", 7, len(face), *face, 2, 0.5, 1e-3)
     return head + body
 
 

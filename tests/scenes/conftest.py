@@ -49,13 +49,13 @@ def _rows(path):
 
 def mcap_rows(path):
     """Return all messages of an MCAP file, read by Rerun instead of Foxglove's library."""
-    return [one for one in _rows(path) if not one.path.startswith("/__")]
+    return [row for row in _rows(path) if not row.path.startswith("/__")]
 
 
 def moves_of(rows, child):
     """Return the transforms of a coordinate frame in order of time."""
     key = "Transform3D:child_frame"
-    return [one for one in rows if one.values.get(key) == [child]]
+    return [row for row in rows if row.values.get(key) == [child]]
 
 
 def drawn_at(rows, topic):
@@ -82,7 +82,7 @@ class ListWriter:
         self.gone.append(gone)
 
     def contents(self, moment=-1):
-        return {"/".join(one.path): one.content for one in self.moments[moment].entities}
+        return {"/".join(entity.path): entity.content for entity in self.moments[moment].entities}
 
 
 @pytest.fixture(scope="session")
@@ -109,9 +109,9 @@ def client(service_url, walk, room_frames, tmp_path_factory):
     with Client(service_url) as client:
         client.create_map(MAP)
         for space, frames in (("room", walk), ("yard", other)):
-            for one in frames:
-                client.upload(MAP, one, meta_of(one, session=space, parent_frame=space))
-        client.wait([one.job_id for one in client.frames(MAP)], timeout_s=PATIENCE_S)
+            for frame in frames:
+                client.upload(MAP, frame, meta_of(frame, session=space, parent_frame=space))
+        client.wait([frame.job_id for frame in client.frames(MAP)], timeout_s=PATIENCE_S)
         yield client
 
 

@@ -45,14 +45,14 @@ def test_the_frames_of_a_map_are_shown(sceneprint, client, tmp_path):
     listed = sceneprint("frames", MAP, "--session", "room", "--mcap", mcap).stdout
     assert len(listed.splitlines()) == 1 + WALK
     frames = list(client.frames(MAP, session="room"))
-    clouds = [client.frame_points(MAP, one.frame_id, "parent").points for one in frames]
+    clouds = [client.frame_points(MAP, frame.frame_id, "parent").points for frame in frames]
     rows = mcap_rows(mcap)
     points = np.array(values(rows, "/room/map/points", "Points3D:positions"))
     assert len(points) == sum(map(len, clouds))
     np.testing.assert_allclose(points[: len(clouds[0])], clouds[0], atol=3e-4)
-    for one in frames:
-        [move] = moves_of(rows, one.pose.child_frame)
-        at = one.pose.translation
+    for frame in frames:
+        [move] = moves_of(rows, frame.pose.child_frame)
+        at = frame.pose.translation
         position = move.values["Transform3D:translation"]
         np.testing.assert_allclose(position, [[at.x, at.y, at.z]], atol=1e-6)
 
@@ -68,7 +68,7 @@ def halves(client, walk):
         meta = meta_of(one, session=name, with_pose=False).model_dump()
         meta |= {"pose": {"matrix": pose.tolist(), "parent_frame": name}}
         client.upload("halves", one, FrameMeta.model_validate(meta))
-    client.wait([one.job_id for one in client.frames("halves")], timeout_s=PATIENCE_S)
+    client.wait([frame.job_id for frame in client.frames("halves")], timeout_s=PATIENCE_S)
     yield
     client.delete_map("halves")
 
@@ -81,20 +81,20 @@ def test_joined_sessions_are_shown_in_one_space(sceneprint, client, tmp_path):
     job, rows = json.loads(said.stdout), mcap_rows(mcap)
     assert job["result"]["joins"][0]["transform"] is not None
     graph = json.loads(client.graph("halves", job["job_id"], "json"))
-    poses = {one["frame_id"]: np.array(one["pose"]["matrix"]) for one in graph["vertices"]}
+    poses = {vertex["frame_id"]: np.array(vertex["pose"]["matrix"]) for vertex in graph["vertices"]}
     space = graph["frame"]
     for name in ("even", "odd"):
-        ids = [one.frame_id for one in client.frames("halves", session=name)]
+        ids = [frame.frame_id for frame in client.frames("halves", session=name)]
         drawn = drawn_at(rows, f"/{space}/sessions")[f"/{space}/sessions/{name}/track"]
         track = sorted([p["x"], p["y"], p["z"]] for p in drawn["lines"][0]["points"])
-        expected = sorted(poses[one][:3, 3].tolist() for one in ids)
+        expected = sorted(poses[frame_id][:3, 3].tolist() for frame_id in ids)
         np.testing.assert_allclose(track, expected, atol=1e-5)
-        clouds = [moved(poses[one], client.frame_points("halves", one).points) for one in ids]
+        clouds = [moved(poses[f], client.frame_points("halves", f).points) for f in ids]
         points = values(rows, f"/{space}/sessions/{name}/points", "Points3D:positions")
         expected = np.concatenate(clouds).mean(axis=0)
         np.testing.assert_allclose(np.mean(points, axis=0), expected, atol=1e-3)
     edges = drawn_at(rows, f"/{space}/edges").values()
-    assert sum(len(one["lines"]) for one in edges) == job["result"]["edges"]
+    assert sum(len(edge["lines"]) for edge in edges) == job["result"]["edges"]
 
 
 def test_what_cannot_be_is_refused_first(sceneprint, unseen, tmp_path):

@@ -52,7 +52,7 @@ def packed(colours):
 
 
 def at(rows, path, component):
-    return [one for one in rows if one.path == path and component in one.values]
+    return [row for row in rows if row.path == path and component in row.values]
 
 
 def test_an_mcap_file_for_foxglove(tmp_path):
@@ -80,11 +80,11 @@ def test_an_mcap_file_for_foxglove(tmp_path):
     assert hall["Transform3D:parent_frame"] == ["my hall upright"]
     [q] = hall["Transform3D:quaternion"]
     np.testing.assert_allclose(rotation_of(np.array(q)) @ (0, -1, 0), (0, 0, 1), atol=1e-7)
-    logs = [one for one in rows if one.path == "/log" and "TextLog:text" in one.values]
-    assert [(one.time_ns, one.values["TextLog:text"]) for one in logs] == [
+    logs = [row for row in rows if row.path == "/log" and "TextLog:text" in row.values]
+    assert [(log.time_ns, log.values["TextLog:text"]) for log in logs] == [
         (START, ["found\n  at `here`"]), (LATER, ["lost"]),
     ]  # fmt: skip
-    assert [one.name for one in tmp_path.iterdir()] == ["a.mcap"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
 def test_lines_and_labels_for_foxglove(tmp_path):
@@ -105,7 +105,7 @@ def test_lines_and_labels_for_foxglove(tmp_path):
     assert (label["text"], label["billboard"]) == ("#1 name", True)
     assert label["pose"]["position"] == {"x": 0.0, "y": 1.0, "z": 0.0}
     [update] = second.values[UPDATE]
-    assert {one["id"] for one in update["deletions"]} == set(entities)
+    assert {deletion["id"] for deletion in update["deletions"]} == set(entities)
     assert not update["entities"]
 
 
@@ -131,10 +131,10 @@ def test_a_file_is_there_whole_or_not_at_all(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert [(one.name, one.read_bytes()) for one in tmp_path.iterdir()] == [("scene", b"old")]
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("scene", b"old")]
     with mcap_file(path) as writer:
         written(SceneStream(writer))
-    assert [one.name for one in tmp_path.iterdir()] == ["scene"]
+    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
     assert len(path.read_bytes()) > 1000
 
 

@@ -249,8 +249,8 @@ def shoot(tmp_path_factory):
 def shots(room_frames, shoot):
     """Three views of each of two rooms, with their poses."""
     return [
-        shoot(one.depth, one.intrinsics, None if one.pose is None else one.pose.tolist())
-        for one in room_frames
+        shoot(frame.depth, frame.intrinsics, None if frame.pose is None else frame.pose.tolist())
+        for frame in room_frames
     ]
 
 

@@ -36,7 +36,7 @@ def told(answer, status=200):
 
 
 def as_text(options):
-    return {n: one if isinstance(one, str) else json.dumps(one) for n, one in options.items()}
+    return {n: o if isinstance(o, str) else json.dumps(o) for n, o in options.items()}
 
 
 def sent(served, path, shot, options, *, bare):

@@ -36,7 +36,7 @@ class Recorder:
         answer = self._client.request(method, pattern.format(**path), headers=headers, **more)
         assert answer.is_success, (name, answer.text)
         lines = self._client.get("/v1/audit", params={"limit": 1000}).json()["items"]
-        found = [one for one in reversed(lines) if one["request_id"] == request_id]
+        found = [line for line in reversed(lines) if line["request_id"] == request_id]
         assert [one["action"] for one in found] == wanted, name
         assert {one["address"] for one in found} <= {"127.0.0.1"}
         self.tried.add(name)
@@ -69,8 +69,8 @@ def test_each_change_has_its_lines(recorder, small_shots, until):
     do("patch_map", ["map.edited"], hall, json={"title": "Hall"})
     do("patch_map", [], hall, json={"title": "Hall"})
     forms = [
-        one.form(session=f"s{i // 2}", pose=pose_of(i), captured_at=f"2026-11-16T09:30:0{i}Z")
-        for i, one in enumerate(small_shots[:4])
+        shot.form(session=f"s{i // 2}", pose=pose_of(i), captured_at=f"2026-11-16T09:30:0{i}Z")
+        for i, shot in enumerate(small_shots[:4])
     ]
     wait = {"Prefer": "wait=200"}
     taken = [
@@ -137,7 +137,7 @@ def test_each_change_of_a_job_has_its_line(begin, recorder, small_shots):
     sign = {"job_id": signing.json()["job_id"]}
     idle.do("cancel_job", ["job.cancelled", "frame.failed"], sign)
     idle.do("retry_job", ["job.retried", "frame.received"], sign)
-    parts = [("frame", ("frame.png", one.png)) for one in small_shots[1:3]]
+    parts = [("frame", ("frame.png", shot.png)) for shot in small_shots[1:3]]
     meta = {"metas": json.dumps([{"intrinsics": small_shots[1].camera}] * 2)}
     idle.do("add_batch", ["frame.received"] * 2, hall, files=parts, data=meta)
     idle.do("reencode", ["map.reencoding"], hall, json={"model": "paper"})

@@ -66,7 +66,7 @@ def hall(served, make_map, shots, small_shots, clouds):
 
 def test_what_is_told_of_a_cloud(served, hall, clouds):
     path, ids = hall
-    image, ply, other = (served.client.get(f"{path}/frames/{one}").json() for one in ids)
+    image, ply, other = (served.client.get(f"{path}/frames/{frame_id}").json() for frame_id in ids)
     assert (image["kind"], image["points"], image["viewpoint"]) == ("depth", None, None)
     assert (ply["kind"], ply["intrinsics"], ply["depth_scale"]) == ("cloud", None, None)
     assert (ply["points"], ply["note"], ply["units_per_metre"]) == (len(clouds[1]), None, 1.0)
@@ -145,5 +145,5 @@ def test_an_image_has_no_viewpoint_and_needs_a_camera(served, gate, small_shots,
         assert problem["errors"][0]["field"].startswith(place)
     answer = served.client.post(f"{gate}/frames", **form(small_shots[0].png))
     problem = refused(answer, 422, "invalid-request")
-    assert [one["field"] for one in problem["errors"]] == ["intrinsics"]
+    assert [error["field"] for error in problem["errors"]] == ["intrinsics"]
     assert served.client.get(f"{gate}/frames").json()["items"] == []

@@ -226,7 +226,7 @@ def test_tls_is_of_version_1_2_or_later(opened, certificate):
     cert, key = certificate
     context = connections.tls_context(Settings(tls_cert=cert, tls_key=key))
     assert context.minimum_version == ssl.TLSVersion.TLSv1_2
-    assert all("CBC" not in one["name"] for one in context.get_ciphers())
+    assert all("CBC" not in cipher["name"] for cipher in context.get_ciphers())
 
 
 def test_a_certificate_that_cannot_be_used_is_said(certificate, tmp_path):

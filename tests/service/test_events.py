@@ -90,7 +90,7 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
         assert [next_event(came)["kind"] for _ in range(2)] == ["frame.indexed", "frame.deleted"]
     asked = {"map": "told", "kind": ["map.", "frame.i"], "order": "oldest"}
     page = client.get("/v1/events", params=asked).json()
-    assert [one["kind"] for one in page["items"]] == ["map.created", "frame.indexed"]
+    assert [item["kind"] for item in page["items"]] == ["map.created", "frame.indexed"]
     assert page["items"] == [first, found[1]]
 
 
@@ -120,7 +120,7 @@ def test_a_map_that_is_not_there_has_no_events(served, refused):
 def test_a_key_is_told_of_its_maps_alone(guarded, keys, refused):
     def kinds(who, **asked):
         answer = guarded.client.get("/v1/events", params=asked, headers=keys[who])
-        return {(one["kind"], one["map"]) for one in answer.json()["items"]}
+        return {(item["kind"], item["map"]) for item in answer.json()["items"]}
 
     assert kinds("admin") >= {
         ("key.created", None), ("map.created", "mine"), ("map.created", "theirs")
@@ -154,7 +154,7 @@ def test_places_are_given_back_and_the_end_comes_at_once(guarded, keys, refused,
 
     def streams():
         text = guarded.client.get("/metrics", headers=keys["admin"]).text
-        (line,) = [one for one in text.splitlines() if one.startswith("sceneprint_event_streams ")]
+        (line,) = [x for x in text.splitlines() if x.startswith("sceneprint_event_streams ")]
         return float(line.split()[1])
 
     until(lambda: streams() == 0)  # of the tests before

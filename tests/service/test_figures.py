@@ -49,5 +49,5 @@ def test_as_many_files_may_be_open_as_the_system_lets(served):
     wanted = process.MOST if hard == resource.RLIM_INFINITY else min(hard, process.MOST)
     for pid in (served.process.pid, *served.workers):
         text = Path(f"/proc/{pid}/limits").read_text()
-        (line,) = [one for one in text.splitlines() if one.startswith("Max open files")]
+        (line,) = [line for line in text.splitlines() if line.startswith("Max open files")]
         assert int(line.split()[3]) >= wanted

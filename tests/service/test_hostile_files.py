@@ -57,7 +57,7 @@ def test_blobs_that_are_missing_cost_what_needs_them(
 ):
     monkeypatch.setenv("SCENEPRINT_GEOMETRY_CACHE_BYTES", "0")  # of which none is in memory
     server = begin("--workers", "0", folder=folder)
-    frames = [one["frame_id"] for one in server.client.get(f"{HALL}/frames").json()["items"]]
+    frames = [frame["frame_id"] for frame in server.client.get(f"{HALL}/frames").json()["items"]]
     asked = "SELECT s.geometry FROM signatures s JOIN frames f ON f.number = s.frame_number"
     ((blob,),) = rows(folder, f"{asked} WHERE f.id = '{frames[0]}'")
     (folder / "blobs" / blob[:2] / blob).unlink()

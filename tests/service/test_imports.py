@@ -13,8 +13,8 @@ def zipped(shots, folder="run", **more):
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w") as archive:
         archive.writestr(f"{folder}/intrinsics.json", json.dumps(shots[0].camera))
-        for i, one in enumerate(shots):
-            archive.writestr(f"{folder}/{i:03d}.png", one.png)
+        for i, shot in enumerate(shots):
+            archive.writestr(f"{folder}/{i:03d}.png", shot.png)
         for name, data in more.items():
             archive.writestr(name, data)
     return made.getvalue()

@@ -144,7 +144,7 @@ class There:
 
     @property
     def ids(self):
-        return [one for name, one in vars(self).items() if name != "session"]
+        return [value for name, value in vars(self).items() if name != "session"]
 
 
 @pytest.fixture(scope="module")
@@ -190,7 +190,7 @@ def there(walled, small_shots, until):
         jobs = [one.headers["location"].rpartition("/")[2] for one in list(begun.values())[:4]]
         alone = sent[0 if name == OWN else 2]["frame_id"]  # the other map has not its content
         names, *rows = copied(walled, "boss", name)
-        row = next(one for one in rows if one[0] == alone)
+        row = next(row for row in rows if row[0] == alone)
         found[name] = There(
             name, frame, query, sent[0]["job_id"], *jobs, tiles[0]["digest"], session,
             row[names.index("geometry")],
@@ -312,7 +312,7 @@ def test_lists_have_nothing_of_another_map(walled, there, operations):
                 one for one in (*there[THEIRS].ids, "keeper", "boss", "watcher") if one in text
             ] == [], path
     assert len(rows := copied(walled, "reader", OWN)) > 1
-    assert not [one for one in there[THEIRS].ids if one in str(rows)]
+    assert not [frame_id for frame_id in there[THEIRS].ids if frame_id in str(rows)]
     mine = walled.ask("reader", "GET", "/v1/maps").json()["items"]
     assert [one["name"] for one in mine] == [OWN]
     jobs = walled.ask("reader", "GET", "/v1/jobs?limit=1000").json()["items"]
@@ -370,8 +370,8 @@ def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
     for method in ("PUT", "DELETE"):
         unseen(walled, method, "/v1/queries/{}/keep", mixed)
     for path in ("/v1/queries?kept=true", f"/v1/queries?kept=true&map={OWN}"):
-        for one in walled.ask("admin", "GET", path).json()["items"]:
-            assert (one["maps"], one["title"]) == ([OWN], None)
+        for item in walled.ask("admin", "GET", path).json()["items"]:
+            assert (item["maps"], item["title"]) == ([OWN], None)
         assert mixed in walled.ask("boss", "GET", path).text, path
     fused = walled.ask("boss", "POST", f"/v1/queries/{mixed}/reconstruction", json={})
     assert fused.status_code == 202, fused.text

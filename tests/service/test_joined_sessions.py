@@ -118,7 +118,7 @@ def test_a_join_is_undone(rooms):
         assert join == rooms.job["result"]["joins"][0] | {"root": None, "undone": True}
     assert client.get(url).json() == undone.json()
     sessions = client.get(f"{rooms.path}/sessions").json()["items"]
-    assert {one["robot"]: one["parent_frames"] for one in sessions} == {
+    assert {session["robot"]: session["parent_frames"] for session in sessions} == {
         "ann": ["ann/morning"], "bob": ["bob/evening"],
     }  # fmt: skip
     now = client.get(f"{rooms.path}/frames", params=of_bob).json()["items"]

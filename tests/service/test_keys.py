@@ -70,7 +70,7 @@ def test_who_uses_a_key_waits_for_no_note_of_it(tmp_path):
         secret = engine.create_key("busy").secret
 
         def used():
-            return {one.name: one.last_used_at is not None for one in list_keys(engine.store).items}
+            return {key.name: key.last_used_at is not None for key in list_keys(engine.store).items}
 
         async def serve():
             service = Service(engine.context, Metrics())

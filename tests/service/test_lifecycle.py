@@ -29,7 +29,7 @@ def test_told_to_stop_it_finishes_the_frame_in_hand(begin, make_map, shots, unti
     server.gone()
     states = rows(server.folder, "SELECT f.state, j.state, j.attempts FROM frames f JOIN jobs j"
                                  " ON j.frame_number = f.number ORDER BY f.number")  # fmt: skip
-    done = [one for one in states if one == ("indexed", "succeeded", 1)]
+    done = [state for state in states if state == ("indexed", "succeeded", 1)]
     assert len(done) >= 1
     assert states == done + [("received", "queued", 0)] * (4 - len(done))
     for line in server.log():  # each line is JSON, to the last

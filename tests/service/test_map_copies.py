@@ -37,14 +37,14 @@ def test_a_reader_copies_what_is_indexed_and_nothing_else(house, small_shots, re
         [part] = head["parts"]
         assert part["sent"]
         assert (sha256(data).hexdigest(), len(data)) == (part["digest"], part["bytes"])
-        names, *rows = [json.loads(one) for one in zlib.decompress(data).split(b"\n")]
+        names, *rows = [json.loads(part) for part in zlib.decompress(data).split(b"\n")]
         assert len(rows) == part["rows"]
         return head, [dict(zip(names, row, strict=True)) for row in rows]
 
     head, rows = rows_of(copy())
     model = read_model("depth")
     assert (head["name"], head["model_id"], head["revision"]) == ("alpha", model.id, 4)
-    assert [one["id"] for one in rows] == ids[:2]  # of what waits and what is deleted, nothing
+    assert [row["id"] for row in rows] == ids[:2]  # of what waits and what is deleted, nothing
     for row in rows:
         assert len(base64.b64decode(row["vector"])) == model.signature_bytes
         data = get(f"/artifacts/{row['geometry']}")

@@ -24,7 +24,7 @@ def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
         answer = served.client.post("/v1/maps", json={"name": "hall", **other})
         refused(answer, 409, "map-exists", "'hall'")
     assert served.client.get("/v1/maps/hall").json()["title"] == "The hall"
-    names = [one["name"] for one in served.client.get("/v1/maps").json()["items"]]
+    names = [map_["name"] for map_ in served.client.get("/v1/maps").json()["items"]]
     assert "hall" in names
     assert names == sorted(names)
 
@@ -34,8 +34,8 @@ def test_what_is_no_slug_is_no_name(served, refused, name):
     problem = refused(
         served.client.post("/v1/maps", json={"name": name}), 422, "invalid-request", "name: "
     )
-    assert [one["field"] for one in problem["errors"]] == ["name"]
-    assert name not in [one["name"] for one in served.client.get("/v1/maps").json()["items"]]
+    assert [error["field"] for error in problem["errors"]] == ["name"]
+    assert name not in [map_["name"] for map_ in served.client.get("/v1/maps").json()["items"]]
 
 
 def test_an_upload_is_safe_then_signed_and_the_same_one_is_there_already(
@@ -104,7 +104,7 @@ def test_a_list_of_maps_is_the_maps_one_by_one(served, small_shots):
     assert asked.status_code == 200
     # the query log is written after the answer
     until(lambda: served.client.get("/v1/maps/queried").json()["recent_queries"])
-    listed = {one["name"]: one for one in served.client.get("/v1/maps").json()["items"]}
+    listed = {map_["name"]: map_ for map_ in served.client.get("/v1/maps").json()["items"]}
     for name, queries in (("counted", {}), ("queried", {asked.json()["status"]: 1})):
         one = listed[name]
         assert one == served.client.get(f"/v1/maps/{name}").json()

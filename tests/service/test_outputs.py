@@ -73,7 +73,7 @@ def test_a_signature_in_the_form_that_is_asked_for(served, shown):
     assert answers["application/octet-stream"].content == vector
     read = np.load(io.BytesIO(answers["application/x-npy"].content), allow_pickle=False)
     assert read.tobytes() == vector
-    assert len({one.headers["etag"] for one in answers.values()}) == 3
+    assert len({answer.headers["etag"] for answer in answers.values()}) == 3
 
 
 def test_pictures_and_uploads_are_files(served, shown, small_shots):

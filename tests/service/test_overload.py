@@ -43,13 +43,13 @@ def test_who_hangs_up_while_waiting_has_sent_a_frame_nevertheless(busy, until, s
     )
     lines = [f"POST {request.url.path} HTTP/1.1".encode()]
     lines += [key + b": " + value for key, value in request.headers.raw]
-    before = {one["frame_id"] for one in busy.client.get("/v1/maps/hall/frames").json()["items"]}
+    before = {f["frame_id"] for f in busy.client.get("/v1/maps/hall/frames").json()["items"]}
     with busy.connect() as wire:
         wire.sendall(b"\r\n".join(lines) + b"\r\n\r\n" + request.read())
 
         def came():
             page = busy.client.get("/v1/maps/hall/frames").json()
-            return {one["frame_id"] for one in page["items"]} - before
+            return {item["frame_id"] for item in page["items"]} - before
 
         (frame_id,) = until(came)
     again = busy.client.post("/v1/maps/hall/frames", **form)

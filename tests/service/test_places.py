@@ -94,7 +94,7 @@ def test_at_most_twenty_fields_are_listed(inside):
     async def test(app):
         wrong = {f"x{i}": 1 for i in range(300)} | {"y" * 999: 1, "name": "a"}
         problem = await Asked(app, "/v1/maps", JSON, [json.dumps(wrong).encode()]).problem()
-        assert [one["field"] for one in problem["errors"]] == [f"x{i}" for i in range(20)]
+        assert [error["field"] for error in problem["errors"]] == [f"x{i}" for i in range(20)]
         assert "(and 298 more; 20 of 301 are listed)" in problem["detail"]
 
     inside(test)
@@ -158,5 +158,5 @@ def test_where_there_is_no_room_to_read_nothing_is_taken(
             assert "folder" not in problem["detail"]
 
     inside(test, concurrent_requests=1, queued_requests=0)
-    told = [one for one in caplog.records if one.message == "request failed"]
+    told = [record for record in caplog.records if record.message == "request failed"]
     assert ["no room in /the/folder" in str(vars(one)["error"]) for one in told] == [True] * 3

@@ -173,7 +173,7 @@ def test_a_filter_that_makes_no_sense_is_named(
     form["data"] |= {"stages": "retrieve", "k": "50", "filter": given}
     answer = served.client.post(f"{hall}/queries", **form)
     problem = refused(answer, 422, "invalid-request")
-    assert [one["field"] for one in problem["errors"]] == [field]
+    assert [error["field"] for error in problem["errors"]] == [field]
     assert text in problem["errors"][0]["reason"]
 
 

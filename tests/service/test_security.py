@@ -79,7 +79,7 @@ def test_a_page_of_an_allowed_origin_may_ask_and_read(served, path):
     assert answer.status_code == (404 if "nowhere" in path else 200)
     assert answer.headers["access-control-allow-origin"] == FLEET
     assert answer.headers["vary"] == "Origin"
-    exposed = {one.strip() for one in answer.headers["access-control-expose-headers"].split(",")}
+    exposed = {part.strip() for part in answer.headers["access-control-expose-headers"].split(",")}
     assert {"ETag", "Idempotent-Replayed", "Location", "Retry-After", "X-Request-Id"} <= exposed
     assert "access-control-allow-credentials" not in answer.headers
 
@@ -247,7 +247,7 @@ def test_unknown_revoked_and_expired_keys_are_answered_alike(walled, refused):
 )
 def test_a_key_that_cannot_be_made_names_the_field(walled, refused, new, field):
     problem = refused(walled.ask("boss", "POST", "/v1/keys", json=new), 422, "invalid-request")
-    assert [one["field"] for one in problem["errors"]] == [field] or field in str(problem["errors"])
+    assert [e["field"] for e in problem["errors"]] == [field] or field in str(problem["errors"])
     assert "a" not in [key["name"] for key in walled.ask("boss", "GET", "/v1/keys").json()["items"]]
 
 

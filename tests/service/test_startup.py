@@ -56,7 +56,7 @@ def test_healthz_is_answered_before_there_is_an_application_and_as_by_it(slow):
             client.get("/healthz", headers={"Host": "rebound.example"}),
             client.get("/healthz", headers={"Origin": "http://elsewhere.example"}),
         ]
-        waiting = [asyncio.create_task(one) for one in others]
+        waiting = [asyncio.create_task(other) for other in others]
         done, _ = await asyncio.wait(waiting, timeout=0.3)
         assert done == set()
         go.set()

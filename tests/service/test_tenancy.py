@@ -49,7 +49,7 @@ def test_beyond_the_quota_nothing_is_taken(house, refused, small_shots):
         "data": {"metas": json.dumps({"intrinsics": a.camera})},
     }
     items = house.ask("robot", "POST", f"{path}/batch", **batch).json()["items"]
-    assert [one["status"] for one in items] == [200, 202, 403]
+    assert [item["status"] for item in items] == [200, 202, 403]
     assert items[2]["problem"]["type"] == "/problems/quota-exceeded"
     for method, place in (("POST", path), ("PUT", f"{path}/mine")):
         answer = house.ask("robot", method, place, **c.form())
@@ -58,7 +58,7 @@ def test_beyond_the_quota_nothing_is_taken(house, refused, small_shots):
     told = house.ask("tenant", "GET", "/v1/maps/alpha").json()
     assert (told["used_frames"], told["used_bytes"]) == (2, len(a.png) + len(b.png))
     # of another's use nobody is told
-    assert [one["name"] for one in house.ask("other", "GET", "/v1/maps").json()["items"]] == [
+    assert [map_["name"] for map_ in house.ask("other", "GET", "/v1/maps").json()["items"]] == [
         "bravo"
     ]
     other = house.ask("other", "GET", "/v1/maps/bravo").json()

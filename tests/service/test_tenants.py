@@ -90,9 +90,9 @@ def test_audit_lines_name_the_tenant_of_the_key(shared):
     shared.secrets["four"] = shared.ask("two", "POST", "/v1/keys", json=new).json()["secret"]
     assert shared.ask("four", "POST", "/v1/keys", json=new).status_code == 403
     told = [
-        (one["action"], one["tenant"])
+        (item["action"], item["tenant"])
         for name in ("two", "four")
-        for one in shared.ask("victim", "GET", f"/v1/audit?actor={name}&limit=1").json()["items"]
+        for item in shared.ask("victim", "GET", f"/v1/audit?actor={name}&limit=1").json()["items"]
     ]
     assert told == [("key.created", "noisy"), ("refused", "noisy")]
 

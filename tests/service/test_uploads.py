@@ -136,7 +136,7 @@ def test_a_key_makes_an_upload_take_effect_once(served, hall, small_shots, refus
 
 
 def batch(shots, metas, **fields):
-    files = [("frame", ("f.png", one if isinstance(one, bytes) else one.png)) for one in shots]
+    files = [("frame", ("f.png", shot if isinstance(shot, bytes) else shot.png)) for shot in shots]
     return {"files": files, "data": {"metas": json.dumps(metas), **fields}}
 
 
@@ -155,7 +155,7 @@ def test_a_batch_that_is_none_is_refused_whole(served, hall, small_shots, refuse
     refused(post(content=b"{}", headers={"Content-Type": "application/json"}), 415,
             "unsupported-type")  # fmt: skip
     frames = http.get(f"{hall}/frames", params={"limit": 200}).json()["items"]
-    assert not any(one["bytes"] == len(shot.png) for one in frames)
+    assert not any(frame["bytes"] == len(shot.png) for frame in frames)
 
 
 @pytest.mark.parametrize("given", ["11", "1.0", "high", "", "٣"])
@@ -163,6 +163,6 @@ def test_a_priority_is_a_small_whole_number(served, hall, small_shots, refused, 
     form = small_shots[30].form()
     form["data"] |= {"priority": given}
     problem = refused(served.client.post(f"{hall}/frames", **form), 422, "invalid-request")
-    assert [one["field"] for one in problem["errors"]] == ["priority"]
+    assert [error["field"] for error in problem["errors"]] == ["priority"]
     query = served.client.post(f"{hall}/queries", **form)
     refused(query, 422, "invalid-request", "an unknown part 'priority'")

@@ -21,7 +21,7 @@ def document():
 
 @pytest.fixture(scope="module")
 def pages():
-    return {one.path: one for one in generated_pages()}
+    return {page.path: page for page in generated_pages()}
 
 
 def test_every_operation_is_described_once_on_the_page_of_its_resource(document, pages):

@@ -60,7 +60,7 @@ def race():
     to, of = nursery.stdin, nursery.stdout
 
     def run(code, count, *args):
-        print(json.dumps([code, count, [str(one) for one in args]]), file=to, flush=True)
+        print(json.dumps([code, count, [str(argument) for argument in args]]), file=to, flush=True)
         answer = of.readline()
         assert answer, "the processes did not end well: see their traceback above"
         return json.loads(answer)
@@ -83,7 +83,7 @@ def empty_file(tmp_path_factory):
     """An empty SQLite file with the current schema, since copying is faster than creating."""
     path = tmp_path_factory.mktemp("empty") / "truth.db"
     open_database(f"sqlite:///{path}").close()
-    assert [one.name for one in path.parent.iterdir()] == [path.name]  # the log is empty
+    assert [path.name for path in path.parent.iterdir()] == [path.name]  # the log is empty
     return path
 
 

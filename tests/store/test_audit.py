@@ -33,7 +33,7 @@ def add_lines(store, *lines):
         "data": {},
     }  # fmt: skip
     with store.database.write() as connection:
-        connection.execute(insert(audit), [usual | one for one in lines])
+        connection.execute(insert(audit), [usual | line for line in lines])
 
 
 def fail_after_event(connection):
@@ -121,7 +121,7 @@ def test_pages_go_from_the_newest_to_the_oldest(store, monkeypatch):
     with pytest.raises(InvalidRequest):
         log.page(AuditFilter(), "none")
     monkeypatch.setattr(operations, "_BLOCK", 2)
-    assert [one.number for one in log.lines(AuditFilter())] == [1, 2, 3, 4, 5]
+    assert [line.number for line in log.lines(AuditFilter())] == [1, 2, 3, 4, 5]
 
 
 def test_old_lines_are_removed(store):

@@ -166,7 +166,7 @@ def test_what_others_leave_there_is_no_blob(kept):
     kept.write(f"blobs/{DIGEST[:2]}/.0123456789ab.part", b"half")
     kept.write("blobs/readme", DIGEST.encode())
     kept.write(f"blobs/{DIGEST[:2]}/{'0' * 64}", b"of another folder")
-    found = {Path(one.place).name: (one.digest, one.unfinished) for one in kept.blobs.entries()}
+    found = {Path(e.place).name: (e.digest, e.unfinished) for e in kept.blobs.entries()}
     part = found.pop(".0123456789ab.part", None)
     assert part in ((None, True), (None, False), None)  # an object store has no half objects
     assert found == {

@@ -71,9 +71,9 @@ def mixed(store, hall, received):
             write_frame(connection, hall, row, drawn(rng))
     with store.database.read() as connection:
         found = [
-            one
+            frame
             for state in FrameState
-            for one in list_frames(connection, hall.number, None, 99, FrameListing(state=state))
+            for frame in list_frames(connection, hall.number, None, 99, FrameListing(state=state))
         ]
     assert len(found) == 60
     return sorted(found, key=lambda row: row.number)

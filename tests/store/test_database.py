@@ -50,7 +50,7 @@ def test_a_damaged_page_is_said(url, store, tmp_path):
 
 def test_the_revisions_are_those_that_alembic_sees(store):
     scripts = ScriptDirectory.from_config(migration_config())
-    every = {one.revision for one in scripts.walk_revisions()}
+    every = {revision.revision for revision in scripts.walk_revisions()}
     assert known_revisions() == (scripts.get_current_head(), every)
     with store.database.read() as connection:
         context = MigrationContext.configure(connection)

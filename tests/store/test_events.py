@@ -94,7 +94,7 @@ def test_the_database_and_the_stream_pick_the_same(store):
 def test_events_are_counted_by_interval(store):
     fill(store, 60)
     with store.database.read() as connection:
-        every = [one for one in list_events(connection, EventFilter()) if one.at < 2000]
+        every = [event for event in list_events(connection, EventFilter()) if event.at < 2000]
         for start, width, name in (
             (1000.0, 10.0, None),
             (1007.5, 4.0, "hall"),
@@ -116,7 +116,7 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
     def told(since, *names):
         wanted = EventFilter(frozenset(names), since=since)
         with store.database.read() as connection:
-            found = [(one.kind, one.map) for one in list_events(connection, wanted)]
+            found = [(event.kind, event.map) for event in list_events(connection, wanted)]
             newest = newest_selected(connection, wanted)
             lost = removal_floor(connection, wanted, 1, 0)
             numbers = connection.execute(select(events.c.number, events.c.kind, events.c.map))

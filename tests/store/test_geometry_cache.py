@@ -33,7 +33,7 @@ def test_what_is_read_again_is_the_same_object_with_what_was_worked_out_of_it(bl
 
 
 def test_the_least_recently_used_goes_first_and_memory_stays_within_its_bound(blobs, artifacts):
-    digests = [blobs.put(one) for one in artifacts]
+    digests = [blobs.put(artifact) for artifact in artifacts]
     size = _size_of_one(blobs, digests[0])
     cache = GeometryCache(blobs, int(3.5 * size))
     read = [cache.read(digest) for digest in digests[:3]]
@@ -48,7 +48,7 @@ def test_the_least_recently_used_goes_first_and_memory_stays_within_its_bound(bl
 
 def test_a_deleted_frame_leaves_nothing(blobs, artifacts):
     cache = GeometryCache(blobs, 1 << 30)
-    digests = [blobs.put(one) for one in artifacts[:2]]
+    digests = [blobs.put(artifact) for artifact in artifacts[:2]]
     kept = [cache.read(digest) for digest in digests][1]
     blobs.remove(digests[0])
     cache.forget([digests[0], "f" * 64])
@@ -63,7 +63,7 @@ def test_what_was_read_long_ago_goes_however_often_it_is_used(blobs, artifacts, 
     now = [100.0]
     # the clock of other threads stays: an event loop that reads another time may sleep for hours
     monkeypatch.setattr(store, "time", SimpleNamespace(monotonic=lambda: now[0]))
-    cache, digests = GeometryCache(blobs, 1 << 30), [blobs.put(one) for one in artifacts[:2]]
+    cache, digests = GeometryCache(blobs, 1 << 30), [blobs.put(a) for a in artifacts[:2]]
     first = cache.read(digests[0])
     now[0] = 130.0
     second = cache.read(digests[1])

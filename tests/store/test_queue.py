@@ -152,7 +152,7 @@ def test_a_claim_is_looked_up_and_not_sorted(store, hall, plans):
     of_jobs = [one for one in said if "jobs" in one and one.startswith(("SEARCH", "SCAN"))]
     assert len(of_jobs) >= 8  # names, the next, best and turn of each; first; silent, turn; last
     indexes = ("INDEX ix_jobs_", "INTEGER PRIMARY KEY")
-    assert all(one.startswith("SEARCH") and any(i in one for i in indexes) for one in of_jobs)
+    assert all(line.startswith("SEARCH") and any(i in line for i in indexes) for line in of_jobs)
     assert not any("TEMP B-TREE" in one for one in said)
 
 

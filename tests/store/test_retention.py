@@ -31,7 +31,7 @@ def filled(store):
 
 
 def numbers_of(connection, name):
-    return [one.number for one in list_events(connection, EventFilter()) if one.map == name]
+    return [event.number for event in list_events(connection, EventFilter()) if event.map == name]
 
 
 def expected(connection, kept, anchors):
@@ -71,7 +71,7 @@ def test_what_happens_elsewhere_moves_nothing(filled):
             assert (removal_floor(connection, shop, 10, after) > after) == (after < own)
         gone = surplus_events(connection, 10, (), 9999)
         shop_numbers = numbers_of(connection, "shop")
-        shops = [one for one in shop_numbers if one < own]
+        shops = [shop for shop in shop_numbers if shop < own]
         assert [one for one in gone if one in shop_numbers] == shops
         assert removal_floor(connection, EventFilter(), 10, 0) > own
 

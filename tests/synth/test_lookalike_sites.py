@@ -62,7 +62,7 @@ def test_a_site_depends_on_its_seed_and_number_alone(kind, is_scanned):
     for one, same in zip((*site.map, *site.queries), (*again.map, *again.queries), strict=True):
         np.testing.assert_array_equal(samples(one), samples(same))
         np.testing.assert_array_equal(one.pose, same.pose)
-    assert min(np.count_nonzero(samples(one)) for one in site.queries) > 5000
+    assert min(np.count_nonzero(samples(query)) for query in site.queries) > 5000
     assert not np.array_equal(site.queries[0].pose, other.queries[0].pose)
     names = [frame.name for frame in (*site.map, *site.queries)]
     assert len(set(names)) == len(names)

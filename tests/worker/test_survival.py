@@ -68,7 +68,7 @@ def add_marked(engine, frame, what):
 
 def test_a_frame_that_ends_its_worker_is_given_up_and_costs_no_other(crew, frames):
     bad = {what: add_marked(crew.engine, frames[i], what) for i, what in enumerate(MARKS)}
-    good = [crew.engine.add_frame("hall", *one)[0].job_id for one in frames[8:12]]
+    good = [crew.engine.add_frame("hall", *frame)[0].job_id for frame in frames[8:12]]
     ended = {"failed": 4, "indexed": 4}  # four workers later, on a machine that is busy
     until(lambda: crew.engine.get_map("hall").frames == ended, 2 * PATIENCE_S)
     jobs = {what: crew.engine.get_job(job) for what, job in bad.items()}

@@ -13,9 +13,7 @@ def test_two_workers_sign_each_frame_once(crew, frames):
     added = []
     while len({crew.pid(one.job_id) for one in added}) < 2:  # on a busy machine one may sign some
         assert len(added) < 40
-        added += [
-            crew.engine.add_frame("many", *one)[0] for one in frames[len(added) : len(added) + 8]
-        ]
+        added += [crew.engine.add_frame("many", *f)[0] for f in frames[len(added) : len(added) + 8]]
         crew.settled("many", len(added))
     jobs = [crew.engine.get_job(one.job_id) for one in added]
     assert {(job.state, job.error) for job in jobs} == {("succeeded", None)}
@@ -29,8 +27,8 @@ def test_a_database_that_vanishes_for_a_moment_is_waited_for(crew, frames):
     crew.change("ALTER TABLE jobs RENAME TO away")
     until(lambda: len(crew.log("store unreachable")) >= 2)
     crew.change("ALTER TABLE away RENAME TO jobs")
-    for one in frames[32:36]:
-        crew.engine.add_frame("shaken", *one)
+    for frame in frames[32:36]:
+        crew.engine.add_frame("shaken", *frame)
     crew.settled("shaken", 4)
     output = crew.log("store unreachable")[0]["error"]  # in the words of either database
     assert re.search('no such table: jobs|relation "jobs" does not', output)

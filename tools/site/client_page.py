@@ -36,10 +36,10 @@ def public_methods(kind: type) -> dict[str, Callable[..., object]]:
 def public_properties(kind: type) -> dict[str, str]:
     """Return the properties of a class with their descriptions."""
     return {
-        name: inspect.getdoc(one) or ""
+        name: inspect.getdoc(value) or ""
         for base in reversed(kind.__mro__)
-        for name, one in vars(base).items()
-        if isinstance(one, property) and base.__module__.startswith("sceneprint_client")
+        for name, value in vars(base).items()
+        if isinstance(value, property) and base.__module__.startswith("sceneprint_client")
     }
 
 
@@ -89,13 +89,16 @@ def signature(name: str, function: Callable[..., object]) -> str:
     found = inspect.signature(function)
     parts: list[str] = []
     before: inspect._ParameterKind | None = None
-    for one in found.parameters.values():
-        if one.name in ("self", "cls"):
+    for parameter in found.parameters.values():
+        if parameter.name in ("self", "cls"):
             continue
-        if one.kind is one.KEYWORD_ONLY and before not in (one.VAR_POSITIONAL, one.KEYWORD_ONLY):
+        if parameter.kind is parameter.KEYWORD_ONLY and before not in (
+            parameter.VAR_POSITIONAL,
+            parameter.KEYWORD_ONLY,
+        ):
             parts.append("*")
-        before = one.kind
-        parts.append(_parameter(one))
+        before = parameter.kind
+        parts.append(_parameter(parameter))
     # The signature of a class omits its return type.
     returned = "" if name[:1].isupper() else f" -> {_annotation(found.return_annotation)}"
     line = f"{name}({', '.join(parts)}){returned}"
@@ -149,4 +152,4 @@ def _entries(body: str) -> Iterator[tuple[str, str]]:
     for entry in re.split(r"\n(?=\S)", body.strip("\n")):
         name, mark, meaning = entry.partition(" : ")
         if mark:
-            yield ", ".join(code(one.strip()) for one in name.split(",")), cell(meaning)
+            yield ", ".join(code(part.strip()) for part in name.split(",")), cell(meaning)

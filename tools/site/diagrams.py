@@ -227,9 +227,9 @@ def _route(source: Node, target: Node, link: Link, number: int) -> Iterator[Node
 
 def _order_layers(found: LayeredGraph) -> list[list[Node]]:
     """Return the order of nodes in each layer with the fewest crossings that the sweeps found."""
-    layers: list[list[Node]] = [[] for _ in range(max(one.layer for one in found.nodes) + 1)]
-    for one in found.nodes:
-        layers[one.layer].append(one)
+    layers: list[list[Node]] = [[] for _ in range(max(node.layer for node in found.nodes) + 1)]
+    for node in found.nodes:
+        layers[node.layer].append(node)
     best, fewest = [list(layer) for layer in layers], crossings(layers, found.routes)
     for sweep in range(24):
         step = 1 if sweep % 2 == 0 else -1
@@ -276,9 +276,9 @@ def _mean(values: Iterable[float], default: float) -> float:
 
 def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
     """Set the positions of nodes: layer after layer, and near their neighbours within a layer."""
-    size = {one.name: (one.height, one.width) if across else (one.width, one.height)
-            for one in found.nodes}  # fmt: skip
-    beside = {one.name: 0.0 for one in found.nodes}
+    size = {node.name: (node.height, node.width) if across else (node.width, node.height)
+            for node in found.nodes}  # fmt: skip
+    beside = {node.name: 0.0 for node in found.nodes}
     near: dict[str, list[str]] = defaultdict(list)
     for route in found.routes:
         for a, b in pairwise(route):
@@ -288,7 +288,7 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
         for layer in layers[:: 1 if sweep % 2 == 0 else -1]:
             wanted = [_mean([beside[o] for o in near[one.name]], beside[one.name]) for one in layer]
             _separate(layer, wanted, beside, {one.name: size[one.name][0] for one in layer})
-    low = min(beside[one.name] - size[one.name][0] / 2 for one in found.nodes)
+    low = min(beside[node.name] - size[node.name][0] / 2 for node in found.nodes)
     along = 2.0
     for layer in layers:
         depth = max(size[one.name][1] for one in layer)
@@ -298,8 +298,8 @@ def _place(found: LayeredGraph, layers: list[list[Node]], across: bool) -> None:
             places = beside[one.name] - low + 2.0, middle
             one.x, one.y = places[::-1] if across else places
         along += depth + (BETWEEN if depth else 0.0)
-    found.width = max(one.x + one.width / 2 for one in found.nodes) + 2.0
-    found.height = max(one.y + one.height / 2 for one in found.nodes) + 2.0
+    found.width = max(node.x + node.width / 2 for node in found.nodes) + 2.0
+    found.height = max(node.y + node.height / 2 for node in found.nodes) + 2.0
 
 
 def _separate(
@@ -346,7 +346,7 @@ def svg_of(diagram: Diagram, identity: str) -> str:
         dashed = ' class="dashed"' if link.dashed else ""
         path = _curve(route, diagram.across)
         parts.append(f'<path d="{path}"{dashed} marker-end="url(#{arrow})"/>')
-    parts += [_draw_node(one) for one in layout.nodes if one.lines]
+    parts += [_draw_node(node) for node in layout.nodes if node.lines]
     return "".join([*parts, "</svg>"])
 
 

@@ -138,10 +138,10 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add generated pages, linked files outside docs/, and assets."""
-    documents = [f"docs/{one.src_uri}" for one in files.documentation_pages()]
+    documents = [f"docs/{page.src_uri}" for page in files.documentation_pages()]
     _Build.sources = {site_path(path): path for path in documents}
-    for path, one in _Build.pages.items():
-        files.append(File.generated(config, path, content=one.text))
+    for path, page in _Build.pages.items():
+        files.append(File.generated(config, path, content=page.text))
     for path in sorted({*linked_files(ROOT, documents), *PROJECT.values()}):
         files.append(_linked_file(path, config))
         _Build.sources[site_path(path)] = path

@@ -65,7 +65,7 @@ def operations(document: Json) -> list[Operation]:
 
 def resource_page(name: str, document: Json) -> str:
     """Return Markdown that describes the operations of a resource."""
-    own = [one for one in operations(document) if one.resource == name]
+    own = [operation for operation in operations(document) if operation.resource == name]
     return page(
         f"# {name.capitalize()}",
         _overview(own, ""),
@@ -130,12 +130,12 @@ def _indented(text: str) -> str:
 def _parameters(parameters: list[Json]) -> str:
     rows = (
         (
-            code(one["name"]),
-            one["in"] + (" (required)" if one.get("required") else ""),
-            type_of(one["schema"]),
-            _meaning(one.get("description", "").removesuffix(BARE), one["schema"]),
+            code(parameter["name"]),
+            parameter["in"] + (" (required)" if parameter.get("required") else ""),
+            type_of(parameter["schema"]),
+            _meaning(parameter.get("description", "").removesuffix(BARE), parameter["schema"]),
         )
-        for one in parameters
+        for parameter in parameters
     )
     return table(("name", "in", "type", "meaning"), rows)
 
@@ -262,10 +262,10 @@ def _name_of(schema: Json) -> str:
 
 def _array(schema: Json) -> str:
     if "prefixItems" in schema:
-        return f"list of {', '.join(type_of(one) for one in schema['prefixItems'])}"
+        return f"list of {', '.join(type_of(item) for item in schema['prefixItems'])}"
     return f"list of {type_of(schema.get('items', {}))}"
 
 
 def resources(document: Json) -> Iterator[str]:
     """Yield the names of the resources that have operations."""
-    yield from sorted({one.resource for one in operations(document)})
+    yield from sorted({operation.resource for operation in operations(document)})

@@ -43,7 +43,7 @@ def test_it_says_what_it_would_do_and_what_it_did(house, fsck, tmp_path):
     )
     result = json.loads(record.read_text())
     assert result["checked"]["frames"] == 15
-    assert [(one["kind"], one["frame_id"], one["done"]) for one in result["findings"]] == [
+    assert [(f["kind"], f["frame_id"], f["done"]) for f in result["findings"]] == [
         ("foreign-file", None, None),
         ("stale-value", frame, None),
     ]

@@ -121,7 +121,7 @@ def test_a_damaged_index_is_removed_and_made_again(house, kind, truth, uploads):
     assert (actual.kind, actual.path, actual.done) == (
         "damaged-index", path.parent, "the index is removed"
     )  # fmt: skip
-    assert [one.suffix for one in path.parent.iterdir() if one.name != ".lock"] == []
+    assert [path.suffix for path in path.parent.iterdir() if path.name != ".lock"] == []
     assert house.look() == []
     assert house.answers(uploads[:12]) == truth
     with Engine(house.settings) as engine:

@@ -65,14 +65,14 @@ def test_a_backup_has_all_that_is_kept_and_can_be_restored(tmp_path):
             files = files_of(connection, find_job(connection, job_id).number)
             assert engine.store.blobs.get(files["mesh.ply"].blob) == b"a mesh"
             rows = list_queries(connection, WantedQueries(), None, 9)
-            assert [(one.id[0], one.kept_at, one.bytes) for one in rows] == [
+            assert [(row.id[0], row.kept_at, row.bytes) for row in rows] == [
                 ("b", None, 0), ("a", 1.0, 9)
             ]  # fmt: skip
             assert read_permanent_answer(connection, rows[1].number) == b"an answer"
             count = connection.exec_driver_sql("SELECT count(*) FROM queries").scalar_one()
             assert count == 2  # not the one that was stored only to look at its answer
         assert engine.tombstones.restore("hall", deletion).frames == 1
-        assert [one.robot for one in engine.list_frames("hall").items] == ["r1"]
+        assert [frame.robot for frame in engine.list_frames("hall").items] == ["r1"]
     assert list(fsck(again, grace_s=0)) == []
 
 

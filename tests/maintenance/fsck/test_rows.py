@@ -62,7 +62,7 @@ FAULTS = {
 
 
 def faults(findings):
-    return [one for one in findings if one.kind != "damaged-model"]
+    return [finding for finding in findings if finding.kind != "damaged-model"]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -76,7 +76,7 @@ def test_a_fault_is_named_and_repaired(house, fault):
     assert actual[0].frame_id
     assert actual[0].left
     assert house.files() == before
-    assert [one.left for one in faults(house.look(repair=True))] == [False]
+    assert [fault.left for fault in faults(house.look(repair=True))] == [False]
     assert house.sql(request) == after
     assert faults(house.look()) == []
 
