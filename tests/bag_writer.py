@@ -45,13 +45,13 @@ T_BASE_CAMERA = transform(0.21, -0.05, 0.93, -0.53, 0.49, -0.47, 0.51)
 def zero(types, name):
     plain_values = {"string": "", "bool": False, "float64": 0.0, "float32": 0.0}
     values = {}
-    for key, (kind, told) in types.fielddefs[name][1]:
+    for key, (kind, declaration) in types.fielddefs[name][1]:
         if kind == Nodetype.NAME:
-            values[key] = zero(types, told)
+            values[key] = zero(types, declaration)
         elif kind == Nodetype.BASE:
-            values[key] = plain_values.get(told[0], 0)
+            values[key] = plain_values.get(declaration[0], 0)
         elif kind == Nodetype.ARRAY:
-            values[key] = np.zeros(told[1])
+            values[key] = np.zeros(declaration[1])
         else:
             values[key] = []
     return types.types[name](**values)
@@ -145,7 +145,7 @@ class BagWriter:
 
     def transforms(self, t, edges, topic="/tf", *, length=1.0):
         """Write transforms with quaternions of a given length."""
-        made = []
+        transforms = []
         for (parent, child), T in edges.items():
             one = self.make(
                 "geometry_msgs/msg/TransformStamped",
@@ -153,8 +153,8 @@ class BagWriter:
             )  # fmt: skip
             one.transform.translation = self.vector(T[:3, 3])
             one.transform.rotation = self.quaternion(T, length)
-            made.append(one)
-        message = self.make("tf2_msgs/msg/TFMessage", transforms=made)
+            transforms.append(one)
+        message = self.make("tf2_msgs/msg/TFMessage", transforms=transforms)
         self.write(topic, "tf2_msgs/msg/TFMessage", t, message)
 
     def odometry(self, t, T, topic="/odom", child="base_link"):
@@ -243,14 +243,14 @@ class BagWriter:
         ]  # fmt: skip
         data = rows.view(np.uint8).reshape(height, -1)
         data = np.pad(data, ((0, 0), (0, padding)), constant_values=0xCD)
-        told = {
+        layout = {
             "height": height, "width": len(rows) // height, "point_step": rows.dtype.itemsize,
             "row_step": data.shape[1],
         } | more  # fmt: skip
         message = self.make(
             "sensor_msgs/msg/PointCloud2",
             header=self.header(t, frame), fields=fields, is_bigendian=big,
-            data=data.reshape(-1), is_dense=False, **told,
+            data=data.reshape(-1), is_dense=False, **layout,
         )  # fmt: skip
         self.write(topic, "sensor_msgs/msg/PointCloud2", t, message)
 

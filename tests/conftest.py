@@ -224,8 +224,8 @@ def _databases_go(request):
 
     server = os.environ["SCENEPRINT_TEST_SERVER"].replace("+psycopg", "")
     with psycopg.connect(f"{server}postgres", autocommit=True) as connection:
-        asked = "DELETE FROM folders WHERE place = %s OR starts_with(place, %s) RETURNING name"
-        for (name,) in connection.execute(asked, (place, f"{place}/")).fetchall():
+        statement = "DELETE FROM folders WHERE place = %s OR starts_with(place, %s) RETURNING name"
+        for (name,) in connection.execute(statement, (place, f"{place}/")).fetchall():
             connection.execute(f'DROP DATABASE "{name}" WITH (FORCE)'.encode())
 
 
@@ -258,11 +258,11 @@ def once(tmp_path_factory):
     def folder(name, make):
         with (shared / f"{name}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            made, begun = shared / name, shared / f"{name}.begun"
-            if not made.exists():
+            result, begun = shared / name, shared / f"{name}.begun"
+            if not result.exists():
                 make(begun)
-                begun.rename(made)
-        return made
+                begun.rename(result)
+        return result
 
     return folder
 
@@ -373,9 +373,9 @@ def truth():
 def rows(truth):
     """A function that returns the rows of a query on the database of a data folder."""
 
-    def ask(folder, asked):
+    def ask(folder, statement):
         with truth(folder) as connection:
-            return [tuple(row) for row in connection.exec_driver_sql(asked)]
+            return [tuple(row) for row in connection.exec_driver_sql(statement)]
 
     return ask
 

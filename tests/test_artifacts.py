@@ -38,7 +38,7 @@ def data(geometries):
     return write_geometry(geometries[0])
 
 
-def made(height, width, patches, depth=2.0, length=16):
+def artifact_geometry(height, width, patches, depth=2.0, length=16):
     """An artifact of a flat wall, or of nothing seen."""
     k = Intrinsics(width, height, 60.0, 60.0, width / 2, height / 2)
     y, x = np.mgrid[:height, :width]
@@ -105,7 +105,7 @@ def test_round_trip(geometries):
 
 
 def test_normals_of_every_direction_come_back():
-    geometry = made(60, 80, 1)
+    geometry = artifact_geometry(60, 80, 1)
     normals = np.random.default_rng(1).normal(size=(60, 80, 3))
     normals[0, :6] = [[0, 0, -1], [0, 0, 1], [1, 0, 0], [0, -1, 0], [1, 1, 0], [-1, 1, 1e-9]]
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
@@ -124,7 +124,7 @@ def test_reading_and_writing_again_changes_no_byte(geometries):
 
 def test_the_layout_is_what_its_schema_says():
     assert (MAGIC, SCHEMA_VERSION) == (b"SPGEO", 1)
-    geometry = made(2, 3, 1, length=4)
+    geometry = artifact_geometry(2, 3, 1, length=4)
     geometry.surface.valid[0, 0] = False
     geometry.surface.points[0, 0] = geometry.surface.normals[0, 0] = 0.0
     geometry.surface.points[1, 2, 2] = 4.0
@@ -145,7 +145,7 @@ def test_the_layout_is_what_its_schema_says():
 
 
 def test_where_nothing_was_seen():
-    geometry = made(3, 4, 2, 0.0)
+    geometry = artifact_geometry(3, 4, 2, 0.0)
     read = read_geometry(write_geometry(geometry))
     assert read.surface.valid.shape == (3, 4)
     for array in (read.surface.valid, read.surface.points, read.surface.normals):
@@ -155,7 +155,7 @@ def test_where_nothing_was_seen():
 
 def test_depths_far_apart_do_not_become_missing():
     # a sample 100,000 times as far as the nearest: less than one step, but still seen
-    geometry = made(2, 2, 0, 0.3)
+    geometry = artifact_geometry(2, 2, 0, 0.3)
     geometry.surface.points[0, 0, 2] = 30_000.0
     read = read_geometry(write_geometry(geometry)).surface
     assert read.valid.all()
@@ -203,7 +203,7 @@ def test_sizes_that_the_bytes_do_not_hold(data):
 
 
 def test_a_camera_and_a_scale_that_are_none():
-    data = write_geometry(made(2, 3, 0, length=0))
+    data = write_geometry(artifact_geometry(2, 3, 0, length=0))
     for at, value in ((8, 0.0), (8, float("nan")), (16, -1.0), (24, float("inf")), (32, 1e9)):
         with pytest.raises(UnreadableGeometry, match="has an invalid camera"):
             read_geometry(sealed(data, at, struct.pack("<d", value)))
@@ -230,8 +230,8 @@ def test_patches_that_are_none(at, data):
 
 
 def test_more_than_a_model_makes():
-    most = write_geometry(made(2, 3, 4096, length=1))
+    most = write_geometry(artifact_geometry(2, 3, 4096, length=1))
     assert len(read_geometry(most).patches) == 4096
     for patches, length in ((4097, 1), (1, 1025)):
         with pytest.raises(UnreadableGeometry, match="invalid or exceed the limits"):
-            read_geometry(write_geometry(made(2, 3, patches, length=length)))
+            read_geometry(write_geometry(artifact_geometry(2, 3, patches, length=length)))

@@ -11,7 +11,7 @@ from sceneprint.errors import UnreadableGeometry
 from sceneprint.formats.artifact import MAXIMUM_POINTS, read_geometry, write_geometry
 from sceneprint.geometry.surface.range_image import directions
 from sceneprint.types import Geometry, Patches, Sphere, Surface
-from tests.test_artifacts import made, sealed
+from tests.test_artifacts import artifact_geometry, sealed
 
 #: Bytes of magic, schema and checksum; and of sizes, camera, step and model id.
 HEAD, BODY = 11, 10 + 4 * 8 + 32
@@ -184,7 +184,7 @@ def test_any_numbers_make_finite_points():
     """What is read, whatever its bytes, can be validated with."""
     rng = np.random.default_rng(6)
     read = 0
-    for data in map(write_geometry, (scan(), fused(300), spinning(), made(4, 5, 2))):
+    for data in map(write_geometry, (scan(), fused(300), spinning(), artifact_geometry(4, 5, 2))):
         for _ in range(150):
             at = int(rng.integers(8, BODY - 32))
             field = rng.integers(0, 256, int(rng.integers(1, 9)), np.uint8).tobytes()

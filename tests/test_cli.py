@@ -265,10 +265,10 @@ def test_sites_are_written_as_clouds_with_poses(tmp_path):
     out = tmp_path / "sites"
     arguments = ["--rooms", "1", "--views", "2", "--seed", "5", "--jobs", "1"]
     run("synth", out, "--sensor", "lidar", *arguments)
-    made = synthesise_survey(5, 0, 2)
+    survey = synthesise_survey(5, 0, 2)
     (sequence,) = find_sequences(out)
     read = [reference.read() for reference in sequence.frames]
-    for cloud, one in zip(read, made.clouds, strict=True):
+    for cloud, one in zip(read, survey.clouds, strict=True):
         assert isinstance(cloud, Cloud)
         np.testing.assert_array_equal(cloud.points, one.points)
         np.testing.assert_allclose(cloud.pose, one.pose, atol=1e-6)

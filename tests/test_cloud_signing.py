@@ -91,11 +91,11 @@ def test_any_points_are_signed_or_refused(
 
 def test_points_in_any_order_are_one_cloud(small_signer, room_frames):
     for has_viewpoint in (True, False):
-        made = [
+        signatures = [
             prepare(cloud_of(room_frames[0], seed, has_viewpoint=has_viewpoint), small_signer)
             for seed in (1, 2)
         ]
-        (a, of_a), (b, of_b) = made
+        (a, of_a), (b, of_b) = signatures
         assert a.vector.tobytes() == b.vector.tobytes()
         assert of_a.surface.points.tobytes() == of_b.surface.points.tobytes()
         assert of_a.descriptors.tobytes() == of_b.descriptors.tobytes()

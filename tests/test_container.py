@@ -330,9 +330,9 @@ def built(folder):
 @pytest.fixture(scope="module")
 def image(tmp_path_factory):
     """Made once for this file, in minutes; `--dist loadfile` keeps a file in one process."""
-    made = built(tmp_path_factory.mktemp("image"))
-    made.env["HOME"] = "/nonexistent"  # the user has none
-    return made
+    result = built(tmp_path_factory.mktemp("image"))
+    result.env["HOME"] = "/nonexistent"  # the user has none
+    return result
 
 
 @pytest.fixture
@@ -388,11 +388,11 @@ def test_service_and_worker_run_as_composed(image, start, room_frames, tmp_path)
     assert httpx.get(f"{url}/v1/maps").status_code == 401
     documented = set(re.findall(r"docker compose exec service (.+?) NAME", DOCKERFILE + COMPOSE))
     assert documented == {"sceneprint keys --create"}
-    made = subprocess.run(
+    key = subprocess.run(
         image.command([*documented.pop().split(), "robot"]), env=image.env, text=True,
         capture_output=True, check=True, cwd=image.root,
     )  # fmt: skip
-    with Client(url, made.stdout.strip(), timeout_s=PATIENCE_S) as client:
+    with Client(url, key.stdout.strip(), timeout_s=PATIENCE_S) as client:
         client.create_map("hall")
         worker, worker_log = start("worker", port)
         lens, path = room_frames[0].intrinsics, tmp_path / "frame.npy"

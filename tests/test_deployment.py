@@ -64,8 +64,8 @@ def database(*ports):
 
 @pytest.mark.thorough
 def test_commands_in_their_order(primary, run, tmp_path):
-    (made,) = blocks("The database")
-    run(made)
+    (commands,) = blocks("The database")
+    run(commands)
     one, there_and, back = tmp_path / "one", *blocks("From one machine to a fleet, and back")
     with Engine(Settings(data_dir=one)) as engine:
         engine.create_map(NewMap(name="building", model="depth"))

@@ -241,10 +241,10 @@ def view(name):
 def test_signatures(preset):
     signer = pipeline.open_signer(preset)
     for name in VIEWS:
-        made = pipeline.sign(view(name), signer).vector[:FROZEN]
-        rows = [made[i : i + ROW].tobytes().hex() for i in range(0, len(made), ROW)]
+        signature = pipeline.sign(view(name), signer).vector[:FROZEN]
+        rows = [signature[i : i + ROW].tobytes().hex() for i in range(0, len(signature), ROW)]
         kept = golden(f"signatures/{preset}-{name.replace(' ', '-')}.hex", rows)
-        off = np.abs(made.astype(int) - np.frombuffer(bytes.fromhex("".join(kept)), np.uint8))
+        off = np.abs(signature.astype(int) - np.frombuffer(bytes.fromhex("".join(kept)), np.uint8))
         # floating sums differ between processors: a component in a hundred may round otherwise
         assert off.max() <= 1, name
         assert (off == 0).mean() >= 0.99, name

@@ -31,10 +31,10 @@ def definitions(tree):
 def code_lines(node):
     """Lines of a function but for its docstring, which may be as long as it is useful."""
     first = node.body[0]
-    told = 0
+    docstring_lines = 0
     if ast.get_docstring(node) is not None:
-        told = (first.end_lineno or 0) - first.lineno + 1
-    return (node.end_lineno or 0) - node.lineno + 1 - told
+        docstring_lines = (first.end_lineno or 0) - first.lineno + 1
+    return (node.end_lineno or 0) - node.lineno + 1 - docstring_lines
 
 
 def test_a_long_function_says_why():

@@ -156,8 +156,8 @@ def test_a_pose_is_found_where_it_outweighs_every_other(blank, here, there, stat
     else:
         assert found.average is None
         assert "less than twice the weight" in found.reason
-        told = [(alternative.support, alternative.T[0, 3]) for alternative in found.alternatives]
-        assert told == [(here, pytest.approx(0.0)), (there, pytest.approx(5.0))]
+        others = [(alternative.support, alternative.T[0, 3]) for alternative in found.alternatives]
+        assert others == [(here, pytest.approx(0.0)), (there, pytest.approx(5.0))]
 
 
 def test_weak_and_ambiguous_matches_weigh_less_and_still_compete(blank):
@@ -332,8 +332,8 @@ APART = 100.0
 def picture(*tiles):
     """Runs of tiles, the first row first: how many, and how much farther off."""
     off = np.full(TILES, NOTHING)
-    told = np.repeat([away for _, away in tiles], [count for count, _ in tiles])
-    off[: len(told)] = told
+    offsets = np.repeat([away for _, away in tiles], [count for count, _ in tiles])
+    off[: len(offsets)] = offsets
     depth = np.nan_to_num(20.0 + 0.1 * np.arange(TILES) + off)
     image = np.kron(depth.reshape(6, 10), np.ones((10, 10)))
     y, x = np.mgrid[:60, :100]
@@ -361,8 +361,8 @@ def told_by(*places, parent="", rendered=None):
     pictures = [one for place in places for one in place]
     poses = [shifted(APART * k) for k, place in enumerate(places) for _ in place]
 
-    def views_of(asked, at):
-        opened = pictures.__getitem__ if asked == parent else lambda _: None
+    def views_of(frame, at):
+        opened = pictures.__getitem__ if frame == parent else lambda _: None
         return MapViews(np.stack(poses), opened, BY_HAND.map, FIXED, rendered=rendered)
 
     return views_of
@@ -398,14 +398,14 @@ def test_a_score_by_hand():
         picture(),
     ])("", np.empty((0, 4, 4)))  # fmt: skip
     query = map_frame(WHOLE, np.eye(4), BY_HAND.map, FIXED)
-    told = score_pose([query], np.eye(4), views, BY_HAND.map, FIXED)
+    score = score_pose([query], np.eye(4), views, BY_HAND.map, FIXED)
     # tiles 0 to 39 have more for than against, 40 to 44 as much, 45 to 49 are seen through
     violations, hidden = 5 / 45, 3 / (40 + 45 + 30 + 3)
-    assert (told.views, told.planes) == (((0, 1), (0, 0), (0, 2)), 40.0)
-    assert (told.share, told.violations, told.hidden) == pytest.approx(
+    assert (score.views, score.planes) == (((0, 1), (0, 0), (0, 2)), 40.0)
+    assert (score.share, score.violations, score.hidden) == pytest.approx(
         (40 / 60, violations, hidden)
     )
-    assert told.score == pytest.approx(40 / 60 * (1 - 2 * (violations + hidden)))
+    assert score.score == pytest.approx(40 / 60 * (1 - 2 * (violations + hidden)))
 
 
 def test_the_best_places_are_refined_and_hopeless_ones_left_out():
@@ -621,8 +621,8 @@ def test_the_map_alone_may_decide_where_no_match_votes():
     assert (itself.support, found.votes) == (0, 0)
     # what a caller asks of matches, a pose without the vote of one does not meet
     strict = replace(BY_HAND, voted_only=True)
-    told = judged(suggested, [WHOLE] * 8, p=strict)
-    assert (told.status, told.alternatives) == ("not_found", ())
+    answer = judged(suggested, [WHOLE] * 8, p=strict)
+    assert (answer.status, answer.alternatives) == ("not_found", ())
     voted = judged([*suggested, suggested_at(0.0, 4, "ambiguous")], [WHOLE] * 8, p=strict)
     assert voted.status == "found"
 
@@ -727,22 +727,22 @@ def test_a_prior_chooses_the_parent_frame_unless_matches_have():
     parents = ["here", "here", "here", "there", "there"]
     views_of = told_by([WHOLE] * 8, [picture((56, SAME))], parent="there")
 
-    def asked(matches, parent, x=0.0):
+    def answer(matches, parent, x=0.0):
         prior = PosePrior(parent, shifted(x), np.eye(6) * 0.01)
         frames = [QueryFrame(WHOLE, matches)]
         found = localize(frames, ROWS[:5], parents, views_of, prior, BY_HAND, FIXED)
         return found.status, found.parent, found.verified_by
 
     tried = [suggested_at(0.0, row) for row in range(5)]  # three of them here
-    assert asked(tried, "here")[1] == "here"
-    assert asked(tried, "there") == ("found", "there", "map")
+    assert answer(tried, "here")[1] == "here"
+    assert answer(tried, "there") == ("found", "there", "map")
     # of a parent frame that no match has, the prior tells nothing about that of the accepted:
     # its numbers are those of a pose there that fits too
     accepted = [*seen_at(0.0, [3, 4]), suggested_at(APART, 3)]
-    assert asked([*tried[:2], *accepted], "here", APART) == ("ambiguous", "there", None)
-    assert asked([*tried[:2], *accepted], "there", APART) == ("found", "there", "prior")
+    assert answer([*tried[:2], *accepted], "here", APART) == ("ambiguous", "there", None)
+    assert answer([*tried[:2], *accepted], "there", APART) == ("found", "there", "prior")
     both = [*seen_at(0.0, [0, 1]), *seen_at(0.0, [3])]
-    assert asked(both, "there")[1] == "there"
+    assert answer(both, "there")[1] == "there"
 
 
 def test_the_parent_frame_is_that_of_the_strongest_matches(blank):
@@ -886,8 +886,8 @@ def test_rivals_are_about_as_near_as_the_farthest_vote(blank):
     at_origin = by_pairs(blank, seen_at(0.0, [0, 1]))
     nearest, distances = [0, 4, 1, 2, 3], (10, 11, 100, 120, 121)
     assert corridor_rivals(at_origin, nearest, [0, 1], distances=distances, rivals=9) == [4, 2]
-    told = corridor_rivals(at_origin, nearest, [0, 1], distances=distances, rival_distance=1.0)
-    assert told == [4]
+    rivals = corridor_rivals(at_origin, nearest, [0, 1], distances=distances, rival_distance=1.0)
+    assert rivals == [4]
     # the farthest that was tried did not vote; one that votes was not ranked
     without = corridor_rivals(
         at_origin, [1, 2, 3, 5], [1, 5], distances=(100, 119, 121, 130), rivals=9
@@ -919,13 +919,13 @@ def test_rivals_are_asked_of_nothing_that_is_not_found(blank):
 def test_what_was_not_compared_is_ambiguous(blank):
     sure = by_pairs(blank, seen_at(4.0, [0, 1]))
     assert sure.average is not None
-    told = mark_unconfirmed(sure)
-    assert (told.status, told.average, told.strength, told.members) == ("ambiguous", None, None, ())
-    assert (told.covariance, told.verified_by, told.guided) == (None, None, 0)
-    [pose] = told.alternatives
+    weak = mark_unconfirmed(sure)
+    assert (weak.status, weak.average, weak.strength, weak.members) == ("ambiguous", None, None, ())
+    assert (weak.covariance, weak.verified_by, weak.guided) == (None, None, 0)
+    [pose] = weak.alternatives
     np.testing.assert_allclose(pose.T, shifted(4.0), atol=1e-12)
     assert pose.support == 2
-    assert mark_unconfirmed(told) is told
+    assert mark_unconfirmed(weak) is weak
 
 
 class Shelf:

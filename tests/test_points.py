@@ -39,22 +39,22 @@ def test_points_are_read_back():
     patches = rng.integers(-1, 600, 300).astype(np.int32)
     residuals = rng.integers(0, 256, 300).astype(np.uint8)
     data = encode_points(points, normals, patches, residuals, total=777, scale=0.05)
-    head, told = decoded(data)
+    head, rows = decoded(data)
     assert (head["flags"], head["total"]) == (7, 777)
     assert head["scale"] == np.float32(0.05)
     assert head["origin"] == pytest.approx(points.min(axis=0), abs=1e-6)
     assert np.add(head["origin"], head["extent"]) == pytest.approx(points.max(axis=0), abs=1e-6)
     half = np.array(head["extent"]) / 65535 / 2 + 1e-6
-    assert (abs(np.array([one["at"] for one in told]) - points) <= half).all()
-    assert (abs(np.array([one["normal"] for one in told]) - normals) <= 0.5 / 127 + 1e-9).all()
-    assert [one["patch"] for one in told] == [65535 if p < 0 else p for p in patches.tolist()]
-    assert [one["residual"] for one in told] == residuals.tolist()
+    assert (abs(np.array([one["at"] for one in rows]) - points) <= half).all()
+    assert (abs(np.array([one["normal"] for one in rows]) - normals) <= 0.5 / 127 + 1e-9).all()
+    assert [one["patch"] for one in rows] == [65535 if p < 0 else p for p in patches.tolist()]
+    assert [one["residual"] for one in rows] == residuals.tolist()
 
 
 def test_far_from_its_origin_a_cloud_keeps_its_shape():
     points = 4e6 + np.array([[0.0, 0, 0], [1, 2, 0.25], [0.5, 1, 0.25]])
-    _, told = decoded(encode_points(points))
-    apart = np.array([one["at"] for one in told]) - told[0]["at"]
+    _, rows = decoded(encode_points(points))
+    apart = np.array([one["at"] for one in rows]) - rows[0]["at"]
     assert apart == pytest.approx(points - points[0], abs=1e-4)
 
 

@@ -108,14 +108,14 @@ def test_diversify_is_the_selection_from_distances_among_the_ranking(model_a):
 
 def test_prepare_is_sign_and_geometry_of_one_look(small_signer, room_frames):
     model = small_signer.model
-    made, geometry = prepare(room_frames[0], small_signer)
-    np.testing.assert_array_equal(made.vector, sign(room_frames[0], small_signer).vector)
+    signature, geometry = prepare(room_frames[0], small_signer)
+    np.testing.assert_array_equal(signature.vector, sign(room_frames[0], small_signer).vector)
     seen = see(room_frames[0], model.parameters)
     alone = geometry_of(seen, model)
     assert alone.surface is seen
     np.testing.assert_array_equal(geometry.surface.points, seen.points)
     np.testing.assert_array_equal(geometry.descriptors, alone.descriptors)
-    assert geometry.model_id == made.model_id == model.id
+    assert geometry.model_id == signature.model_id == model.id
     # the patches are of their own segmentation, the descriptors of its surroundings
     p = model.parameters
     patches = extract_patches(seen, segment(seen, p.validation_segmentation))
@@ -222,14 +222,14 @@ def test_frames_are_judged_by_the_numbers_of_their_model(room_frames, small_mode
     lidar = read_model("lidar")
     halls = [replace(one, model_id=lidar.id) for one in (query, match)]
     p = lidar.parameters.validation
-    own, told, indoors = validate(*halls), validate(*halls, p=p), validate(query, match)
-    assert (own.reason, own.inliers) == (told.reason, told.inliers)
+    own, outdoors, indoors = validate(*halls), validate(*halls, p=p), validate(query, match)
+    assert (own.reason, own.inliers) == (outdoors.reason, outdoors.inliers)
     assert own.inliers != indoors.inliers
     strict = replace(small_model.parameters.validation, minimum_patches=10_000)
     other = replace(small_model, parameters=replace(small_model.parameters, validation=strict))
     mine = [replace(one, model_id=other.id) for one in (query, match)]
     with pytest.raises(ModelMismatch, match=r"has not been used by this process. Pass `p`"):
         validate(*mine)
-    made = geometry_of(see(room_frames[0], other.parameters), other)
-    assert made.model_id == other.id
+    geometry = geometry_of(see(room_frames[0], other.parameters), other)
+    assert geometry.model_id == other.id
     assert validate(*mine).status == "rejected"

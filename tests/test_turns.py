@@ -55,14 +55,14 @@ def test_who_waits_for_too_long_gets_none_and_holds_nobody_up():
 
 
 def test_after_the_end_there_are_no_turns():
-    turns, told = ThreadTurns(1), list[bool]()
+    turns, results = ThreadTurns(1), list[bool]()
     assert turns.acquire("a", 60)
-    waiting = threading.Thread(target=lambda: told.append(turns.acquire("b", 600)))
+    waiting = threading.Thread(target=lambda: results.append(turns.acquire("b", 600)))
     waiting.start()
     await_waiting(turns, 1)
     turns.close()
     waiting.join(PATIENCE_S)
-    assert told == [False]
+    assert results == [False]
     assert not turns.acquire("c", 600)
 
 

@@ -93,9 +93,9 @@ def content():
 
 @pytest.fixture(scope="session")
 def rows():
-    def ask(folder, asked):
+    def ask(folder, statement):
         with closing(sqlite3.connect(folder / "sceneprint.db", timeout=PATIENCE_S)) as database:
-            results = database.execute(asked).fetchall()
+            results = database.execute(statement).fetchall()
             database.commit()
             return results
 
@@ -104,14 +104,14 @@ def rows():
 
 @pytest.fixture(scope="session")
 def answers():
-    def of(settings, asked):
+    def of(settings, uploads):
         free = {"query_id": "", "milliseconds": {}}
         with Engine(settings) as engine:
             return [
                 engine.queries.upload(["hall"], one.data, one.meta, Query(exact=True)).model_copy(
                     update=free
                 )
-                for one in asked
+                for one in uploads
             ]
 
     return of

@@ -35,9 +35,9 @@ def fleet_of(folder, url, **other):
     return Settings(data_dir=folder, database_url=SecretStr(url), index_dir=None, **other)
 
 
-def ask(url, asked):
+def ask(url, statement):
     with psycopg.connect(url.replace("+psycopg", ""), autocommit=True) as connection:
-        return connection.execute(asked).fetchall()
+        return connection.execute(statement).fetchall()
 
 
 def rows_in(url):

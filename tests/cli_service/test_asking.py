@@ -30,24 +30,24 @@ def maps(service_url, whole_rooms):
 
 def test_a_query_says_where_frames_were_lost(sceneprint, maps, whole_rooms):
     frame = whole_rooms / "room-0" / "seq-01" / "frame-000000.depth.png"
-    asked = ("query", "near", frame, "--candidates", 1, "--validation", "weak=0", "--no-keep")
+    command = ("query", "near", frame, "--candidates", 1, "--validation", "weak=0", "--no-keep")
     explained = ("--explain", "--explain-frame", maps["near"][1])
-    told = json.loads(sceneprint(*asked, *explained, "--json").stdout)
-    assert (told["counts"]["selected"], told["matches"][0]["validation"]["strength"]) == (1, "weak")
-    lines = sceneprint(*asked, *explained).stdout.splitlines()
+    body = json.loads(sceneprint(*command, *explained, "--json").stdout)
+    assert (body["counts"]["selected"], body["matches"][0]["validation"]["strength"]) == (1, "weak")
+    lines = sceneprint(*command, *explained).stdout.splitlines()
     first, second = (f"{maps['near'][i]} (frame-00000{i}.depth.png)" for i in range(2))
     assert lines[-3].startswith(f"     1  {first}  1.00  validate: accepted; accepted:")
     assert "retrieve: not selected; most similar to the selected frame" in lines[-2]
     assert lines[-1].startswith(f"  {second}: rank 2 of 2; dropped at selection: ")
     several = ("--map", "far", "--diversity", "omega=1000", "--json")
-    both = json.loads(sceneprint(*asked, *several).stdout)
+    both = json.loads(sceneprint(*command, *several).stdout)
     assert (both["maps"], both["counts"]["map"]) == (["near", "far"], 4)
     for options, text in (
         (["--diversity", "tau=2"], "diversity.tau"),
         (["--validation", "mode=fast"], "validation.mode"),
         (["--map", "nowhere"], "'nowhere'"),
     ):
-        assert text in sceneprint(*asked, *options, expect=2).stderr
+        assert text in sceneprint(*command, *options, expect=2).stderr
 
 
 def test_a_frame_is_localized(sceneprint, maps, whole_rooms):
@@ -66,8 +66,8 @@ def test_a_frame_is_localized(sceneprint, maps, whole_rooms):
     assert ": not found; none of 2 candidates is accepted" in lost
     assert lost.splitlines()[1] == "  cause: nothing_alike"
     prior = {"pose": {"parent_frame": "room-0/seq-01", "matrix": np.eye(4).tolist()}}
-    asked = ("localize", "near", whole_rooms / "room-0", "--prior", json.dumps(prior))
-    refused = sceneprint(*asked, expect=2).stderr
+    command = ("localize", "near", whole_rooms / "room-0", "--prior", json.dumps(prior))
+    refused = sceneprint(*command, expect=2).stderr
     assert "has 3 frames, but --prior applies to one. Select it with --frame.\n" in refused
 
 
@@ -79,22 +79,22 @@ def sides(service_url, tmp_path_factory):
         client.create_map("sides", model="depth")
         for one in circled((30, 120, 210, 300)):
             client.upload("sides", one.data, FrameMeta.model_validate(one.meta), wait_s=PATIENCE_S)
-    (asked,) = circled([40])
-    (folder / "view.npy").write_bytes(asked.data)
-    (folder / "intrinsics.json").write_text(json.dumps(asked.meta["intrinsics"]))
-    return folder / "view.npy", asked.meta["pose"]["matrix"]
+    (view,) = circled([40])
+    (folder / "view.npy").write_bytes(view.data)
+    (folder / "intrinsics.json").write_text(json.dumps(view.meta["intrinsics"]))
+    return folder / "view.npy", view.meta["pose"]["matrix"]
 
 
 def test_an_ambiguous_place_is_told_with_its_alternatives(sceneprint, sides):
     file, truth = sides
-    told = json.loads(sceneprint("localize", "sides", file, "--json", expect=1).stdout)
-    assert (told["status"], told["pose"], len(told["alternatives"])) == ("ambiguous", None, 4)
+    answer = json.loads(sceneprint("localize", "sides", file, "--json", expect=1).stdout)
+    assert (answer["status"], answer["pose"], len(answer["alternatives"])) == ("ambiguous", None, 4)
     located = sceneprint("localize", "sides", file, expect=1).stdout.splitlines()
-    assert f"/view: ambiguous {floored(told['confidence'])} %; {told['reason']} (" in located[0]
+    assert f"/view: ambiguous {floored(answer['confidence'])} %; {answer['reason']} (" in located[0]
     assert located[1:] == sceneprint("query", "sides", file).stdout.splitlines()[-5:]
     assert located[1] == "  4 poses are supported; at most one is right:"
     places = []
-    for line, alternative in zip(located[2:], told["alternatives"], strict=True):
+    for line, alternative in zip(located[2:], answer["alternatives"], strict=True):
         sure, _, x, y = line.split()[:4]
         assert float(sure) == floored(alternative["confidence"])
         assert f" m in hall, support 1; {round(alternative['evidence']['planes'])} plane" in line
@@ -113,15 +113,15 @@ def floored(confidence):
 def test_frames_of_a_folder_are_asked_with_those_before_them(
     sceneprint, maps, whole_rooms, tmp_path
 ):
-    asked = ("localize", "near", whole_rooms / "room-0")
-    first, both, last = map(json.loads, sceneprint(*asked, "--json").stdout.splitlines())
-    alone = json.loads(sceneprint(*asked, "--frame", 1, "--json", "--last", 1).stdout)
+    command = ("localize", "near", whole_rooms / "room-0")
+    first, both, last = map(json.loads, sceneprint(*command, "--json").stdout.splitlines())
+    alone = json.loads(sceneprint(*command, "--frame", 1, "--json", "--last", 1).stdout)
     # from frame 0 to frame 2 the way turns by more than 120 degrees
     assert [one["frames"] for one in (first, both, last, alone)] == [1, 2, 2, 1]
     assert both["votes"] > alone["votes"]  # the frame before votes too
     here, there = (np.array(one["pose"]["matrix"]) for one in (alone, both))
     assert np.linalg.norm(here[:3, 3] - there[:3, 3]) < 0.05
-    up = json.loads(sceneprint(*asked, "--frame", 1, "--up", "0,-1,0", "--json").stdout)
+    up = json.loads(sceneprint(*command, "--frame", 1, "--up", "0,-1,0", "--json").stdout)
     assert up["frames"] == 1
     # without poses beside them each frame is alone
     no_poses = shutil.ignore_patterns("*.pose.txt")
@@ -129,8 +129,8 @@ def test_frames_of_a_folder_are_asked_with_those_before_them(
     one = ("localize", "near", tmp_path / "room-0", "--frame", 1)
     assert json.loads(sceneprint(*one, "--json").stdout)["frames"] == 1
     for wrong, text in (
-        ((*asked, "--last", 11), "--last 11: use a number from 1 to 10"),
-        ((*asked, "--last", 2, "--up", "0,-1,0"), "--up applies to one frame"),
+        ((*command, "--last", 11), "--last 11: use a number from 1 to 10"),
+        ((*command, "--last", 2, "--up", "0,-1,0"), "--up applies to one frame"),
         ((*one, "--last", 2), "has no pose, but --last 2 requires odometry"),
     ):
         assert text in sceneprint(*wrong, expect=2).stderr
@@ -140,12 +140,12 @@ def test_a_prior_is_a_file_or_json(sceneprint, sides, tmp_path, capsys):
     file, truth = sides
     prior = {"pose": {"parent_frame": "hall", "matrix": truth}, "deviation_m": 0.2}
     (tmp_path / "prior.json").write_text(json.dumps(prior))
-    asked = ("localize", "sides", file, "--json", "--prior")
-    there = json.loads(sceneprint(*asked, json.dumps(prior)).stdout)
+    command = ("localize", "sides", file, "--json", "--prior")
+    there = json.loads(sceneprint(*command, json.dumps(prior)).stdout)
     assert (there["status"], there["verified_by"]) == ("found", "prior")
     off = np.array(there["pose"]["matrix"])[:3, 3] - np.array(truth)[:3, 3]
     assert np.linalg.norm(off) < 0.1
-    by_file = json.loads(sceneprint(*asked, tmp_path / "prior.json").stdout)
+    by_file = json.loads(sceneprint(*command, tmp_path / "prior.json").stdout)
     assert by_file["pose"] == there["pose"]
     lines = sceneprint("query", "sides", file, "--prior", json.dumps(prior)).stdout.splitlines()
     assert "; several poses fit, and the prior decided; " in lines[-1]
@@ -180,9 +180,9 @@ def test_queries_that_came_are_listed(sceneprint, service_url, whole_rooms):
     assert second.startswith(lost.query_id)
     assert second.endswith(f"  cart/seq-01  {lost.reason}")
     chosen = ("--status", "found", "--status", "failed", "--json")
-    told = json.loads(sceneprint("queries", "asked", *chosen).stdout)
-    assert (told["query_id"], told["robot"]) == (found.query_id, "spot\u2028")
-    assert sceneprint("queries", "asked", "--until", told["at"], "--json").stdout == ""
+    record = json.loads(sceneprint("queries", "asked", *chosen).stdout)
+    assert (record["query_id"], record["robot"]) == (found.query_id, "spot\u2028")
+    assert sceneprint("queries", "asked", "--until", record["at"], "--json").stdout == ""
 
 
 def test_a_query_is_laid_on_its_match(sceneprint, service_url, whole_rooms, tmp_path):

@@ -43,7 +43,7 @@ def test_all_entries_are_exported(sceneprint, data):
     }  # fmt: skip
     file = data / "audit.log"
     assert sceneprint(*export, "syslog", "--output", file).stdout == ""
-    told = [MESSAGE.fullmatch(line) for line in file.read_text().splitlines()]
-    assert [one and one[1] for one in told] == lines
+    messages = [MESSAGE.fullmatch(line) for line in file.read_text().splitlines()]
+    assert [one and one[1] for one in messages] == lines
     sceneprint(*export, "jsonl", "--output", file, "--actor", "command")
     assert file.read_text().splitlines()[4:] == lines  # behind what was there

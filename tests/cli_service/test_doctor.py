@@ -46,24 +46,24 @@ def test_a_sound_machine(sceneprint, data_folder, working):
     for needed in ("python", "sqlite", "data folder", "database", "service", "workers"):
         assert found[needed] == "ok"
     assert set(found.values()) <= {"ok", "note"}
-    for told in (
+    for pattern in (
         rf"{working} answers, version {re.escape(__version__)}", "1 worker runs, ",
         "accepts uploads and answers queries", r"clock differs from this machine's by 0\.\d s",
     ):  # fmt: skip
-        assert re.search(told, done.stdout), told
+        assert re.search(pattern, done.stdout), pattern
     assert "the default of --data" not in done.stdout
     assert done.stdout.splitlines()[-1] == "no problems found"
 
 
 def test_a_key_that_may_not_see_all(sceneprint, service_url, monkeypatch):
-    def asked(key):
+    def findings(key):
         with Client(service_url, key) as client:
             client._http.headers["X-Forwarded-For"] = "192.0.2.7"  # as behind a proxy
             return list(service_checks(client, service_url))
 
     with Client(service_url) as client:
         few = client.create_key("doctor-few", {"nowhere": "read"}).secret
-    none, few_found, wrong = asked(None), asked(few), asked("sp_wrong")
+    none, few_found, wrong = findings(None), findings(few), findings("sp_wrong")
     assert [one.subject for one in none] == ["service", "ready", "workers"]
     assert "requires a key; pass one with --key" in none[-1].text
     assert [one.subject for one in few_found] == ["service", "ready", "workers", "models"]

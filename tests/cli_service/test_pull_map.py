@@ -13,11 +13,11 @@ def test_a_map_is_pulled_and_renewed(sceneprint, service_url, rooms, tmp_path):
         client.create_map("pulled-too", model="depth")
         sceneprint("upload", "pulled", rooms / "room-0")
         said = sceneprint("pull", "--map", "pulled", "--map", "pulled-too", "--data", copy)
-        told = said.stdout.splitlines()
-        assert told[0].startswith(
+        lines = said.stdout.splitlines()
+        assert lines[0].startswith(
             f"{copy} has map pulled of revision 3: 3 frames, 3 new or changed"
         )
-        assert told[1].startswith(f"{copy} has map pulled-too of revision 0: 0 frames, 0 new")
+        assert lines[1].startswith(f"{copy} has map pulled-too of revision 0: 0 frames, 0 new")
         said = sceneprint("pull", "--map", "pulled", "--data", copy)
         assert ", 0 new or changed, 0 removed; 0 artifacts, 0.0 MB fetched" in said.stdout
         online = sorted(frame.frame_id for frame in client.frames("pulled"))

@@ -16,15 +16,15 @@ FRAMES = 8
 
 @pytest.fixture(scope="module")
 def folder(building, tmp_path_factory):
-    made = tmp_path_factory.mktemp("folder") / "room"
-    made.mkdir()
+    path = tmp_path_factory.mktemp("folder") / "room"
+    path.mkdir()
     for frame in find_sequences(building / "room-0" / "seq-01")[0].frames[:FRAMES]:
-        (made / frame.path.name).write_bytes(frame.path.read_bytes())
+        (path / frame.path.name).write_bytes(frame.path.read_bytes())
         pose = frame.path.name.replace(".depth.png", ".pose.txt")
-        (made / pose).write_bytes((frame.path.parent / pose).read_bytes())
+        (path / pose).write_bytes((frame.path.parent / pose).read_bytes())
     camera = building / "room-0" / "intrinsics.json"
-    (made / "intrinsics.json").write_bytes(camera.read_bytes())
-    return made
+    (path / "intrinsics.json").write_bytes(camera.read_bytes())
+    return path
 
 
 def record(ros, place, name, frames):

@@ -15,12 +15,12 @@ def test_a_map_is_signed_anew_while_its_service_runs(sceneprint, service_url, da
     assert re.fullmatch(r"map anew, model paper-[0-9a-f]{12}\n", said)
     assert reencode("--status").stdout == said
     with Client(service_url) as client:
-        told = client.map("anew")
-        assert (f"map anew, model {told.model}\n", told.reencoding) == (said, None)
-        assert told.frames == {"indexed": 3}
+        record = client.map("anew")
+        assert (f"map anew, model {record.model}\n", record.reencoding) == (said, None)
+        assert record.frames == {"indexed": 3}
     frame = next(iter(sorted(rooms.rglob("*.depth.png"))))
     answer = sceneprint("query", "anew", frame, "--json").stdout
-    assert f'"model":"{told.model}"' in answer.replace(": ", ":")
+    assert f'"model":"{record.model}"' in answer.replace(": ", ":")
     again = reencode("--model", "paper", expect=2).stderr
     assert again.startswith("sceneprint reencode: Map 'anew' already uses the model paper-")
 

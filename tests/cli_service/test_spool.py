@@ -54,8 +54,8 @@ def test_frames_are_spooled_and_uploaded(sceneprint, service_url, rooms, tmp_pat
     assert lines[0] == "0 frames wait; 0.0 of 100.0 MB"
     assert lines[1] == "6 uploaded, 1 refused, 0 thinned, 0 refused and discarded"
     assert lines[2].startswith("  broken.ply: ")
-    told = json.loads(sceneprint("spool", spool, "--json").stdout)
-    assert (told["uploaded"], told["refusals"][0]["name"]) == (6, "broken.ply")
+    report = json.loads(sceneprint("spool", spool, "--json").stdout)
+    assert (report["uploaded"], report["refusals"][0]["name"]) == (6, "broken.ply")
     said = sceneprint("spool", spool, "--to", "spooled", "--retry-refused", expect=2)
     assert said.stdout.startswith("0 frames uploaded; 1 refused, 0 wait\nposes of 0 of 1 frames")
 
@@ -73,9 +73,9 @@ def example(rooms, tmp_path, monkeypatch, capsys):
 
 
 def test_the_example_goes_on_while_it_is_offline(service_url, example):
-    told = example("http://127.0.0.1:9")
-    assert told[0].startswith("offline, 6 frames wait: http://127.0.0.1:9 cannot be reached")
-    assert told[1] == "0 uploaded, 6 wait, 0 thinned"
+    lines = example("http://127.0.0.1:9")
+    assert lines[0].startswith("offline, 6 frames wait: http://127.0.0.1:9 cannot be reached")
+    assert lines[1] == "0 uploaded, 6 wait, 0 thinned"
     with Client(service_url) as client:
         client.create_map("offline-example", model="depth")
         assert example(service_url) == [

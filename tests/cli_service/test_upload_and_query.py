@@ -209,8 +209,8 @@ def test_maps_are_listed_made_and_deleted(sceneprint, house):
     assert by_name[house][1:5] == ["6", "0", "0", "0"]
     assert by_name["hall"][5].startswith("depth-")
     assert by_name["hall"][6:] == ["Hall", "2"]
-    told = map(Map.model_validate_json, sceneprint("maps", "--json").stdout.splitlines())
-    assert {one.name: one.title for one in told}["hall"] == "Hall 2"
+    records = map(Map.model_validate_json, sceneprint("maps", "--json").stdout.splitlines())
+    assert {one.name: one.title for one in records}["hall"] == "Hall 2"
     assert "Add --yes" in sceneprint("maps", "--delete", "hall", expect=2).stderr
     done = sceneprint("maps", "--delete", "hall", "--yes")
     assert done.stdout == "deleted map hall and its 0 frames\n"
@@ -223,11 +223,11 @@ def test_maps_are_listed_made_and_deleted(sceneprint, house):
 
 
 def test_an_archive_is_uploaded_as_its_folder_is(sceneprint, house, rooms, tmp_path):
-    made = shutil.make_archive(str(tmp_path / "rooms"), "gztar", rooms.parent, rooms.name)
-    done = sceneprint("upload", house, made, "--robot", "r1")
+    archive = shutil.make_archive(str(tmp_path / "rooms"), "gztar", rooms.parent, rooms.name)
+    done = sceneprint("upload", house, archive, "--robot", "r1")
     assert done.stdout.startswith("6 frames: 0 received, 6 already there; 6 indexed, ")
     assert done.stdout.splitlines()[1].startswith("rooms.tar.gz: poses of 6 of 6 frames; depth ")
-    done = sceneprint("upload", house, made, "--depth-scale", 1000, expect=2)
+    done = sceneprint("upload", house, archive, "--depth-scale", 1000, expect=2)
     assert 'put the value as "depth_scale" into intrinsics.json' in done.stderr
     bad = tmp_path / "bad.zip"
     bad.write_bytes(b"PK\x03\x04" + bytes(600))
@@ -236,14 +236,14 @@ def test_an_archive_is_uploaded_as_its_folder_is(sceneprint, house, rooms, tmp_p
 
 
 def test_a_map_has_limits(sceneprint, house):
-    made = sceneprint("maps", "--create", "small", "--model", "depth", "--quota-frames", "2")
-    assert re.fullmatch(r"map small, depth-\w{12}, 0 of 2 frames\n", made.stdout)
+    created = sceneprint("maps", "--create", "small", "--model", "depth", "--quota-frames", "2")
+    assert re.fullmatch(r"map small, depth-\w{12}, 0 of 2 frames\n", created.stdout)
     changes = ("--quota-frames", "none", "--quota-bytes", "1500000", "--retention-days", "30")
     done = sceneprint("maps", "--edit", "small", "--title", "Small", *changes).stdout
     assert done.endswith(", 0.0 of 1.5 MB, kept 30 days\n")
-    told = sceneprint("maps", "--edit", house, "--retention-days", "0.000001", expect=2).stderr
-    assert "would permanently delete the 6 frames of map" in told
-    assert "Add --yes" in told
+    refusal = sceneprint("maps", "--edit", house, "--retention-days", "0.000001", expect=2).stderr
+    assert "would permanently delete the 6 frames of map" in refusal
+    assert "Add --yes" in refusal
     assert "There is nothing to change" in sceneprint("maps", "--edit", house, expect=2).stderr
     sceneprint("maps", "--delete", "small", "--yes")
 

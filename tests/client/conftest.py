@@ -32,7 +32,7 @@ def answer(status, at=0.0, parent="map", **fields):
         "rotation": dict(zip("xyzw", quaternion_of(matrix[:3, :3]), strict=True)),
     }  # fmt: skip
     found = status == "found"
-    told = {
+    record = {
         "status": status, "reason": f"{status}, told by a test", "map": "m",
         "pose": pose if found else None, "support": 3 * found, "votes": 3 * found,
         "spread_m": None, "spread_deg": None, "strength": "strong" if found else None,
@@ -43,7 +43,7 @@ def answer(status, at=0.0, parent="map", **fields):
         if status == "ambiguous" else [],
         **fields,
     }  # fmt: skip
-    return Localization.model_validate(told)
+    return Localization.model_validate(record)
 
 
 @pytest.fixture
@@ -129,7 +129,7 @@ class Scripted:
     """A service with scripted answers that records its requests."""
 
     url: str
-    asked: list[tuple[str, str, bytes]] = field(default_factory=list)
+    requests: list[tuple[str, str, bytes]] = field(default_factory=list)
     headers: list[dict[str, str]] = field(default_factory=list)
     stop: Callable[[], None] = lambda: None
 
@@ -143,9 +143,9 @@ def scripted():
         class Handler(BaseHTTPRequestHandler):
             def answer(self):
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
-                told.asked.append((self.command, self.path, body))
-                told.headers.append(dict(self.headers.items()))
-                status, headers, document = replies[min(len(told.asked), len(replies)) - 1]
+                script.requests.append((self.command, self.path, body))
+                script.headers.append(dict(self.headers.items()))
+                status, headers, document = replies[min(len(script.requests), len(replies)) - 1]
                 if status == 0:
                     self.connection.close()
                     return
@@ -164,15 +164,15 @@ def scripted():
         server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         server.handle_error = lambda *_: None
         servers.append(server)
-        told = Scripted(f"http://127.0.0.1:{server.server_address[1]}")
+        script = Scripted(f"http://127.0.0.1:{server.server_address[1]}")
 
         def stop():
             server.shutdown()
             server.server_close()
 
-        told.stop = stop
+        script.stop = stop
         Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True).start()
-        return told
+        return script
 
     yield make
     for server in servers:

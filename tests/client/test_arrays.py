@@ -118,33 +118,33 @@ def test_the_pose_of_the_base_is_stored_as_that_of_the_sensor(client, map_name, 
     camera = camera_of((k.fx, k.fy, k.cx, k.cy), (k.width, k.height))
     turn = {"x": 0, "y": 0, "z": QUARTER, "w": QUARTER}
     still = {"x": 0, "y": 0, "z": 0, "w": 1}
-    told = {
+    record = {
         "intrinsics": camera.model_dump(),
         "pose": {"position": {"x": 1, "y": 2, "z": 0}, "orientation": turn, "of": "base",
                  "parent_frame": "odom"},
         "T_base_sensor": {"translation": {"x": 0.2, "y": 0, "z": 0.5}, "rotation": still},
     }  # fmt: skip
     client.create_map(map_name, "base")
-    meta = FrameMeta.model_validate(told)
+    meta = FrameMeta.model_validate(record)
     added = client.upload(map_name, room_frames[0].depth, meta, wait_s=PATIENCE_S)
     pose = client.frame(map_name, added.frame_id).pose
     np.testing.assert_allclose(np.array(pose.matrix)[:3, 3], [1, 2.2, 0.5], atol=1e-12)
     with pytest.raises(InvalidRequest, match="requires T_base_sensor"):
-        checked(FrameMeta, "The frame", **{**told, "T_base_sensor": None})
+        checked(FrameMeta, "The frame", **{**record, "T_base_sensor": None})
     with pytest.raises(InvalidRequest, match="pose of the sensor"):
-        checked(Prior, "The prior", pose=told["pose"])
+        checked(Prior, "The prior", pose=record["pose"])
     with pytest.raises(InvalidRequest, match="the pose of the base"):
         client.edit_frame(map_name, added.frame_id, {"pose": {"of": "base"}})
 
 
 def test_poses_as_ros_names_them():
-    told = {"position": {"x": 1, "y": 2, "z": 3},
+    record = {"position": {"x": 1, "y": 2, "z": 3},
             "orientation": {"x": 0, "y": 0, "z": QUARTER, "w": QUARTER}}  # fmt: skip
-    pose = GivenPose.model_validate({**told, "parent_frame": "map"})
+    pose = GivenPose.model_validate({**record, "parent_frame": "map"})
     assert (pose.translation.y, pose.rotation.w) == (2, QUARTER)
     given = pose.model_dump(exclude_defaults=True)
     assert set(given) == {"translation", "rotation", "parent_frame"}
-    for twice in ({**told, "translation": told["position"]}, {"position": told["position"]}):
+    for twice in ({**record, "translation": record["position"]}, {"position": record["position"]}):
         with pytest.raises(InvalidRequest):
             checked(GivenPose, "The pose", **twice)
 

@@ -116,4 +116,4 @@ def test_requests_are_repeated(hasty, scripted):
                 await client.map("hall")
 
     asyncio.run(session())
-    assert [method for method, *_ in server.asked] == ["GET"] * 3 + ["DELETE"] * 2 + ["GET"] * 8
+    assert [method for method, *_ in server.requests] == ["GET"] * 3 + ["DELETE"] * 2 + ["GET"] * 8

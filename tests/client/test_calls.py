@@ -81,9 +81,9 @@ def test_a_job_is_cancelled_before_anybody_waits_for_it(embedded, references):
 def test_what_is_not_there(client, map_name, references):
     client.create_map(map_name)
     for priority in (-11, 11):
-        with pytest.raises(InvalidRequest, match=f"is {priority}") as told:
+        with pytest.raises(InvalidRequest, match=f"is {priority}") as error:
             client.upload(map_name, references[1], priority=priority)
-        assert told.value.fields == (("priority", "out of range"),)
+        assert error.value.fields == (("priority", "out of range"),)
     for name in ("nobody", "", "..", "a/b", "Ä"):
         with pytest.raises(UnknownMap):
             client.map(name)

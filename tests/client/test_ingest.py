@@ -28,15 +28,15 @@ def rooms(references):
 
 
 def packed(rooms, **more):
-    made = io.BytesIO()
-    with tarfile.open(fileobj=made, mode="w:gz") as archive:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
         archive.add(rooms, ".")
         for name, data in more.items():
             info = tarfile.TarInfo(name.replace("__", "/") + ".png")
             info.size = len(data)
             archive.addfile(info, io.BytesIO(data))
-    made.seek(0)
-    return made
+    buffer.seek(0)
+    return buffer
 
 
 def done(client, map_name, archive, options=None):

@@ -35,7 +35,7 @@ def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
         "file": archive, "path": archive, "target": tmp_path / "target", "into": tmp_path / "into",
         "deletion_id": "0",
     }  # fmt: skip
-    asked = []
+    names = []
     for name, method in inspect.getmembers(Client, inspect.isfunction):
         if name.startswith("_") or name in OPEN | {"wait_for_product"}:
             continue
@@ -55,26 +55,26 @@ def test_no_call_gets_by_without_a_key(remote, references, tmp_path):
 
         with pytest.raises(KeyRequired):
             call()
-        asked.append(name)
-    assert len(asked) > 50
+        names.append(name)
+    assert len(names) > 50
     assert remote.healthy()
     assert (remote.status().frames, remote.status().jobs) == (None, None)
 
 
 def test_keys_are_made_listed_rotated_and_revoked(embedded):
     until = datetime.now(UTC) + timedelta(hours=1)
-    made = embedded.create_key("cart 9", {"hall": "write", "yard": "read"}, until)
-    assert (made.name, made.grants) == ("cart 9", {"hall": "write", "yard": "read"})
-    assert made.expires_at == until
+    key = embedded.create_key("cart 9", {"hall": "write", "yard": "read"}, until)
+    assert (key.name, key.grants) == ("cart 9", {"hall": "write", "yard": "read"})
+    assert key.expires_at == until
     found = embedded.keys()
     (listed,) = [key for key in found if key.name == "cart 9"]
-    assert listed.model_dump() == made.model_dump(exclude={"secret"})
+    assert listed.model_dump() == key.model_dump(exclude={"secret"})
     with pytest.raises(Conflict, match="A key named 'cart 9' already exists"):
         embedded.create_key("cart 9", {"*": "read"})
     me = embedded.me()
     assert (me.name, me.grants) == (None, {"*": "admin"})
     turned = embedded.rotate_key("cart 9", 60)
-    assert (turned.secret != made.secret, turned.grants) == (True, made.grants)
+    assert (turned.secret != key.secret, turned.grants) == (True, key.grants)
     assert turned.previous_until - datetime.now(UTC) <= timedelta(seconds=60)
     embedded.revoke_key("cart 9")
     found = embedded.keys()

@@ -42,17 +42,17 @@ def test_events_that_are_kept(client, map_name, references):
 def test_models_and_reencoding(embedded, map_name):
     """Nobody works here, so that it is surely under way."""
     client = embedded
-    made = client.create_map(map_name, model="depth")
+    created = client.create_map(map_name, model="depth")
     listed = client.models()
     assert [one.name for one in listed][: len(PRESETS)] == list(PRESETS)
     depth = next(one for one in listed if one.name == "depth")
     assert depth.model_id == read_model("depth").id
     assert map_name in depth.maps
-    told = client.reencode(map_name, read_model("paper").label)
-    assert told.reencoding.model_id == read_model("paper").id
+    record = client.reencode(map_name, read_model("paper").label)
+    assert record.reencoding.model_id == read_model("paper").id
     with pytest.raises(Conflict):
         client.reencode(map_name, depth.model_id)
-    assert client.cancel_reencoding(map_name) == made
+    assert client.cancel_reencoding(map_name) == created
 
 
 EVENT = Event(

@@ -61,10 +61,10 @@ def test_edits(client, map_name, ids):
         client.edit_frame(map_name, ids[0], {"tags": []}, before.etag)
     with pytest.raises(InvalidRequest):
         client.edit_frame(map_name, ids[0], {"depth_scale": 1})
-    told = client.map(map_name)
-    assert client.edit_map(map_name, {"title": "Küche"}, told.etag).title == "Küche"
+    record = client.map(map_name)
+    assert client.edit_map(map_name, {"title": "Küche"}, record.etag).title == "Küche"
     with pytest.raises(PreconditionFailed):
-        client.edit_map(map_name, {"title": None}, told.etag)
+        client.edit_map(map_name, {"title": None}, record.etag)
     client.delete_frame(map_name, ids[0])
     with pytest.raises(UnknownFrame, match="was deleted"):
         client.upload_of(map_name, ids[0])

@@ -70,11 +70,11 @@ def test_a_product_from_request_to_deletion(
 
 
 def test_the_cells_of_a_difference_are_sent(client):
-    told = client.compute(Difference, MAP, before="a", after="b")
-    result = told.result
+    job = client.compute(Difference, MAP, before="a", after="b")
+    result = job.result
     assert result.same > 500
     assert (result.parent_frame, result.frames_before, result.frames_after) == ("room", 2, 2)
-    found = client.difference_points(MAP, told.job_id)
+    found = client.difference_points(MAP, job.job_id)
     assert found.patches is not None
     assert (found.patches == SAME).sum() == result.same
     assert (np.diff(found.patches) >= 0).all()
@@ -88,6 +88,6 @@ def test_frames_and_changes_of_coverage(client):
     frames = list(client.coverage_frames(MAP, first.job_id))
     assert {frame.frame_id for frame in frames} == {frame.frame_id for frame in client.frames(MAP)}
     assert list(client.coverage_frames(MAP, first.job_id, "not_found")) == []
-    told = client.coverage_changes(MAP, second.job_id, first.job_id)
-    assert set(told.trends) - {"same"} == {"better", "worse", "new", "gone"}
-    assert told.trends["same"] == sum(len(plan.cells) for plan in told.plans) > 0
+    changes = client.coverage_changes(MAP, second.job_id, first.job_id)
+    assert set(changes.trends) - {"same"} == {"better", "worse", "new", "gone"}
+    assert changes.trends["same"] == sum(len(plan.cells) for plan in changes.plans) > 0

@@ -47,12 +47,12 @@ def ply(data):
 
 
 def test_a_surface_and_its_figures(client, answered):
-    made = client.reconstruct(answered, voxel_m=0.04)
-    [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
+    begun = client.reconstruct(answered, voxel_m=0.04)
+    [job] = client.wait([begun.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.kind, job.map) == ("succeeded", "reconstruct", NAME), job.error
-    done = client.product(Reconstruction, None, made.job_id)
+    done = client.product(Reconstruction, None, begun.job_id)
     coverage = done.result
-    mesh = client.reconstruction_mesh(made.job_id)
+    mesh = client.reconstruction_mesh(begun.job_id)
     points, triangles, comment = ply(mesh)
     assert (points, triangles) == (coverage.points, coverage.triangles)
     assert comment == "comment frame query.optical: x right, y down, z forward, metres"
@@ -71,23 +71,23 @@ def test_a_surface_and_its_figures(client, answered):
 def test_what_is_wanted_is_what_is_fused(client, answered):
     answer = answered
     first = next(match for match in answer.matches if match.validation.status == "accepted")
-    made = client.reconstruct(
+    done = client.reconstruct(
         answer.query_id, frames=[first.frame_id], include_query=False, voxel_m=0.05,
         output="cloud", wait_s=PATIENCE_S,
     )  # fmt: skip
-    assert made.result is not None, made.error
-    assert [view.frame_id for view in made.result.views] == [first.frame_id]
-    assert (made.result.triangles, made.result.voxel_m) == (0, 0.05)
-    assert made.result.area_m2 > 1.0  # also of a cloud: it is that of the surface
-    points, triangles, _ = ply(client.reconstruction_mesh(made.job_id))
-    assert (points, triangles) == (made.result.points, 0)
+    assert done.result is not None, done.error
+    assert [view.frame_id for view in done.result.views] == [first.frame_id]
+    assert (done.result.triangles, done.result.voxel_m) == (0, 0.05)
+    assert done.result.area_m2 > 1.0  # also of a cloud: it is that of the surface
+    points, triangles, _ = ply(client.reconstruction_mesh(done.job_id))
+    assert (points, triangles) == (done.result.points, 0)
 
 
 def test_the_surface_lies_where_the_query_saw_it(client, answered, views):
     """Matches alone, in the query's camera: their points project onto the query's depth."""
-    made = client.reconstruct(answered, include_query=False, strength="strong", wait_s=PATIENCE_S)
-    data = client.reconstruction_mesh(made.job_id).partition(b"end_header\n")[2]
-    rows = np.frombuffer(data[: 27 * made.result.points], np.uint8).reshape(-1, 27)
+    job = client.reconstruct(answered, include_query=False, strength="strong", wait_s=PATIENCE_S)
+    data = client.reconstruction_mesh(job.job_id).partition(b"end_header\n")[2]
+    rows = np.frombuffer(data[: 27 * job.result.points], np.uint8).reshape(-1, 27)
     points = rows[:, :12].copy().view("<f4").astype(float)
     query = views[0].read()
     k = query.intrinsics
@@ -109,15 +109,15 @@ def test_refusals(client, answered):
         client.reconstruct(answered, frames=["nobody"])
     with pytest.raises(InvalidRequest, match="voxel_m"):
         client.reconstruct(answered, voxel_m=0.0001)
-    made = client.reconstruct(answered, voxel_m=0.002)  # finer than memory allows for a room
-    [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
+    begun = client.reconstruct(answered, voxel_m=0.002)  # finer than memory allows for a room
+    [job] = client.wait([begun.job_id], timeout_s=PATIENCE_S)
     assert (job.state, job.attempts) == ("failed", 1)
     assert "Request 0.005 m or more" in str(job.error)
     with pytest.raises(NotIndexed, match=r"is failed \(.*Its mesh\.ply will be"):
-        client.reconstruction_mesh(made.job_id)
-    client.delete_product(Reconstruction, None, made.job_id)
+        client.reconstruction_mesh(begun.job_id)
+    client.delete_product(Reconstruction, None, begun.job_id)
     with pytest.raises(UnknownJob):
-        client.delete_product(Reconstruction, None, made.job_id)
+        client.delete_product(Reconstruction, None, begun.job_id)
     unvalidated = client.query(NAME, frame_id=answered.matches[0].frame_id, stages=["retrieve"])
     with pytest.raises(InvalidRequest, match="no accepted match, so"):
         client.reconstruct(unvalidated)
@@ -133,29 +133,29 @@ def test_a_lost_upload_is_stood_in_for_and_a_deleted_frame_left_out(views, tmp_p
             (m for m in answer.matches if m.validation.status == "accepted"), key=lambda m: m.rank
         )
         assert len(accepted) >= 2
-        made = client.reconstruct(answer, voxel_m=0.05)
+        begun = client.reconstruct(answer, voxel_m=0.05)
         lost, deleted = accepted[0].frame_id, accepted[1].frame_id
         size = client.frame(NAME, lost).bytes
         next(path for path in files(tmp_path) if path.stat().st_size == size).unlink()
         client.delete_frame(NAME, deleted)
         client.put_frame(NAME, deleted, views[0])  # another frame, which nobody has matched
-        [job] = client.wait([made.job_id], timeout_s=PATIENCE_S)
+        [job] = client.wait([begun.job_id], timeout_s=PATIENCE_S)
         assert job.state == "succeeded", job.error
-        coverage = client.product(Reconstruction, None, made.job_id).result
+        coverage = client.product(Reconstruction, None, begun.job_id).result
         sources = {view.frame_id: view.source for view in coverage.views}
         assert sources[lost] == "geometry"
         assert [one.frame_id for one in coverage.left_out] == [deleted]
         assert "replaced by a new frame" in coverage.left_out[0].reason
         # what the query saw is not kept beyond the job, and all goes with it
         before = files(tmp_path)
-        client.delete_product(Reconstruction, None, made.job_id)
+        client.delete_product(Reconstruction, None, begun.job_id)
         assert len(before - files(tmp_path)) == 1
 
 
 def test_files_are_sent_in_ranges(client, answered):
-    made = client.reconstruct(answered, voxel_m=0.05, wait_s=PATIENCE_S)
-    whole = client.reconstruction_mesh(made.job_id)
-    url = f"/v1/reconstructions/{made.job_id}/mesh.ply"
+    job = client.reconstruct(answered, voxel_m=0.05, wait_s=PATIENCE_S)
+    whole = client.reconstruction_mesh(job.job_id)
+    url = f"/v1/reconstructions/{job.job_id}/mesh.ply"
     http = client._http
     given = http.get(url)
     tag = given.headers["ETag"]

@@ -32,7 +32,7 @@ def test_a_busy_service_is_asked_again_when_it_said(scripted):
         start = time.monotonic()
         assert client.map("m").name == "m"
         assert time.monotonic() - start >= 1.0
-    assert [asked[:2] for asked in server.asked] == [("GET", "/v1/maps/m")] * 2
+    assert [request[:2] for request in server.requests] == [("GET", "/v1/maps/m")] * 2
 
 
 @pytest.mark.usefixtures("hasty")
@@ -41,8 +41,8 @@ def test_an_upload_survives_a_broken_connection_whole(scripted, references):
     with Client(server.url, "secret") as client:
         added, new = client.add("m", references[0], wait_s=7.9)
     assert (added.frame_id, new) == ("f", True)
-    assert len(server.asked) == 3
-    for (method, path, body), headers in zip(server.asked, server.headers, strict=True):
+    assert len(server.requests) == 3
+    for (method, path, body), headers in zip(server.requests, server.headers, strict=True):
         assert (method, path) == ("POST", "/v1/maps/m/frames")
         assert references[0].path.read_bytes() in body
         assert b'"parent_frame"' not in body  # it is the session's name
@@ -56,15 +56,15 @@ def test_patience_ends(scripted):
     server = scripted([problem("busy", 503)])
     with Client(server.url) as client, pytest.raises(errors.Busy, match="it is busy"):
         client.maps()
-    assert len(server.asked) == http.TRIES == 8
+    assert len(server.requests) == http.TRIES == 8
     server = scripted([(503, {"Retry-After": "31"}, problem("busy", 503)[2])])
     with Client(server.url) as client, pytest.raises(errors.Busy):
         client.maps()  # at once: nobody waits half a minute
-    assert len(server.asked) == 1
+    assert len(server.requests) == 1
     server = scripted([(0, {}, None)])
     with Client(server.url) as client, pytest.raises(errors.Unreachable, match="cannot be reached"):
         client.maps()
-    assert len(server.asked) == http.TRIES == 8
+    assert len(server.requests) == http.TRIES == 8
 
 
 @pytest.mark.usefixtures("hasty")
@@ -83,7 +83,7 @@ def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted):
     server = scripted([(0, {}, None), problem("unknown-frame", 404)])
     with Client(server.url) as client:
         client.delete_frame("m", "f")
-    assert len(server.asked) == 2
+    assert len(server.requests) == 2
     server = scripted([problem("unknown-frame", 404)])
     with Client(server.url) as client, pytest.raises(errors.UnknownFrame, match="it is unknown"):
         client.delete_frame("m", "f")
@@ -100,14 +100,14 @@ def test_what_was_deleted_by_a_try_without_answer_is_deleted(scripted):
 def test_problems_become_errors_and_are_not_repeated(scripted, kind, status, error):
     fields = [{"field": "k", "reason": "too large"}, "nonsense", {"field": "seed"}]
     server = scripted([problem(kind, status, errors=fields, instance="/requests/7")])
-    with Client(server.url) as client, pytest.raises(error, match=f"it is {kind}") as told:
+    with Client(server.url) as client, pytest.raises(error, match=f"it is {kind}") as raised:
         client.map("m")
-    assert len(server.asked) == 1
-    assert type(told.value) is error
+    assert len(server.requests) == 1
+    assert type(raised.value) is error
     if error is errors.InvalidRequest:
-        assert told.value.fields == (("k", "too large"),)
+        assert raised.value.fields == (("k", "too large"),)
     if error is errors.Refused:
-        assert (told.value.status, told.value.problem["instance"]) == (400, "/requests/7")
+        assert (raised.value.status, raised.value.problem["instance"]) == (400, "/requests/7")
 
 
 def test_another_kind_of_server(scripted):
@@ -138,7 +138,7 @@ def test_pages_are_followed(scripted):
     server = scripted([(200, {}, page) for page in pages])
     with Client(server.url) as client:
         assert [frame.frame_id for frame in client.frames("m")] == ["a", "b", "c"]
-    assert [path for _, path, _ in server.asked] == [
+    assert [path for _, path, _ in server.requests] == [
         "/v1/maps/m/frames?limit=200",
         "/v1/maps/m/frames?cursor=2&limit=200",
         "/v1/maps/m/frames?cursor=3&limit=200",
@@ -158,10 +158,10 @@ def test_nobody_there():
         url = f"http://127.0.0.1:{taken.getsockname()[1]}"
         with Client(url) as client:
             assert not client.healthy()
-            with pytest.raises(errors.Unreachable, match="sceneprint serve") as told:
+            with pytest.raises(errors.Unreachable, match="sceneprint serve") as raised:
                 client.maps()
-    assert "\n" not in str(told.value)
-    assert str(told.value).startswith(url)
+    assert "\n" not in str(raised.value)
+    assert str(raised.value).startswith(url)
 
 
 def test_who_answered_before_is_waited_for(scripted, monkeypatch):
@@ -195,9 +195,9 @@ def test_a_silent_service():
 
 @pytest.mark.parametrize("key", ["schlüssel☃", "top\nsecret", "top secret", "\n", ""])
 def test_a_key_that_cannot_be_sent_is_not_shown(key):
-    with pytest.raises(errors.KeyRequired, match="Copy it again") as told:
+    with pytest.raises(errors.KeyRequired, match="Copy it again") as raised:
         Client("http://127.0.0.1:8008", key)
-    assert not key.strip() or key not in str(told.value)
+    assert not key.strip() or key not in str(raised.value)
 
 
 def test_a_key_is_sent_without_the_newline_of_its_file(scripted):
@@ -243,8 +243,8 @@ def test_every_error_keeps_its_name_over_http():
     assert errors.kebab_case("UnknownMap") == "unknown-map"
     assert errors.kebab_case("Busy") == "busy"
     assert len(KINDS) > 25
-    told = {type_of(kind.__name__).removeprefix("/problems/"): kind for kind in KINDS}
-    assert http.problem_kinds() == told
+    kinds = {type_of(kind.__name__).removeprefix("/problems/"): kind for kind in KINDS}
+    assert http.problem_kinds() == kinds
     assert our_errors.kebab_case is errors.kebab_case  # both ask the same place
 
 

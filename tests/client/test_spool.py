@@ -260,7 +260,7 @@ def test_nothing_is_sent_from_a_spool_that_cannot_be_written(remote, map_name, t
 def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, references, tmp_path):
     remote.create_map(map_name, model="depth")
     there = remote.upload(map_name, references[0], meta_of(references[0]))
-    told = []
+    progress = []
     with Spool(tmp_path / "spool") as spool:
         for reference in references[:3]:
             spool.add(reference, meta_of(reference))
@@ -269,9 +269,9 @@ def test_what_waits_is_uploaded_and_refusals_are_set_aside(remote, map_name, ref
         with pytest.raises(UnknownMap):
             spool.sync(remote, "nowhere")
         assert spool.status().waiting == 5
-        report = spool.sync(remote, map_name, progress=lambda *one: told.append(one))
+        report = spool.sync(remote, map_name, progress=lambda *one: progress.append(one))
         assert (report.received, report.there, report.refused) == (3, 1, 1)
-        assert told == [(5, 5)]
+        assert progress == [(5, 5)]
         [refusal] = spool.refusals()
         assert (refusal.name, refusal.captured_at) == ("broken", START)
         assert refusal.reason
@@ -336,7 +336,7 @@ def test_a_service_that_asks_to_come_back_is_waited_for(scripted, monkeypatch, t
         assert (pauses, spool.status().waiting) == ([], 1)
         assert spool.sync(client, "hall", patience_s=46).received == 1
         assert (pauses, spool.status().waiting) == ([45.0], 0)
-    assert len(server.asked) == 3
+    assert len(server.requests) == 3
 
 
 # Kills. A child adds frames or uploads them, and is killed; everything it said has to hold.

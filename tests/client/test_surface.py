@@ -30,10 +30,10 @@ def fused(produced, walk):
 
 
 def test_tiles_and_the_frames_that_saw_them(fused):
-    told = fused.surface(MAP)
-    assert (told.state, told.frames, told.sessions) == ("ready", 4, ["a", "b"])
-    assert fused.begin_surface(MAP) == told  # there is nothing to do
-    (parent,) = told.parents
+    surface = fused.surface(MAP)
+    assert (surface.state, surface.frames, surface.sessions) == ("ready", 4, ["a", "b"])
+    assert fused.begin_surface(MAP) == surface  # there is nothing to do
+    (parent,) = surface.parents
     cells, sessions = 0, set()
     for level in parent.levels:
         tiles = list(fused.surface_tiles(MAP, "room", level.level))

@@ -30,7 +30,7 @@ K = (5.0, 5.0, 1.5, 1.0)
 @dataclass
 class FakeClient:
     answers: list[Localization | Exception]
-    asked: list[dict[str, Any]] = field(default_factory=list)
+    requests: list[dict[str, Any]] = field(default_factory=list)
     begun: Event = field(default_factory=Event)
     may_answer: Event = field(default_factory=Event)
 
@@ -44,14 +44,14 @@ class FakeClient:
         seen = [depth_of(frame) for frame in frames]
         return self.answer({"map": map_name, "frames": seen, "metas": metas, **how})
 
-    def answer(self, asked):
-        self.asked.append(asked)
+    def answer(self, request):
+        self.requests.append(request)
         self.begun.set()
         assert self.may_answer.wait(PATIENCE_S)
-        told = self.answers[min(len(self.asked), len(self.answers)) - 1]
-        if isinstance(told, Exception):
-            raise told
-        return told
+        reply = self.answers[min(len(self.requests), len(self.answers)) - 1]
+        if isinstance(reply, Exception):
+            raise reply
+        return reply
 
 
 def depth(metres):
@@ -87,7 +87,7 @@ def test_its_state_is_the_prior_of_the_next_question():
     state = tracker.update(DEPTH, ahead(0), stamp=0.0, up=(0, -1, 0))
     assert (state.status, state.parent_frame) == ("tracking", "map")
     tracker.update(DEPTH, ahead(1), stamp=1.0, meta=camera_of(K, (4, 3)))
-    first, second = client.asked
+    first, second = client.requests
     (meta,) = first["metas"]
     up = GivenDirection(x=0, y=-1, z=0)
     assert (first["map"], first["frames"], first["prior"]) == ("m", [1.0], None)
@@ -104,8 +104,8 @@ def test_weak_answers_are_no_fix_alone():
     for fields in ({"support": 1}, {"strength": "weak"}):
         tracker = Tracker(fake(answer("found", 5.0, **fields)), "m", camera=K)
         assert tracker.update(DEPTH, ahead(0), stamp=0.0).status == "lost"
-    told = answer("found", 5.0, verified_by="prior")
-    assert Tracker(fake(told), "m", camera=K).update(DEPTH, ahead(0)).status == "lost"
+    weak = answer("found", 5.0, verified_by="prior")
+    assert Tracker(fake(weak), "m", camera=K).update(DEPTH, ahead(0)).status == "lost"
     no_poses = Tracker(fake(answer("found", pose=None)), "m", camera=K)
     assert "no matching frame" in no_poses.update(DEPTH, ahead(0)).reason.lower()
 
@@ -124,10 +124,10 @@ def test_a_service_that_is_away_leaves_it_to_odometry():
 
 
 def test_its_log_replays_to_the_same_states():
-    told = [answer("found", 5.0), answer("ambiguous", 6.0), answer("found", 40.0),
+    answers = [answer("found", 5.0), answer("ambiguous", 6.0), answer("found", 40.0),
             answer("found", 41.0), answer("not_found"), answer("found", 43.0)]  # fmt: skip
     log = io.StringIO()
-    tracker = Tracker(fake(*told), "m", camera=K, log=log)
+    tracker = Tracker(fake(*answers), "m", camera=K, log=log)
     states = []
     for i in range(6):
         states.append(tracker.move(ahead(i - 0.5), i - 0.5))
@@ -153,7 +153,7 @@ def test_a_thread_asks_for_the_latest_frame_alone():
         assert not tracker.wait(0)
         client.may_answer.set()
         assert tracker.wait(PATIENCE_S)
-        assert [one["frames"] for one in client.asked] == [[0.0], [3.0]]
+        assert [one["frames"] for one in client.requests] == [[0.0], [3.0]]
         assert tracker.dropped == 2
         state = tracker.submit(depth(4), ahead(4), stamp=4.0)
         assert (state.status, state.age) == ("tracking", 1.0)
@@ -204,19 +204,19 @@ def asked_with(tracker, xs, client):
     """Depths of the frames of each question; the depth of a frame is its place on the way."""
     for i, x in enumerate(xs):
         tracker.update(depth(x), ahead(x), stamp=float(i))
-    return [one["frames"] for one in client.asked]
+    return [one["frames"] for one in client.requests]
 
 
 def test_while_it_is_lost_it_asks_with_the_latest_frames_that_differ():
     client = fake(answer("not_found"), answer("ambiguous"))
     tracker = Tracker(client, "m", camera=K)
-    told = asked_with(tracker, [5, 5.05, 5.2, 5.4, 5.41, 5.8, 8.75], client)
+    requests = asked_with(tracker, [5, 5.05, 5.2, 5.4, 5.41, 5.8, 8.75], client)
     # 5.05 is too near to 5, and 5.41 to 5.4; only 5.8 is within 3 m of 8.75
     expected = [
         [5], [5.05], [5, 5.2], [5, 5.2, 5.4], [5, 5.2, 5.41], [5.2, 5.4, 5.8], [5.8, 8.75],
     ]  # fmt: skip
-    assert [[round(frame, 2) for frame in frames] for frames in told] == expected
-    third = client.asked[3]
+    assert [[round(frame, 2) for frame in frames] for frames in requests] == expected
+    third = client.requests[3]
     # odometry from the last frame: 40 cm and 20 cm behind it
     for meta, x in zip(third["metas"], (-0.4, -0.2, 0.0), strict=True):
         assert meta.pose.parent_frame == "odom"
@@ -240,14 +240,14 @@ def test_it_asks_with_one_frame_while_it_tracks_or_where_only_one_is_wanted():
 
 def test_after_a_kidnapping_no_frame_from_before_is_sent():
     # at 2 it is carried away: both answers there contradict the tracked place
-    told = [answer("found", 0.0), answer("found", 1.0), answer("found", 40.0)]
-    client = fake(*told, answer("found", 41.0), answer("not_found"))
+    answers = [answer("found", 0.0), answer("found", 1.0), answer("found", 40.0)]
+    client = fake(*answers, answer("found", 41.0), answer("not_found"))
     tracker = Tracker(client, "m", camera=K)
     assert asked_with(tracker, [0, 1, 2, 3, 4], client)[2:] == [[2.0], [3.0], [3.0, 4.0]]
     assert tracker.state().status == "lost"
     tracker.reset("a lift")
     tracker.update(depth(5), ahead(5), stamp=5.0)
-    assert client.asked[-1]["frames"] == [5.0]
+    assert client.requests[-1]["frames"] == [5.0]
 
 
 def test_frames_that_were_not_answered_or_are_old_are_not_sent_again():
@@ -258,18 +258,18 @@ def test_frames_that_were_not_answered_or_are_old_are_not_sent_again():
     assert asked_with(tracker, [1, 2], client) == [[1.0], [1.0, 2.0]]
     client.answers[3:] = [errors.UselessFrame("blank"), not_found]
     assert tracker.update(depth(2.5), ahead(2.5), stamp=2.0).reason == "blank"
-    assert [one["frames"] for one in client.asked[2:]] == [[1.0, 2.5], [2.5]]
+    assert [one["frames"] for one in client.requests[2:]] == [[1.0, 2.5], [2.5]]
     tracker.update(depth(3), ahead(3), stamp=3.0)
     tracker.update(depth(3.5), ahead(3.5), stamp=32.0)  # 32 s after the first
-    assert [one["frames"] for one in client.asked[4:]] == [[1.0, 3.0], [3.0, 3.5]]
+    assert [one["frames"] for one in client.requests[4:]] == [[1.0, 3.0], [3.0, 3.5]]
 
 
 @pytest.mark.parametrize("error", [errors.UselessFrame("blank"), errors.TooLarge("3 MB")])
 def test_where_earlier_frames_are_refused_it_asks_with_the_last_alone(error):
     client = fake(answer("not_found"), error, answer("not_found"))
     tracker = Tracker(client, "m", camera=K)
-    told = asked_with(tracker, [1, 2, 3], client)
-    assert told == [[1.0], [1.0, 2.0], [2.0], [2.0, 3.0]]
+    requests = asked_with(tracker, [1, 2, 3], client)
+    assert requests == [[1.0], [1.0, 2.0], [2.0], [2.0, 3.0]]
 
 
 def test_answers_that_share_frames_or_nearly_are_one_view():

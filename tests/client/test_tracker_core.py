@@ -201,15 +201,15 @@ def test_the_prior_is_left_out_every_fourth_time_and_after_a_contradiction():
     core = TrackerCore()
     assert core.prior(at(0)) is None
     step(core, 0, 0, found(T_MAP_ODOM))
-    asked = []
+    priors = []
     for i in range(1, 9):
         prior = core.prior(at(i))
-        asked.append(prior is not None)
+        priors.append(prior is not None)
         if prior is not None:
             np.testing.assert_allclose(prior.T_map_sensor, at(10, 20 + i, 0, 90), atol=1e-9)
             assert prior.parent_frame == "map"
         step(core, i, i, found(at(10, 20 + i, 0, 90)))
-    assert asked == [True, True, False, True, True, True, False, True]
+    assert priors == [True, True, False, True, True, True, False, True]
     step(core, 9, 9, found(at(50, 29, 0, 90)))
     assert core.prior(at(10)) is None
 

@@ -100,14 +100,14 @@ class Station:
 
     def key(self, name, grants, **more):
         """Create a key and return its secret."""
-        made = self.client.post("/v1/keys", json={"name": name, "grants": grants, **more})
-        assert made.status_code == 201, made.text
-        return str(made.json()["secret"])
+        answer = self.client.post("/v1/keys", json={"name": name, "grants": grants, **more})
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["secret"])
 
     def make_map(self, name, **more):
         """Create a map and return its path."""
-        made = self.client.post("/v1/maps", json={"name": name, "model": "depth", **more})
-        assert made.status_code == 201, made.text
+        answer = self.client.post("/v1/maps", json={"name": name, "model": "depth", **more})
+        assert answer.status_code == 201, answer.text
         return f"/v1/maps/{name}"
 
 

@@ -22,10 +22,10 @@ def test_paths_leave_gaps_where_nothing_is_known(call):
     given = (
         "const v = [null, 1, 3, null, 2, null, 0, 4], x = (i) => 10 * i, y = (n) => 40 - 10 * n;"
     )
-    told = call(
+    result = call(
         "lib/scales", f"{given} return [m.linePath, m.dotPath, m.areaPath].map(f => f(v, x, y))"
     )
-    assert told == [
+    assert result == [
         "M10 30L20 10M60 40L70 0",
         "M40 20h0",
         "M10 40L10 30L20 10L20 40ZM60 40L60 40L70 0L70 40Z",
@@ -53,15 +53,15 @@ def test_a_chart_reads_out_what_the_keys_point_at_and_keeps_it(call, page):
     ]
     # 118 px for 6: red of minutes 0, 2, 3, then green of 0, 1, 3
     assert heights() == [19.67, 98.33, 39.33, 59, 78.67, 19.67]
-    told = lambda: plot.get_attribute("aria-valuetext")  # noqa: E731
-    assert told() == "09:02: red 5 pc, green –, all 5 pc"  # the last minute that is over
+    value = lambda: plot.get_attribute("aria-valuetext")  # noqa: E731
+    assert value() == "09:02: red 5 pc, green –, all 5 pc"  # the last minute that is over
     plot.focus()
     page.keyboard.press("Home")
-    assert told() == "09:00: red 1 pc, green 3 pc, all 4 pc"
+    assert value() == "09:00: red 1 pc, green 3 pc, all 4 pc"
     page.keyboard.press("ArrowRight")
-    assert told() == "09:01: red 0 pc, green 4 pc, all 4 pc"
+    assert value() == "09:01: red 0 pc, green 4 pc, all 4 pc"
     call("lib/charts", "window.later()")
-    assert told() == "09:01: red 0 pc, green 4 pc, all 4 pc"  # stays with its minute
+    assert value() == "09:01: red 0 pc, green 4 pc, all 4 pc"  # stays with its minute
     assert page.evaluate("document.activeElement.getAttribute('aria-label')") == "Apples"
     page.keyboard.press("End")
-    assert told() == "09:04: red 7 pc, green 7 pc, all 14 pc"
+    assert value() == "09:04: red 7 pc, green 7 pc, all 14 pc"

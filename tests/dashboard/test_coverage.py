@@ -46,9 +46,9 @@ def measured(station, four_sides, page, settle):
     settle(page)
     (i,) = (i for i in station.client.get(path).json()["items"] if i["job_id"] not in known)
     assert (i["request"]["not_within_s"], i["request"]["cell_m"]) == (0, 0.5)
-    told = station.client.get(f"{path}/{i['job_id']}").json()
+    record = station.client.get(f"{path}/{i['job_id']}").json()
     frames = station.client.get(f"{path}/{i['job_id']}/frames").json()["items"]
-    return {**told, "frames": frames}
+    return {**record, "frames": frames}
 
 
 @pytest.mark.thorough

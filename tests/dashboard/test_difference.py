@@ -35,8 +35,8 @@ def test_two_sessions_are_compared_and_seen_side_by_side(station, weeks, page, s
     legend = page.get_by_role("list", name="Legend")
     expect(legend).to_be_visible()
     settle(page)
-    (told,) = station.client.get(f"{weeks}/differences").json()["items"]
-    result = told["result"]
+    (difference,) = station.client.get(f"{weeks}/differences").json()["items"]
+    result = difference["result"]
     assert result["same"] > 500
     shown = {
         "Before": ("same", "gone", "unseen_after"),

@@ -23,7 +23,7 @@ def listed(station, name, **wanted):
     return [item["frame_id"] for item in found["items"]]
 
 
-def told(station, path, **params):
+def preview(station, path, **params):
     """(h, w, 3) colours of a preview as the API sends it."""
     answer = station.client.get(path, params=params)
     return colours(answer.content)
@@ -71,7 +71,7 @@ def test_gallery_shows_and_filters_what_the_api_lists(page, station, settle, axe
     page.get_by_role("button", name="Normals").click()
     settle(page)
     path = f"/v1/maps/building/frames/{ann[0]}/preview.png"
-    want = told(station, path, view="normals", width=240)
+    want = preview(station, path, view="normals", width=240)
     assert np.array_equal(drawn(page.locator(".tile canvas").first), want)
     assert "view=normals" in page.url
     page.reload()  # the address has it all
@@ -183,7 +183,7 @@ def test_frame_page_tells_what_the_api_tells(page, station, shown, settle, axe, 
         "button", name="Patches"
     ).first.click()
     settle(page)
-    want = told(station, f"{path}/preview.png", view="patches", width=640)
+    want = preview(station, f"{path}/preview.png", view="patches", width=640)
     assert np.array_equal(drawn(page.locator(".frame-look canvas")), want)
     assert f"{sizes[0]} patches" in page.locator(".frame-meaning").inner_text()
     assert axe(page) == []

@@ -13,7 +13,7 @@ BROKEN = ("frame.png", b"\x89PNG\r\n\x1a\n", "image/png")
 
 
 @pytest.fixture(scope="module")
-def asked(station):
+def answers(station):
     """Answers to four queries of a map of their own: two found, one of nobody, one that failed."""
     path = station.make_map("seen")
     for sent in station.frames[:2]:
@@ -42,28 +42,28 @@ def records(station, **params):
 
 
 def test_the_rows_are_the_records_and_filters_are_in_the_address(
-    station, asked, page, settle, axe, written
+    station, answers, page, settle, axe, written
 ):
     page.goto(f"{station.home}#/maps/seen/queries")
     settle(page)
-    told = records(station)
+    listing = records(station)
     rows = page.evaluate(ROWS)
     assert [(row["id"], row["status"]) for row in rows] == [
-        (one["query_id"], one["status"]) for one in told
+        (one["query_id"], one["status"]) for one in listing
     ]
     assert [row["status"] for row in rows] == ["failed", "not_found", "found", "found"]
     failed, lost, second, first = (row["cells"] for row in rows)
     assert (failed[1:5], failed[7]) == (["not named", "Failed", "–", "–"], "no answer")
-    assert failed[6] == told[0]["reason"]
+    assert failed[6] == listing[0]["reason"]
     assert lost[2] == "Not found"
-    assert lost[6] == written(asked[2]["reason"][0].upper() + asked[2]["reason"][1:]) + "."
+    assert lost[6] == written(answers[2]["reason"][0].upper() + answers[2]["reason"][1:]) + "."
     assert (second[1], first[1]) == ("cart\nrun", "spot\nrun")
-    place = asked[0]["location"]["pose"]["translation"]
+    place = answers[0]["location"]["pose"]["translation"]
     there = ", ".join(f"{place[axis]:.2f}" for axis in "xyz")
     assert first[3] == f"{there}\nm in room-0"
-    assert first[4] == str(asked[0]["location"]["support"])
+    assert first[4] == str(answers[0]["location"]["support"])
     assert [row["answer"] for row in rows] == [
-        None, *(f"#/queries/{one['query_id']}" for one in reversed(asked))
+        None, *(f"#/queries/{one['query_id']}" for one in reversed(answers))
     ]  # fmt: skip
     assert axe(page) == []
     page.select_option("#queries-status", "lost")
@@ -75,22 +75,22 @@ def test_the_rows_are_the_records_and_filters_are_in_the_address(
     assert [one["status"] for one in page.evaluate(ROWS)] == ["failed", "not_found"]
     page.goto(f"{station.home}#/maps/seen/queries?robot=spot&last=1")
     settle(page)
-    assert [one["id"] for one in page.evaluate(ROWS)] == [asked[0]["query_id"]]
-    page.goto(f"{station.home}#/maps/seen/queries?until={told[-1]['at']}")
+    assert [one["id"] for one in page.evaluate(ROWS)] == [answers[0]["query_id"]]
+    page.goto(f"{station.home}#/maps/seen/queries?until={listing[-1]['at']}")
     settle(page)
     assert page.locator(".state h2").inner_text() == "No queries match"
 
 
 @pytest.mark.thorough
-def test_new_queries_are_announced_and_looking_leaves_none(station, asked, page, settle, until):
+def test_new_queries_are_announced_and_looking_leaves_none(station, answers, page, settle, until):
     before = records(station)
     page.goto(f"{station.home}#/maps/seen/queries")
     settle(page)
     # the answer, a stored frame with its neighbours, and a query that an address asks once more
-    page.get_by_role("link", name=f"Answer {asked[0]['query_id'][:8]}").click()
+    page.get_by_role("link", name=f"Answer {answers[0]['query_id'][:8]}").click()
     settle(page)
     assert page.locator("h1").inner_text().startswith("Answer")
-    frame = asked[0]["matches"][0]["frame_id"]
+    frame = answers[0]["matches"][0]["frame_id"]
     for place in (f"frames/{frame}", f"query?frame={frame}", "queries"):
         page.goto(f"{station.home}#/maps/seen/{place}")
         settle(page)

@@ -62,8 +62,8 @@ def test_a_map_is_made(station, page, settle, axe):
     page.keyboard.press("Enter")
     expect(page).to_have_url(f"{station.home}#/maps/made-here")
     expect(page.get_by_role("status").filter(has_text="made-here was created")).to_be_visible()
-    made = station.client.get("/v1/maps/made-here").json()
-    assert (made["title"], made["model"].partition("-")[0]) == ("Made by hand", "depth")
+    record = station.client.get("/v1/maps/made-here").json()
+    assert (record["title"], record["model"].partition("-")[0]) == ("Made by hand", "depth")
 
 
 def test_a_map_is_removed_when_its_name_was_typed(station, page, settle):
@@ -171,7 +171,7 @@ def test_robots_are_seen_moving_on_the_plan(station, page, settle, axe, walk, wa
 
 
 def test_the_health_is_one_sentence(run):
-    def told(maps, jobs):
+    def health(maps, jobs):
         one = run("maps/condition", "m.conditionOf(...given)", maps, jobs)
         return [one["kind"], one["text"], one.get("href")]
 
@@ -179,8 +179,8 @@ def test_the_health_is_one_sentence(run):
         return {"name": name, "frames": frames, "reencoding": None}
 
     fine = "Everything is signed; no job failed."
-    assert told([], []) == told([of("hall", indexed=3, rejected=1)], []) == ["good", fine, None]
+    assert health([], []) == health([of("hall", indexed=3, rejected=1)], []) == ["good", fine, None]
     job = {"kind": "associate", "map": "hall", "job_id": "7"}
-    assert told([of("a", received=2, signing=1)], [job]) == [
+    assert health([of("a", received=2, signing=1)], [job]) == [
         "bad", "The `associate` job of `hall` failed; 3 frames wait.", "#/operations/jobs/7"
     ]  # fmt: skip

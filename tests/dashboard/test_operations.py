@@ -60,8 +60,8 @@ def repair(station):
 
 
 def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, until):
-    asked = station.client.post("/v1/maps/building/queries", **station.frames[2].form())
-    assert asked.json()["status"] == "found"
+    answer = station.client.post("/v1/maps/building/queries", **station.frames[2].form())
+    assert answer.json()["status"] == "found"
     refused = station.client.get("/v1/maps/nowhere")
     assert refused.status_code == 404
 
@@ -78,14 +78,14 @@ def test_what_is_shown_is_what_the_service_counted(station, page, settle, axe, u
     until(lambda: page.evaluate(FIGURES)["live"] == "live")
     page.locator("figure", has_text="Frames per minute").get_by_text("Show as table").click()
 
-    def told():
+    def shown_and_stats():
         """What is shown at one moment, and the answer that it is of: the page asks again."""
         shown = page.evaluate(FIGURES)
         of_it = [answer for answer in answers if answer.json()["at"] == shown["at"]]
         # the table fills when the browser tells that it was opened
         return (shown, of_it[0].json()) if of_it and shown["minutes"] else None
 
-    shown, stats = until(told)
+    shown, stats = until(shown_and_stats)
     total = stats["total"]
     assert shown["waiting"] == str(stats["waiting"])
     assert shown["workers"] == str(len(stats["workers"])) == "2"

@@ -22,12 +22,12 @@ def address(station, answer, match, **search):
 
 def residuals(station, answer, match, by):
     """Of all points of both sides, as the API tells them."""
-    told = []
+    parts = []
     for side in ("query", "match"):
         path = f"/v1/queries/{answer['query_id']}/matches/{match['frame_id']}/points"
         data = station.client.get(path, params={"side": side, "transform": by}).content
-        told.append(np.frombuffer(data, POINT, offset=HEADER.size)["residual"])
-    return np.concatenate(told)
+        parts.append(np.frombuffer(data, POINT, offset=HEADER.size)["residual"])
+    return np.concatenate(parts)
 
 
 def text(page, what):
@@ -48,8 +48,8 @@ def percent(x):
 
 def matrix(page):
     """By which the query is drawn."""
-    told = page.evaluate("document.querySelector('.overlay-canvas').scene.matrix")
-    return np.array(told).reshape(4, 4).T
+    values = page.evaluate("document.querySelector('.overlay-canvas').scene.matrix")
+    return np.array(values).reshape(4, 4).T
 
 
 @pytest.fixture(scope="module")
@@ -64,17 +64,17 @@ def test_what_is_shown_is_what_the_api_says(page, station, answer, settle, axe):
     page.goto(address(station, answer, best))
     settle(page)
     v = best["validation"]
-    told = figures(page)
-    assert told["Overlap"] == percent(v["overlap"])
-    assert told["Plane overlap"] == percent(v["plane_overlap"])
-    assert told["Inliers"].startswith(f"{v['inliers']:,} of ")
-    assert told["Violations"] == percent(v["free_space_violations"])
-    assert told["Ambiguity"] == percent(v["ambiguity"])
+    rows = figures(page)
+    assert rows["Overlap"] == percent(v["overlap"])
+    assert rows["Plane overlap"] == percent(v["plane_overlap"])
+    assert rows["Inliers"].startswith(f"{v['inliers']:,} of ")
+    assert rows["Violations"] == percent(v["free_space_violations"])
+    assert rows["Ambiguity"] == percent(v["ambiguity"])
     assert text(page, ".overlay-verdict") == f"accepted, {v['strength']}"
     assert text(page, ".overlay-reason").lower() == f"{v['reason']}.".lower()
     path = f"/v1/queries/{answer['query_id']}/matches/{best['frame_id']}"
     details = station.client.get(path).json()
-    assert told["Patches"] == f"{len(details['patches']['query']):,}"
+    assert rows["Patches"] == f"{len(details['patches']['query']):,}"
     assert "All six directions are constrained" in text(page, ".overlay-side")
     T = np.array(details["transform"]["matrix"])
     assert matrix(page) == pytest.approx(T)
@@ -97,14 +97,14 @@ def test_what_is_shown_is_what_the_api_says(page, station, answer, settle, axe):
 
 @pytest.mark.thorough
 def test_before_after_and_what_is_drawn(page, station, answer, settle, pixels, until):
-    def told(match):
+    def details_of(match):
         path = f"/v1/queries/{answer['query_id']}/matches/{match['frame_id']}"
         return station.client.get(path, params={"map": "building"}).json()
 
     def refuted(details):
         return all(len(details[side]["violations"]) > 5 for side in ("query", "match"))
 
-    details = next(one for one in map(told, reversed(answer["matches"])) if refuted(one))
+    details = next(one for one in map(details_of, reversed(answer["matches"])) if refuted(one))
     assert details["validation"]["status"] == "rejected"
     page.goto(address(station, answer, details))
     settle(page)

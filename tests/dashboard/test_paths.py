@@ -45,8 +45,8 @@ def apart(station, until):
 @pytest.mark.thorough
 def test_runs_are_joined_from_here(page, apart, station, settle):
     """Before and after: what nothing joins is told, and then drawn where the join says."""
-    asked = []
-    page.on("request", lambda one: asked.append(urlsplit(one.url)))
+    urls = []
+    page.on("request", lambda one: urls.append(urlsplit(one.url)))
     page.goto(apart["url"])
     settle(page)
     expect(page.locator(".paths-run")).to_have_text(["1ann4 poses"])
@@ -54,9 +54,9 @@ def test_runs_are_joined_from_here(page, apart, station, settle):
         "carol · 1 frame: no poses",
         "bob · 4 frames: poses in bob/odom, which no association joins to ann/odom",
     ])  # fmt: skip
-    (thinned,) = [parse_qs(one.query) for one in asked if one.path.endswith("/trajectory")]
+    (thinned,) = [parse_qs(one.query) for one in urls if one.path.endswith("/trajectory")]
     assert int(thinned["most"][0]) <= 2000  # however many there are
-    lists = [parse_qs(one.query) for one in asked if one.path.endswith("/frames")]
+    lists = [parse_qs(one.query) for one in urls if one.path.endswith("/frames")]
     assert [one["limit"] for one in lists] == [["1"]]
     page.get_by_role("button", name="New association…").click()
     dialog = page.get_by_role("dialog")
@@ -156,9 +156,9 @@ def test_numbers_behind_the_picture(run):
         {"transform": {"matrix": turn.tolist()}, "from_parent": "c", "to_parent": "d",
          "strength": "strong", "support": 9, "undone": True},
     ]  # fmt: skip
-    told = [{"job_id": "x", "result": {"joins": joins}}]
+    jobs = [{"job_id": "x", "result": {"joins": joins}}]
     reached = run("paths/joined", """[...m.reach("a", m.bridges(given[0]))]
-        .map(([name, one]) => [name, one.matrix, one.over.length])""", told)  # fmt: skip
+        .map(([name, one]) => [name, one.matrix, one.over.length])""", jobs)  # fmt: skip
     assert [(name, over) for name, _, over in reached] == [("a", 0), ("b", 1), ("c", 2)]
     a_from_c = np.linalg.inv(turn) @ shift
     np.testing.assert_allclose(np.array(reached[2][1]).reshape(4, 4).T, a_from_c, atol=1e-12)

@@ -70,23 +70,23 @@ def highest(built):
 
 @pytest.mark.thorough
 def test_a_spot_names_the_frames_that_saw_it(page, station, built, settle, axe, until):
-    asked = []
-    page.on("request", lambda one: asked.append(urlsplit(one.url)))
+    urls = []
+    page.on("request", lambda one: urls.append(urlsplit(one.url)))
     opened(page, station, settle, "#/maps/building/place?parent=room-0&heights=all", until)
     spot = highest(built)
     click_at(page, spot)
     section = page.locator("section", has=page.locator("#place-spot"))
     expect(section.locator("[role=status]")).to_contain_text("frame")
     settle(page)
-    (sent,) = [parse_qs(one.query) for one in asked if one.path.endswith("/surface/frames")]
+    (sent,) = [parse_qs(one.query) for one in urls if one.path.endswith("/surface/frames")]
     assert np.array(sent["at"][0].split(","), float) == pytest.approx(spot, abs=0.06)
-    told = station.client.get(
+    frames = station.client.get(
         f"{built['path']}/frames", params={name: values[0] for name, values in sent.items()}
     ).json()["items"]
-    assert told
+    assert frames
     links = section.locator(".place-frames .paths-told a:first-child")
     hrefs = links.evaluate_all("all => all.map((one) => one.getAttribute('href'))")
-    assert hrefs == [f"#/maps/building/frames/{one['frame_id']}" for one in told]
+    assert hrefs == [f"#/maps/building/frames/{one['frame_id']}" for one in frames]
     assert axe(page) == []
 
 
@@ -207,11 +207,11 @@ def test_detail_by_value(run):
             (None, "unvalidated"), ("cart", "found"), ("spot", "failed"),
         ])
     ]  # fmt: skip
-    told = run("place/robots", """m.robotsOf(given[0]).map((one) => [one.name, one.last.query_id,
+    result = run("place/robots", """m.robotsOf(given[0]).map((one) => [one.name, one.last.query_id,
         one.found?.query_id ?? null, one.trail.map((each) => each.query_id),
         one.lost.map((each) => [each.record.query_id, each.near?.query_id ?? null])])""",
         records)  # fmt: skip
-    assert told == [
+    assert result == [
         ["spot", 6, 1, [], [[0, None], [3, 1], [6, 1]]],
         ["cart", 5, 5, [2], []],
         ["not named", 4, None, [], []],

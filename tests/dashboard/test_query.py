@@ -69,25 +69,25 @@ def accepted(answer):
 def test_the_rows_are_the_answer(station, page, ask, axe, written):
     answer = ask("&k=2&candidates=4")
     frame_id = station.frames[0].frame_id
-    asked = {"frame_id": frame_id, "k": 2, "candidates": 4, "explain": True}
-    again = station.client.post("/v1/maps/building/queries", json=asked).json()
+    body = {"frame_id": frame_id, "k": 2, "candidates": 4, "explain": True}
+    again = station.client.post("/v1/maps/building/queries", json=body).json()
     for name in ("matches", "explanations", "counts", "location", "status"):
         assert again[name] == answer[name]  # the page asks as one asks by hand
     ranking, selection, validated = (tiles(page, row) for row in ("R", "DR", "VDR"))
     assert [e["key"] for e in ranking] == [key(e) for e in answer["explanations"]]
-    for tile, told in zip(ranking, answer["explanations"], strict=True):
-        assert tile["rank"] == told["rank"]
-        assert f"distance {told['distance']:,}" in tile["text"]
-        similar = 100 * told["similarity"]
+    for tile, explanation in zip(ranking, answer["explanations"], strict=True):
+        assert tile["rank"] == explanation["rank"]
+        assert f"distance {explanation['distance']:,}" in tile["text"]
+        similar = 100 * explanation["similarity"]
         digits = 2 if 0 < similar < 1 else 1 if similar < 10 else 0
         assert f"similar {similar:.{digits}f} %" in tile["text"]
     chosen = sorted(answer["matches"], key=lambda one: one["rank"])
     assert [one["key"] for one in selection] == [key(one) for one in chosen]
-    for tile, told in zip(selection, chosen, strict=True):
-        assert f"gain {round(told['diversity_gain'], 2):g}" in tile["text"]
+    for tile, explanation in zip(selection, chosen, strict=True):
+        assert f"gain {round(explanation['diversity_gain'], 2):g}" in tile["text"]
     assert [match["key"] for match in validated] == [key(match) for match in answer["matches"]]
-    for tile, told in zip(validated, answer["matches"], strict=True):
-        validation = told["validation"]
+    for tile, explanation in zip(validated, answer["matches"], strict=True):
+        validation = explanation["validation"]
         assert tile["status"] == validation["status"]
         assert written(validation["reason"]) in tile["text"]
         if validation["inliers"] is not None:
@@ -174,15 +174,15 @@ def test_an_ambiguous_answer_lists_poses_of_one_rank(station, page, four_sides, 
             why: one.querySelector(".alternatives-why").textContent,
         }))"""
     )
-    for i, (item, told) in enumerate(zip(items, several, strict=True)):
+    for i, (item, alternative) in enumerate(zip(items, several, strict=True)):
         assert item["letter"] == "ABCDE"[i]
-        p = told["pose"]["translation"]
+        p = alternative["pose"]["translation"]
         place = ", ".join(f"{axis} {round(p[axis], 2):g}" for axis in "xyz")
         assert item["place"].startswith(place)
         assert item["place"].endswith(" from A") == (i > 0)
-        support = told["support"]
+        support = alternative["support"]
         supported = f"{support} match{'es' if support > 1 else ''}" if support else "the map alone"
-        sure, score = told["confidence"], told["evidence"]["score"]
+        sure, score = alternative["confidence"], alternative["evidence"]["score"]
         assert item["figures"] == [
             f"{math.floor(1000 * sure) / 10:.1f} %", f"{100 * score:.0f} %", supported
         ]  # fmt: skip
@@ -242,7 +242,7 @@ def test_the_plan_and_the_overlay_are_on_the_first_screen(station, page, ask, se
 
 
 def test_what_a_found_pose_rests_on_is_told_in_words(run):
-    def told(**change):
+    def reasons(**change):
         pose = {"parent_frame": "hall", "translation": {"x": 1, "y": 2, "z": 0.5}}
         location = {
             "map": "house", "pose": pose, "support": 3, "guided": 0, "votes": 3,
@@ -262,18 +262,18 @@ def test_what_a_found_pose_rests_on_is_told_in_words(run):
     near = f"{seen}the next best place fits 42 % as well"
     firm = "3 of 3 accepted matches agree on this pose, within 20 mm, 0.5°"
     title = "Found, 99.6 % sure"  # rounded down
-    assert told() == ([near, firm, "strong matches"], "good", title)
+    assert reasons() == ([near, firm, "strong matches"], "good", title)
     alone = {"planes": 1.2, "frames": 1, "excess": -0.01, "rival": 0.04}
-    assert told(support=1, votes=1, evidence=alone, confidence=0.99996) == (
+    assert reasons(support=1, votes=1, evidence=alone, confidence=0.99996) == (
         ["1 plane and 1 frame of the map agree, nothing is missing, no other place fits",
          "one view", "strong match"], "good", "Found, 99.9 % sure"
     )  # fmt: skip
-    assert told(support=0, votes=0, verified_by="map", strength="weak")[:2] == (
+    assert reasons(support=0, votes=0, verified_by="map", strength="weak")[:2] == (
         [near, "confirmed by the map’s frames", "no accepted match"], "good"
     )  # fmt: skip
     # found with less confidence than the default, or without one
-    assert told(confidence=0.9)[1:] == ("warn", "Found, 90.0 % sure")
-    assert told(confidence=None)[1:] == ("warn", "Found")
+    assert reasons(confidence=0.9)[1:] == ("warn", "Found, 90.0 % sure")
+    assert reasons(confidence=None)[1:] == ("warn", "Found")
 
 
 @pytest.mark.thorough
@@ -317,7 +317,7 @@ def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle, writ
         if explanation["outcome"] == "accepted" and explanation["frame_id"] != listed
     )
     for frame_id in (ids[0], ids[9], listed, after, out["frame_id"]):
-        told = station.client.post(
+        record = station.client.post(
             "/v1/maps/building/queries",
             json={"frame_id": ids[0], "explain_frame": frame_id, **options},
         ).json()["explained_frame"]
@@ -325,16 +325,16 @@ def test_why_not_is_told_as_the_api_explains_it(station, page, ask, settle, writ
         page.locator("#why-frame").press("Enter")
         settle(page)
         head = page.locator(".query-why-head")
-        assert head.get_attribute("data-lost") == (told["lost_at"] or "none")
+        assert head.get_attribute("data-lost") == (record["lost_at"] or "none")
         said = page.locator(".query-why-result").inner_text()
-        assert written(told["reason"][1:]).replace("`", "") in said  # code is shown as code
-        if told["rank"] is not None:
-            assert f"{told['rank']} of {told['of']}" in said
-            assert f"{told['distance']:,}" in said
+        assert written(record["reason"][1:]).replace("`", "") in said  # code is shown as code
+        if record["rank"] is not None:
+            assert f"{record['rank']} of {record['of']}" in said
+            assert f"{record['distance']:,}" in said
         marked = page.locator(".query-step[data-lost=here], .query-step[data-lost=not]")
-        step = steps.get(told["lost_at"], "accepted")
+        step = steps.get(record["lost_at"], "accepted")
         assert marked.evaluate_all("all => all.map(one => one.dataset.step)") == [step]
-        seen.add(told["lost_at"])
+        seen.add(record["lost_at"])
     assert seen == {"query", "filter", "selection", "turn", None}
 
 
@@ -383,9 +383,9 @@ def test_an_answer_is_kept_shared_and_released(station, open_page, settle, axe, 
     page = open_page(permissions=["clipboard-read", "clipboard-write"])
     frame = station.frames[2].frame_id
     body = {"frame_id": frame, "k": 3}
-    asked = station.client.post("/v1/maps/building/queries", json=body).json()["query_id"]
-    path = f"/v1/queries/{asked}/question"
-    page.goto(f"{station.home}#/queries/{asked}")
+    query_id = station.client.post("/v1/maps/building/queries", json=body).json()["query_id"]
+    path = f"/v1/queries/{query_id}/question"
+    page.goto(f"{station.home}#/queries/{query_id}")
     settle(page)
     panel = page.get_by_role("group", name="Keep this answer")
     expect(panel).to_contain_text("This answer expires in")
@@ -398,7 +398,7 @@ def test_an_answer_is_kept_shared_and_released(station, open_page, settle, axe, 
     listed = f"{station.home}#/maps/building/queries?kept=true"
     page.goto(listed)
     settle(page)
-    row = page.locator(f"[data-query='{asked}']")
+    row = page.locator(f"[data-query='{query_id}']")
     expect(row).to_contain_text("kept")
     row.get_by_role("link", name="Answer").click()
     settle(page)
@@ -420,10 +420,10 @@ def test_an_answer_is_reconstructed(station, page, ask, settle, with_open3d):
     mesh = card.get_by_role("button", name="Mesh (PLY)")
     expect(mesh).to_be_visible(timeout=120_000)
     job = page.url.rpartition("reconstruction=")[2]
-    told = station.client.get(f"/v1/reconstructions/{job}").json()
-    assert told["query_id"] == answer["query_id"]
-    expect(card).to_contain_text(f"{len(told['result']['views'])} views show")
-    expect(card).to_contain_text(f"{told['result']['area_m2']:.1f} m²")
+    record = station.client.get(f"/v1/reconstructions/{job}").json()
+    assert record["query_id"] == answer["query_id"]
+    expect(card).to_contain_text(f"{len(record['result']['views'])} views show")
+    expect(card).to_contain_text(f"{record['result']['area_m2']:.1f} m²")
     with page.expect_download() as download:
         mesh.click()
     ply = station.client.get(f"/v1/reconstructions/{job}/mesh.ply").content

@@ -12,7 +12,7 @@ BUDGET = 40_000
 
 def test_the_first_page_is_small_and_asks_for_nothing_long(station, page, settle, axe):
     code = {}
-    asked = []
+    paths = []
 
     def note(answer):
         path = answer.url.removeprefix(station.url).partition("?")[0]
@@ -20,7 +20,7 @@ def test_the_first_page_is_small_and_asks_for_nothing_long(station, page, settle
             assert answer.headers["content-encoding"] == "gzip"
             code[path] = int(answer.headers["content-length"])
         else:
-            asked.append(answer.url.removeprefix(station.url))
+            paths.append(answer.url.removeprefix(station.url))
 
     page.on("response", note)
     page.goto(station.url)  # led on to the dashboard
@@ -33,7 +33,7 @@ def test_the_first_page_is_small_and_asks_for_nothing_long(station, page, settle
     assert set(code) >= {"/dashboard", "/dashboard/main.js", "/dashboard/maps/maps.js"}
     # a list of frames is none of the first page's, nor of any map that is not in view
     kinds = {re.sub("/v1/maps/[^/]+/surface(/plan.png)?", "plan", one.partition("?")[0])
-             for one in asked}  # fmt: skip
+             for one in paths}  # fmt: skip
     assert kinds <= {
         "/", "/v1/keys/me", "/v1/maps", "/v1/jobs", "/v1/queries", "/v1/events", "plan"
     }  # fmt: skip
@@ -52,14 +52,14 @@ def test_keys(station, open_page, settle, axe):
     expect(page.get_by_role("heading", name="This service requires a key")).to_be_visible()
     assert axe(page) == []
     field = page.get_by_label("Key", exact=True)
-    for wrong, told in (
+    for wrong, message in (
         ("", "Paste a key first"), ("sp_nonsense", "unknown, revoked or expired"),
         ("schlüssel", "contains characters that keys do not have"),
         (late, "unknown, revoked or expired"),
     ):  # fmt: skip
         field.fill(wrong)
         page.keyboard.press("Enter")
-        expect(page.get_by_role("alert")).to_contain_text(told)
+        expect(page.get_by_role("alert")).to_contain_text(message)
     field.fill(f" {reader} ")
     page.keyboard.press("Enter")
     settle(page)
@@ -165,7 +165,7 @@ def test_nothing_is_wider_than_a_small_screen(station, open_page, settle):
 
 @pytest.mark.thorough
 def test_the_api_s_page_draws_every_operation_with_its_own_files(page, station):
-    told = station.client.get("/openapi.json").json()
-    operations = sum(len(path) for path in told["paths"].values())
+    document = station.client.get("/openapi.json").json()
+    operations = sum(len(path) for path in document["paths"].values())
     page.goto(station.home.replace("/dashboard", "/docs"))
     expect(page.locator(".opblock")).to_have_count(operations)

@@ -40,10 +40,10 @@ def stage(page, station):
 
 
 def cloud(page, data, **more):
-    told = {"shade": 0, "size": 0.05, **more}
+    options = {"shade": 0, "size": 0.05, **more}
     page.evaluate(
-        "([text, told]) => view.cloud('a', { points: points.parsePoints(bytes(text)), ...told })",
-        [base64.b64encode(data).decode(), told],
+        "([text, more]) => view.cloud('a', { points: points.parsePoints(bytes(text)), ...more })",
+        [base64.b64encode(data).decode(), options],
     )
 
 
@@ -70,10 +70,10 @@ def test_the_orbit_by_value(stage):
     js = stage.evaluate
     axes = js("() => new camera.Orbit('-y').axes()")  # looking down a little
     js("() => { window.o = new camera.Orbit('z'); o.look({azimuth: 0, elevation: 0}); }")
-    told = js("() => o.axes()")
-    assert told["right"] == pytest.approx([1, 0, 0])
-    assert told["above"] == pytest.approx([0, 0, 1])
-    assert told["ahead"] == pytest.approx([0, 1, 0])
+    axis = js("() => o.axes()")
+    assert axis["right"] == pytest.approx([1, 0, 0])
+    assert axis["above"] == pytest.approx([0, 0, 1])
+    assert axis["ahead"] == pytest.approx([0, 1, 0])
     assert axes["ahead"] == pytest.approx([0, math.sin(0.35), math.cos(0.35)])
     js("() => o.look({ azimuth: Math.PI / 2, distance: 3, target: [1, 0, 0] })")
     assert js("() => o.axes().ahead") == pytest.approx([1, 0, 0])
@@ -157,21 +157,21 @@ def test_points_are_read_as_they_were_written(stage):
     residuals = rng.integers(0, 256, 50).astype(np.uint8)
     data = encode_points(at, normals, np.arange(-1, 49), residuals, total=99, scale=0.12)
     text = base64.b64encode(data).decode()
-    told = stage.evaluate(
+    result = stage.evaluate(
         """(text) => { const p = points.parsePoints(bytes(text));
           return [p.count, p.total, p.scale, p.hasNormals && p.hasPatches && p.hasResiduals,
             [...Array(p.count).keys()].map((i) => points.pointAt(p, i)),
             [...points.residualCounts(p)]]; }""",
         text,
     )
-    assert told[:2] == [50, 99]
-    assert told[2] == pytest.approx(0.12)
-    assert told[3] is True
-    assert np.array([p["position"] for p in told[4]]) == pytest.approx(at, abs=2e-4)
-    assert np.array([p["normal"] for p in told[4]]) == pytest.approx(normals, abs=0.005)
-    assert [p["patch"] for p in told[4]] == [65535, *range(49)]
-    assert [p["residual"] for p in told[4]] == residuals.tolist()
-    assert told[5] == np.bincount(residuals, minlength=256).tolist()
+    assert result[:2] == [50, 99]
+    assert result[2] == pytest.approx(0.12)
+    assert result[3] is True
+    assert np.array([p["position"] for p in result[4]]) == pytest.approx(at, abs=2e-4)
+    assert np.array([p["normal"] for p in result[4]]) == pytest.approx(normals, abs=0.005)
+    assert [p["patch"] for p in result[4]] == [65535, *range(49)]
+    assert [p["residual"] for p in result[4]] == residuals.tolist()
+    assert result[5] == np.bincount(residuals, minlength=256).tolist()
 
 
 def test_the_nearer_hides_the_farther_and_none_is_too_small(stage):

@@ -82,23 +82,23 @@ def desk(tmp_path_factory):
 
 
 def zipped(folder, **options):
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w", options.get("method", zipfile.ZIP_DEFLATED)) as packed:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", options.get("method", zipfile.ZIP_DEFLATED)) as packed:
         for path in sorted(folder.rglob("*")):
             packed.write(path, path.relative_to(folder.parent))
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 def tarred(folder, form=tarfile.GNU_FORMAT):
-    made = io.BytesIO()
-    with tarfile.open(fileobj=made, mode="w", format=form) as packed:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=form) as packed:
         packed.add(folder, folder.name)
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 def tar_of(*members):
-    made = io.BytesIO()
-    with tarfile.open(fileobj=made, mode="w", format=tarfile.GNU_FORMAT) as packed:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.GNU_FORMAT) as packed:
         for member in members:
             if isinstance(member, tarfile.TarInfo):
                 packed.addfile(member, io.BytesIO(bytes(member.size)))
@@ -106,7 +106,7 @@ def tar_of(*members):
             info = tarfile.TarInfo(member[0])
             info.size = len(member[1])
             packed.addfile(info, io.BytesIO(member[1]))
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 def inflated(data, most=1 << 30, step=1 << 16):
@@ -127,7 +127,7 @@ def said(sequence, frame, data):
     return (*of_all, frame.name, frame.camera, frame.timestamp, pose, data)
 
 
-def told(archive):
+def contents(archive):
     return [said(s, f, archive.data_of(f)) for s in archive.sequences for f in s.frames]
 
 
@@ -146,7 +146,7 @@ def test_it_is_read_as_the_folder_is(kind, which, kitchen, desk, tmp_path):
         data = PACKERS.get(kind, bytes)(tarred(folder, forms.get(kind, tarfile.GNU_FORMAT)))
     assert is_archive(data[:512])
     with looked_into(data, tmp_path) as archive:
-        assert told(archive) == oracle(folder)
+        assert contents(archive) == oracle(folder)
         assert archive.refused == []
         assert archive.ignored == (6 if which == "kitchen" else 1)
         first = archive.sequences[0].frames[0]
@@ -293,13 +293,13 @@ def test_a_tar_that_ends_early_gives_what_it_has(kitchen, tmp_path):
 
 
 def test_encrypted_and_strangely_packed_members_are_told(kitchen, tmp_path):
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w") as packed:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as packed:
         packed.write(kitchen / "intrinsics.json", "s/intrinsics.json")
         image = (kitchen / "seq-01" / "frame-000000.depth.png").read_bytes()
         packed.writestr("s/1.png", image)
         packed.writestr("s/2.png", image, zipfile.ZIP_LZMA)
-    data = bytearray(made.getvalue())
+    data = bytearray(buffer.getvalue())
     entry = data.rindex(b"PK\x01\x02", 0, data.index(b"s/1.png", data.index(b"PK\x01\x02")))
     data[entry + 8] |= 1
     with looked_into(bytes(data), tmp_path) as archive:

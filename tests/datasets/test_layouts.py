@@ -139,8 +139,8 @@ def test_what_is_left_out_is_named(tmp_path):
     assert [f.path.name for s in found for f in s.frames] == ["0.png", "0.png"]
     assert found[0].note.startswith("skipped: scene/ir, scene/depth/confidence_0.png (colour, ")
     assert found[1].note == ""
-    (asked,) = find_sequences(scene / "ir")
-    assert len(asked.frames) == 1
+    (sequence,) = find_sequences(scene / "ir")
+    assert len(sequence.frames) == 1
     for image in scene.glob("*depth*/?.png"):
         image.unlink()
     with pytest.raises(DatasetError, match=r"skipped: scene/ir, .*confidence_0\.png"):

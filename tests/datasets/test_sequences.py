@@ -148,8 +148,8 @@ def test_frames_have_the_numbers_and_names_of_their_files(kitchen, tmp_path):
     write_intrinsics(plain, CAMERA)
     for name in ("b10.png", "b9.png", "a.png"):
         write_depth_png(plain / name, DEPTH, 1000.0)
-    (told,) = find_sequences(plain)
-    assert [(f.original, f.sequence) for f in told.frames] \
+    (sequence,) = find_sequences(plain)
+    assert [(f.original, f.sequence) for f in sequence.frames] \
         == [("a.png", 0), ("b9.png", 1), ("b10.png", 2)]  # fmt: skip
     (alone,) = find_sequences(plain / "b9.png")
     assert alone.frames[0].sequence is None  # its place is not known
@@ -157,8 +157,8 @@ def test_frames_have_the_numbers_and_names_of_their_files(kitchen, tmp_path):
 
 def test_sequences_of_one_session_are_numbered_one_after_the_other(kitchen):
     def places(found, session):
-        told = numbered_sequences(found, session)
-        return [[frame.sequence for frame in one.frames] for one in told]
+        sequences = numbered_sequences(found, session)
+        return [[frame.sequence for frame in one.frames] for one in sequences]
 
     found = find_sequences(kitchen)
     assert places(found, None) == [[0, 1], [0, 1], [0, 1]]

@@ -156,18 +156,18 @@ def test_a_tenant_alone_has_all_places_and_beside_another_half():
     with work_of("a"):
         for one in held:
             one.__enter__()
-    asked, served, release = threading.Event(), threading.Event(), threading.Event()
+    begun, served, release = threading.Event(), threading.Event(), threading.Event()
 
     def other():
         set_tenant("b")
-        asked.set()
+        begun.set()
         with pool.place():
             served.set()
             release.wait(PATIENCE_S)
 
     thread = threading.Thread(target=other)
     thread.start()
-    assert asked.wait(PATIENCE_S)
+    assert begun.wait(PATIENCE_S)
     assert not served.is_set()
     held.pop().__exit__(None, None, None)  # goes to b, though a might ask first
     assert served.wait(PATIENCE_S)

@@ -127,8 +127,8 @@ def whitened_model(small_model):
 @pytest.fixture(scope="session")
 def prepared(uploads, signer):
     """The library's signatures of the uploads, with decoded artifacts."""
-    made = [prepare(each.frame, signer) for each in uploads]
-    return [(signature, read_geometry(write_geometry(seen))) for signature, seen in made]
+    pairs = [prepare(each.frame, signer) for each in uploads]
+    return [(signature, read_geometry(write_geometry(seen))) for signature, seen in pairs]
 
 
 @pytest.fixture

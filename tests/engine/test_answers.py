@@ -52,13 +52,13 @@ def test_an_upload_is_found_where_it_was_taken(full, uploads):
     assert np.trace(place[:3, :3].T @ upload.pose[:3, :3]) > 1 + 2 * np.cos(np.radians(1))
 
 
-@pytest.mark.parametrize(("asked", "k", "seed"), [(8, 2, 7), (3, 11, 1)])
-def test_an_answer_has_the_numbers_of_the_library(full, prepared, signer, uploads, asked, k, seed):
+@pytest.mark.parametrize(("number", "k", "seed"), [(8, 2, 7), (3, 11, 1)])
+def test_an_answer_has_the_numbers_of_the_library(full, prepared, signer, uploads, number, k, seed):
     names = full.ids()
-    others = [i for i in range(len(prepared)) if i != asked]
+    others = [i for i in range(len(prepared)) if i != number]
     signatures = [prepared[i][0] for i in others]
     geometries = [prepared[i][1] for i in others]
-    query, seen = prepared[asked]
+    query, seen = prepared[number]
     ranking = retrieve(query, signatures, signer.model)
     ten = diversify(ranking, signatures, 10).indices.tolist()
     deciding = associate(seen, ranking, ten, geometries.__getitem__, 5, seed)
@@ -71,7 +71,7 @@ def test_an_answer_has_the_numbers_of_the_library(full, prepared, signer, upload
     tried = associate(seen, ranking, among, geometries.__getitem__, max(5, k), seed)
     accepted = [m.index for m in tried if m.validation.status == "accepted"]
     matches = [m for m in tried if m.index not in accepted[k:]]
-    answer = full.query_frame("hall", names[asked], Query(k=k, seed=seed))
+    answer = full.query_frame("hall", names[number], Query(k=k, seed=seed))
     first = answer.matches[: len(matches)]
     assert [m.frame_id for m in first] == [names[others[m.index]] for m in matches]
     assert (answer.counts.validated, answer.counts.accepted) == (len(tried), len(accepted))

@@ -51,11 +51,11 @@ def two_runs(tmp_path_factory, make_upload, room_views):
         for i, frame in enumerate(room.frames):
             robot, session = (("ann", "a"), ("bob", "b"))[i % 2]
             pose = inverse(ORIGINS[f"{robot}/{session}"]) @ frame.pose
-            made = make_upload(
+            upload = make_upload(
                 frame, room.name, robot=robot, session=session, pose={"matrix": pose.tolist()},
                 captured_at=BEGIN + timedelta(seconds=i),
             )  # fmt: skip
-            engine.add(made)
+            engine.add(upload)
         assert set(engine.work_off()) == {JobState.SUCCEEDED}
     return folder
 
@@ -66,8 +66,8 @@ def engine(two_runs, tmp_path, make_engine):
     return make_engine()
 
 
-def done(engine, **asked):
-    begun = engine.associations.begin("hall", NewAssociation.model_validate(asked))
+def done(engine, **body):
+    begun = engine.associations.begin("hall", NewAssociation.model_validate(body))
     assert begun.state is JobState.QUEUED
     engine.work_off()
     return engine.associations.get("hall", begun.job_id)
@@ -328,8 +328,8 @@ def difference(engine, before, after):
     return engine.differences.get("hall", begun.job_id)
 
 
-def points_of(engine, told):
-    file = engine.differences.file("hall", told.job_id, POINTS)
+def points_of(engine, difference):
+    file = engine.differences.file("hall", difference.job_id, POINTS)
     return decode_points(engine.store.blobs.get(file.blob))
 
 

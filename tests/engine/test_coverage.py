@@ -69,11 +69,11 @@ def rooms(tmp_path_factory, uploads, make_upload, room_views):
 
         def add(name, frame, room, session):
             second = 5 * len(positions) if name == "pair" else len(positions)
-            made = make_upload(
+            upload = make_upload(
                 frame, room, session=session, robot="ann",
                 captured_at=BEGIN + timedelta(seconds=second),
             )  # fmt: skip
-            engine.add(made, name)
+            engine.add(upload, name)
             positions.append(frame.pose[:3, 3])
 
         rng, frame = np.random.default_rng(5), path.frames[0]
@@ -99,15 +99,15 @@ def engine(rooms, tmp_path, make_engine):
     return make_engine()
 
 
-def measured(engine, map_name="hall", **asked):
-    begun = engine.coverage.begin(map_name, NewMapCoverage.model_validate(asked))
+def measured(engine, map_name="hall", **body):
+    begun = engine.coverage.begin(map_name, NewMapCoverage.model_validate(body))
     assert begun.state is JobState.QUEUED
     assert engine.work_off()[-1] is JobState.SUCCEEDED
     return engine.coverage.get(map_name, begun.job_id)
 
 
-def frames_of(engine, told):
-    return engine.coverage.frames(told.map, told.job_id).items
+def frames_of(engine, record):
+    return engine.coverage.frames(record.map, record.job_id).items
 
 
 def test_equal_rooms_are_ambiguous_and_linked(engine, rooms):
@@ -180,10 +180,10 @@ def test_every_nth_frame_and_at_most_so_many(engine):
     frames = [(frame.session, frame.frame_id) for frame in engine.list_frames("hall").items]
     order = [frame_id for _, frame_id in sorted(frames, key=lambda one: one[0] or "")]
 
-    def chosen(**asked):
+    def chosen(**body):
         with engine.store.database.read() as connection:
             row = find_map(connection, "hall")
-            numbers = frames_to_query(connection, row, NewMapCoverage.model_validate(asked))
+            numbers = frames_to_query(connection, row, NewMapCoverage.model_validate(body))
             stops = path_frames(connection, numbers)
         return [stops[number].id for number in numbers]
 

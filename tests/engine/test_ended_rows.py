@@ -154,8 +154,8 @@ def aged(full):
 def test_what_is_too_old_goes_with_its_bytes(aged, uploads, monkeypatch):
     monkeypatch.setattr(purge, "AT_ONCE", 2)
     names, revision = aged.ids(), aged.get_map("hall").revision
-    made = select(signatures.c.geometry).order_by(signatures.c.frame_number).limit(5)
-    first = list(aged.fetch(made).scalars())
+    query = select(signatures.c.geometry).order_by(signatures.c.frame_number).limit(5)
+    first = list(aged.fetch(query).scalars())
     assert aged.get_map("hall").overdue is None
     assert Retention(aged.store, ROWS_DAYS).run() == 0  # nobody has said how long
     result = edit_map(aged.store, "hall", {"retention_days": 7.0})

@@ -60,7 +60,7 @@ def twins(twin_folder, make_engine, uploads, tmp_path):
         query = Query.model_validate({"keep": False, **how})
         return engine.ask(request, query, meta=meta)
 
-    return SimpleNamespace(ask=ask, asked=request, first=every[6:12], second=every[12:])
+    return SimpleNamespace(ask=ask, query=request, first=every[6:12], second=every[12:])
 
 
 #: So many candidates are all but one of the twin room.
@@ -90,21 +90,21 @@ def test_an_equal_room_that_fills_the_selection_makes_the_answer_ambiguous(twins
     assert {result[m.frame_id] for m in beyond} == {("validate", "accepted")}
     assert answer.counts.selected == FEW
     assert answer.counts.validated == FEW + len(beyond)
-    places = [a.pose.matrix[0][3] - twins.asked.pose[0, 3] for a in answer.alternatives[:2]]
+    places = [a.pose.matrix[0][3] - twins.query.pose[0, 3] for a in answer.alternatives[:2]]
     assert sorted(places) == pytest.approx([0.0, APART], abs=0.05)
     # without them the selection alone would be believed: 30 m off
     monkeypatch.setattr(RIVAL_ROWS, blind_to_rivals)
     believed = twins.ask(candidates=FEW)
     assert believed.status == "found"
-    off = believed.location.pose.matrix[0][3] - twins.asked.pose[0, 3]
+    off = believed.location.pose.matrix[0][3] - twins.query.pose[0, 3]
     assert off == pytest.approx(APART, abs=0.05)
 
 
 def test_a_prior_tells_equal_rooms_apart(twins):
-    pose = {"matrix": twins.asked.pose.tolist(), "parent_frame": twins.asked.room}
+    pose = {"matrix": twins.query.pose.tolist(), "parent_frame": twins.query.room}
     answer = twins.ask(candidates=FEW, prior={"pose": pose})
     assert (answer.status, answer.location.verified_by) == ("found", "prior")
-    assert answer.location.pose.matrix[0][3] == pytest.approx(twins.asked.pose[0, 3], abs=0.05)
+    assert answer.location.pose.matrix[0][3] == pytest.approx(twins.query.pose[0, 3], abs=0.05)
 
 
 def test_what_the_deadline_leaves_uncompared_is_not_found(twins, monkeypatch):
@@ -122,7 +122,7 @@ def test_what_the_deadline_leaves_uncompared_is_not_found(twins, monkeypatch):
     assert (answer.status, answer.deadline_reached) == ("ambiguous", True)
     assert "the deadline passed before similar frames of other places" in answer.reason
     [pose] = answer.alternatives
-    assert pose.pose.matrix[0][3] - twins.asked.pose[0, 3] == pytest.approx(APART, abs=0.05)
+    assert pose.pose.matrix[0][3] - twins.query.pose[0, 3] == pytest.approx(APART, abs=0.05)
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ class Known:
 def fill(engine, count, seed, name="hall"):
     """Index frames of random metadata; places and times are round, so that bounds are met."""
     rng = np.random.default_rng(seed)
-    made = []
+    frames = []
     with engine.store.database.write() as connection:
         row = stored_maps.find_map(connection, name)
         model = engine.signers(row.model_id).model
@@ -60,8 +60,8 @@ def fill(engine, count, seed, name="hall"):
             signature = StoredSignature(model.id, vector.tobytes(), "11" * 32, [1], [1])
             index_frame(connection, frame, signature)
             robot, session, tags = (values[name] for name in ("robot", "session", "tags"))
-            made.append(Known(frame.id, vector, robot, session, at, tags, parent, place))
-    return made
+            frames.append(Known(frame.id, vector, robot, session, at, tags, parent, place))
+    return frames
 
 
 def passes(one, wanted, own):

@@ -27,16 +27,16 @@ from tests.engine.conftest import begin_import, bytes_on_disk, claim_long, used
 
 
 def packed(uploads):
-    made = io.BytesIO()
+    buffer = io.BytesIO()
     camera = uploads[0].meta.intrinsics.model_dump(exclude={"distortion"})
-    with tarfile.open(fileobj=made, mode="w:gz") as archive:
+    with tarfile.open(fileobj=buffer, mode="w:gz") as archive:
         members = {"run/intrinsics.json": json.dumps(camera).encode()}
         members |= {f"run/{i}.png": upload.data for i, upload in enumerate(uploads)}
         for name, data in members.items():
             info = tarfile.TarInfo(name)
             info.size = len(data)
             archive.addfile(info, io.BytesIO(data))
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 def test_a_slice_that_was_lost_is_done_again(empty, uploads, monkeypatch):
@@ -115,12 +115,12 @@ def test_a_cancelled_import_takes_no_frame_more(empty, uploads, monkeypatch):
 
 def zeros(megabytes, name):
     """Return a compressed archive of a few kilobytes with a member of zeros."""
-    made = io.BytesIO()
-    with tarfile.open(fileobj=made, mode="w:gz", compresslevel=1) as archive:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz", compresslevel=1) as archive:
         info = tarfile.TarInfo(f"{name}/0.png")
         info.size = megabytes << 20
         archive.addfile(info, io.BytesIO(bytes(info.size)))
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 QUOTA = 8 << 20

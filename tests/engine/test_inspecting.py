@@ -30,12 +30,12 @@ def xyz(rows, of=("x", "y", "z")):
 
 
 @pytest.fixture
-def asked(full):
+def response(full):
     return full.query_frame("hall", full.ids()[3], Query(k=2, seed=5))
 
 
-def test_the_cloud_is_what_the_query_saw(full, uploads, prepared, asked):
-    comments, rows = vertices(full.inspection.cloud(asked.query_id))
+def test_the_cloud_is_what_the_query_saw(full, uploads, prepared, response):
+    comments, rows = vertices(full.inspection.cloud(response.query_id))
     points, normals = points_of(prepared[3][1].surface)
     assert xyz(rows).tobytes() == points.tobytes()
     assert xyz(rows, ("nx", "ny", "nz")).tobytes() == normals.tobytes()
@@ -49,13 +49,13 @@ def test_the_cloud_is_what_the_query_saw(full, uploads, prepared, asked):
             call()
 
 
-def test_similarities_are_those_of_the_signatures(full, prepared, asked, signer):
-    answer = full.inspection.similarities(asked.query_id)
+def test_similarities_are_those_of_the_signatures(full, prepared, response, signer):
+    answer = full.inspection.similarities(response.query_id)
     numbers = {frame_id: i for i, frame_id in enumerate(full.ids())}
     ranked = [numbers[frame.frame_id] for frame in answer.frames]
     assert len(ranked) == 11
     assert sorted(ranked) == [i for i in range(12) if i != 3]
-    for match in asked.matches:
+    for match in response.matches:
         assert answer.frames[match.rank - 1].frame_id == match.frame_id
     every = [3, *ranked]
     scale = signer.model.unrelated_distance
@@ -64,7 +64,7 @@ def test_similarities_are_those_of_the_signatures(full, prepared, asked, signer)
             share = 1 - distance(prepared[a][0], prepared[b][0]) / scale
             assert answer.similarity[i][j] == pytest.approx(min(max(share, 0), 1), abs=5e-5)
     full.delete_frame("hall", answer.frames[0].frame_id)
-    fewer = full.inspection.similarities(asked.query_id, 3)
+    fewer = full.inspection.similarities(response.query_id, 3)
     assert fewer.frames == answer.frames[1:3]
     assert fewer.similarity == [[answer.similarity[i][j] for j in (0, 2, 3)] for i in (0, 2, 3)]
 
@@ -81,9 +81,9 @@ def test_a_match_is_validated_as_the_query_was(full, prepared):
         assert (result.seed, result.map, result.uncertainty) == (5, "hall", None)
 
 
-def test_what_a_match_rests_on(full, prepared, asked):
-    names, best = full.ids(), asked.matches[0]
-    answer = full.inspection.match(asked.query_id, best.frame_id)
+def test_what_a_match_rests_on(full, prepared, response):
+    names, best = full.ids(), response.matches[0]
+    answer = full.inspection.match(response.query_id, best.frame_id)
     query, match = prepared[3][1], prepared[names.index(best.frame_id)][1]
     v = validate(query, match, 5)
     assert answer.validation == best.validation
@@ -105,13 +105,13 @@ def test_what_a_match_rests_on(full, prepared, asked):
         assert pairs.match_normal[k] == pytest.approx(match.patches.normals[j], abs=6e-5)
 
 
-def test_overlays_lie_in_the_frame_of_the_match(full, prepared, asked):
-    names, best = full.ids(), asked.matches[0]
+def test_overlays_lie_in_the_frame_of_the_match(full, prepared, response):
+    names, best = full.ids(), response.matches[0]
     query, match = prepared[3][1], prepared[names.index(best.frame_id)][1]
     ours, theirs = points_of(query.surface)[0], points_of(match.surface)[0]
 
     def overlay(**how):
-        return vertices(full.inspection.overlay(asked.query_id, best.frame_id, **how))
+        return vertices(full.inspection.overlay(response.query_id, best.frame_id, **how))
 
     comments, rows = overlay()
     assert comments[0] == f"frame {best.frame_id}.optical"
@@ -129,21 +129,21 @@ def test_overlays_lie_in_the_frame_of_the_match(full, prepared, asked):
     assert (laid["green"] == 130).mean() > 2 * (apart["green"] == 130).mean()
 
 
-def test_what_is_not_there_is_refused(full, asked):
-    look, best = full.inspection, asked.matches[0].frame_id
+def test_what_is_not_there_is_refused(full, response):
+    look, best = full.inspection, response.matches[0].frame_id
     elsewhere = full.ids()[6:]
-    far = next(m for m in asked.matches if m.frame_id in elsewhere)
+    far = next(m for m in response.matches if m.frame_id in elsewhere)
     with pytest.raises(InvalidRequest, match="has no rival"):
-        look.overlay(asked.query_id, far.frame_id, by="rival")
+        look.overlay(response.query_id, far.frame_id, by="rival")
     with pytest.raises(UnknownFrame, match="has no match"):
-        look.match(asked.query_id, full.ids()[3])
+        look.match(response.query_id, full.ids()[3])
     with pytest.raises(UnknownFrame, match="in map 'attic'"):
-        look.match(asked.query_id, best, "attic")
+        look.match(response.query_id, best, "attic")
     full.delete_frame("hall", best)
     for call in (look.match, look.overlay):
         with pytest.raises(UnknownFrame, match="was deleted"):
-            call(asked.query_id, best)
-    assert look.answer(asked.query_id) == asked
+            call(response.query_id, best)
+    assert look.answer(response.query_id) == response
 
 
 def test_answers_speak_of_the_robots_base(full, make_upload, uploads):

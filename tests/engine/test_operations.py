@@ -86,8 +86,8 @@ def test_what_waits_and_who_works(make_engine, uploads):
         engine.add_frame("shop" if i else "hall", uploads[i].data, uploads[i].meta)
     with engine.store.database.write() as connection:
         for number in (1, 2, 3):
-            made = time.time() - 100 * number
-            connection.execute(update(jobs).where(jobs.c.number == number).values(created_at=made))
+            at = time.time() - 100 * number
+            connection.execute(update(jobs).where(jobs.c.number == number).values(created_at=at))
     stats = engine.statistics.collect(1)
     assert (stats.maps, stats.frames, stats.jobs) == (2, {"received": 3}, {"queued": 3})
     assert (stats.waiting, stats.workers) == (3, [])

@@ -71,19 +71,19 @@ def test_patches_are_those_that_were_signed(full, uploads, prepared, signer):
 
 
 def test_a_signature_is_that_of_the_library(full, prepared):
-    name, made = full.ids()[2], prepared[2][0]
+    name, psi = full.ids()[2], prepared[2][0]
     result = full.outputs.signature("hall", name).make()
-    assert np.array_equal(np.frombuffer(base64.b64decode(result.base64), np.uint8), made.vector)
+    assert np.array_equal(np.frombuffer(base64.b64decode(result.base64), np.uint8), psi.vector)
     assert (result.model_id, result.length, result.dtype) == (
-        made.model_id,
-        len(made.vector),
+        psi.model_id,
+        len(psi.vector),
         "uint8",
     )
-    assert tuple(result.n_patches) == made.n_patches
-    assert tuple(result.n_pairs) == made.n_pairs
-    assert full.outputs.vector("hall", name, BYTES).make() == made.vector.tobytes()
+    assert tuple(result.n_patches) == psi.n_patches
+    assert tuple(result.n_pairs) == psi.n_pairs
+    assert full.outputs.vector("hall", name, BYTES).make() == psi.vector.tobytes()
     read = np.load(io.BytesIO(full.outputs.vector("hall", name, NPY).make()), allow_pickle=False)
-    assert np.array_equal(read, made.vector)
+    assert np.array_equal(read, psi.vector)
     assert read.dtype == np.uint8
 
 

@@ -77,17 +77,17 @@ def test_frames_are_found_by_where_they_were_taken(full, uploads):
 
 
 @pytest.mark.parametrize(
-    ("asked", "candidates", "without"),
+    ("number", "candidates", "without"),
     [(8, 10, ()), (8, 1, ()), (8, 10, (1, 2, 3, 7)), (2, 1, (3, 9))],
 )
 def test_poses_are_scored_on_the_frames_that_pass_alone(
-    full, prepared, signer, uploads, asked, candidates, without
+    full, prepared, signer, uploads, number, candidates, without
 ):
     names = full.ids()
-    others = [i for i in range(len(prepared)) if i != asked and i not in without]
+    others = [i for i in range(len(prepared)) if i != number and i not in without]
     signatures = [prepared[i][0] for i in others]
     geometries = [prepared[i][1] for i in others]
-    query, seen = prepared[asked]
+    query, seen = prepared[number]
     p = signer.model.parameters.validation
     p = replace(p, acceptance=replace(p.acceptance, ambiguous=0.0))  # no match is accepted
     ranking = retrieve(query, signatures, signer.model)
@@ -102,7 +102,7 @@ def test_poses_are_scored_on_the_frames_that_pass_alone(
     how = {"candidates": candidates, "validation": {"ambiguous": 0.0}}
     if without:
         how["filter"] = {"exclude_frames": [names[i] for i in without]}
-    answer = full.query_frame("hall", names[asked], Query.model_validate(how))
+    answer = full.query_frame("hall", names[number], Query.model_validate(how))
     assert answer.status == by_library.status != "not_found"
     result = judged(localization_of(answer))
     for (matrix, confidence, evidence), alternative in zip(
@@ -264,14 +264,14 @@ def test_a_sequence_needs_frames_and_odometry(full, uploads):
 
 
 @pytest.mark.parametrize(
-    ("change", "cause", "told"),
+    ("change", "cause", "reason"),
     [
         ("scale", "scale", "times as far away as those in the map. Check `depth_scale`"),
         ("wall", "one_plane", "towards furniture"),
     ],
 )
 def test_what_is_not_found_names_its_likeliest_cause(
-    full, uploads, make_upload, change, cause, told
+    full, uploads, make_upload, change, cause, reason
 ):
     frame = uploads[0].frame
     if change == "scale":
@@ -285,7 +285,7 @@ def test_what_is_not_found_names_its_likeliest_cause(
         wall = make_upload(replace(frame, depth=depth, pose=np.eye(4)), "wall")
         answer = full.ask(wall, Query(keep=False))
     assert (answer.status, answer.cause, answer.location) == ("not_found", cause, None)
-    assert told in answer.reason
+    assert reason in answer.reason
     assert [m.pose_in_map for m in answer.matches if m.validation.status == "rejected"] == [
         None for m in answer.matches if m.validation.status == "rejected"
     ]
@@ -294,11 +294,11 @@ def test_what_is_not_found_names_its_likeliest_cause(
 def came_of(geometry, *statuses, estimate=None, late=False, others=()):
     matches = []
     for i, status in enumerate(statuses):
-        made = PairValidation(
+        validation = PairValidation(
             status, "strong" if status == "accepted" else None, f"as given {i}",
             np.eye(4), 0.01, 0.01, 0.5, 0.4, 0.0, 100, 0.0, None, 0,
         )  # fmt: skip
-        matches.append(PairMatch(i, 10, 0.5, made))
+        matches.append(PairMatch(i, 10, 0.5, validation))
     n = len(matches)
     tried = Validated(range(n + late), matches, {}, "", late, dict(enumerate(others)))
     counts = Counts(

@@ -104,7 +104,7 @@ def secret(lived_in, uploads):
     }
 
 
-def asked(engine, frame_id, uploads):
+def answers_of(engine, frame_id, uploads):
     options = Query(stages="retrieve,diversify,validate", seed=1)
     own = engine.query_frame("hall", frame_id, options)
     other = engine.ask(uploads[1], options)
@@ -117,7 +117,7 @@ def asked(engine, frame_id, uploads):
 
 def test_no_byte_is_left(lived_in, secret, uploads, tmp_path):
     engine, frame_id = lived_in, lived_in.ids()[0]
-    own, shows, fused = asked(engine, frame_id, uploads)
+    own, shows, fused = answers_of(engine, frame_id, uploads)
     third = engine.query_frame("hall", frame_id, Query(seed=1)).query_id
     for one in (shows, third):
         assert engine.query_log.keep(one, None).kept_at is not None
@@ -157,7 +157,7 @@ def test_no_byte_is_left(lived_in, secret, uploads, tmp_path):
 
 def test_no_byte_of_a_map_is_left(lived_in, secret, uploads, tmp_path):
     engine, frame_id = lived_in, lived_in.ids()[0]
-    _, shows, _ = asked(engine, frame_id, uploads)
+    _, shows, _ = answers_of(engine, frame_id, uploads)
     engine.query_log.keep(shows, None)
     engine.delete_frame("hall", engine.ids()[1])
     engine.delete_map("hall")

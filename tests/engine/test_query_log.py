@@ -44,10 +44,10 @@ EVERY = WantedQueries()
 
 @pytest.fixture
 def engine(make_engine):
-    made = make_engine()
+    result = make_engine()
     for name in ("hall", "attic"):
-        made.create_map(NewMap(name=name, model="depth"))
-    return made
+        result.create_map(NewMap(name=name, model="depth"))
+    return result
 
 
 def row(number, **more):

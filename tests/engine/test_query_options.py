@@ -32,7 +32,7 @@ def ask(engine, frame_id, **how):
     return engine.query_frame("hall", frame_id, Query.model_validate({"keep": False, **how}))
 
 
-def told(answer, *without):
+def fields(answer, *without):
     return answer.model_dump_json(exclude={"query_id", "milliseconds", *without})
 
 
@@ -106,7 +106,7 @@ def test_a_deadline_stops_validation_and_says_so(full, monkeypatch):
     name = full.ids()[0]
     whole = ask(full, name, k=50, deadline_ms=600_000)
     assert whole.deadline_reached is False
-    assert told(whole, "deadline_reached") == told(ask(full, name, k=50), "deadline_reached")
+    assert fields(whole, "deadline_reached") == fields(ask(full, name, k=50), "deadline_reached")
     none = ask(full, name, deadline_ms=1)
     assert (none.deadline_reached, none.status, none.location) == (True, "unvalidated", None)
     assert none.counts.selected == len(none.matches) == 10
@@ -160,7 +160,7 @@ def test_every_frame_of_the_ranking_is_explained(full, prepared):
     for candidates in (5, 11):  # some of the ranking, and all of it
         how = {"k": 2, "candidates": candidates}
         plain, answer = ask(full, names[0], **how), ask(full, names[0], **how, explain=True)
-        assert told(answer, "explanations") == told(plain, "explanations")
+        assert fields(answer, "explanations") == fields(plain, "explanations")
         actual = answer.explanations
         assert [(one.rank, one.frame_id) for one in actual] == list(enumerate(ranked, 1))
         matches = {match.frame_id: match for match in answer.matches}
@@ -198,7 +198,7 @@ def test_a_frame_is_explained_where_it_was_lost(full, prepared, signer, monkeypa
     def explained(frame_id, **how):
         answer = ask(full, names[0], explain_frame=frame_id, **how)
         plain = ask(full, names[0], **how)
-        assert told(answer, "explained_frame") == told(plain, "explained_frame")
+        assert fields(answer, "explained_frame") == fields(plain, "explained_frame")
         one = answer.explained_frame
         assert (one.frame_id, one.map, one.state) == (frame_id, "hall", "indexed")
         return one

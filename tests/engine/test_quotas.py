@@ -130,15 +130,15 @@ def test_what_had_no_room_is_taken_when_it_is_sent_again(empty, uploads):
 def test_a_map_made_anew_has_the_quota_of_the_one_before(empty):
     limit(empty, quota_frames=3, retention_days=2.0)
     empty.delete_map("hall")
-    made, _ = empty.create_map(NewMap(name="hall", model="depth"))
-    assert (made.quota_frames, made.quota_bytes, made.retention_days) == (3, None, None)
+    row, _ = empty.create_map(NewMap(name="hall", model="depth"))
+    assert (row.quota_frames, row.quota_bytes, row.retention_days) == (3, None, None)
     assert empty.create_map(NewMap(name="hall", model="depth"))[1] is False
     assert empty.create_map(NewMap(name="hall", model="depth", quota_frames=3))[1] is False
     with pytest.raises(MapExists, match="its title, model, limits or up vector differ"):
         empty.create_map(NewMap(name="hall", model="depth", quota_frames=4))
     empty.delete_map("hall")
-    made, _ = empty.create_map(NewMap(name="hall", model="depth", quota_frames=None))
-    assert made.quota_frames is None
+    row, _ = empty.create_map(NewMap(name="hall", model="depth", quota_frames=None))
+    assert row.quota_frames is None
 
 
 def test_limits_are_looked_at_before_they_are_set(empty):

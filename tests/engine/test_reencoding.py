@@ -256,10 +256,10 @@ def found(answer):
     return [(match.frame_id, match.distance) for match in answer.matches]
 
 
-def right(names, by_model, label, asked):
+def right(names, by_model, label, number):
     """What a query by upload must find in a map of the model."""
     vectors = by_model[label][1]
-    apart = distances(vectors[asked].copy(), vectors, "l2")
+    apart = distances(vectors[number].copy(), vectors, "l2")
     return [(names[i], int(apart[i])) for i in np.argsort(apart, kind="stable")]
 
 
@@ -270,10 +270,10 @@ def test_a_query_signed_before_the_switch_is_signed_again(
 
     def then_switch(step):
         def run(*given, **more):
-            made = step(*given, **more)
+            result = step(*given, **more)
             if models:
                 switch(full, models.pop(0))
-            return made
+            return result
 
         return run
 

@@ -27,12 +27,12 @@ def _small_blocks(monkeypatch):
 
 def fill(engine, uploads, taken):
     """Add frames that nobody signs: states do not matter."""
-    made = []
+    ids = []
     for i, (upload, (session, robot, tags)) in enumerate(zip(uploads, taken, strict=True)):
         known = {"session": session, "robot": robot, "tags": tags, "name": f"{i:02d}.png"}
         meta = FrameMeta.model_validate(upload.meta.model_dump() | known)
-        made.append(engine.add_frame("hall", upload.data, meta)[0].frame_id)
-    return made
+        ids.append(engine.add_frame("hall", upload.data, meta)[0].frame_id)
+    return ids
 
 
 @pytest.fixture

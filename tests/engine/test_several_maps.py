@@ -98,10 +98,10 @@ def test_two_maps_may_call_their_frames_alike(full, uploads):
             full.uploads.add(name, upload)
     full.work_off()
 
-    def asked(of, **how):
+    def located(of, **how):
         return full.queries.stored(of, NamedFrame(map="attic", frame_id="b"), Query(**how))
 
-    several = asked(maps)
+    several = located(maps)
     first = several.matches[0]
     assert (first.map, first.frame_id, first.distance) == ("cellar", "a", 0)
     for match in several.matches:
@@ -111,13 +111,13 @@ def test_two_maps_may_call_their_frames_alike(full, uploads):
     details = full.inspection.match(several.query_id, "b", "cellar")
     assert details.transform == same.transform
     assert b"comment frame query.optical" in full.inspection.cloud(several.query_id)
-    assert asked(["cellar"]).location.pose.child_frame == "query.optical"
-    assert asked(["attic"]).location.pose.child_frame == "b.optical"
-    answer = asked(maps, explain_frame="b", keep=False).explained_frame
+    assert located(["cellar"]).location.pose.child_frame == "query.optical"
+    assert located(["attic"]).location.pose.child_frame == "b.optical"
+    answer = located(maps, explain_frame="b", keep=False).explained_frame
     assert (answer.map, answer.lost_at, answer.rank) == ("cellar", None, same.rank)
     assert answer.transform == same.transform
     full.delete_frame("attic", "a")
-    assert asked(maps, explain_frame="a", keep=False).explained_frame.map == "cellar"
+    assert located(maps, explain_frame="a", keep=False).explained_frame.map == "cellar"
 
 
 def test_maps_of_two_models_are_not_asked_as_one(two, uploads):

@@ -211,20 +211,20 @@ def test_after_its_time_a_deletion_is_for_good(full):
 
 
 def test_what_could_not_be_signed_is_restored_as_it_was(empty, uploads):
-    made = []
+    frames = []
     for upload, state in zip(uploads, (FrameState.REJECTED, FrameState.REDUNDANT), strict=False):
         name = empty.add(upload)[0].frame_id
         with empty.store.database.write() as connection:
             actual = find_frame(connection, find_map(connection, "hall"), name)
             set_state(connection, actual.number, state, "as a test says")
-        made.append(empty.get_frame("hall", name))
+        frames.append(empty.get_frame("hall", name))
     use = used(empty)
-    deletion = delete(empty, [one.frame_id for one in made]).deletion
+    deletion = delete(empty, [one.frame_id for one in frames]).deletion
     assert deletion.frames == 1
     assert restore(empty, deletion).frames == 1
-    now = empty.get_frame("hall", made[0].frame_id)
+    now = empty.get_frame("hall", frames[0].frame_id)
     assert (now.state, now.reason) == (FrameState.REJECTED, "as a test says")
-    assert empty.get_frame("hall", made[1].frame_id).state == FrameState.DELETED
+    assert empty.get_frame("hall", frames[1].frame_id).state == FrameState.DELETED
     assert used(empty) == use
 
 

@@ -52,11 +52,11 @@ def test_a_frame_keeps_its_up(empty, uploads):
 
 def test_a_map_has_an_up_that_can_be_changed(empty):
     new = NewMap.model_validate({"name": "level", "up": {"x": 0, "y": 0, "z": 1}})
-    made, _ = empty.create_map(new)
-    assert made.up.z == 1.0
-    answer = edit_map(empty.store, "level", {"up": [0, -1, 0]}, [str(made.etag)])
+    record, _ = empty.create_map(new)
+    assert record.up.z == 1.0
+    answer = edit_map(empty.store, "level", {"up": [0, -1, 0]}, [str(record.etag)])
     assert answer.up.y == -1.0
-    assert answer.etag != made.etag
+    assert answer.etag != record.etag
     assert edit_map(empty.store, "level", {"title": "Level"}).up == answer.up
     assert edit_map(empty.store, "level", {"up": None}).up is None
     with pytest.raises(InvalidRequest, match="length is 2, not 1"):

@@ -245,7 +245,7 @@ def _wrong_frames(engine, operation, said, before):
 def _wrong_events(engine):
     number_events(engine.store.database)
     with engine.store.database.read() as connection:
-        told = Counter(
+        counts = Counter(
             tuple(row) for row in connection.execute(select(events.c.kind, events.c.frame_id))
         )
         rows = list(connection.execute(select(frames.c.id, frames.c.state)))
@@ -254,8 +254,8 @@ def _wrong_events(engine):
     yield from (f"a job {row.kind} is {row.state}" for row in lost)
     for name, state in rows:
         for kind in ("received", state):
-            if told["frame." + kind, name] != 1:
-                yield f"frame {name} has {told['frame.' + kind, name]} events {kind}"
+            if counts["frame." + kind, name] != 1:
+                yield f"frame {name} has {counts['frame.' + kind, name]} events {kind}"
 
 
 def _remains(store, parts):

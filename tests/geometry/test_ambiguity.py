@@ -135,10 +135,10 @@ def test_free_space_refutes_no_rival_for_what_it_holds_against_the_transform_too
     agreed = plane_agreement(*views, voted, overlap_p)
     assert (agreed.violations > P.refuted).any()
     none = np.empty((0, 4, 4))
-    told = [
+    shares = [
         best_alternative(*views, T, violations, voted, none, P, overlap_p)[0]
         for violations in (0.0, 1.0)
     ]
     # of a transform that violates everything no rival is refuted: the one that agrees most counts
-    assert told[1] >= agreed.share.max()
-    assert told[0] < agreed.share.max()
+    assert shares[1] >= agreed.share.max()
+    assert shares[0] < agreed.share.max()

@@ -56,9 +56,9 @@ def test_transport_against_monte_carlo():
         (inverse, transform_covariance(S, T[:3, :3].T, inverse(T)[:3, 3])),
     )
     some = [with_error(T, error) for error in errors]
-    for told, expected in cases:
-        there = told(T)
-        found = np.cov(np.array([pose_error(there, told(one)) for one in some]).T)
+    for pose_of, expected in cases:
+        there = pose_of(T)
+        found = np.cov(np.array([pose_error(there, pose_of(one)) for one in some]).T)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         np.testing.assert_allclose(found / scale, expected / scale, atol=0.06)
 
@@ -76,13 +76,13 @@ def test_a_pairs_covariance_from_the_definition(lost):
     refined = [Refinement(T, some_covariance(rng) + np.eye(6), 500, s) for s in (3e-5, 1e-5)]
     information, noise = np.zeros((6, 6)), []
     step = 1e-6
-    for i, (one, told) in enumerate(zip(refined, (lambda A: A, np.linalg.inv), strict=True)):
+    for i, (one, pose_of) in enumerate(zip(refined, (lambda A: A, np.linalg.inv), strict=True)):
         if i == lost:
             continue
         J = np.array(
             [
-                (left_twist(told(T), told(with_error(T, e)))
-                 - left_twist(told(T), told(with_error(T, -e)))) / (2 * step)
+                (left_twist(pose_of(T), pose_of(with_error(T, e)))
+                 - left_twist(pose_of(T), pose_of(with_error(T, -e)))) / (2 * step)
                 for e in step * np.eye(6)
             ]
         ).T  # fmt: skip

@@ -121,10 +121,10 @@ def test_an_edge_of_the_same_viewpoint_supports_nothing():
         source, onto = np.array(chosen), np.array(target)
         transforms = inverses(there[onto]) @ here[source]
         edges = LoopEdges(source, onto, transforms, np.ones(len(source)))
-        told = judge_edges(edges, a_run(here), a_run(there))
-        assert told.accepted.all()
-        assert (told.closed == len(source) - 1).all()
-        return told.supported.tolist()
+        judged = judge_edges(edges, a_run(here), a_run(there))
+        assert judged.accepted.all()
+        assert (judged.closed == len(source) - 1).all()
+        return judged.supported.tolist()
 
     still = line(0.0, 0.01, 0.02)
     assert found([0, 1], [0, 1], still) == [False, False]

@@ -44,7 +44,7 @@ def test_a_frame_is_worked_out_once_for_each_of_the_other_arguments():
 def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames):
     """No result may hold the frame that it is kept with."""
     geometry = prepare(room_frames[0], open_signer("depth"))[1]
-    made = (
+    references = (
         sample_points(geometry.surface, 5),
         overlap_target(geometry.surface, OverlapParameters()).points,
         plane_view(geometry, PlaneParameters()).weights,
@@ -54,4 +54,4 @@ def test_nothing_of_a_frame_is_kept_when_it_is_gone(room_frames):
     del geometry
     gc.collect()
     assert [part() for part in parts] == [None, None, None]
-    assert all(len(one) for one in made)
+    assert all(len(one) for one in references)

@@ -117,25 +117,25 @@ def test_an_exact_up_and_one_with_noise_lose_nothing(rooms):
             accepted += before.status == "accepted"
             for noise in (0.0, 0.5):
                 ups = tuple(leaning(up_in(T), noise, rng) for T in (T_query, T_match))
-                told = validate(query, match, 1, ups=(ups[0], ups[1]))
+                result = validate(query, match, 1, ups=(ups[0], ups[1]))
                 if before.status == "accepted":
-                    assert told.status == "accepted"
-                    metres, radians = pose_difference(told.T_match_query, true)
+                    assert result.status == "accepted"
+                    metres, radians = pose_difference(result.T_match_query, true)
                     assert metres < 0.05
                     assert radians < math.radians(2)
-                    assert told.tilt_rad == pytest.approx(0.0, abs=math.radians(1 + 2 * noise))
-                assert told.contradicts_up is False
+                    assert result.tilt_rad == pytest.approx(0.0, abs=math.radians(1 + 2 * noise))
+                assert result.contradicts_up is False
     assert accepted >= 6
 
 
 def test_one_up_alone_changes_nothing_for_depth_images(rooms):
     (T, query), (_, match) = rooms[0][:2]
-    before, told = without_ups(query, match), validate(query, match, 1, ups=(up_in(T), None))
+    before, after = without_ups(query, match), validate(query, match, 1, ups=(up_in(T), None))
     assert (before.status, before.overlap, before.reason) == (
-        told.status, told.overlap, told.reason,
+        after.status, after.overlap, after.reason,
     )  # fmt: skip
-    assert (told.T_match_query == before.T_match_query).all()
-    assert told.tilt_rad is None
+    assert (after.T_match_query == before.T_match_query).all()
+    assert after.tilt_rad is None
 
 
 @pytest.mark.parametrize("degrees", [20, 90])
@@ -144,8 +144,8 @@ def test_a_wrong_up_gives_a_sentence_and_no_pose(rooms, degrees):
     for views in rooms if degrees == 20 else rooms[:1]:
         for (T_query, query), (T_match, match) in pairwise(views):
             ups = leaning(up_in(T_query), degrees, rng), up_in(T_match)
-            told = validate(query, match, 1, ups=ups)
-            assert told.status != "accepted"
+            result = validate(query, match, 1, ups=ups)
+            assert result.status != "accepted"
             before = without_ups(query, match)
             checked = validate_without_up(query, match, 1, None, ups)
             if before.strength != "strong":

@@ -187,5 +187,5 @@ def test_a_query_upside_down_is_found_when_nothing_else_is_accepted(hall):
     assert metres < 0.3
     assert radians < math.radians(3)
     # a known up says at once what the other axes had to be tried for
-    told = validate(query, match, ups=(np.array([0.0, 0, -1]), np.array([0.0, 0, 1])))
-    assert told.status == "accepted"
+    result = validate(query, match, ups=(np.array([0.0, 0, -1]), np.array([0.0, 0, 1])))
+    assert result.status == "accepted"

@@ -99,21 +99,21 @@ def test_a_larger_world_signs_and_validates_the_same(small_signer):
     R = cloud_scenes.rotation(1)
     here = cloud_scenes.in_room(cloud_scenes.directions(30_000, 1, 75))[0]
     there = (cloud_scenes.in_room(cloud_scenes.directions(30_000, 2, 80))[0] - step) @ R.T
-    made = []
+    results = []
     for factor in (1.0, 8.0):
         larger = replace(
             small_signer, model=replace(model, parameters=scale_lengths(small, factor))
         )
-        made.append(
+        results.append(
             [prepare(Cloud((one * factor).astype(np.float32)), larger) for one in (here, there)]
         )
-    for (a, _), (b, _) in zip(*made, strict=True):
+    for (a, _), (b, _) in zip(*results, strict=True):
         assert a.n_patches == b.n_patches
         np.testing.assert_allclose(a.vector.astype(int), b.vector.astype(int), atol=1)
     rivals_allowed = replace(small.validation.acceptance, ambiguous=9.0, ambiguous_share=9.0)
     p = replace(small.validation, acceptance=rivals_allowed)
-    first = validate(made[0][0][1], made[0][1][1], 3, p)
-    second = validate(made[1][0][1], made[1][1][1], 3, scale_lengths(p, 8.0))
+    first = validate(results[0][0][1], results[0][1][1], 3, p)
+    second = validate(results[1][0][1], results[1][1][1], 3, scale_lengths(p, 8.0))
     assert (first.status, first.strength) == (second.status, second.strength)
     np.testing.assert_allclose(second.T_match_query[:3, :3], first.T_match_query[:3, :3], atol=1e-5)
     np.testing.assert_allclose(

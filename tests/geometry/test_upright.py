@@ -25,8 +25,8 @@ TURNS = {
 @cache
 def room(index):
     """A furnished room: vertices and triangles."""
-    made, _ = room_and_rng(4242, index)
-    return made.vertices, made.faces
+    mesh, _ = room_and_rng(4242, index)
+    return mesh.vertices, mesh.faces
 
 
 @cache

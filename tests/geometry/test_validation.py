@@ -239,20 +239,20 @@ def test_where_the_directions_disagree_the_better_one_is_told(rooms):
         there = align(a, b, np.random.default_rng((0, 0)), p.alignment, p.agreement)
         back = align(b, a, np.random.default_rng((0, 1)), p.alignment, p.agreement)
         found = answer(query, match)
-        told = np.stack([there.T, inverse(back.T)])
+        poses = np.stack([there.T, inverse(back.T)])
         assert found.T_match_query is not None
         if found.residual_m < 0.08 and found.residual_rad < math.radians(5):
             met += 1
-            np.testing.assert_array_equal(middle(*told), found.T_match_query)
+            np.testing.assert_array_equal(middle(*poses), found.T_match_query)
             assert found.directions == ("query_to_match", "match_to_query")
             assert found.T_other is None
             continue
         apart += 1
-        seen = plane_agreement(a.planes, b.planes, told, p.agreement)
+        seen = plane_agreement(a.planes, b.planes, poses, p.agreement)
         best = int(np.argmax(seen.share - seen.violations))
-        np.testing.assert_array_equal(found.T_match_query, told[best])
+        np.testing.assert_array_equal(found.T_match_query, poses[best])
         # the other one is not lost
-        np.testing.assert_array_equal(found.T_other, told[1 - best])
+        np.testing.assert_array_equal(found.T_other, poses[1 - best])
         assert found.directions == (("query_to_match", "match_to_query")[best],)
         assert found.plane_overlap == seen.share[best]
         assert found.plane_violations == seen.violations[best]

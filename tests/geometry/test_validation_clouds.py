@@ -43,7 +43,7 @@ def model():
 
 
 @pytest.fixture(scope="module")
-def made(model):
+def frame_of(model):
     def make(frame):
         return read_geometry(write_geometry(geometry_of(see(frame, model.parameters), model)))
 
@@ -74,7 +74,7 @@ def scanned(room, T, rng):
 
 
 @pytest.fixture(scope="module")
-def rooms(made):
+def rooms(frame_of):
     """Two furnished rooms, scanned twice each, half a metre and 100 degrees apart."""
     found = []
     for number in (2, 5):
@@ -83,17 +83,17 @@ def rooms(made):
         views = []
         for T in (pose(*middle, 20.0), pose(middle[0] + 0.4, middle[1] - 0.3, 120.0)):
             points = scanned(room, T, rng)
-            views.append(View(T, points, made(Cloud(points))))
+            views.append(View(T, points, frame_of(Cloud(points))))
         found.append((room, views))
     return found
 
 
 @pytest.fixture(scope="module")
-def fused(rooms, made):
+def fused(rooms, frame_of):
     """The same points in the room's coordinates, of nobody's view."""
     return [
         [
-            made(Cloud(transform_points(v.T, v.points).astype(np.float32), has_viewpoint=False))
+            frame_of(Cloud(transform_points(v.T, v.points).astype(np.float32), has_viewpoint=False))
             for v in views
         ]
         for _, views in rooms
@@ -123,23 +123,23 @@ def test_two_scans_of_a_room(rooms):
         assert np.linalg.eigvalsh(v.covariance)[0] > 0
 
 
-def test_other_rooms_and_mirror_images_are_rejected(rooms, made):
+def test_other_rooms_and_mirror_images_are_rejected(rooms, frame_of):
     for query, match in product(rooms[0][1], rooms[1][1]):
         assert validate(query.scan, match.scan).status != "accepted"
     _, (query, match) = rooms[0]
-    mirrored = made(Cloud(query.points * np.array([1, -1, 1], np.float32)))
+    mirrored = frame_of(Cloud(query.points * np.array([1, -1, 1], np.float32)))
     for one in (query, match):
         assert validate(mirrored, one.scan).status != "accepted"
 
 
-def test_a_depth_image_beside_the_cloud_of_the_same_view(rooms, made):
+def test_a_depth_image_beside_the_cloud_of_the_same_view(rooms, frame_of):
     room, (first, _) = rooms[0]
     T = looking(np.array([first.T[0, 3], first.T[1, 3], 1.4, 0.4, -0.3, 0.0]))
     depth = take(room, T, KINECT, np.random.default_rng(1))
     y, x = np.nonzero((depth > 0.4) & (depth < 6))
     z = depth[y, x].astype(float)
     points = np.stack([(x - KINECT.cx) / KINECT.fx * z, (y - KINECT.cy) / KINECT.fy * z, z], axis=1)
-    image, cloud = made(DepthFrame(depth, KINECT)), made(Cloud(points.astype(np.float32)))
+    image, cloud = frame_of(DepthFrame(depth, KINECT)), frame_of(Cloud(points.astype(np.float32)))
     assert isinstance(cloud.surface.camera, Sphere)
     for v in (validate(image, cloud), validate(cloud, image), validate(cloud, cloud)):
         assert not v.around  # a cloud may see no more than a camera does

@@ -37,9 +37,9 @@ def files(folder):
 
 def test_what_is_published_is_what_is_opened(walk, published, tmp_path):
     keys, signatures = np.arange(300)[::-1] * 7 - 50, walk(300)
-    made = published(keys, signatures, revision=41, anchor=lambda: "an event")
+    written = published(keys, signatures, revision=41, anchor=lambda: "an event")
     opened = newest(tmp_path / "map", "model", LENGTH)
-    for version in (made, opened):
+    for version in (written, opened):
         assert holds(version, frames_of(keys, signatures))
         assert (version.number, version.revision, version.model_id) == (1, 41, "model")
         assert (version.manifest.dimension, len(version)) == (LENGTH, 300)

@@ -58,24 +58,24 @@ def test_merges_by_hand():
 def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, flat, seed):
     folder, rng = tmp_path_factory.mktemp("map"), np.random.default_rng(seed)
     frames = {}
-    made = None
+    index = None
     for step in range(data.draw(st.integers(1, 7))):
-        new = data.draw(st.sets(st.integers(0, 150), min_size=int(made is None), max_size=70))
-        drop = data.draw(st.sets(st.integers(0, 150), max_size=12)) if made is not None else set()
+        new = data.draw(st.sets(st.integers(0, 150), min_size=int(index is None), max_size=70))
+        drop = data.draw(st.sets(st.integers(0, 150), max_size=12)) if index is not None else set()
         keys = rng.permutation(np.array(sorted(new), np.int64))
         own = rng.integers(0, 2, (len(keys), LENGTH), np.uint8)
         clean = data.draw(st.booleans())
-        made = publish(
-            folder, model_id="model", revision=step, blocks=[(keys, own)], previous=made,
+        index = publish(
+            folder, model_id="model", revision=step, blocks=[(keys, own)], previous=index,
             drop=frozenset(drop), clean=clean, flat_bytes=flat,
         )  # fmt: skip
         frames |= dict(zip(keys.tolist(), own, strict=True))
         frames = {key: row for key, row in frames.items() if key not in drop}
-        assert not (clean and made.manifest.worn_keys)
-        for segment in made.segments:
+        assert not (clean and index.manifest.worn_keys)
+        for segment in index.segments:
             assert len(segment.gone) <= GONE_SHARE * len(segment.keys)
     opened = newest(folder, "model", LENGTH)
-    assert made is not None
+    assert index is not None
     assert opened is not None
     tail_keys = np.array(sorted(data.draw(st.sets(st.integers(100, 200), max_size=9))), np.int64)
     tail = Tail(tail_keys, bits(len(tail_keys), seed + 1))
@@ -88,7 +88,7 @@ def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, fla
         if key not in dead and (among is None or key in among)
     }  # fmt: skip
     query = bits(1, seed + 2)[0]
-    for version in (made, opened):
+    for version in (index, opened):
         assert version.keys.tolist() == sorted(frames)
         assert (len(version), version.manifest.frames) == (len(frames), len(frames))
         candidates = np.arange(-3, 210)
@@ -108,35 +108,35 @@ def test_any_history_is_searched_as_one_map(tmp_path_factory, nearest, data, fla
 
 def test_a_segment_of_which_too_much_is_gone_is_written_again(published):
     rows = bits(500, 2)
-    made = published(np.arange(400), rows[:400])
-    made = published(np.arange(400, 440), rows[400:440], made)
-    before = made.segments
-    made = published(*NONE, made, drop=frozenset(range(100)))  # a quarter
-    assert [len(segment.keys) for segment in made.segments] == [400, 40]
-    made = published(*NONE, made, drop=frozenset([100]))
-    assert [len(segment.keys) for segment in made.segments] == [299, 40]
-    assert made.segments[1] is before[1]
-    made = published(*NONE, made, drop=frozenset(range(400, 440)))  # nothing stays of it
-    assert [len(segment.keys) for segment in made.segments] == [299]
+    version = published(np.arange(400), rows[:400])
+    version = published(np.arange(400, 440), rows[400:440], version)
+    before = version.segments
+    version = published(*NONE, version, drop=frozenset(range(100)))  # a quarter
+    assert [len(segment.keys) for segment in version.segments] == [400, 40]
+    version = published(*NONE, version, drop=frozenset([100]))
+    assert [len(segment.keys) for segment in version.segments] == [299, 40]
+    assert version.segments[1] is before[1]
+    version = published(*NONE, version, drop=frozenset(range(400, 440)))  # nothing stays of it
+    assert [len(segment.keys) for segment in version.segments] == [299]
 
 
 def test_cleaning_writes_only_segments_that_something_is_gone_of(walk, published, tmp_path):
     signatures = walk(207, LENGTH)
-    made = published(np.arange(150), signatures[:150])
+    version = published(np.arange(150), signatures[:150])
     for start, end in ((150, 190), (190, 203), (203, 207)):
-        made = published(np.arange(start, end), signatures[start:end], made)
-    made = published(*NONE, made, drop=frozenset([160]))
-    assert sizes(made) == [150, 39, 13, 4]
+        version = published(np.arange(start, end), signatures[start:end], version)
+    version = published(*NONE, version, drop=frozenset([160]))
+    assert sizes(version) == [150, 39, 13, 4]
     content = b"".join(path.read_bytes() for path in (tmp_path / "map").iterdir())
     assert signatures[160].tobytes() in content
-    clean = published(*NONE, made, clean=True)
+    clean = published(*NONE, version, clean=True)
     content = b"".join(path.read_bytes() for path in (tmp_path / "map").iterdir())
     assert signatures[160].tobytes() not in content
     assert signatures[161].tobytes() in content
-    assert [a is b for a, b in zip(made.segments, clean.segments, strict=True)] == [
+    assert [a is b for a, b in zip(version.segments, clean.segments, strict=True)] == [
         True, False, True, True,
     ]  # fmt: skip
-    assert written(made, clean) < 40 * (LENGTH + 8) + 200
+    assert written(version, clean) < 40 * (LENGTH + 8) + 200
     assert clean.manifest.worn_keys == ()
 
 
@@ -144,15 +144,15 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(walk, published,
     length = 64
     signatures = walk(3000, length, walks=20)
     flat = 2500 * length
-    made = published(np.arange(2000), signatures[:2000], flat_bytes=flat)
-    made = published(np.arange(2000, 2500), signatures[2000:2500], made, flat_bytes=flat)
-    assert [segment.sketches for segment in made.segments] == [None, None]
-    assert made.manifest.recall.sample == 0
-    known = made.segments
-    made = published(np.arange(2500, 2530), signatures[2500:2530], made, flat_bytes=flat)
-    assert sizes(made) == [2000, 500, 30]
-    assert [segment.sketches is None for segment in made.segments] == [False, False, True]
-    for segment, before in zip(made.segments, known, strict=False):
+    version = published(np.arange(2000), signatures[:2000], flat_bytes=flat)
+    version = published(np.arange(2000, 2500), signatures[2000:2500], version, flat_bytes=flat)
+    assert [segment.sketches for segment in version.segments] == [None, None]
+    assert version.manifest.recall.sample == 0
+    known = version.segments
+    version = published(np.arange(2500, 2530), signatures[2500:2530], version, flat_bytes=flat)
+    assert sizes(version) == [2000, 500, 30]
+    assert [segment.sketches is None for segment in version.segments] == [False, False, True]
+    for segment, before in zip(version.segments, known, strict=False):
         assert segment.record.file("faiss") == before.record.file("faiss")
         assert segment.record.recall.frames == len(segment)
     opened = newest(tmp_path / "map", "model", length)
@@ -164,7 +164,7 @@ def test_a_map_that_becomes_large_gets_sketches_for_what_it_has(walk, published,
     hits = search(signatures[2999], opened, Tail.empty(length), 10, metric="l2")
     assert not hits.exact
     assert 30 + 10 <= hits.compared < 2530
-    less = published(*[part[:0] for part in (np.arange(0), signatures)], made,
+    less = published(*[part[:0] for part in (np.arange(0), signatures)], version,
                      drop=frozenset(range(2500, 2530)), flat_bytes=flat)  # fmt: skip
     assert [segment.sketches for segment in less.segments] == [None, None]
     assert less.manifest.recall.probes == 0

@@ -42,12 +42,12 @@ def test_a_map_that_is_large_has_sketches(walk, published, nearest, tmp_path):
     assert only(flat).sketches is None
     recall = flat.manifest.recall
     assert (recall.share, recall.sample, recall.probes) == (1, 0, 0)
-    made = published(keys, signatures, flat_bytes=3000 * LENGTH - 1)
+    written = published(keys, signatures, flat_bytes=3000 * LENGTH - 1)
     opened = newest(tmp_path / "map", "model", LENGTH)
     assert opened is not None
     frames = dict(zip(keys.tolist(), signatures, strict=True))
     query = walk(31, LENGTH, seed=8)[30]
-    for version in (made, opened):
+    for version in (written, opened):
         own = sketches_of(version)
         assert (len(own), own.probes) == (3000, version.manifest.recall.probes)
         np.testing.assert_array_equal(own.means, signatures.mean(axis=0).astype(np.uint8))
@@ -65,15 +65,15 @@ def test_a_map_that_is_large_has_sketches(walk, published, nearest, tmp_path):
 def test_nothing_of_a_deleted_frame_is_in_sketches(walk, published):
     signatures = walk(50, LENGTH, walks=5)
     signatures[7] = 255  # it moves every mean
-    made = published(np.arange(50), signatures, flat_bytes=0)
+    before = published(np.arange(50), signatures, flat_bytes=0)
     none = np.empty(0, np.int64), np.empty((0, LENGTH), np.uint8)
-    after = published(*none, previous=made, drop=frozenset([7]), flat_bytes=0)
-    assert only(after).record.file("sketches") == only(made).record.file("sketches")
+    after = published(*none, previous=before, drop=frozenset([7]), flat_bytes=0)
+    assert only(after).record.file("sketches") == only(before).record.file("sketches")
     after = published(*none, previous=after, flat_bytes=0, clean=True)
     left, alone = sketches_of(after), make_sketches(np.delete(signatures, 7, axis=0))
     np.testing.assert_array_equal(left.means, alone.means)
     np.testing.assert_array_equal(codes_of(left), codes_of(alone))
-    assert (left.means < sketches_of(made).means).any()
+    assert (left.means < sketches_of(before).means).any()
 
 
 def test_recall_is_what_searches_find(walk, published, monkeypatch):
@@ -153,7 +153,7 @@ def test_neighbours_are_the_nearest_by_exact_distance(walk, monkeypatch, most):
 def test_one_frame_and_equal_frames_have_lists_too(published, tmp_path):
     for n in (1, 2, 50):
         same = np.full((n, LENGTH), 7, np.uint8)
-        made = published(np.arange(n), same, folder=tmp_path / str(n), flat_bytes=0)
-        hits = search_l2(same[0], made, EMPTY, 5)
+        version = published(np.arange(n), same, folder=tmp_path / str(n), flat_bytes=0)
+        hits = search_l2(same[0], version, EMPTY, 5)
         assert hits.keys.tolist() == list(range(min(n, 5)))
-        assert made.manifest.recall.share == 1
+        assert version.manifest.recall.share == 1

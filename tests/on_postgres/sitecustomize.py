@@ -40,12 +40,12 @@ def database_of(folder, execute):
         name, _, place = mark.read().partition("\n")
         if place == str(folder.resolve()):
             return name
-        made = f"f{secrets.token_hex(8)}"
-        execute(f'CREATE DATABASE "{made}" TEMPLATE "{name or TEMPLATE}"')
-        execute(f"INSERT INTO folders VALUES ('{made}', '{folder.absolute()}')")
+        database = f"f{secrets.token_hex(8)}"
+        execute(f'CREATE DATABASE "{database}" TEMPLATE "{name or TEMPLATE}"')
+        execute(f"INSERT INTO folders VALUES ('{database}', '{folder.absolute()}')")
         mark.truncate(0)
-        mark.write(f"{made}\n{folder.resolve()}")
-        return made
+        mark.write(f"{database}\n{folder.resolve()}")
+        return database
 
 
 def _mend_settings(module):

@@ -49,14 +49,14 @@ def rows(server_store):
 @pytest.fixture(scope="session")
 def waiting():
     """A function that counts the advisory locks that somebody waits for."""
-    asked = text(
+    statement = text(
         "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND NOT granted "
         "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
     )
 
     def count(store):
         with store.database.read() as connection:
-            return int(connection.execute(asked).scalar_one())
+            return int(connection.execute(statement).scalar_one())
 
     return count
 

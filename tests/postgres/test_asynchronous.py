@@ -36,7 +36,7 @@ def found(engine, frame):
 
 
 @pytest.fixture
-def told(engine):
+def events(engine):
     """What a stream of events tells, from the first on."""
     found = []
     ended = threading.Event()
@@ -67,7 +67,7 @@ async def _gather(feed, found):
 
 
 def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
-    engine, pair, small, until, told
+    engine, pair, small, until, events
 ):
     primary, standby = pair
     engine.create_map(NewMap(name="hall", model="depth"))
@@ -81,13 +81,13 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
     before = engine.store.database.history
     lost = index(engine, small[2])
     assert found(engine, small[2]) == sorted([*kept, lost])  # held in memory from now on
-    until(lambda: told and (told[-1].kind, told[-1].frame_id) == ("frame.indexed", lost))
+    until(lambda: events and (events[-1].kind, events[-1].frame_id) == ("frame.indexed", lost))
     primary.kill()
     with pytest.raises(StoreAway):
         engine.get_map("hall")
     standby.promote()
     # whoever follows learns that what it was told may not be so, and then goes on
-    until(lambda: told and told[-1].kind == "events.missed")
+    until(lambda: events and events[-1].kind == "events.missed")
     assert engine.get_map("hall").frames == {"indexed": 2}
     assert engine.store.database.history != before
     with pytest.raises(UnknownFrame):
@@ -95,7 +95,7 @@ def test_what_it_lacked_is_gone_and_no_memory_of_it_hides_what_comes_then(
     other = index(engine, small[3])  # which is given the number and the revision of the lost one
     assert engine.get_map("hall").frames == {"indexed": 3}
     assert found(engine, small[3]) == sorted([*kept, other])
-    until(lambda: told and (told[-1].kind, told[-1].frame_id) == ("frame.indexed", other))
-    assert [one.kind for one in told].count("events.missed") == 1
+    until(lambda: events and (events[-1].kind, events[-1].frame_id) == ("frame.indexed", other))
+    assert [one.kind for one in events].count("events.missed") == 1
     again = index(engine, small[2])  # as by a robot that keeps its frames for a while
     assert found(engine, small[2]) == sorted([*kept, other, again])

@@ -114,8 +114,8 @@ def test_a_claim_beside_a_cancellation(store, hand, until, first):
 
 
 def _id_of(connection, number):
-    asked = text("SELECT id FROM jobs WHERE number = :number")
-    return str(connection.execute(asked, {"number": number}).scalar_one())
+    statement = text("SELECT id FROM jobs WHERE number = :number")
+    return str(connection.execute(statement, {"number": number}).scalar_one())
 
 
 @pytest.mark.parametrize("what", ["finish", "check_held", "renew"])

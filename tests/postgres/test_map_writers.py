@@ -26,7 +26,7 @@ from sceneprint.store.tables import pending_events
 MAPS = 3
 
 
-def told(store):
+def events_of(store):
     return next_events(store.database, EventFilter(), 0, 10_000).events
 
 
@@ -61,10 +61,10 @@ def test_what_cannot_be_numbered_now_comes_later_and_marks_no_state(
         record_event(connection, "late", name)
     with database._engine.begin() as other:  # as a long transaction that told something
         other.exec_driver_sql(f"SELECT pg_advisory_xact_lock({LOCKS}, {EVENTS})")
-        assert [one.kind for one in told(server_store)] == ["map.created"] * MAPS
+        assert [one.kind for one in events_of(server_store)] == ["map.created"] * MAPS
         with pytest.raises(StoreLocked):
             anchor_of_now(database, name)
-    assert [one.kind for one in told(server_store)][MAPS:] == ["late"]
+    assert [one.kind for one in events_of(server_store)][MAPS:] == ["late"]
 
 
 def test_an_anchor_marks_what_was_pending(server_store, rows):
@@ -74,7 +74,7 @@ def test_an_anchor_marks_what_was_pending(server_store, rows):
     anchor = anchor_of_now(database, row.name)
     with database.read() as connection:
         assert holds_anchor(connection, anchor)
-        assert anchor_number(anchor) == told(server_store)[-1].number == MAPS + 1
+        assert anchor_number(anchor) == events_of(server_store)[-1].number == MAPS + 1
         assert anchor_of_now(database, rows[1].name) != anchor
 
 
@@ -96,7 +96,7 @@ def test_of_two_requests_with_one_key_for_two_maps_only_the_first_takes_effect(s
     with pytest.raises(IdempotencyConflict):  # as uploads do then
         writes.run(keep_second)
     assert len(tries) == 2
-    assert "second" not in [one.kind for one in told(server_store)]
+    assert "second" not in [one.kind for one in events_of(server_store)]
     with database.read() as connection:
         assert first.stored_result(connection) == {"of": "first"}
 

@@ -32,18 +32,18 @@ def receive(database, *given, wait_s=10.0):
 
 def counted(database):
     with database.read() as connection:
-        asked = select(maps.c.name, maps.c.used_frames, maps.c.used_bytes).order_by(maps.c.name)
-        return [tuple(row) for row in connection.execute(asked)]
+        query = select(maps.c.name, maps.c.used_frames, maps.c.used_bytes).order_by(maps.c.name)
+        return [tuple(row) for row in connection.execute(query)]
 
 
 def content_of(database):
     with database.read() as connection:
-        asked = (
+        query = (
             select(frames.c.map_number, frames.c.content_id, jobs.c.id)
             .join(jobs, jobs.c.frame_number == frames.c.number)
             .order_by(frames.c.number)
         )
-        return [tuple(row) for row in connection.execute(asked)]
+        return [tuple(row) for row in connection.execute(query)]
 
 
 def test_frames_of_several_maps_are_taken_in_their_order(server_store, rows):
@@ -55,8 +55,8 @@ def test_frames_of_several_maps_are_taken_in_their_order(server_store, rows):
     ]
     assert counted(database) == [("a", 2, 6), ("b", 1, 77), ("c", 2, 6)]
     with database.read() as connection:
-        told = connection.execute(select(pending_events).order_by(pending_events.c.number))
-        assert [(one.map, one.frame_id, one.job_id) for one in told] == [
+        pending = connection.execute(select(pending_events).order_by(pending_events.c.number))
+        assert [(one.map, one.frame_id, one.job_id) for one in pending] == [
             (one.row.name, one.frame_id, one.job_id) for one in given
         ]
 
@@ -66,8 +66,8 @@ def test_a_cloud_has_no_intrinsics(server_store, rows):
     given = [new(rows[0], 1), new(rows[0], 2, intrinsics=None)]
     assert receive(server_store.database, *given) == [True, True]
     with server_store.database.read() as connection:
-        asked = text("SELECT CAST(intrinsics AS text), pose IS NULL FROM frames ORDER BY number")
-        assert [tuple(one) for one in connection.execute(asked)] == [
+        query = text("SELECT CAST(intrinsics AS text), pose IS NULL FROM frames ORDER BY number")
+        assert [tuple(one) for one in connection.execute(query)] == [
             ('{"width": 1}', True), ("null", True),
         ]  # fmt: skip
 

@@ -134,8 +134,8 @@ def test_the_archive_takes_a_file_again_and_never_another_of_its_name(place):
 
     def take(content):
         (place / "wal").write_text(content)
-        told = command.replace("%p", str(place / "wal")).replace("%f", "0001")
-        return subprocess.run(["sh", "-c", told], capture_output=True, check=False).returncode
+        shell = command.replace("%p", str(place / "wal")).replace("%f", "0001")
+        return subprocess.run(["sh", "-c", shell], capture_output=True, check=False).returncode
 
     assert [take("first"), take("first")] == [0, 0]
     assert take("second") != 0

@@ -66,14 +66,14 @@ def claimed(store, row):
     return held
 
 
-def indexed(store, row, job, made=MADE, *, at_once):
+def indexed(store, row, job, signature=MADE, *, at_once):
     with store.database.write(map_number=row.number) as connection:
-        asked = select(frames).where(frames.c.number == job.frame_number)
-        frame = frame_row(connection.execute(asked).mappings().one())
+        query = select(frames).where(frames.c.number == job.frame_number)
+        frame = frame_row(connection.execute(query).mappings().one())
         if at_once:
-            return index_claimed_frame(connection, job, frame, row.name, made)
+            return index_claimed_frame(connection, job, frame, row.name, signature)
         queue.finish(connection, job, JobState.SUCCEEDED)
-        index_frame(connection, frame, made)
+        index_frame(connection, frame, signature)
         record_event(connection, "frame.indexed", row.name, frame.id, job.id)
         return True
 

@@ -57,9 +57,9 @@ def held(store, row):
 
 def test_it_is_committed_with_its_answer_and_keeps_no_turn(server_store, row):
     database = server_store.database
-    asked = text(str(LOCKS_HELD).replace("count(*)", "mode") + " AND pid = pg_backend_pid()")
+    query = text(str(LOCKS_HELD).replace("count(*)", "mode") + " AND pid = pg_backend_pid()")
     with database.write(map_number=row.number, single=True) as connection:
-        found = connection.execute(asked).scalars().all()  # it had its turn, and its map alone
+        found = connection.execute(query).scalars().all()  # it had its turn, and its map alone
         assert sorted(found) == ["ExclusiveLock", "ShareLock"]
         assert locks(server_store) == 0
     with database.write(map_number=row.number, single=True) as connection:
@@ -69,9 +69,9 @@ def test_it_is_committed_with_its_answer_and_keeps_no_turn(server_store, row):
 
 def test_nothing_cuts_its_commit_off(server_store, row):
     """A commit may wait for a standby for longer than any statement may take."""
-    asked = text("SELECT current_setting('statement_timeout'), current_setting('lock_timeout')")
+    query = text("SELECT current_setting('statement_timeout'), current_setting('lock_timeout')")
     with server_store.database.write(map_number=row.number, single=True) as connection:
-        assert tuple(connection.execute(asked).one()) == ("0", "10s")
+        assert tuple(connection.execute(query).one()) == ("0", "10s")
     with server_store.database.read() as connection:  # and it is of that transaction alone
         assert connection.exec_driver_sql("SHOW statement_timeout").scalar_one() == "1min"
 

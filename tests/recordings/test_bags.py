@@ -370,8 +370,8 @@ def test_lenses_that_are_not_supported(more, message, tmp_path, ros):
 
 
 def test_rectified_images_have_the_camera_of_the_projection(tmp_path, ros):
-    made = {"d": (0.1, 0.2, 0, 0, 0), "p": (65.0, 66.0, 38.0, 28.0)}
-    (frame,) = only(one_image(ros, tmp_path, "/camera/depth/image_rect", **made)).frames
+    camera = {"d": (0.1, 0.2, 0, 0, 0), "p": (65.0, 66.0, 38.0, 28.0)}
+    (frame,) = only(one_image(ros, tmp_path, "/camera/depth/image_rect", **camera)).frames
     k = frame.camera.intrinsics
     assert (k.fx, k.fy, k.cx, k.cy, k.distortion) == (65, 66, 38, 28, ())
 

@@ -44,10 +44,10 @@ def read_all(path):
 
 def check(error):
     """An error is one line that says what to do."""
-    told = str(error)
-    assert told.isprintable()
-    assert told.endswith("."), told
-    assert len(told) < 2000
+    message = str(error)
+    assert message.isprintable()
+    assert message.endswith("."), message
+    assert len(message) < 2000
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +67,11 @@ def small(tmp_path_factory, ros, walk):
             writer.points(t, rows, height=1 + i % 2)
 
     folder = tmp_path_factory.mktemp("small")
-    made = {c: ros.write(folder / c, fill, c) for c in ros.containers}
-    made["zstd"] = ros.write(folder / "zstd", fill, "mcap", compression="storage")
-    made["bz2"] = ros.write(folder / "bz2", fill, "ros1", compression="bz2")
-    made["message"] = ros.write(folder / "message", fill, "sqlite3", compression="message")
-    return made
+    files = {c: ros.write(folder / c, fill, c) for c in ros.containers}
+    files["zstd"] = ros.write(folder / "zstd", fill, "mcap", compression="storage")
+    files["bz2"] = ros.write(folder / "bz2", fill, "ros1", compression="bz2")
+    files["message"] = ros.write(folder / "message", fill, "sqlite3", compression="message")
+    return files
 
 
 def damaged(bag, folder, content, number):
@@ -243,8 +243,8 @@ def test_a_chunk_that_grows_beyond_what_it_announces(tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=True
     )
-    told, peak = done.stdout.strip().rsplit("\n", 1)
-    assert "a chunk does not end within 4096 bytes" in told
+    message, peak = done.stdout.strip().rsplit("\n", 1)
+    assert "a chunk does not end within 4096 bytes" in message
     assert int(peak) < 400_000  # KB
 
 

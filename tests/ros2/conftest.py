@@ -204,7 +204,7 @@ def plain(message):
 @pytest.fixture
 def bus(ros, monkeypatch):
     """A bus on which `start_node` runs a node with stand-in modules."""
-    made = Bus()
+    result = Bus()
     writer = ros.messages()
 
     def module(name, **names):
@@ -212,13 +212,13 @@ def bus(ros, monkeypatch):
         vars(one).update(names)
         monkeypatch.setitem(sys.modules, name, one)
 
-    kind = type("LifecycleNode", (StubNode,), {"bus": made, "types": writer.types})
+    kind = type("LifecycleNode", (StubNode,), {"bus": result, "types": writer.types})
     stopped = type("ExternalShutdownException", (Exception,), {})
     module(
         "rclpy",
-        init=lambda args=None: setattr(made, "is_up", True),
-        spin=lambda node: [callback() for _, callback in made.timers[:1]],
-        try_shutdown=lambda: setattr(made, "is_up", False),
+        init=lambda args=None: setattr(result, "is_up", True),
+        spin=lambda node: [callback() for _, callback in result.timers[:1]],
+        try_shutdown=lambda: setattr(result, "is_up", False),
     )
     outcomes = SimpleNamespace(SUCCESS="success", FAILURE="failure")
     module("rclpy.lifecycle", LifecycleNode=kind, TransitionCallbackReturn=outcomes)
@@ -246,7 +246,7 @@ def bus(ros, monkeypatch):
     monkeypatch.syspath_prepend(str(PACKAGE))
     for name in ("sceneprint_ros", "sceneprint_ros.relocaliser_node"):
         monkeypatch.delitem(sys.modules, name, raising=False)
-    return made
+    return result
 
 
 @pytest.fixture

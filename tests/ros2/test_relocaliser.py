@@ -21,12 +21,12 @@ class ScriptedLocalizer:
     """A client that answers every question with the truth, or as it was told."""
 
     def __init__(self, found_at=None):
-        self.asked: list[dict[str, Any]] = []
+        self.requests: list[dict[str, Any]] = []
         self.found_at = found_at or (lambda number: np.eye(4))
 
     def localize(self, map_name, frame, meta=None, **how):
-        self.asked.append({"frame": frame, "meta": meta, **how})
-        matrix = self.found_at(len(self.asked) - 1)
+        self.requests.append({"frame": frame, "meta": meta, **how})
+        matrix = self.found_at(len(self.requests) - 1)
         return answer("not_found") if matrix is None else answer("found", matrix, "site")
 
     def localize_sequence(self, map_name, frames, metas, **how):
@@ -114,7 +114,7 @@ def test_frames_are_asked_for_no_oftener_than_told(ros):
     with scripted(interval_s=0.5) as (core, client):
         reports = run(core, still(ros, 31, every=1 / 15).written)
     assert len(reports) == 31
-    assert len(client.asked) == 4  # at 0, 8, 16 and 24 fifteenths of a second
+    assert len(client.requests) == 4  # at 0, 8, 16 and 24 fifteenths of a second
     assert [round((r.stamp_ns - ros.start * SECOND) * 15e-9) for r in reports] == [*range(31)]
 
 
@@ -144,7 +144,7 @@ def test_a_frame_waits_for_its_transform_and_no_longer_than_told(ros):
             result.message
             == "no transforms from odom to camera and base_link at the stamps of the frames"
         )
-    assert len(client.asked) == 2
+    assert len(client.requests) == 2
 
 
 def test_what_is_silent_is_not_told(ros):
@@ -163,15 +163,15 @@ def test_relocalising_forgets_and_asks_at_once(ros):
     with scripted(interval_s=60.0) as (core, client):
         reports = run(core, still(ros, 3).written)
         assert [report.state.status for report in reports] == ["tracking"] * 3
-        assert len(client.asked) == 1
+        assert len(client.requests) == 1
         core.relocalise()
         lost = core.report(ros.start * SECOND + SECOND)
         assert (lost.state.status, lost.pose) == ("lost", None)
         assert "relocalisation" in lost.message
         (actual,) = run(core, still(ros, 1, start=2.0).written)
         assert actual.is_fix
-        assert len(client.asked) == 2
-        assert client.asked[1]["prior"] is None
+        assert len(client.requests) == 2
+        assert client.requests[1]["prior"] is None
 
 
 def test_a_clock_that_jumps_back_begins_anew(ros):
@@ -183,7 +183,7 @@ def test_a_clock_that_jumps_back_begins_anew(ros):
         ros.start * SECOND,
         ros.start * SECOND + SECOND // 2,
     ]
-    assert len(client.asked) == 5
+    assert len(client.requests) == 5
 
 
 def test_the_pose_is_that_of_the_base_and_so_is_its_covariance(ros):
@@ -271,7 +271,7 @@ def test_up_is_sent_while_the_robot_is_at_rest(ros):
         writer.transforms(1.0, {("odom", "base_link"): np.eye(4)})
         with scripted() as (core, client):
             run(core, writer.written)
-        up = client.asked[0]["meta"].up
+        up = client.requests[0]["meta"].up
         if expected is None:
             assert up is None
         else:

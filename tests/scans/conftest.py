@@ -102,11 +102,11 @@ def rows_of(points, layout):
 def serialize(ros):
     writer = ros.messages()
 
-    def made(rows, *, little=True, **how):
+    def message(rows, *, little=True, **how):
         writer.points(1.5, rows, **how)
         return bytes(writer.types.serialize_cdr(writer.last(), NAME, little_endian=little))
 
-    return made
+    return message
 
 
 @pytest.fixture(scope="session")

@@ -16,10 +16,10 @@ TRIES = 400  #: of each file
 MOST = 1 << 20
 
 
-def tried(files, told, most, tries):
+def tried(files, file_format, most, tries):
     read = 0
     for data in files:
-        decode_scan(data, file_format=told)  # and so kernels are compiled
+        decode_scan(data, file_format=file_format)  # and so kernels are compiled
     tracemalloc.start()
     try:
         for data in files:
@@ -28,7 +28,7 @@ def tried(files, told, most, tries):
                 before, _ = tracemalloc.get_traced_memory()
                 said = ""
                 try:
-                    scan = decode_scan(changed, file_format=told)
+                    scan = decode_scan(changed, file_format=file_format)
                 except FrameError as error:
                     said = str(error)
                 else:
@@ -73,14 +73,14 @@ def test_las(las):
     assert min(read, refused) > 30
 
 
-@pytest.mark.parametrize("told", [None, "pointcloud2"])
-def test_pointcloud2(serialize, points, told):
+@pytest.mark.parametrize("file_format", [None, "pointcloud2"])
+def test_pointcloud2(serialize, points, file_format):
     files = [
         serialize(rows_of(points, layout), little=little, height=height)
         for layout in LAYOUTS[:2]
         for little, height in ((True, 1), (False, 3))
     ]
-    read, refused = tried(files, told, MOST, TRIES // 2)
+    read, refused = tried(files, file_format, MOST, TRIES // 2)
     assert min(read, refused) > 30
 
 

@@ -137,7 +137,7 @@ def certificate(tmp_path_factory):
     key, now = ec.generate_private_key(ec.SECP256R1()), datetime.now(UTC)
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
     names = [x509.DNSName("localhost"), x509.IPAddress(IPv4Address("127.0.0.1"))]
-    made = (
+    document = (
         x509.CertificateBuilder()
         .subject_name(name)
         .issuer_name(name)
@@ -148,7 +148,7 @@ def certificate(tmp_path_factory):
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .sign(key, hashes.SHA256())
     )
-    (folder / "certificate.pem").write_bytes(made.public_bytes(Encoding.PEM))
+    (folder / "certificate.pem").write_bytes(document.public_bytes(Encoding.PEM))
     (folder / "key.pem").write_bytes(
         key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     )
@@ -273,8 +273,8 @@ def make_map():
     """A function that creates a map on a server and returns its path."""
 
     def make(server, name, model="depth"):
-        made = server.client.post("/v1/maps", json={"name": name, "model": model})
-        assert made.status_code == 201, made.text
+        answer = server.client.post("/v1/maps", json={"name": name, "model": model})
+        assert answer.status_code == 201, answer.text
         return f"/v1/maps/{name}"
 
     return make
@@ -317,8 +317,8 @@ def _walled(begin, keys, *arguments, **settings):
     # The printed address is that of all interfaces.
     server.client.base_url = server.url = server.url.replace("0.0.0.0", "127.0.0.1")
     with Engine(Settings(data_dir=server.folder, database_url=None)) as engine:
-        made = {name: engine.create_key(name, grants) for name, grants in keys.items()}
-    return Walled(server, {name: key.secret for name, key in made.items()})
+        created = {name: engine.create_key(name, grants) for name, grants in keys.items()}
+    return Walled(server, {name: key.secret for name, key in created.items()})
 
 
 @pytest.fixture(scope="module")
@@ -352,8 +352,8 @@ class House:
 
     def ask(self, key, method, path, **request):
         headers = {"Authorization": f"Bearer {self.secrets[key]}", **request.pop("headers", {})}
-        asked = partial(self.client.request, method, path, headers=headers, **request)
-        return self.portal.call(asked)
+        call = partial(self.client.request, method, path, headers=headers, **request)
+        return self.portal.call(call)
 
     def work(self):
         """Run all queued jobs."""

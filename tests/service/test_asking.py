@@ -29,7 +29,7 @@ def maps(served, make_map, shots):
     return found
 
 
-def told(answer, status=200):
+def body(answer, status=200):
     assert answer.status_code == status, answer.text
     found = answer.json()
     return {k: v for k, v in found.items() if k not in ("query_id", "milliseconds")}
@@ -58,7 +58,7 @@ def test_options_are_the_same_however_they_come(served, maps, shots):
         ("/v1/queries", {"maps": "ask-b,ask-a"}),
     ):
         one, two = (
-            told(sent(served, path, shots[1], OPTIONS | more, bare=bare)) for bare in (False, True)
+            body(sent(served, path, shots[1], OPTIONS | more, bare=bare)) for bare in (False, True)
         )
         assert one == two
     assert one["maps"] == ["ask-b", "ask-a"]
@@ -66,7 +66,7 @@ def test_options_are_the_same_however_they_come(served, maps, shots):
     assert one["matches"][0]["validation"]["strength"] == "weak"
     own = maps["ask-a"][1]
     by_text, by_json = (
-        told(served.client.post("/v1/maps/ask-a/queries", json={"frame_id": own, **given}))
+        body(served.client.post("/v1/maps/ask-a/queries", json={"frame_id": own, **given}))
         for given in (as_text(OPTIONS), OPTIONS)
     )
     assert by_text == by_json

@@ -141,11 +141,11 @@ def test_a_compressed_body_is_refused(narrow, refused):
     for route in ("frames", "queries"):
         packed = gzip.compress(FRAME + KNOWN + END)
         headers = {"content-type": X, "content-encoding": "gzip"}
-        told = narrow.client.post(f"/v1/maps/hall/{route}", content=packed, headers=headers)
-        refused(told, 415, "unsupported-type", "Content-Encoding 'gzip'")
+        answer = narrow.client.post(f"/v1/maps/hall/{route}", content=packed, headers=headers)
+        refused(answer, 415, "unsupported-type", "Content-Encoding 'gzip'")
     plain = {"content-type": X, "content-encoding": "identity"}
-    told = narrow.client.post("/v1/maps/hall/frames", content=FRAME + KNOWN + END, headers=plain)
-    refused(told, 422, "unreadable-frame")
+    answer = narrow.client.post("/v1/maps/hall/frames", content=FRAME + KNOWN + END, headers=plain)
+    refused(answer, 422, "unreadable-frame")
 
 
 def test_a_caller_who_hangs_up_leaves_nothing_behind(narrow, wire, small_shots):

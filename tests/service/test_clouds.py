@@ -100,8 +100,8 @@ def test_a_cloud_is_who_its_points_are(served, hall, clouds, refused):
     assert elsewhere.status_code == 201
     fused = post(raw(repacked, viewpoint="none"))
     assert fused.status_code == 201
-    told = http.get(f"{path}/frames/{fused.json()['frame_id']}").json()
-    assert (told["viewpoint"], told["base_frame"], told["kind"]) == (None, None, "cloud")
+    record = http.get(f"{path}/frames/{fused.json()['frame_id']}").json()
+    assert (record["viewpoint"], record["base_frame"], record["kind"]) == (None, None, "cloud")
     for one in (elsewhere, fused):
         assert http.delete(f"{path}/frames/{one.json()['frame_id']}").status_code == 204
 

@@ -60,32 +60,32 @@ def running(application, context=None):
 def opened(monkeypatch, request, certificate):
     """Connections to a service that is soon tired of waiting; by TLS where a test asks for it."""
     cert, key = certificate
-    asked = context = None
+    trust = context = None
     if getattr(request, "param", "http") == "https":
         context = connections.tls_context(Settings(tls_cert=cert, tls_key=key))
-        asked = ssl.create_default_context(cafile=str(cert))
+        trust = ssl.create_default_context(cafile=str(cert))
     monkeypatch.setattr(connections, "HANDSHAKE_S", 0.8)
     monkeypatch.setattr(connections, "SILENT_S", 0.8)
     monkeypatch.setattr(connections, "READING_S", 1.0)
     monkeypatch.setattr(limits, "IDLE_S", 0.8)
     settings = Settings(max_upload_bytes=1 << 20, cors_origins=())
-    made = []
+    wires = []
     with running(RequestMiddleware(app, settings, Origins(()), Metrics()), context) as address:
 
         def connect(said=b"", *, bare=False):
             wire = socket.create_connection(address, timeout=PATIENCE_S)
-            if asked is not None and not bare:
-                wire = asked.wrap_socket(
+            if trust is not None and not bare:
+                wire = trust.wrap_socket(
                     wire, server_hostname="localhost", suppress_ragged_eofs=True
                 )
-            made.append(wire)
-            made[-1].sendall(said)
-            return made[-1]
+            wires.append(wire)
+            wires[-1].sendall(said)
+            return wires[-1]
 
         try:
             yield connect
         finally:
-            for one in made:
+            for one in wires:
                 one.close()
 
 

@@ -56,9 +56,9 @@ def test_a_browser_is_led_there_and_others_are_told_as_ever(served):
     led = served.client.get("/", headers=HTML)
     # relative: behind a proxy's prefix, and its TLS, it leads to the same place
     assert (led.status_code, led.headers["location"]) == (307, "dashboard")
-    told = served.client.get("/", headers={"Accept": "application/json"})
-    assert told.status_code == 404
-    assert told.json()["type"] == "/problems/not-found"
+    answer = served.client.get("/", headers={"Accept": "application/json"})
+    assert answer.status_code == 404
+    assert answer.json()["type"] == "/problems/not-found"
 
 
 @pytest.mark.parametrize(
@@ -79,6 +79,6 @@ def test_no_other_path_leads_to_a_file(served, path):
 
 def test_it_is_for_whom_the_service_is_for(served, refused):
     # a page of others that lets its name lead here gets nothing; a proxy's visitor needs no key yet
-    told = served.client.get("/dashboard", headers={**HTML, "Host": "evil.example"})
-    refused(told, 421, "misdirected")
+    answer = served.client.get("/dashboard", headers={**HTML, "Host": "evil.example"})
+    refused(answer, 421, "misdirected")
     assert served.client.get("/dashboard", headers={"X-Forwarded-For": "192.0.2.7"}).is_success

@@ -83,9 +83,9 @@ def test_what_is_gone_is_said_to_be(database):
         feed = Feed(database, most=9, retained=9)
         for after, place in ((1, 1), (99, 12)):
             stream = feed.batches(EventFilter(), after, always)
-            first, told = await anext(stream)
+            first, position = await anext(stream)
             assert [(one.number, one.kind) for one in first] == [(place, "events.missed")]
-            assert told == place
+            assert position == place
             if place < 12:
                 assert await gather(stream, 10) == [2, *range(4, 13)]
         assert await anext(feed.batches(EventFilter(), 3, always)) == ([], 3)

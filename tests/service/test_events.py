@@ -29,8 +29,8 @@ def keys(guarded):
         "admin": {"*": "admin"}, "every": {"*": "read"}, "mine": {"mine": "write"}
     }  # fmt: skip
     with Engine(Settings(data_dir=guarded.folder)) as engine:
-        made = {name: engine.create_key(name, granted).secret for name, granted in grants.items()}
-    headers = {name: {"Authorization": f"Bearer {secret}"} for name, secret in made.items()}
+        tokens = {name: engine.create_key(name, granted).secret for name, granted in grants.items()}
+    headers = {name: {"Authorization": f"Bearer {secret}"} for name, secret in tokens.items()}
     for name in ("mine", "theirs"):
         path, body = "/v1/maps", {"name": name, "model": "depth"}
         assert guarded.client.post(path, json=body, headers=headers["admin"]).status_code == 201
@@ -88,14 +88,14 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
         assert next(came) == ["retry: 1000"]
         assert next(came)[0] == ": alive"
         assert [next_event(came)["kind"] for _ in range(2)] == ["frame.indexed", "frame.deleted"]
-    asked = {"map": "told", "kind": ["map.", "frame.i"], "order": "oldest"}
-    page = client.get("/v1/events", params=asked).json()
+    filters = {"map": "told", "kind": ["map.", "frame.i"], "order": "oldest"}
+    page = client.get("/v1/events", params=filters).json()
     assert [item["kind"] for item in page["items"]] == ["map.created", "frame.indexed"]
     assert page["items"] == [first, found[1]]
 
 
 @pytest.mark.parametrize(
-    ("asked", "headers"),
+    ("filters", "headers"),
     [
         ({"kind": "frame%"}, {}),
         ({"after": "0" * 32}, {}),
@@ -105,9 +105,9 @@ def test_a_stream_tells_what_happens_and_goes_on_where_it_broke(served, make_map
         ({}, {"Last-Event-ID": "1e3"}),
     ],
 )
-def test_what_cannot_be_asked_is_refused_before_a_stream_begins(served, refused, asked, headers):
+def test_what_cannot_be_asked_is_refused_before_a_stream_begins(served, refused, filters, headers):
     for accept in ({}, STREAM):
-        answer = served.client.get("/v1/events", params=asked, headers=headers | accept)
+        answer = served.client.get("/v1/events", params=filters, headers=headers | accept)
         refused(answer, 422, "invalid-request")
 
 
@@ -118,8 +118,8 @@ def test_a_map_that_is_not_there_has_no_events(served, refused):
 
 
 def test_a_key_is_told_of_its_maps_alone(guarded, keys, refused):
-    def kinds(who, **asked):
-        answer = guarded.client.get("/v1/events", params=asked, headers=keys[who])
+    def kinds(who, **filters):
+        answer = guarded.client.get("/v1/events", params=filters, headers=keys[who])
         return {(item["kind"], item["map"]) for item in answer.json()["items"]}
 
     assert kinds("admin") >= {

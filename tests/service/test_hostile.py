@@ -60,8 +60,8 @@ def test_a_full_disk_takes_nothing_and_costs_nothing(
     assert server.client.get("/readyz").json() == before
     found = server.client.post(f"{path}/queries", json={"frame_id": first})
     assert found.status_code == 200
-    asked = server.client.post(f"{path}/queries", **shots[0].form())
-    assert (asked.status_code, asked.json()["status"]) == (200, "found")
+    query = server.client.post(f"{path}/queries", **shots[0].form())
+    assert (query.status_code, query.json()["status"]) == (200, "found")
     os.kill(worker, signal.SIGCONT)
     until(lambda: len(server.log("store unreachable")) >= 2)
     assert server.client.get("/healthz").status_code == 200
@@ -105,8 +105,8 @@ def test_another_process_that_keeps_writing_stops_uploads_alone(kept, small_shot
         with ThreadPoolExecutor(4) as pool:
             sent = [pool.submit(upload, i) for i in (8, 9, 10, 11)]
             until(lambda: any(one.done() for one in sent))
-            asked = kept.client.post(f"{path}/queries", **small_shots[0].form())
-            assert (asked.status_code, asked.json()["status"]) == (200, "found")
+            query = kept.client.post(f"{path}/queries", **small_shots[0].form())
+            assert (query.status_code, query.json()["status"]) == (200, "found")
             for address in ("/healthz", "/readyz", "/metrics", path, f"{path}/frames"):
                 assert kept.client.get(address).status_code == 200
             answers = [one.result() for one in sent]
@@ -173,8 +173,8 @@ def test_a_read_only_folder_is_served_as_it_is(sealed, stored, begin, small_shot
     assert (ready["status"], ready["read_only"], ready["frames"]) == ("ready", True, {"indexed": 4})
     said = "the store is read-only: queries work, but nothing is stored or signed"
     assert len(server.log(said)) == 1
-    asked = server.client.post(f"{path}/queries", **small_shots[1].form())
-    assert (asked.status_code, asked.json()["status"]) == (200, "found")
+    query = server.client.post(f"{path}/queries", **small_shots[1].form())
+    assert (query.status_code, query.json()["status"]) == (200, "found")
     frames = server.client.get(f"{path}/frames").json()["items"]
     assert len(frames) == 4
     for answer in (

@@ -58,14 +58,14 @@ def test_blobs_that_are_missing_cost_what_needs_them(
     monkeypatch.setenv("SCENEPRINT_GEOMETRY_CACHE_BYTES", "0")  # of which none is in memory
     server = begin("--workers", "0", folder=folder)
     frames = [frame["frame_id"] for frame in server.client.get(f"{HALL}/frames").json()["items"]]
-    asked = "SELECT s.geometry FROM signatures s JOIN frames f ON f.number = s.frame_number"
-    ((blob,),) = rows(folder, f"{asked} WHERE f.id = '{frames[0]}'")
+    query = "SELECT s.geometry FROM signatures s JOIN frames f ON f.number = s.frame_number"
+    ((blob,),) = rows(folder, f"{query} WHERE f.id = '{frames[0]}'")
     (folder / "blobs" / blob[:2] / blob).unlink()
     answer = server.client.post(f"{HALL}/queries", **small_shots[1].form()).json()
-    told = {match["frame_id"]: match["validation"] for match in answer["matches"]}
-    assert told[frames[0]]["status"] == "skipped"
-    assert "No such file" in told[frames[0]]["reason"]
-    assert (answer["status"], told[frames[1]]["status"]) == ("found", "accepted")
+    validations = {match["frame_id"]: match["validation"] for match in answer["matches"]}
+    assert validations[frames[0]]["status"] == "skipped"
+    assert "No such file" in validations[frames[0]]["reason"]
+    assert (answer["status"], validations[frames[1]]["status"]) == ("found", "accepted")
     own = server.client.post(f"{HALL}/queries", json={"frame_id": frames[0]})
     assert (own.status_code, own.json()["status"]) == (200, "found")  # made of its upload
     assert nearest(server, frames[0])["counts"]["compared"] == 8  # without the stage that needs it
@@ -92,12 +92,12 @@ def test_a_store_that_takes_no_artifact_costs_a_frame_no_try(
 ):
     """The blob cannot be written, and the database can: no fault of the frame's."""
     shot = small_shots[30]
-    artifact, asked = "", "SELECT geometry FROM signatures ORDER BY frame_number DESC LIMIT 1"
+    artifact, query = "", "SELECT geometry FROM signatures ORDER BY frame_number DESC LIMIT 1"
     with opened(Path(shutil.copytree(stored, tmp_path / "trial"))) as engine:
         engine.add_frame("hall", shot.png, meta_of(shot))
         work = engine.claim("w")
         assert engine.run(work) == JobState.SUCCEEDED
-        ((artifact,),) = rows(tmp_path / "trial", asked)
+        ((artifact,),) = rows(tmp_path / "trial", query)
     with opened(folder) as engine:
         added, _ = engine.add_frame("hall", shot.png, meta_of(shot))
         place = folder / "blobs" / artifact[:2]

@@ -10,14 +10,14 @@ import pytest
 
 
 def zipped(shots, folder="run", **more):
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w") as archive:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr(f"{folder}/intrinsics.json", json.dumps(shots[0].camera))
         for i, shot in enumerate(shots):
             archive.writestr(f"{folder}/{i:03d}.png", shot.png)
         for name, data in more.items():
             archive.writestr(name, data)
-    return made.getvalue()
+    return buffer.getvalue()
 
 
 def sent(data, kind="application/zip", **params):

@@ -152,8 +152,8 @@ def there(walled, small_shots, until):
     """Two maps with three frames each, and of each an answer and a job of every kind."""
     found = {}
     for name, some in ((OWN, small_shots[:3]), (THEIRS, small_shots[1:4])):
-        made = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
-        assert made.status_code == 201
+        created = walled.ask("boss", "POST", "/v1/maps", json={"name": name, "model": "depth"})
+        assert created.status_code == 201
         session = f"run-of-{name}"
         sent = [
             walled.ask(
@@ -171,8 +171,8 @@ def there(walled, small_shots, until):
         ]  # fmt: skip
         assert [one["state"] for one in sent] == ["indexed"] * 3
         frame = sent[0]["frame_id"]
-        asked = walled.ask("boss", "POST", f"/v1/maps/{name}/queries", json={"frame_id": frame})
-        query = asked.json()["query_id"]
+        answer = walled.ask("boss", "POST", f"/v1/maps/{name}/queries", json={"frame_id": frame})
+        query = answer.json()["query_id"]
         begun = {
             path: walled.ask("boss", "POST", path, json=body)
             for path, body in (
@@ -224,16 +224,16 @@ def request_of(operation, case, path, rest):
         return (path if found[1] == "map_name" else rest).of(operation, found[1])
 
     method, pattern = operation.split()
-    made = {"method": method, "path": re.sub(r"\{(\w+)\}", part, pattern)}
+    request = {"method": method, "path": re.sub(r"\{(\w+)\}", part, pattern)}
     if case.query:
-        made["params"] = {name: rest.fill(value) for name, value in case.query.items()}
+        request["params"] = {name: rest.fill(value) for name, value in case.query.items()}
     if case.body is not None:
-        made["content"] = rest.fill(json.dumps(case.body))
-        made["headers"] = {"Content-Type": "application/json"}
-    return made
+        request["content"] = rest.fill(json.dumps(case.body))
+        request["headers"] = {"Content-Type": "application/json"}
+    return request
 
 
-def told(answer, about):
+def answers_of(answer, about):
     """All that an answer tells, but for what was asked for and the request's own id."""
 
     def blank(text):
@@ -262,7 +262,7 @@ def test_every_operation_is_in_a_list(operations):
     ],
 )
 def test_what_is_anothers_is_answered_as_what_is_not_there(walled, there, operation, key):
-    case, asked = OF_A_MAP[operation], 0
+    case, requests = OF_A_MAP[operation], 0
     for path in ([THEIRS, NONE], [OWN, OWN]):
         if path[0] == OWN and not re.search(r"\{(?!map_name)\w+\}", operation + str(case.body)):
             continue  # nothing but the map is named
@@ -273,14 +273,14 @@ def test_what_is_anothers_is_answered_as_what_is_not_there(walled, there, operat
             given = request_of(operation, case, there[of_path], there[rest])
             answers.append((walled.ask(key, **given), there[rest]))
         (theirs, about), (none, nothing) = answers
-        assert told(theirs, about) == told(none, nothing), operation
-        asked += 1
+        assert answers_of(theirs, about) == answers_of(none, nothing), operation
+        requests += 1
         if path[0] == OWN and key == "admin" and operation in MADE_OF_ANYTHING:
             continue
         assert theirs.status_code in (403, 404), (operation, theirs.text)
         if operation != "POST /v1/maps" and (key == "admin" or path[0] == THEIRS):
             assert theirs.status_code == 404, (operation, theirs.text)
-    assert asked
+    assert requests
 
 
 def test_its_own_is_there_all_the_same(walled, there):
@@ -336,21 +336,21 @@ def test_asking_all_maps_asks_those_that_the_key_may_read(walled, there):
         walled.ask("reader", "POST", "/v1/queries", json=body | {"maps": [OWN, name]})
         for name in (THEIRS, NONE)
     ]
-    assert told(refused[0], there[THEIRS]) == told(refused[1], there[NONE])
+    assert answers_of(refused[0], there[THEIRS]) == answers_of(refused[1], there[NONE])
     assert refused[0].status_code == 404
 
 
 def test_an_answer_over_two_maps_is_for_who_may_read_both(walled, there):
     """And so is what is made of it."""
     frame = {"map": OWN, "frame_id": there[OWN].frame}
-    asked = walled.ask("boss", "POST", "/v1/queries", json={"maps": [OWN, THEIRS], "frame": frame})
-    assert asked.status_code == 200, asked.text
-    mixed = asked.json()["query_id"]
-    assert {match["map"] for match in asked.json()["matches"]} == {OWN, THEIRS}
+    answer = walled.ask("boss", "POST", "/v1/queries", json={"maps": [OWN, THEIRS], "frame": frame})
+    assert answer.status_code == 200, answer.text
+    mixed = answer.json()["query_id"]
+    assert {match["map"] for match in answer.json()["matches"]} == {OWN, THEIRS}
     assert walled.ask("watcher", "GET", f"/v1/queries/{mixed}").status_code == 200
     theirs = {"map": THEIRS, "frame_id": there[THEIRS].frame}
-    asked = walled.ask("boss", "POST", "/v1/queries", json={"maps": [OWN], "frame": theirs})
-    unseen(walled, "GET", "/v1/queries/{}", asked.json()["query_id"])
+    answer = walled.ask("boss", "POST", "/v1/queries", json={"maps": [OWN], "frame": theirs})
+    unseen(walled, "GET", "/v1/queries/{}", answer.json()["query_id"])
     match = f"/matches/{there[OWN].frame}"
     for end in (
         "", "/cloud.ply", "/similarities", "/points", "/question", "/preview.png", match,
@@ -391,7 +391,7 @@ def unseen(walled, method, path, id_):
         (walled.ask("admin", method, path.format(one)), There("-", "-", one, *"--------"))
         for one in (id_, NO_ID)
     ]
-    assert told(*answers[0]) == told(*answers[1])
+    assert answers_of(*answers[0]) == answers_of(*answers[1])
     assert answers[0][0].status_code == 404, (path, answers[0][0].text)
 
 
@@ -412,7 +412,7 @@ def test_what_is_anothers_beside_what_is_the_keys_own(walled, there):
         for one in (there[THEIRS], there[NONE]):
             content = one.fill(json.dumps(body))
             given = {"content": content, "headers": {"Content-Type": "application/json"}}
-            answers.append(told(walled.ask("admin", "POST", path, **given), one))
+            answers.append(answers_of(walled.ask("admin", "POST", path, **given), one))
         if answers[0][0] == 200:  # an answer of its own map, with what becomes of the other frame
             texts = [json.loads(text) for _, _, text in answers]
             assert texts[0]["explanation"] == texts[1]["explanation"]

@@ -30,17 +30,17 @@ WRONG_KEY = "The key that was sent is unknown, revoked or expired."
 
 
 @pytest.mark.parametrize(
-    ("shown", "told"),
+    ("shown", "detail"),
     [
         (None, NO_KEY), ("Bearer", NO_KEY), ("Basic {}", NO_KEY), ("{}", NO_KEY),
         ("Bearer sp_wrong", WRONG_KEY), ("Bearer {}x", WRONG_KEY), ("Bearer \xe9", WRONG_KEY),
     ],
 )  # fmt: skip
-def test_without_its_key_nothing_below_v1_is_told(walled, secret, refused, shown, told):
+def test_without_its_key_nothing_below_v1_is_told(walled, secret, refused, shown, detail):
     headers = {} if shown is None else {"Authorization": shown.format(secret).encode("latin-1")}
     for method, path in BELOW:
         answer = walled.server.client.request(method, path, headers=headers)
-        refused(answer, 401, "key-required", told)
+        refused(answer, 401, "key-required", detail)
         assert answer.headers["www-authenticate"] == "Bearer"
 
 

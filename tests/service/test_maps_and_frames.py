@@ -14,12 +14,12 @@ def test_a_map_is_made_once_and_stays_as_it_was_made(served, refused):
     assert (first.status_code, again.status_code) == (201, 200)
     assert first.headers["location"] == "/v1/maps/hall" == again.headers["location"]
     assert first.json() == again.json() == served.client.get("/v1/maps/hall").json()
-    made = first.json()
-    assert (made["name"], made["title"], made["frames"], made["revision"]) == (
+    record = first.json()
+    assert (record["name"], record["title"], record["frames"], record["revision"]) == (
         "hall", "The hall", {}, 0,
     )  # fmt: skip
-    assert made["model"] == f"depth-{made['model_id'][:12]}"
-    assert datetime.fromisoformat(made["created_at"]).utcoffset() is not None
+    assert record["model"] == f"depth-{record['model_id'][:12]}"
+    assert datetime.fromisoformat(record["created_at"]).utcoffset() is not None
     for other in ({"title": "Another"}, {}, {"title": "The hall", "model": "paper"}):
         answer = served.client.post("/v1/maps", json={"name": "hall", **other})
         refused(answer, 409, "map-exists", "'hall'")
@@ -100,12 +100,12 @@ def test_a_list_of_maps_is_the_maps_one_by_one(served, small_shots):
         form = small_shots[number].form(pose=pose)
         sent = served.client.post(f"/v1/maps/{name}/frames", **form, headers={"Prefer": "wait=200"})
         assert sent.json()["state"] == "indexed", sent.text
-    asked = served.client.post("/v1/maps/queried/queries", **small_shots[91].form())
-    assert asked.status_code == 200
+    answer = served.client.post("/v1/maps/queried/queries", **small_shots[91].form())
+    assert answer.status_code == 200
     # the query log is written after the answer
     until(lambda: served.client.get("/v1/maps/queried").json()["recent_queries"])
     listed = {map_["name"]: map_ for map_ in served.client.get("/v1/maps").json()["items"]}
-    for name, queries in (("counted", {}), ("queried", {asked.json()["status"]: 1})):
+    for name, queries in (("counted", {}), ("queried", {answer.json()["status"]: 1})):
         one = listed[name]
         assert one == served.client.get(f"/v1/maps/{name}").json()
         assert (one["frames"], one["posed_frames"], one["parent_frames"], one["recent_queries"]) \

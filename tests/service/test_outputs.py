@@ -56,9 +56,9 @@ def test_what_a_caller_has_is_not_sent_again(served, shown):
 def test_a_signature_in_the_form_that_is_asked_for(served, shown):
     path, ids = shown
     url = f"{path}/frames/{ids[0]}/signature"
-    told = served.client.get(url)
-    vector = base64.b64decode(told.json()["base64"])
-    assert (told.json()["length"], told.json()["frame_id"]) == (len(vector), ids[0])
+    as_json = served.client.get(url)
+    vector = base64.b64decode(as_json.json()["base64"])
+    assert (as_json.json()["length"], as_json.json()["frame_id"]) == (len(vector), ids[0])
     answers = {}
     for accept, kind in {
         "application/octet-stream": "application/octet-stream",

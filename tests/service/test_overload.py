@@ -20,9 +20,9 @@ def test_who_comes_too_many_is_sent_away_and_may_come_back(busy, shots, refused)
         return busy.client.post("/v1/maps/hall/queries", **shots[0].form())
 
     with ThreadPoolExecutor(13) as pool:
-        asked = [pool.submit(ask, i) for i in range(12)]
+        futures = [pool.submit(ask, i) for i in range(12)]
         health = pool.submit(busy.client.get, "/healthz")
-        answers = [one.result() for one in asked]
+        answers = [one.result() for one in futures]
         assert health.result().json()["status"] == "ok"
     kinds = sorted(answer.status_code for answer in answers)
     assert set(kinds) == {200, 503}

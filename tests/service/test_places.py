@@ -82,10 +82,10 @@ def inside(tmp_path):
 @pytest.mark.parametrize("path", ["/v1/maps", "/v1/maps/a/queries"])
 def test_of_json_no_more_is_read_than_anyone_has_to_say(inside, path):
     async def test(app):
-        asked = Asked(app, path, JSON, [b" " * (1 << 16)] * 100)
-        problem = await asked.problem()
+        request = Asked(app, path, JSON, [b" " * (1 << 16)] * 100)
+        problem = await request.problem()
         assert (problem["status"], problem["type"]) == (413, "/problems/too-large")
-        assert asked.read == 5  # four pieces are 256 KiB
+        assert request.read == 5  # four pieces are 256 KiB
 
     inside(test)
 
@@ -120,9 +120,9 @@ def test_bodies_that_are_still_read_take_places_among_their_like(inside, kind, o
         welcome = Asked(app, f"/v1/maps/a/{other}", FORM, [HEAD, END])  # uploads stop no query
         assert (await welcome.problem())["type"] == "/problems/invalid-request"
         by_id = Asked(app, "/v1/maps/a/queries", JSON, [b'{"frame_id": "a"}'])
-        told = await by_id.problem()
+        problem = await by_id.problem()
         busy = kind == "queries"
-        assert (told["status"], by_id.read > 0) == (503 if busy else 404, not busy)
+        assert (problem["status"], by_id.read > 0) == (503 if busy else 404, not busy)
         for one in slow:
             one.more.set()
             assert (await one.problem())["detail"].startswith("The form has no field `meta`.")
@@ -152,11 +152,11 @@ def test_where_there_is_no_room_to_read_nothing_is_taken(
 
     async def test(app):
         for _ in range(3):  # each gives its place back
-            asked = Asked(app, "/v1/maps/a/frames", FORM, [HEAD, END])
-            problem = await asked.problem()
+            request = Asked(app, "/v1/maps/a/frames", FORM, [HEAD, END])
+            problem = await request.problem()
             assert (problem["status"], problem["type"]) == (status, f"/problems/{kind}")
             assert "folder" not in problem["detail"]
 
     inside(test, concurrent_requests=1, queued_requests=0)
-    told = [record for record in caplog.records if record.message == "request failed"]
-    assert ["no room in /the/folder" in str(vars(one)["error"]) for one in told] == [True] * 3
+    records = [record for record in caplog.records if record.message == "request failed"]
+    assert ["no room in /the/folder" in str(vars(one)["error"]) for one in records] == [True] * 3

@@ -22,8 +22,8 @@ def test_who_may_read_a_map_may_list_its_queries(house, small_shots, refused):
         house.ask("boss", "POST", f"/v1/maps/{name}/frames", **shot.form())
     house.work()
     for name, key in (("alpha", "robot"), ("bravo", "other"), ("alpha", "boss")):
-        asked = house.ask(key, "POST", f"/v1/maps/{name}/queries", **shot.form())
-        assert asked.status_code == 200, asked.text
+        response = house.ask(key, "POST", f"/v1/maps/{name}/queries", **shot.form())
+        assert response.status_code == 200, response.text
     both = [(one["map"], one["key"]) for one in listed(house, "both")]
     assert both == [("alpha", "boss"), ("bravo", "other"), ("alpha", "robot")]
     assert [one["map"] for one in listed(house, "robot")] == ["alpha", "alpha"]

@@ -178,7 +178,7 @@ def test_a_filter_that_makes_no_sense_is_named(
 
 
 @pytest.mark.parametrize(
-    ("count", "poses", "more", "told"),
+    ("count", "poses", "more", "message"),
     [
         (1, True, {}, "The sequence has 1 frames"),
         (2, False, {}, "frame 0 has no pose"),
@@ -188,7 +188,7 @@ def test_a_filter_that_makes_no_sense_is_named(
     ],
 )
 def test_what_is_no_sequence_is_refused(
-    served, hall, small_shots, refused, count, poses, more, told
+    served, hall, small_shots, refused, count, poses, more, message
 ):
     odometry = {"pose": {"matrix": np.eye(4).tolist(), "parent_frame": "odom"}} if poses else {}
     forms = [shot.form(**odometry) for shot in small_shots[:count]]
@@ -197,4 +197,4 @@ def test_what_is_no_sequence_is_refused(
         f"{hall}/localize/sequence", data={"metas": json.dumps(metas), **more},
         files=[("frame", form["files"]["frame"]) for form in forms],
     )  # fmt: skip
-    assert told in str(refused(answer, 422, "invalid-request"))
+    assert message in str(refused(answer, 422, "invalid-request"))

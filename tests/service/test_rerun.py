@@ -11,7 +11,7 @@ def shots(small_shots):
 
 
 @pytest.fixture(scope="module")
-def asked(served, make_map, shots):
+def original(served, make_map, shots):
     """Three views of a room in a map, and the answer to an upload with a base and a session."""
     path = make_map(served, "again")
     for i in (0, 1, 3):
@@ -44,16 +44,16 @@ def same(answer):
     }
 
 
-def test_an_upload_is_asked_again_without_its_file(served, asked):
-    told = again(served, asked["query_id"])
-    assert told["query_id"] != asked["query_id"]
-    assert same(told) == same(asked)
-    assert same(served.client.get(f"/v1/queries/{told['query_id']}").json()) == same(asked)
-    fewer = again(served, told["query_id"], k=1, candidates=2)
+def test_an_upload_is_asked_again_without_its_file(served, original):
+    repeated = again(served, original["query_id"])
+    assert repeated["query_id"] != original["query_id"]
+    assert same(repeated) == same(original)
+    assert same(served.client.get(f"/v1/queries/{repeated['query_id']}").json()) == same(original)
+    fewer = again(served, repeated["query_id"], k=1, candidates=2)
     assert (fewer["counts"]["selected"], fewer["seed"]) == (2, 3)
-    assert again(served, fewer["query_id"], k=None, candidates=None)["counts"] == asked["counts"]
+    assert again(served, fewer["query_id"], k=None, candidates=None)["counts"] == original["counts"]
     # the session and the time that came with the upload are known still
-    apart = again(served, asked["query_id"], filter={"not_within_s": 2.0})
+    apart = again(served, original["query_id"], filter={"not_within_s": 2.0})
     assert apart["counts"]["passed"] == 1
 
 
@@ -67,27 +67,27 @@ def test_another_frame_of_the_same_id_is_not_asked_in_its_place(served, make_map
         assert reply.json()["state"] == "indexed", reply.text
 
     put(0)
-    asked = {"frame_id": "door", "stages": "retrieve"}
-    query_id = served.client.post(f"{path}/queries", json=asked).json()["query_id"]
+    by_id = {"frame_id": "door", "stages": "retrieve"}
+    query_id = served.client.post(f"{path}/queries", json=by_id).json()["query_id"]
     assert served.client.delete(f"{path}/frames/door").status_code == 204
     put(2)
     body = {"maps": ["again-other"], "query_id": query_id}
     refused(served.client.post("/v1/queries", json=body), 404, "unknown-query")
 
 
-def test_what_cannot_be_asked_again(served, asked, shots, refused):
-    path = f"/v1/queries/{asked['query_id']}"
+def test_what_cannot_be_asked_again(served, original, shots, refused):
+    path = f"/v1/queries/{original['query_id']}"
     reply = served.client.get(f"{path}/preview.png?view=patches")
     refused(reply, 422, "invalid-request", "not stored")
     frame = {"map": "again", "frame_id": "x"}
     for wrong in ({"kk": 2}, {"frame": frame}):
-        body = {"maps": ["again"], "query_id": asked["query_id"]} | wrong
+        body = {"maps": ["again"], "query_id": original["query_id"]} | wrong
         refused(served.client.post("/v1/queries", json=body), 422, "invalid-request", "")
     form = shots[0].form()
-    form["data"] |= {"maps": "again", "query_id": asked["query_id"]}
+    form["data"] |= {"maps": "again", "query_id": original["query_id"]}
     refused(served.client.post("/v1/queries", **form), 422, "invalid-request", "two frames")
     for body, kind in (
-        ({"maps": ["nowhere"], "query_id": asked["query_id"]}, "unknown-map"),
+        ({"maps": ["nowhere"], "query_id": original["query_id"]}, "unknown-map"),
         ({"maps": ["again"], "query_id": "0" * 32}, "unknown-query"),
     ):
         refused(served.client.post("/v1/queries", json=body), 404, kind)
@@ -101,20 +101,20 @@ def test_what_cannot_be_asked_again(served, asked, shots, refused):
     refused(reply, 409, "not-indexed", "Send the frame")
 
 
-def test_stored_results_that_are_not_there(served, asked, shots, refused):
+def test_stored_results_that_are_not_there(served, original, shots, refused):
     form = shots[1].form()
     form["data"]["keep"] = "false"
     unkept = served.client.post("/v1/maps/again/queries", **form).json()
     assert served.client.get(f"/v1/queries/{unkept['query_id']}").status_code == 404
-    path, best = f"/v1/queries/{asked['query_id']}", asked["matches"][0]["frame_id"]
+    path, best = f"/v1/queries/{original['query_id']}", original["matches"][0]["frame_id"]
     for tail in ("", "/cloud.ply", "/similarities", "/matches/x", "/matches/x/overlay.ply"):
-        for query_id in ("0" * 32, "..%2fsceneprint.db", "x", asked["query_id"].upper()):
+        for query_id in ("0" * 32, "..%2fsceneprint.db", "x", original["query_id"].upper()):
             reply = served.client.get(f"/v1/queries/{query_id}{tail}")
             assert reply.status_code == 404
             if "%" not in query_id:
                 refused(reply, 404, "unknown-query", "expired")
     refused(served.client.get(f"{path}/matches/nobody"), 404, "unknown-frame", "has no match")
-    wall = asked["matches"][-1]["frame_id"]
+    wall = original["matches"][-1]["frame_id"]
     reply = served.client.get(f"{path}/matches/{wall}/overlay.ply?transform=rival")
     refused(reply, 422, "invalid-request", "has no rival")
     assert served.client.delete(f"/v1/maps/again/frames/{best}").status_code == 204

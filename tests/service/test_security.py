@@ -48,9 +48,9 @@ def test_a_key_that_is_sent_counts_where_none_is_required(served, make_map, refu
     hall = make_map(served, "keyed-unasked")
     wrong = {"Authorization": "Bearer sp_wrong"}
     refused(served.client.get(hall, headers=wrong), 401, "key-required", "unknown, revoked")
-    made = served.client.post("/v1/keys", json={"name": "reader", "grants": {hall[9:]: "read"}})
+    key = served.client.post("/v1/keys", json={"name": "reader", "grants": {hall[9:]: "read"}})
     try:
-        shown = {"Authorization": f"Bearer {made.json()['secret']}"}
+        shown = {"Authorization": f"Bearer {key.json()['secret']}"}
         assert served.client.get(hall, headers=shown).status_code == 200
         assert served.client.delete(hall, headers=shown).status_code == 403
     finally:
@@ -148,8 +148,8 @@ def test_what_comes_through_a_proxy_needs_a_key(served, refused, header):
 
 def test_with_its_key_a_caller_behind_a_proxy_has_what_the_key_may(served, refused):
     client = served.client
-    made = client.post("/v1/keys", json={"name": "far", "grants": {"hall": "read"}})
-    given = {"X-Forwarded-For": "1.2.3.4", "Authorization": f"Bearer {made.json()['secret']}"}
+    key = client.post("/v1/keys", json={"name": "far", "grants": {"hall": "read"}})
+    given = {"X-Forwarded-For": "1.2.3.4", "Authorization": f"Bearer {key.json()['secret']}"}
     assert client.get("/v1/maps", headers=given).status_code == 200
     me = client.get("/v1/keys/me", headers=given).json()
     assert (me["name"], me["grants"]) == ("far", {"hall": "read"})
@@ -186,17 +186,17 @@ def test_a_key_is_made_shown_once_used_and_revoked(walled, refused):
     answer = walled.ask("boss", "POST", "/v1/keys", json=new)
     assert answer.status_code == 201
     assert answer.headers["location"] == "/v1/keys/robot%2F7%20%C3%A9"
-    made = answer.json()
-    assert made["secret"].startswith("sp_")
-    assert datetime.fromisoformat(made["expires_at"]) == until
-    walled.secrets["new"] = made["secret"]
+    key = answer.json()
+    assert key["secret"].startswith("sp_")
+    assert datetime.fromisoformat(key["expires_at"]) == until
+    walled.secrets["new"] = key["secret"]
     me = walled.ask("new", "GET", "/v1/keys/me").json()
     assert (me["name"], me["grants"]) == ("robot/7 é", {"hall": "write"})
     listed = walled.ask("boss", "GET", "/v1/keys?limit=3").json()
     assert [key["name"] for key in listed["items"]] == ["admin", "boss", "keeper"]
     rest = walled.ask("boss", "GET", f"/v1/keys?cursor={listed['next_cursor']}").json()
     assert [key["name"] for key in rest["items"]] == ["reader", "robot/7 é", "watcher", "writer"]
-    assert made["secret"] not in str(listed) + str(rest)
+    assert key["secret"] not in str(listed) + str(rest)
     again = walled.ask("boss", "POST", "/v1/keys", json=new)
     refused(again, 409, "conflict")
     gone = walled.ask("boss", "DELETE", answer.headers["location"])
@@ -216,13 +216,13 @@ def test_unknown_revoked_and_expired_keys_are_answered_alike(walled, refused):
     assert walled.ask("gone", "GET", "/v1/maps").status_code == 200
     assert walled.ask("boss", "DELETE", "/v1/keys/gone").status_code == 204
     walled.secrets["guess"] = "sp_" + "A" * (len(walled.secrets["late"]) - 3)
-    told = []
+    answers = []
     for name in ("late", "gone", "guess"):
         answer = walled.ask(name, "GET", "/v1/maps", headers={"X-Request-Id": "alike"})
         refused(answer, 401, "key-required")
         alike = {key: value for key, value in answer.headers.items() if key != "date"}
-        told.append((alike, answer.content))
-    assert told[0] == told[1] == told[2]
+        answers.append((alike, answer.content))
+    assert answers[0] == answers[1] == answers[2]
     assert answer.json()["detail"].startswith(
         "The key that was sent is unknown, revoked or expired. Check that it is complete, or ask "
     )
@@ -271,9 +271,9 @@ def test_figures_are_for_who_may_read_all(walled, refused):
 
 
 def test_the_address_is_that_of_the_connection(walled):
-    asked = {"X-Forwarded-For": "203.0.113.9", "Content-Type": "application/json"}
-    made = walled.ask("boss", "POST", "/v1/maps", json={"name": "seen"}, headers=asked)
-    assert made.status_code == 201
+    headers = {"X-Forwarded-For": "203.0.113.9", "Content-Type": "application/json"}
+    created = walled.ask("boss", "POST", "/v1/maps", json={"name": "seen"}, headers=headers)
+    assert created.status_code == 201
     (line,) = walled.ask("boss", "GET", "/v1/audit?map=seen").json()["items"]
     assert (line["address"], line["actor"]) == ("127.0.0.1", "boss")
 

@@ -16,16 +16,16 @@ from service.startup import Front
 
 async def _lived(front, test):
     """Run a test between a front's start and its end."""
-    told = asyncio.Queue()
+    messages = asyncio.Queue()
     said = asyncio.Queue()
-    life = asyncio.create_task(front({"type": "lifespan"}, told.get, said.put))
-    await told.put({"type": "lifespan.startup"})
+    life = asyncio.create_task(front({"type": "lifespan"}, messages.get, said.put))
+    await messages.put({"type": "lifespan.startup"})
     assert (await said.get())["type"] == "lifespan.startup.complete"
     async with httpx.AsyncClient(
         transport=httpx.ASGITransport(front), base_url="http://127.0.0.1"
     ) as client:
         result = await test(client)
-    await told.put({"type": "lifespan.shutdown"})
+    await messages.put({"type": "lifespan.shutdown"})
     assert (await said.get())["type"] == "lifespan.shutdown.complete"
     await life
     return result

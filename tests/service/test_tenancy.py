@@ -19,8 +19,8 @@ def test_a_quota_is_the_operators(house, refused):
             refused(answer, 403, "forbidden", "'admin' for")
         refused(house.ask("other", "PATCH", path, json=body), 404, "unknown-map")
     assert house.ask("tenant", "GET", path).json()["title"] is None
-    told = house.ask("boss", "PATCH", path, json={"quota_frames": 10, "quota_bytes": 10**9}).json()
-    assert (told["quota_frames"], told["quota_bytes"], told["used_frames"]) == (10, 10**9, 0)
+    row = house.ask("boss", "PATCH", path, json={"quota_frames": 10, "quota_bytes": 10**9}).json()
+    assert (row["quota_frames"], row["quota_bytes"], row["used_frames"]) == (10, 10**9, 0)
     new = {"name": "later", "model": "depth"}
     refused(
         house.ask("tenant", "POST", "/v1/maps", json=new | {"quota_frames": 5}), 403, "forbidden"
@@ -30,8 +30,8 @@ def test_a_quota_is_the_operators(house, refused):
     )
     # and it is not lost by deleting the map and making it anew
     assert house.ask("tenant", "DELETE", path).status_code == 204
-    made = house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "depth"})
-    assert (made.status_code, made.json()["quota_frames"]) == (201, 10)
+    created = house.ask("tenant", "POST", "/v1/maps", json={"name": "alpha", "model": "depth"})
+    assert (created.status_code, created.json()["quota_frames"]) == (201, 10)
     audited = house.ask("boss", "GET", "/v1/audit").json()["items"]
     [change] = [one for one in audited if one["action"] == "map.edited"]
     assert (change["actor"], change["map"]) == ("boss", "alpha")
@@ -55,8 +55,8 @@ def test_beyond_the_quota_nothing_is_taken(house, refused, small_shots):
         answer = house.ask("robot", method, place, **c.form())
         refused(answer, 403, "quota-exceeded", "has 2 frames, and its quota is 2")
     assert house.ask("robot", "GET", f"{path}/mine").status_code == 404
-    told = house.ask("tenant", "GET", "/v1/maps/alpha").json()
-    assert (told["used_frames"], told["used_bytes"]) == (2, len(a.png) + len(b.png))
+    record = house.ask("tenant", "GET", "/v1/maps/alpha").json()
+    assert (record["used_frames"], record["used_bytes"]) == (2, len(a.png) + len(b.png))
     # of another's use nobody is told
     assert [map_["name"] for map_ in house.ask("other", "GET", "/v1/maps").json()["items"]] == [
         "bravo"

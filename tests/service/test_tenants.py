@@ -42,8 +42,8 @@ def shared(wall):
     with Engine(Settings(data_dir=held.server.folder, database_url=None)) as engine:
         create_tenant(engine.store, "noisy")
         for name in ("one", "two"):
-            made = engine.create_key(name, {"*": "admin"}, tenant="noisy")
-            held.secrets[name] = made.secret
+            key = engine.create_key(name, {"*": "admin"}, tenant="noisy")
+            held.secrets[name] = key.secret
     return held
 
 
@@ -79,8 +79,8 @@ def test_keys_tell_their_tenant(shared, refused):
     new = {"name": "three", "grants": {"*": "read"}, "tenant": "nobody"}
     answer = shared.ask("victim", "POST", "/v1/keys", json=new)
     refused(answer, 404, "unknown-tenant", "no tenant named 'nobody'")
-    made = shared.ask("victim", "POST", "/v1/keys", json=new | {"tenant": "noisy"})
-    assert (made.status_code, made.json()["tenant"]) == (201, "noisy")
+    response = shared.ask("victim", "POST", "/v1/keys", json=new | {"tenant": "noisy"})
+    assert (response.status_code, response.json()["tenant"]) == (201, "noisy")
     assert shared.ask("victim", "DELETE", "/v1/keys/three").status_code == 204
 
 
@@ -89,12 +89,12 @@ def test_audit_lines_name_the_tenant_of_the_key(shared):
     new = {"name": "four", "grants": {"*": "read"}, "tenant": "noisy"}
     shared.secrets["four"] = shared.ask("two", "POST", "/v1/keys", json=new).json()["secret"]
     assert shared.ask("four", "POST", "/v1/keys", json=new).status_code == 403
-    told = [
+    lines = [
         (item["action"], item["tenant"])
         for name in ("two", "four")
         for item in shared.ask("victim", "GET", f"/v1/audit?actor={name}&limit=1").json()["items"]
     ]
-    assert told == [("key.created", "noisy"), ("refused", "noisy")]
+    assert lines == [("key.created", "noisy"), ("refused", "noisy")]
 
 
 def test_a_job_is_of_the_tenant_that_asked(shared, small_shots):
@@ -105,8 +105,8 @@ def test_a_job_is_of_the_tenant_that_asked(shared, small_shots):
         Engine(Settings(data_dir=shared.server.folder, database_url=None)) as engine,
         engine.store.database.read() as connection,
     ):
-        asked = select(jobs.c.tenant).where(jobs.c.id == job["job_id"])
-        assert connection.execute(asked).scalar_one() == "noisy"
+        query = select(jobs.c.tenant).where(jobs.c.id == job["job_id"])
+        assert connection.execute(query).scalar_one() == "noisy"
 
 
 def test_a_tenant_holds_three_quarters_at_most_and_gives_it_back():
@@ -260,10 +260,10 @@ def test_metrics_tell_tenants_apart(shared, until):
 
 def test_series_of_tenants_stay_few():
     metrics = Metrics()
-    told = metrics.tenants
+    counters = metrics.tenants
     for number in range(MOST_TENANTS + 5):
-        told.request(f"t{number}", 200, 0.5)
-    told.update(requests_in_progress={"t0": 2, "t51": 3, "t52": 4, NOBODY: 9})
+        counters.request(f"t{number}", 200, 0.5)
+    counters.update(requests_in_progress={"t0": 2, "t51": 3, "t52": 4, NOBODY: 9})
     text = generate_latest(metrics.registry).decode()
     assert text.count("sceneprint_tenant_requests_total{") == MOST_TENANTS + 1
     assert 'sceneprint_tenant_requests_total{status="200",tenant="(others)"} 5.0' in text

@@ -58,7 +58,7 @@ class Twin:
         frames = self.ask("boss", "GET", "/v1/maps/bravo/frames?limit=1").json()["items"]
         self.ask("boss", "DELETE", f"/v1/maps/bravo/frames/{frames[0]['frame_id']}")
 
-    def told(self, key, method, path, **request):
+    def answer_of(self, key, method, path, **request):
         """Return all that an answer tells, on lines."""
         answer = self.ask(key, method, path, **request)
         assert answer.status_code < 500, answer.text
@@ -76,8 +76,8 @@ def live(one):
         one.ids["job"] = sent.json()["job_id"]
         one.disturb()
     one.house.work()
-    asked = one.ask("boss", "POST", f"{ALPHA}/queries", json={"frame_id": "frame-0"})
-    one.ids["query"] = asked.json()["query_id"]
+    answer = one.ask("boss", "POST", f"{ALPHA}/queries", json={"frame_id": "frame-0"})
+    one.ids["query"] = answer.json()["query_id"]
     one.disturb()
     begun = one.ask("boss", "POST", f"{ALPHA}/coverage", json={"not_within_s": 0})
     one.ids["coverage"] = begun.json()["job_id"]
@@ -95,14 +95,14 @@ def everything(one):
         "/v1/stats", "/v1/stats?map=alpha", f"/v1/jobs/{one.ids['job']}", "/v1/jobs?state=queued",
         "/v1/events?map=alpha&kind=frame.", "/v1/events?after=0&limit=1000", "/v1/keys/me",
     ):  # fmt: skip
-        yield one.told("reader", "GET", path)
+        yield one.answer_of("reader", "GET", path)
     for path in (f"{ALPHA}/frames?limit=3", f"{ALPHA}/frames?limit=2&order=desc",
                  f"{ALPHA}/coverage?limit=1", "/v1/jobs?limit=3", "/v1/events?limit=5",
                  "/v1/events?limit=5&order=oldest"):  # fmt: skip
         cursor = ""
         while cursor is not None:
             page = f"{path}{cursor and '&cursor='}{cursor}"
-            yield one.told("reader", "GET", page)
+            yield one.answer_of("reader", "GET", page)
             cursor = one.ask("reader", "GET", page).json()["next_cursor"]
     frame = {"map": "alpha", "frame_id": "frame-0"}
     for method, path, body in (
@@ -117,18 +117,18 @@ def everything(one):
         ("GET", "/v1/events", None),
         ("GET", "/v1/jobs", None),
     ):  # fmt: skip
-        yield one.told("admin", method, path, **({} if body is None else {"json": body}))
+        yield one.answer_of("admin", method, path, **({} if body is None else {"json": body}))
         one.disturb()
 
 
-def plain(told):
+def plain(texts):
     """Number random values in their order, and leave out times."""
     numbers = {}
 
     def number(found):
         return f"<{numbers.setdefault(found[0], len(numbers))}>"
 
-    return [TOOK.sub("<took>", TIMES.sub("<time>", CHANCE.sub(number, one))) for one in told]
+    return [TOOK.sub("<took>", TIMES.sub("<time>", CHANCE.sub(number, one))) for one in texts]
 
 
 @pytest.mark.thorough

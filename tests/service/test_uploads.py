@@ -69,11 +69,11 @@ def test_a_body_that_is_the_frame_is_taken_as_the_form_is(served, hall, small_sh
     )  # fmt: skip
     again = http.put(f"{hall}/frames/raw", **form)
     assert (again.status_code, again.json()["frame_id"]) == (200, "raw")
-    told = http.get(f"{hall}/frames/raw").json()
-    assert (told["base_frame"], told["T_base_sensor"]["translation"]["z"]) == ("base_link", 0.4)
-    assert told["T_base_sensor"]["child_frame"] == "raw.optical"
-    assert told["pose"]["matrix"][0][3] == 1
-    assert told["up"] == pytest.approx({"x": 0.6, "y": -0.8, "z": 0.0})
+    record = http.get(f"{hall}/frames/raw").json()
+    assert (record["base_frame"], record["T_base_sensor"]["translation"]["z"]) == ("base_link", 0.4)
+    assert record["T_base_sensor"]["child_frame"] == "raw.optical"
+    assert record["pose"]["matrix"][0][3] == 1
+    assert record["up"] == pytest.approx({"x": 0.6, "y": -0.8, "z": 0.0})
 
 
 @pytest.mark.parametrize(

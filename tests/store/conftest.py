@@ -25,24 +25,24 @@ import sceneprint.engine.admin.operations
 
 fork = get_context("fork")
 
-def run(i, work, start, told):
+def run(i, work, start, queue):
     start.wait()
     try:
-        told.put([i, work(i)])
+        queue.put([i, work(i)])
     except BaseException as error:
-        told.put([i, f"{type(error).__name__}: {error}"])
+        queue.put([i, f"{type(error).__name__}: {error}"])
 
 for line in sys.stdin:
     code, count, args = json.loads(line)
     names = {"ARGS": args}
     exec(code, names)
-    start, told = fork.Barrier(count), fork.Queue()
+    start, queue = fork.Barrier(count), fork.Queue()
     children = [
-        fork.Process(target=run, args=(i, names["work"], start, told)) for i in range(count)
+        fork.Process(target=run, args=(i, names["work"], start, queue)) for i in range(count)
     ]
     for child in children:
         child.start()
-    results = dict(told.get(timeout=240) for _ in children)
+    results = dict(queue.get(timeout=240) for _ in children)
     for child in children:
         child.join()
     print(json.dumps([results[i] for i in range(count)]), flush=True)
@@ -194,14 +194,14 @@ def plans():
 
     @contextmanager
     def looked_at(connection):
-        told = []
+        steps = []
 
         def explain(_, cursor, statement, parameters, *__):
             cursor.execute(f"EXPLAIN QUERY PLAN {statement}", parameters)
-            told.extend(row[3] for row in cursor.fetchall())
+            steps.extend(row[3] for row in cursor.fetchall())
 
         event.listen(connection, "before_cursor_execute", explain)
-        yield told
+        yield steps
         event.remove(connection, "before_cursor_execute", explain)
 
     return looked_at

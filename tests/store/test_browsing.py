@@ -216,8 +216,8 @@ def test_poses_are_stamped_by_time_or_else_by_place(store, hall, received):
 
     def stamps(clock="taken"):
         with store.database.read() as connection:
-            asked = run.model_copy(update={"clock": clock})
-            return stamps_of_run(connection, hall.number, asked)
+            query = run.model_copy(update={"clock": clock})
+            return stamps_of_run(connection, hall.number, query)
 
     received("0" * 64, **posed)
     received("1" * 64, session="s", captured_at=1.0)  # of no pose, it stamps none
@@ -274,7 +274,7 @@ def test_each_list_takes_the_index_that_is_meant_for_it(store, hall, plans):
     ]  # fmt: skip
     for (wanted, way), beyond in product(ways, (None, CapturePosition(7, 1.0, None))):
         listing = FrameListing.model_validate(wanted)
-        with store.database.read() as connection, plans(connection) as told:
+        with store.database.read() as connection, plans(connection) as steps:
             list_frames(connection, hall.number, beyond, 9, listing)
-        assert any(way in step for step in told), (wanted, told)
-        assert not any(step.startswith("SCAN") for step in told), (wanted, told)
+        assert any(way in step for step in steps), (wanted, steps)
+        assert not any(step.startswith("SCAN") for step in steps), (wanted, steps)

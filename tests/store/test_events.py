@@ -66,8 +66,8 @@ def test_who_reads_on_misses_nothing_of_several_writers(race, url, store, tmp_pa
     sure = sum(1 + n % 3 for n in range(18) if n % 7 != 3) * 3
     *_, seen = race(WRITE + READ, 4, url, blobs, sure)
     with store.database.read() as connection:
-        asked = select(events.c.number, events.c.frame_id).order_by(events.c.number)
-        rows = connection.execute(asked).all()
+        query = select(events.c.number, events.c.frame_id).order_by(events.c.number)
+        rows = connection.execute(query).all()
     assert [list(row) for row in rows] == seen
     assert len(seen) == sure
     for i in range(3):  # each writer's own in its order
@@ -113,7 +113,7 @@ def test_events_are_counted_by_interval(store):
 def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
     """Nor is it told of one that is already deleted it was made, and of which there is no other."""
 
-    def told(since, *names):
+    def changes(since, *names):
         wanted = EventFilter(frozenset(names), since=since)
         with store.database.read() as connection:
             found = [(event.kind, event.map) for event in list_events(connection, wanted)]
@@ -149,17 +149,17 @@ def test_a_later_key_is_told_nothing_of_a_former_map_of_the_name(store):
     at(200)
     begin("hall", "yard")
     at(300)
-    made, gone = ("map.created", "hall"), ("map.deleted", "hall")
-    assert told(None, "hall") == told(150, "hall") == [made, gone, made]
-    assert told(250, "hall") == told(900, "hall") == [made]
-    assert told(250, "shop") == told(250, "attic") == []
-    assert told(150, "shop") == [("map.created", "shop"), ("map.deleted", "shop")]
-    assert told(250, "hall", "shop", "yard") == [made, ("map.created", "yard")]
+    created, gone = ("map.created", "hall"), ("map.deleted", "hall")
+    assert changes(None, "hall") == changes(150, "hall") == [created, gone, created]
+    assert changes(250, "hall") == changes(900, "hall") == [created]
+    assert changes(250, "shop") == changes(250, "attic") == []
+    assert changes(150, "shop") == [("map.created", "shop"), ("map.deleted", "shop")]
+    assert changes(250, "hall", "shop", "yard") == [created, ("map.created", "yard")]
     end("hall")  # by whoever had it: what was before it stays hidden
     at(400)
-    assert told(250, "hall") == [made, gone]
-    assert told(500, "hall") == []
+    assert changes(250, "hall") == [created, gone]
+    assert changes(500, "hall") == []
     begin("hall")
     at(600)
-    assert told(250, "hall") == [made, gone, made]
-    assert told(500, "hall") == [made]
+    assert changes(250, "hall") == [created, gone, created]
+    assert changes(500, "hall") == [created]

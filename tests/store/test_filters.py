@@ -56,7 +56,7 @@ def test_only_indexed_frames_of_the_map_pass(store, hall, indexed, received):
 
 def test_own_session_is_that_of_the_robot(store, hall, indexed):
     """Named: by robot, session and time of a frame; the query is r1 in s at 100, 10 s away."""
-    made = {
+    frames = {
         given: indexed(str(given), robot=given[0], session=given[1], captured_at=given[2]).number
         for given in [
             ("r1", "s", 89.9), ("r1", "s", 90.0), ("r1", "s", 110.0), ("r1", "s", 110.1),
@@ -67,11 +67,11 @@ def test_own_session_is_that_of_the_robot(store, hall, indexed):
     away = [("r1", "s", 89.9), ("r1", "s", 110.1), ("r1", "t", 100.0), ("r1", None, 100.0),
             (None, "s", 200.0)]  # fmt: skip
     of_r2 = [("r2", "s", 100.0), ("r2", "s", None)]
-    asked = QueryOrigin("r1", "s", 100.0)
-    assert found(store, hall, asked, not_within_s=10) == sorted(made[o] for o in away + of_r2)
+    origin = QueryOrigin("r1", "s", 100.0)
+    assert found(store, hall, origin, not_within_s=10) == sorted(frames[o] for o in away + of_r2)
     # a query that names no robot may be any robot's
-    asked = QueryOrigin(None, "s", 100.0)
-    assert found(store, hall, asked, not_within_s=10) == sorted(made[o] for o in away)
+    origin = QueryOrigin(None, "s", 100.0)
+    assert found(store, hall, origin, not_within_s=10) == sorted(frames[o] for o in away)
     with pytest.raises(ValueError, match="no session"):
         found(store, hall, NOBODY, not_within_s=10)
 
@@ -92,14 +92,14 @@ BOX = {"min": {"x": 0, "y": 0, "z": 0}, "max": {"x": 1, "y": 1, "z": 1}}
     ],
 )
 def test_no_filter_reads_other_maps(store, hall, plans, wanted):
-    with store.database.read() as connection, plans(connection) as told:
+    with store.database.read() as connection, plans(connection) as steps:
         passing_frames(
             connection, hall.number, Filter.model_validate(wanted), QueryOrigin("r1", "s", 1.0)
         )
-    assert told
-    assert all("SEARCH" in step or "LIST SUBQUERY" in step for step in told), told
-    assert not any("TEMP B-TREE" in step for step in told), told
+    assert steps
+    assert all("SEARCH" in step or "LIST SUBQUERY" in step for step in steps), steps
+    assert not any("TEMP B-TREE" in step for step in steps), steps
     if "session" in wanted:
-        assert any("session=?" in step for step in told), told
+        assert any("session=?" in step for step in steps), steps
     if "tags" in wanted:
-        assert sum("tag=?" in step for step in told) == 2
+        assert sum("tag=?" in step for step in steps) == 2

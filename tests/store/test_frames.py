@@ -21,11 +21,11 @@ def indexed(store, hall):
     """Give a frame a signature of three bytes that tell its number."""
 
     def index(frame):
-        made = signed.StoredSignature(
+        signature = signed.StoredSignature(
             hall.model_id, bytes([frame.number, 2, 3]), f"{frame.number:064d}", [4], [12]
         )
         with store.database.write() as connection:
-            return signed.index_frame(connection, frame, made)
+            return signed.index_frame(connection, frame, signature)
 
     return index
 
@@ -147,8 +147,8 @@ def test_a_deleted_frame_leaves_a_row_and_nothing_else(store, hall, received, in
         assert stored_maps.geometry_blobs(connection, [frame.number], hall.model_id) == {}
         assert stored.refers_to(connection, "11" * 32)  # the other frame does
         assert not stored.refers_to(connection, artifact)
-        told = connection.execute(select(events).where(events.c.kind == "frame.deleted")).all()
-        assert [(each.map, each.frame_id) for each in told] == [("hall", frame.id)]
+        rows = connection.execute(select(events).where(events.c.kind == "frame.deleted")).all()
+        assert [(each.map, each.frame_id) for each in rows] == [("hall", frame.id)]
     with pytest.raises(UnknownFrame, match="is already deleted"):
         delete(store, hall, frame)
     with store.database.write() as connection:

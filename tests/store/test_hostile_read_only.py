@@ -107,9 +107,9 @@ def test_a_log_that_was_left_is_read_or_refused(folder, ask):
         (folder / f"a.db{end}").write_bytes(data)
     assert ask() == "3 ['a.db', 'a.db-shm', 'a.db-wal']"
     (folder / "a.db-shm").unlink()
-    told = ask()  # the row in the log must not be overlooked
-    assert told.startswith("UnusableStore: ")
-    assert "was not closed properly, and cannot be recovered on a read-only disk" in told
+    answer = ask()  # the row in the log must not be overlooked
+    assert answer.startswith("UnusableStore: ")
+    assert "was not closed properly, and cannot be recovered on a read-only disk" in answer
     (folder / "a.db-wal").write_bytes(b"")
     assert ask() == "1 ['a.db', 'a.db-wal']"  # all that the file itself holds
 

@@ -86,11 +86,11 @@ def test_a_key_is_shown_once_and_kept_as_a_hash(store):
         assert [row.digest for row in rows] == [
             hashlib.sha256(s.encode()).hexdigest() for s in (secret, other)
         ]
-        told = connection.execute(select(events)).all()
-    assert [(each.kind, each.data) for each in told] == [
+        event_rows = connection.execute(select(events)).all()
+    assert [(each.kind, each.data) for each in event_rows] == [
         ("key.created", {"name": "fleet"}), ("key.created", {"name": "dashboard"}),
     ]  # fmt: skip
-    assert secret not in repr(rows) + repr(told)
+    assert secret not in repr(rows) + repr(event_rows)
     with store.database.write() as connection:
         keys.revoke_key(connection, "fleet")
         assert keys.find_key(connection, secret) is None

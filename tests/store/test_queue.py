@@ -111,13 +111,13 @@ def test_a_lease_that_is_over_is_given_to_another_with_a_greater_token(store, ha
 def test_what_comes_late_leaves_nothing(store, hand, hall, received, turned):
     frame = received("a")
     job = hand.do(queue.enqueue, "sign", frame.number)
-    made = StoredSignature(hall.model_id, b"\1\2\3", "cd" * 32, [4, 2], [12, 2])
+    signature = StoredSignature(hall.model_id, b"\1\2\3", "cd" * 32, [4, 2], [12, 2])
     first = hand.taken("w")
     turned(job, leased_until=1.0)
     second = hand.taken("w")  # of the same name, so that the token alone tells them apart
     for order in (1, -1):  # the effect before the end of the job, and after it
         steps = (
-            lambda c: index_frame(c, frame, made),
+            lambda c: index_frame(c, frame, signature),
             lambda c: queue.finish(c, first, JobState.SUCCEEDED),
         )
         with pytest.raises(LostLease), store.database.write() as connection:
@@ -126,7 +126,7 @@ def test_what_comes_late_leaves_nothing(store, hand, hall, received, turned):
             assert connection.execute(select(signatures)).all() == []
     with store.database.write() as connection:
         queue.finish(connection, second, JobState.SUCCEEDED)
-        assert index_frame(connection, frame, made) == 1
+        assert index_frame(connection, frame, signature) == 1
     assert hand.row(job).state == JobState.SUCCEEDED
 
 

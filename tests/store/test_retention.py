@@ -114,6 +114,6 @@ def test_names_of_maps_that_are_gone_are_bounded(filled, monkeypatch):
         # of the one that is forgotten it is known that it went before the oldest that is not
         assert known == lasts | {"a": lasts["b"]}
         for name, quota in (("limited", 7), ("b", None), ("a", None)):
-            made = add_map(connection, name, None, "m" * 64)
-            assert (made.quota_frames, made.quota_bytes) == (quota, None)
+            row = add_map(connection, name, None, "m" * 64)
+            assert (row.quota_frames, row.quota_bytes) == (quota, None)
         assert events.last_event(connection, "b") == 0  # fewer than can be remembered: none is

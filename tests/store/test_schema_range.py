@@ -54,9 +54,9 @@ def test_a_process_may_begin_on_a_later_schema_that_allows_it(url, store):
 
 def _range(url):
     """Return the revision of a store, and the oldest one whose processes may write to it."""
-    asked = text("SELECT version_num, least_revision FROM alembic_version, schema_range")
+    query = text("SELECT version_num, least_revision FROM alembic_version, schema_range")
     with closing(reach_database(url)) as found, found.read() as connection:
-        revision, least = connection.execute(asked).one()
+        revision, least = connection.execute(query).one()
         return revision, least
 
 

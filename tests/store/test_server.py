@@ -50,8 +50,8 @@ def test_two_processes_may_open_an_empty_database_at_once(empty_url, race):
     assert not database_exists(empty_url)
     assert race(SCHEMA_OF, 2, empty_url) == [[known_revisions()[0]]] * 2
     assert database_exists(empty_url)
-    made = open_database(empty_url)
-    with made.read() as connection:
+    database = open_database(empty_url)
+    with database.read() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, metadata) == []
         narrow = text(
@@ -62,7 +62,7 @@ def test_two_processes_may_open_an_empty_database_at_once(empty_url, race):
         assert connection.execute(narrow).all() == []
         counted = connection.execute(text("SELECT DISTINCT data_type::text FROM pg_sequences"))
         assert counted.scalars().all() == ["bigint"]
-    made.close()
+    database.close()
 
 
 def test_the_blobs_of_a_database_that_is_there_are_not_made_up_for(
@@ -168,10 +168,10 @@ def test_a_text_with_nul_is_found_nowhere_and_noted_all_the_same(store):
 
 
 def test_more_numbers_are_asked_for_than_one_statement_takes(store, hall, received):
-    made = [received(name).number for name in "abc"]
+    numbers = [received(name).number for name in "abc"]
     with store.database.read() as connection:
         found = frames_of(connection, range(70_000))
-    assert sorted(found) == made
+    assert sorted(found) == numbers
 
 
 def test_what_was_stored_is_json(store, hall):

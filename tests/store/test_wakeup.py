@@ -77,14 +77,14 @@ def test_all_who_wait_are_woken_once(ours):
 
 
 def test_another_descriptor_ends_the_wait_too(ours):
-    told, tell = os.pipe()
+    reader, tell = os.pipe()
     with listening(ours) as listener:
         os.write(tell, b"!")
-        assert not listener.wait(FOREVER, -1, told)
-        os.read(told, 1)
+        assert not listener.wait(FOREVER, -1, reader)
+        os.read(reader, 1)
         ours.ring()
-        assert listener.wait(FOREVER, told)
-    os.close(told)
+        assert listener.wait(FOREVER, reader)
+    os.close(reader)
     os.close(tell)
 
 
@@ -171,10 +171,10 @@ def test_a_server_that_never_answers_holds_up_no_end(monkeypatch):
         port = silent.getsockname()[1]
         mute = Notices(reach_database(f"postgresql://u@127.0.0.1:{port}/x?connect_timeout=60"))
         mute.ring()
-        asked, _ = silent.accept()
+        connection, _ = silent.accept()
         ringer = mute._ringer
         mute.close()
         assert ringer.is_alive()
-        asked.close()
+        connection.close()
     ringer.join(FOREVER)
     assert not ringer.is_alive()

@@ -47,8 +47,8 @@ def until_waiting(group, count):
 
 def count(database, kind):
     with database.read() as connection:
-        asked = select(func.count()).where(events.c.kind == kind)
-        return int(connection.execute(asked).scalar_one())
+        query = select(func.count()).where(events.c.kind == kind)
+        return int(connection.execute(query).scalar_one())
 
 
 def noting(kind, result):

@@ -34,9 +34,9 @@ class Crew:
         lines = [json.loads(line) for line in text[: text.rfind("\n") + 1].splitlines()]
         return [line for line in lines if line["message"] == message]
 
-    def rows(self, asked):
+    def rows(self, statement):
         with self.engine.store.database.read() as connection:
-            return [tuple(row) for row in connection.exec_driver_sql(asked)]
+            return [tuple(row) for row in connection.exec_driver_sql(statement)]
 
     def change(self, statement):
         with self.engine.store.database.write() as connection:
@@ -57,11 +57,11 @@ class Crew:
 
     def signed(self, map_name):
         """Return the number of signatures of each frame of a map."""
-        asked = (
+        statement = (
             "SELECT count(*) FROM signatures s JOIN frames f ON f.number = s.frame_number "
             f"JOIN maps m ON m.number = f.map_number AND m.name = '{map_name}' GROUP BY f.number"
         )
-        return [count for (count,) in self.rows(asked)]
+        return [count for (count,) in self.rows(statement)]
 
     def pause(self):
         """Stop both workers while neither is writing, since its lock would block others."""

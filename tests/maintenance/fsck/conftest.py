@@ -54,17 +54,17 @@ class House:
             for path in self.place.rglob("*")
         }
 
-    def sql(self, asked, *values):
+    def sql(self, statement, *values):
         """Query or change the database without its checks, and without a log."""
         if self.is_sqlite:
             with closing(sqlite3.connect(self.data / "sceneprint.db")) as database:
-                found = database.execute(asked, values).fetchall()
+                found = database.execute(statement, values).fetchall()
                 database.commit()
             return found
         engine = create_engine(self.settings.database, poolclass=NullPool)
         with engine.begin() as connection:
             connection.exec_driver_sql("SET session_replication_role = replica")
-            result = connection.exec_driver_sql(asked.replace("?", "%s"), values)
+            result = connection.exec_driver_sql(statement.replace("?", "%s"), values)
             return [tuple(row) for row in result] if result.returns_rows else []
 
     def blob(self, digest):

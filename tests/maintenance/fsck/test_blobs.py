@@ -156,11 +156,11 @@ def test_an_upload_that_is_found_again_clears_the_reason(house, state):
     assert house.sql(statement, frame_id) == [("indexed", None)]
 
 
-@pytest.mark.parametrize("made", ["artifact", "signature"])
-def test_what_was_made_of_a_lost_upload_cannot_be_made_again(house, made, truth, uploads):
+@pytest.mark.parametrize("product", ["artifact", "signature"])
+def test_what_was_made_of_a_lost_upload_cannot_be_made_again(house, product, truth, uploads):
     frame_id, upload, artifact = house.sql(f"{FIRST} ORDER BY number")[0]
     house.blob(upload).unlink()
-    if made == "artifact":
+    if product == "artifact":
         house.damage(house.blob(artifact))
     else:
         house.sql("UPDATE signatures SET checksum = checksum + 1 WHERE frame_number = 1")
@@ -169,7 +169,7 @@ def test_what_was_made_of_a_lost_upload_cannot_be_made_again(house, made, truth,
     ((state, reason),) = house.sql("SELECT state, reason FROM frames WHERE id = ?", frame_id)
     assert "its upload is lost" in reason
     assert (kinds, state) == (
-        (["missing-upload", "damaged-artifact"], "indexed") if made == "artifact"
+        (["missing-upload", "damaged-artifact"], "indexed") if product == "artifact"
         else (["damaged-signature", "missing-upload"], "failed")
     )  # fmt: skip
     assert house.answers(uploads[:12]) == truth

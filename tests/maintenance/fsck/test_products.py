@@ -86,9 +86,9 @@ def bundles(copied, tmp_path_factory):
 
 @pytest.fixture
 def fleet(bundles, master, house_at, postgres_url, tmp_path):
-    made = house_at(tmp_path / "node", SecretStr(postgres_url), master.settings.cache_dir)
-    restore_to_server(bundles, made.settings)
-    return made
+    node = house_at(tmp_path / "node", SecretStr(postgres_url), master.settings.cache_dir)
+    restore_to_server(bundles, node.settings)
+    return node
 
 
 @pytest.mark.sqlite_only("has a server of its own")
